@@ -1,0 +1,49 @@
+"""What everything that watches a stream has in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.episodes import Episode
+from asm_gym.stream import StreamSpec
+
+State = Any
+"""A monitor's running state: a value, passed in and handed back, never kept in the monitor."""
+
+
+class Surprise(NamedTuple):
+    """How unexpected the last row of each stream in a batch was.
+
+    Attributes:
+        value: (B,) what the threshold applies to; ``inf`` where the row was not finite.
+        attribution: (B, D) each number's share; adds up to ``value`` along the last axis.
+    """
+
+    value: NDArray[np.float64]
+    attribution: NDArray[np.float64]
+
+
+class Monitor(Protocol):
+    """Watches a stream and says how surprising it is."""
+
+    spec: StreamSpec
+
+    @property
+    def threshold(self) -> float:
+        """What surprise must exceed for an alarm. Raises RuntimeError before ``calibrate``."""
+        ...
+
+    def fit(self, episodes: Sequence[Episode]) -> Self: ...
+
+    def calibrate(self, episodes: Sequence[Episode], false_alarm_rate: float = 0.01) -> Self: ...
+
+    def initial_state(self, batch: int = 1) -> State: ...
+
+    def observe(self, state: State, stream: NDArray[np.floating[Any]]) -> tuple[State, Surprise]: ...
+
+    def save(self, path: str | Path) -> None: ...

@@ -1,0 +1,176 @@
+"""The sensorimotor stream: what the robot senses, and what it was told to do, one row per control step.
+
+A row is ``x_t = [sensed_t, commanded_t]``: the sensors as read after the control step, and the action that was
+commanded during it (the efference copy). A :class:`StreamSpec` names every number in the row.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+MOTOR = "action"
+"""The group that holds the commanded action."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One named signal of one or more numbers.
+
+    Args:
+        name: for example ``joint_position``.
+        size: how many numbers it has.
+        unit: SI unit, ``"1"`` where there is none.
+        noise: standard deviation of the sensor noise [unit].
+        group: what the channel can be selected by, for example ``joint`` or ``wrench``. The group ``action`` is the
+            efference copy: it is given to the memory, not predicted from the senses.
+        elements: a name for each number; ``0, 1, …`` where empty.
+    """
+
+    name: str
+    size: int
+    unit: str = "1"
+    noise: float = 0.0
+    group: str = "sense"
+    elements: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.size < 1:
+            raise ValueError(f"channel {self.name!r} must have a size of at least 1, got {self.size}")
+        if not self.noise >= 0.0:
+            raise ValueError(f"channel {self.name!r}: noise must be >= 0, got {self.noise}")
+        if self.elements and len(self.elements) != self.size:
+            raise ValueError(f"channel {self.name!r} has size {self.size} but {len(self.elements)} element names")
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A name for every number, such as ``joint_position[3]``; the bare name where there is one number."""
+        if self.size == 1 and not self.elements:
+            return (self.name,)
+        return tuple(f"{self.name}[{e}]" for e in (self.elements or range(self.size)))
+
+
+@dataclass(frozen=True)
+class StreamSpec:
+    """The layout of a stream row, and the rate it comes at.
+
+    Args:
+        channels: in the order they stand in a row.
+        dt: control period [s].
+        source: what made the stream, for example ``Panda``. A name for people: two specs with the same channels and
+            rate are compatible whatever their source.
+    """
+
+    channels: tuple[Channel, ...]
+    dt: float
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        names = [c.name for c in self.channels]
+        if len(set(names)) != len(names):
+            raise ValueError(f"channel names must be unique, got {names}")
+        if not any(c.group != MOTOR for c in self.channels):
+            raise ValueError("a stream needs at least one channel that is not an action")
+        if not self.dt > 0:
+            raise ValueError(f"dt must be > 0, got {self.dt}")
+
+    @cached_property
+    def size(self) -> int:
+        """D, the length of a row."""
+        return sum(c.size for c in self.channels)
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """D names, one for each number in a row."""
+        return tuple(label for c in self.channels for label in c.labels)
+
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        """Where each channel stands in a row."""
+        ends = np.cumsum([c.size for c in self.channels])
+        return {c.name: slice(int(e) - c.size, int(e)) for c, e in zip(self.channels, ends, strict=True)}
+
+    @cached_property
+    def noise(self) -> NDArray[np.float64]:
+        """(D,) standard deviation of the sensor noise [unit of each channel]."""
+        return np.concatenate([np.full(c.size, c.noise) for c in self.channels])
+
+    @cached_property
+    def motor(self) -> NDArray[np.intp]:
+        """Indices of the commanded action."""
+        return self._indices(motor=True)
+
+    @cached_property
+    def sensory(self) -> NDArray[np.intp]:
+        """Indices of everything that is sensed."""
+        return self._indices(motor=False)
+
+    def _indices(self, motor: bool) -> NDArray[np.intp]:
+        return np.array(
+            [i for c in self.channels if (c.group == MOTOR) is motor for i in range(self.size)[self.slices[c.name]]],
+            dtype=np.intp,
+        )
+
+    def by_channel(self, values: NDArray[np.floating[Any]]) -> dict[str, NDArray[np.floating[Any]]]:
+        """Sums ``values`` (…, D) within each channel: {name: (…)}."""
+        return {name: values[..., s].sum(axis=-1) for name, s in self.slices.items()}
+
+    def check_row(self, stream: NDArray[np.floating[Any]]) -> None:
+        """Raises ValueError unless the last axis of ``stream`` is D long."""
+        if stream.ndim < 1 or stream.shape[-1] != self.size:
+            raise ValueError(
+                f"a stream of this spec has {self.size} numbers a step ({', '.join(c.name for c in self.channels)}), "
+                f"got an array of shape {stream.shape}"
+            )
+
+    def difference(self, other: StreamSpec) -> list[str]:
+        """What keeps a memory of this spec from reading streams of ``other``, a line each; empty where nothing does."""
+        mine, theirs = ({c.name: c for c in s.channels} for s in (self, other))
+        lines = [f"{n}: missing" for n in mine if n not in theirs] + [f"{n}: new" for n in theirs if n not in mine]
+        for name in mine:
+            if name in theirs and mine[name].size != theirs[name].size:
+                lines.append(f"{name}: size {mine[name].size} against {theirs[name].size}")
+            elif name in theirs and mine[name].unit != theirs[name].unit:
+                lines.append(f"{name}: unit {mine[name].unit} against {theirs[name].unit}")
+            elif name in theirs and mine[name].group != theirs[name].group:
+                lines.append(f"{name}: group {mine[name].group} against {theirs[name].group}")
+        if not lines and list(mine) != list(theirs):
+            lines.append(f"order: {', '.join(mine)} against {', '.join(theirs)}")
+        if abs(self.dt - other.dt) > 1e-9:
+            lines.append(f"dt: {self.dt} s against {other.dt} s")
+        return lines
+
+    def require(self, other: StreamSpec, whose: str) -> None:
+        """Raises ValueError naming the channels that differ, unless ``other`` can be read with this spec."""
+        lines = self.difference(other)
+        if lines:
+            raise ValueError(f"{whose} does not fit this stream:\n  " + "\n  ".join(lines))
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> StreamSpec:
+        raw = json.loads(text)
+        channels = tuple(Channel(**{**c, "elements": tuple(c["elements"])}) for c in raw["channels"])
+        return cls(channels, raw["dt"], raw["source"])
+
+    @classmethod
+    def from_spaces(cls, observation: spaces.Space[Any], action: spaces.Space[Any], dt: float = 1.0) -> StreamSpec:
+        """The spec of an environment that has no stream of its own: its observation, then the action.
+
+        Raises:
+            TypeError: either space is not a Box.
+        """
+        for name, space in (("observation", observation), ("action", action)):
+            if not isinstance(space, spaces.Box):
+                raise TypeError(f"the {name} space must be a Box to be read as a stream, got {space}")
+        sizes = [int(np.prod(s.shape)) for s in (observation, action) if s.shape is not None]
+        return cls((Channel("observation", sizes[0]), Channel("action", sizes[1], group=MOTOR)), dt, "spaces")
+
