@@ -1,3 +1,16 @@
 """Neural associative skill memories that watch robots: importing this registers the environments with Gymnasium."""
 
+import gymnasium
+
+from asm_gym.tasks import TASKS
+
 __version__ = "0.1.0"
+
+for _task in TASKS.values():
+    gymnasium.register(
+        id=_task.id,
+        entry_point="asm_gym.envs.robosuite_env:RobosuiteEnv",
+        kwargs={"task": _task.name},
+        # The environment truncates itself, so that `horizon` is an argument like any other.
+        max_episode_steps=None,
+    )

@@ -1,0 +1,93 @@
+"""Pictures of the simulation, made lazily: an environment that never renders never touches OpenGL."""
+
+from __future__ import annotations
+
+import os
+import sys
+import weakref
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+
+class OffscreenRenderer:
+    """Renders one camera without a display; follows the model when a hard reset replaces it.
+
+    OpenGL comes from EGL, or from OSMesa where the environment variable ``MUJOCO_GL`` says ``osmesa``. Shadows,
+    reflections and multisampling are off: on a CPU they cost three times the rest.
+
+    Args:
+        camera: a camera of the model.
+        width: [pixels].
+        height: [pixels].
+    """
+
+    def __init__(self, camera: str, width: int, height: int) -> None:
+        self.camera, self.width, self.height = camera, width, height
+        self._model: mujoco.MjModel | None = None
+        self._gl: Any = None
+        self._camera = mujoco.MjvCamera()
+        self._options = mujoco.MjvOption()
+        self._options.geomgroup[0] = 0  # collision shapes
+        self._viewport = mujoco.MjrRect(0, 0, width, height)
+
+    def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
+        """(height, width, 3) uint8."""
+        if self._model is not model:
+            self._open(model)
+        self._gl.make_current()
+        mujoco.mjv_updateScene(
+            model, data, self._options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
+        )
+        mujoco.mjr_render(self._viewport, self._scene, self._context)
+        frame = np.empty((self.height, self.width, 3), np.uint8)
+        mujoco.mjr_readPixels(frame, None, self._viewport, self._context)
+        return np.flipud(frame).copy()
+
+    def _open(self, model: mujoco.MjModel) -> None:
+        self.close()
+        self._gl = _gl_context(self.width, self.height)
+        # At exit too, before OpenGL's own modules are torn down.
+        self._free = weakref.finalize(self, self._gl.free)
+        self._gl.make_current()
+        model.vis.quality.offsamples = 0
+        model.vis.global_.offwidth, model.vis.global_.offheight = self.width, self.height
+        self._scene = mujoco.MjvScene(model, maxgeom=10_000)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._scene.flags[flag] = 0
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._camera.fixedcamid = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, self.camera)
+        self._model = model
+
+    def close(self) -> None:
+        """Frees the OpenGL context; may be called more than once."""
+        if self._gl is not None:
+            if self._model is not None:
+                self._context.free()
+            self._free()
+        self._gl = self._model = None
+
+
+def _gl_context(width: int, height: int) -> Any:
+    """An OpenGL context that needs no display.
+
+    Raises:
+        RuntimeError: there is none to be had on this machine.
+    """
+    try:
+        # mujoco.Renderer would take GLFW here, which needs a display, unless MUJOCO_GL was set before MuJoCo's import.
+        if sys.platform == "darwin":
+            from mujoco.cgl import GLContext
+        elif os.environ.get("MUJOCO_GL", "").lower() == "osmesa":
+            from mujoco.osmesa import GLContext
+        else:
+            from mujoco.egl import GLContext
+        return GLContext(width, height)
+    except (ImportError, RuntimeError, AttributeError, OSError) as error:
+        raise RuntimeError(
+            f"no OpenGL for rendering: {error}. `asm-gym doctor` says which library is missing and how to get it."
+        ) from error
