@@ -1,0 +1,1 @@
+"""Evaluation: pure functions over recorded episodes; no simulator, no wrappers."""

@@ -1,0 +1,283 @@
+"""How well faults were told from nominal episodes: pure functions of recorded traces.
+
+Detection is measured where the monitor only watches (``acting == "policy alone"``), so that the override cannot
+change what it is judged on; what the override changes is measured on the other traces.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
+
+
+def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
+    """The score interval of a proportion of ``k`` in ``n`` (Wilson 1927); (0, 1) where ``n`` is 0.
+
+    ``(p + z²/2n ± z √(p(1-p)/n + z²/4n²)) / (1 + z²/n)``
+    """
+    if not 0 <= k <= n:
+        raise ValueError(f"k must be in [0, n], got {k} of {n}")
+    if n == 0:
+        return 0.0, 1.0
+    z = NormalDist().inv_cdf(0.5 + _check_confidence(confidence) / 2)
+    p, shrink = k / n, 1 + z * z / n
+    centre = (p + z * z / (2 * n)) / shrink
+    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / shrink
+    # At the ends the bound is exact; rounding would leave 1e-17.
+    return (0.0 if k == 0 else centre - half), (1.0 if k == n else centre + half)
+
+
+def binomial_interval(n: int, p: float, confidence: float = 0.95) -> tuple[int, int]:
+    """Counts (lo, hi) that ``n`` trials of probability ``p`` stay within, equal tails: P(k < lo), P(k > hi) <= (1-c)/2.
+
+    For checking a calibration: alarms in n nominal episodes at the false-alarm rate p.
+    """
+    if not 0 <= p <= 1:
+        raise ValueError(f"p must be in [0, 1], got {p}")
+    if n < 0:
+        raise ValueError(f"n must be >= 0, got {n}")
+    tail = (1 - _check_confidence(confidence)) / 2
+    if p in (0.0, 1.0):
+        return round(n * p), round(n * p)
+    log_mass = [
+        math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) + k * math.log(p) + (n - k) * math.log1p(-p)
+        for k in range(n + 1)
+    ]
+    mass = np.exp(log_mass)  # (n + 1,)
+    below, above = np.cumsum(mass), np.cumsum(mass[::-1])[::-1]  # P(K <= k), P(K >= k)
+    return int(np.argmax(below > tail)), int(n - np.argmax(above[::-1] > tail))
+
+
+def auroc(scores_pos: ArrayLike, scores_neg: ArrayLike) -> float:
+    """The probability that a positive scores higher than a negative, ties counted half (Mann-Whitney).
+
+    Takes infinite scores, refuses NaN.
+    """
+    pos, neg = np.asarray(scores_pos, np.float64), np.asarray(scores_neg, np.float64)
+    if not pos.size or not neg.size:
+        raise ValueError(f"auroc needs scores of both kinds, got {pos.size} positive and {neg.size} negative")
+    if np.isnan(pos).any() or np.isnan(neg).any():
+        raise ValueError("scores must not be NaN")
+    neg = np.sort(neg)
+    lower, not_higher = np.searchsorted(neg, pos, "left"), np.searchsorted(neg, pos, "right")  # (P,)
+    return float((lower + not_higher).sum() / (2 * pos.size * neg.size))
+
+
+def placements(faulty: Sequence[Trace], nominal: Sequence[Trace], window_s: float) -> NDArray[np.float64]:
+    """For each fault, the share of nominal episodes that were at least as surprising over the same steps.
+
+    The score is the greatest surprise in ``[onset, onset + window)``; a faulty episode is compared with the nominal
+    ones over its own steps, because surprise depends on the phase of the task: the covariate-adjusted ROC curve of
+    Janes & Pepe 2009, of which these are the placement values. Ties count half.
+
+    Returns:
+        (F,) for the F traces with a fault and at least one nominal episode that lasted until its onset.
+    """
+    values = []
+    for trace in faulty:
+        if trace.onset is None:
+            continue
+        end = min(trace.onset + window_steps(window_s, trace.dt), len(trace))
+        negatives = [n.surprise[trace.onset : end].max() for n in nominal if len(n) > trace.onset]
+        if negatives:
+            values.append(1.0 - auroc([trace.surprise[trace.onset : end].max()], negatives))
+    return np.array(values)
+
+
+def time_matched_auroc(faulty: Sequence[Trace], nominal: Sequence[Trace], window_s: float) -> float | None:
+    """AUROC of the greatest surprise within the window, each fault against the same steps of nominal episodes.
+
+    Equal to :func:`auroc` where all onsets are; None where nothing can be compared.
+    """
+    values = placements(faulty, nominal, window_s)
+    return float(1.0 - values.mean()) if values.size else None
+
+
+class Share(NamedTuple):
+    """``k`` of ``n``."""
+
+    k: int
+    n: int
+
+    @property
+    def value(self) -> float:
+        return self.k / self.n if self.n else math.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % Wilson interval."""
+        return wilson_interval(self.k, self.n)
+
+    @classmethod
+    def of(cls, outcomes: Sequence[bool]) -> Share:
+        return cls(sum(map(bool, outcomes)), len(outcomes))
+
+
+class Delays(NamedTuple):
+    """How long detection took; a miss counts as infinitely late.
+
+    Attributes:
+        median_ms: half of all faults were detected within this; ``inf`` where fewer were.
+        p95_ms: the same for 95 % of all faults.
+        detected: faults detected within the window.
+        missed: faults that were not.
+    """
+
+    median_ms: float
+    p95_ms: float
+    detected: int
+    missed: int
+
+
+def window_steps(window_s: float, dt: float) -> int:
+    """How many control steps a window holds, at least one."""
+    if not window_s > 0:
+        raise ValueError(f"window_s must be > 0, got {window_s}")
+    return max(1, math.floor(window_s / dt + 1e-6))  # 0.3 / 0.1 is a hair below 3
+
+
+def delays_ms(traces: Sequence[Trace], window_s: float) -> NDArray[np.float64]:
+    """(F,) sorted times from the fault to its alarm [ms], ``inf`` where that took longer than the window.
+
+    Only the traces with a fault. The time runs from the beginning of the control step the fault began in to the end
+    of the one that raised the alarm, so the shortest is one control period.
+    """
+    found = [(t.detected_after, window_steps(window_s, t.dt), t.delay) for t in traces if t.onset is not None]
+    return np.sort([math.inf if k is None or d is None or k >= window else 1e3 * d for k, window, d in found])
+
+
+def delay_summary(traces: Sequence[Trace], window_s: float) -> Delays | None:
+    """Median and 95th percentile of the delay within the window; None where no trace holds a fault."""
+    delays = delays_ms(traces, window_s)
+    if not delays.size:
+        return None
+    # Observed values, not interpolated ones: between a number and a miss there is nothing.
+    median, p95 = (float(delays[math.ceil(q * delays.size) - 1]) for q in (0.5, 0.95))
+    detected = int(np.isfinite(delays).sum())
+    return Delays(median, p95, detected, delays.size - detected)
+
+
+def false_alarms_per_hour(traces: Sequence[Trace]) -> float:
+    """Alarms raised before any fault, per hour of operation before any fault [1/h]; NaN where there was none."""
+    hours = sum((len(t) if t.onset is None else t.onset) * t.dt for t in traces) / 3600
+    return sum(len(t.false_alarms) for t in traces) / hours if hours else math.nan
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How episodes of one condition ended, with one kind of acting.
+
+    Args:
+        acting: ``"policy alone"``, or what the alarm did.
+        success: episodes that solved the task.
+        ended_by_alarm: episodes that the alarm ended.
+        peak_force: median over episodes of the greatest contact force [N]; NaN where it was not measured.
+    """
+
+    acting: str
+    success: Share
+    ended_by_alarm: Share
+    peak_force: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one condition showed.
+
+    Args:
+        condition: ``"nominal"``, or the name of the fault.
+        episodes: watched with the policy alone, as everything down to ``top_labels``.
+        false_alarm_episodes: those with an alarm before the fault; with any alarm, where there is none.
+        false_alarms_per_hour: [1/h] of operation before any fault.
+        detected: faults with an alarm raised within the window; of 0 where there was no fault.
+        delays: None where there was no fault.
+        auroc: time-matched, against the nominal traces; None where there is nothing to compare.
+        top_labels: the channel with the greatest share of surprise when the first alarm was raised (in a faulty
+            episode, the first since the onset), with the number of episodes; the three most frequent.
+        outcomes: one for each kind of acting, the policy alone first.
+    """
+
+    condition: str
+    episodes: int
+    false_alarm_episodes: Share
+    false_alarms_per_hour: float
+    detected: Share
+    delays: Delays | None
+    auroc: float | None
+    top_labels: tuple[tuple[str, int], ...]
+    outcomes: tuple[Outcome, ...]
+
+    def outcome(self, acting: str) -> Outcome | None:
+        """The outcome with this kind of acting; None where it was not tried."""
+        return next((o for o in self.outcomes if o.acting == acting), None)
+
+
+def summarise(traces: Sequence[Trace], window_s: float) -> list[Row]:
+    """One row a condition, the nominal one first, then in order of appearance.
+
+    Args:
+        traces: any mixture of conditions and kinds of acting.
+        window_s: how soon an alarm must come to count as detection [s].
+    """
+    conditions = sorted(dict.fromkeys(t.condition for t in traces), key=lambda c: c != NOMINAL)
+    nominal = [t for t in traces if t.condition == NOMINAL and t.watched_only]
+    return [_row(c, [t for t in traces if t.condition == c], nominal, window_s) for c in conditions]
+
+
+def _row(condition: str, traces: Sequence[Trace], nominal: Sequence[Trace], window_s: float) -> Row:
+    watched = [t for t in traces if t.watched_only]
+    delays = delay_summary(watched, window_s)
+    actings = sorted(dict.fromkeys(t.acting for t in traces), key=lambda a: a != POLICY_ALONE)
+    return Row(
+        condition=condition,
+        episodes=len(watched),
+        false_alarm_episodes=Share.of([bool(t.false_alarms) for t in watched]),
+        false_alarms_per_hour=false_alarms_per_hour(watched),
+        detected=Share(delays.detected, delays.detected + delays.missed) if delays else Share(0, 0),
+        delays=delays,
+        auroc=time_matched_auroc(watched, nominal, window_s),
+        top_labels=tuple(Counter(top_label(t) for t in watched if _blamed_step(t) is not None).most_common(3)),
+        outcomes=tuple(_outcome(a, [t for t in traces if t.acting == a]) for a in actings),
+    )
+
+
+def _outcome(acting: str, traces: Sequence[Trace]) -> Outcome:
+    peaks = [float(t.contact_force.max()) for t in traces]
+    return Outcome(
+        acting=acting,
+        success=Share.of([t.success for t in traces]),
+        ended_by_alarm=Share.of([t.ended_by_alarm for t in traces]),
+        peak_force=float(np.median(peaks)),
+    )
+
+
+def _blamed_step(trace: Trace) -> int | None:
+    """The step of the first alarm since the onset, or of the first alarm where there is no fault."""
+    return next((t for t in trace.alarms if t >= (trace.onset or 0)), None)
+
+
+def top_label(trace: Trace) -> str:
+    """The channel with the greatest share when the first alarm was raised (since the onset, where there is one).
+
+    Raises:
+        ValueError: there was no such alarm.
+    """
+    step = _blamed_step(trace)
+    if step is None:
+        raise ValueError("no alarm was raised in this trace")
+    return trace.labels[int(np.argmax(trace.attribution[step]))]
+
+
+def _check_confidence(confidence: Any) -> float:
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must be in (0, 1), got {confidence}")
+    return float(confidence)

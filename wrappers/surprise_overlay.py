@@ -1,0 +1,97 @@
+"""Pictures that show what the monitor thinks: a strip chart of surprise under every rendered frame."""
+
+from __future__ import annotations
+
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
+
+from asm_gym.evaluation.overlay import StripChart, compose
+
+
+class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Draws surprise, threshold, alarm and ground-truth fault under the pictures of a watched environment.
+
+    Goes over ``NeuralASMSafety``, and under ``RecordVideo``. Reads ``info["asm"]`` (surprise, threshold, alarm,
+    intervened) and, where there is one, ``info["fault"]`` (truthy while a fault is active). Changes nothing but
+    what ``render`` returns.
+
+    Args:
+        env: an environment with ``render_mode="rgb_array"``.
+        caption: what to call the episode, such as the condition.
+        seconds: time the chart shows [s].
+        chart_height: [px]; a fifth of the picture where None.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        caption: str = "",
+        seconds: float = 5.0,
+        chart_height: int | None = None,
+    ) -> None:
+        RecordConstructorArgs.__init__(self, caption=caption, seconds=seconds, chart_height=chart_height)
+        gym.Wrapper.__init__(self, env)
+        if env.render_mode != "rgb_array":
+            raise ValueError(
+                f'SurpriseOverlay draws on pictures and needs render_mode="rgb_array", got {env.render_mode!r}: '
+                'make the environment with gym.make(..., render_mode="rgb_array")'
+            )
+        if not seconds > 0:
+            raise ValueError(f"seconds must be > 0, got {seconds}")
+        self.caption = caption
+        self._seconds = seconds
+        self._chart_height = chart_height
+        self._dt = _control_period(env)
+        self._clear()
+
+    def _clear(self) -> None:
+        self._ratio: list[float] = []  # surprise / threshold, one a step
+        self._alarm: list[bool] = []
+        self._fault: list[bool] = []
+        self._intervened = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._clear()
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        asm = info.get("asm")
+        if asm is None:
+            raise KeyError(
+                'SurpriseOverlay found no info["asm"]: put it over NeuralASMSafety, '
+                f"as in SurpriseOverlay(NeuralASMSafety(env, monitor)); it is over {self.env}"
+            )
+        surprise, threshold = float(asm["surprise"]), float(asm["threshold"])
+        if not threshold > 0:
+            raise ValueError(f"a log axis needs a threshold > 0, got {threshold}")
+        self._ratio.append(surprise / threshold)
+        self._alarm.append(bool(asm["alarm"]))
+        self._fault.append(bool(info.get("fault")))
+        self._intervened = bool(asm["intervened"])
+        return observation, reward, terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8]:
+        """(H + chart height, W, 3) uint8."""
+        frame = np.asarray(self.env.render())
+        height, width = frame.shape[:2]
+        # In units of the threshold, the chart is the same whatever the monitor.
+        chart = StripChart(width, self._chart_height or max(72, height // 5), max(2, round(self._seconds / self._dt)))
+        strip = chart.draw(self._ratio, self._alarm, self._fault)
+        return compose(frame, strip, bool(self._alarm and self._alarm[-1]), self._line())
+
+    def _line(self) -> str:
+        time = f"{len(self._ratio) * self._dt:.2f} s"
+        acting = "override acting" if self._intervened else "policy acting"
+        return "   ".join(part for part in (self.caption, time, acting) if part)
+
+
+def _control_period(env: gym.Env[Any, Any]) -> float:
+    """[s] from the stream's spec, or from the frame rate of environments that have no stream."""
+    spec = getattr(env.unwrapped, "stream_spec", None)
+    return float(spec.dt if spec is not None else 1.0 / env.metadata.get("render_fps", 20))
