@@ -1,0 +1,51 @@
+"""``asm-gym <command>``: one entry for every script; each is imported only when it is asked for."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from typing import NamedTuple
+
+from asm_gym import __version__
+
+
+class Command(NamedTuple):
+    """A script: the module whose ``main(argv) -> int`` it is, and one line of what it does."""
+
+    module: str
+    summary: str
+
+
+COMMANDS: dict[str, Command] = {
+    "demo": Command("asm_gym.scripts.demo", "a robot that notices when something is wrong, in a few minutes"),
+    "doctor": Command("asm_gym.scripts.doctor", "what this machine lacks, and the command that installs it"),
+}
+
+
+def usage() -> str:
+    """The commands, a line each."""
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items()]
+    return "\n".join(
+        ["usage: asm-gym COMMAND [OPTIONS]", "", *lines, "", "`asm-gym COMMAND --help` lists the options of one."]
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one command, and returns its exit code: 2 where there is no such command."""
+    name, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
+    if name in ("-h", "--help", "help"):
+        print(usage())
+        return 0
+    if name == "--version":
+        print(f"asm-gym {__version__}")
+        return 0
+    if name not in COMMANDS:
+        print(f"asm-gym: unknown command {name!r}; the commands are {', '.join(COMMANDS)}", file=sys.stderr)
+        return 2
+    code: int = import_module(COMMANDS[name].module).main(rest)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,213 @@
+"""What this machine lacks to run asm-gym, and the command that installs it.
+
+Nothing checked here is imported here: the doctor has to work where ``import robosuite`` does not.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import cache
+from importlib import metadata
+
+import tyro
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+PACKAGES = ("mujoco", "robosuite", "gymnasium", "stable-baselines3", "numpy", "torch")
+BACKENDS = ("egl", "osmesa")  # EGL first: it uses a GPU where there is one
+REINSTALL = "make clean, then make doctor (or: python -m pip install -c constraints.txt -e .)"
+COMPILER = "apt-get install gcc libc6-dev linux-libc-dev python3-dev"
+
+# opencv-python links to these, and `import robosuite` imports it.
+LIBRARIES = {"libGL.so.1": "libgl1", "libglib-2.0.so.0": "libglib2.0-0", "libgthread-2.0.so.0": "libglib2.0-0"}
+GL_LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
+
+# A lit white ball on black: a driver that draws nothing returns a frame of one colour.
+ONE_FRAME = """
+import mujoco
+ball = "<mujoco><worldbody><light pos='0 0 3'/><geom size='.1' rgba='1 1 1 1'/></worldbody></mujoco>"
+model = mujoco.MjModel.from_xml_string(ball)
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 32, 32) as renderer:
+    renderer.update_scene(data)
+    frame = renderer.render()  # (32, 32, 3) uint8
+assert frame.min() < frame.max(), "the frame is one colour"
+"""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing looked at.
+
+    Args:
+        name: what was looked at.
+        ok: it is there, and works.
+        needed: asm-gym does not run without it; otherwise only something of it is missing, such as video.
+        detail: what was found.
+        remedy: the command that puts it right; empty where nothing is wrong.
+    """
+
+    name: str
+    ok: bool
+    needed: bool
+    detail: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Says what this machine lacks to run asm-gym, and how to install it. Exit code 1: it cannot run."""
+
+
+def run_checks() -> list[Check]:
+    """Every check, in the order in which a remedy for one helps the next."""
+    libraries = [library(name, package) for name, package in LIBRARIES.items()] if sys.platform == "linux" else []
+    return [python(), *map(package, PACKAGES), *libraries, rendering(), encoder()]
+
+
+def python() -> Check:
+    """The running Python against ``requires-python``."""
+    version = platform.python_version()
+    wanted = supported_python()
+    ok = SpecifierSet(wanted).contains(version, prereleases=True)
+    detail = version if ok else f"{version}, but asm-gym needs {wanted}"
+    return Check("Python", ok, True, detail, "" if ok else "make clean, then make demo PYTHON=python3.11")
+
+
+def supported_python() -> str:
+    """``requires-python`` of asm-gym as installed; any version where it is not installed."""
+    try:
+        return metadata.metadata("asm-gym")["Requires-Python"]
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+def package(name: str) -> Check:
+    """The installed version of ``name`` against the range that asm-gym, or else what it builds on, asks for."""
+    wanted = wanted_versions(name)
+    try:
+        version = metadata.version(name)
+    except metadata.PackageNotFoundError:
+        # robosuite brings evdev, which is compiled.
+        remedy = f"{COMPILER}, then {REINSTALL}" if name == "robosuite" else REINSTALL
+        return Check(name, False, True, "not installed", remedy)
+    ok = wanted.contains(version, prereleases=True)
+    return Check(name, ok, True, version if ok else f"{version}, but needs {wanted}", "" if ok else REINSTALL)
+
+
+def wanted_versions(name: str) -> SpecifierSet:
+    """The range of versions of ``name`` in asm-gym's requirements, or in stable-baselines3's (which brings torch)."""
+    for asker in ("asm-gym", "stable-baselines3"):
+        try:
+            lines = metadata.requires(asker) or []
+        except metadata.PackageNotFoundError:
+            continue
+        for requirement in map(Requirement, lines):
+            if requirement.name == name and (requirement.marker is None or requirement.marker.evaluate({"extra": ""})):
+                return requirement.specifier
+    return SpecifierSet()
+
+
+def library(name: str, package: str) -> Check:
+    """A shared library that opencv links to, which robosuite imports."""
+    ok = loads(name)
+    detail = "found" if ok else "missing, and `import robosuite` needs it"
+    return Check(name, ok, True, detail, "" if ok else f"apt-get install {package}")
+
+
+def loads(library: str) -> bool:
+    """The dynamic linker finds ``library``, and everything that it links to."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+def rendering() -> Check:
+    """A way to draw without a screen; without one there is no video, and everything else runs."""
+    backend = rendering_backend()
+    if backend:
+        return Check("rendering", True, False, f"MUJOCO_GL={backend} draws a frame")
+    found = ", ".join(f"{lib} {'draws nothing' if loads(lib) else 'missing'}" for lib in GL_LIBRARIES.values())
+    remedy = "apt-get install libegl1 libgl1 libgl1-mesa-dri (or libosmesa6)"
+    return Check("rendering", False, False, f"no video: {found}", remedy)
+
+
+@cache
+def rendering_backend() -> str | None:
+    """The first value of ``MUJOCO_GL`` with which MuJoCo draws a frame here, ``"egl"`` or ``"osmesa"``; None: no video.
+
+    Tried in other processes: a choice of backend cannot be undone within one.
+    """
+    return next((backend for backend in BACKENDS if draws_a_frame(backend)), None)
+
+
+def draws_a_frame(backend: str) -> bool:
+    """MuJoCo draws one frame with ``MUJOCO_GL=backend``, in a process of its own."""
+    env = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": backend}
+    try:
+        # A driver may wait for a device for ever; importing mujoco on a busy machine takes tens of seconds.
+        done = subprocess.run([sys.executable, "-c", ONE_FRAME], env=env, capture_output=True, timeout=120, check=False)
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
+
+
+def encoder() -> Check:
+    """An ffmpeg with the H.264 encoder that browsers and players understand."""
+    remedy = "python -m pip install --force-reinstall imageio-ffmpeg (or: apt-get install ffmpeg)"
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        exe = get_ffmpeg_exe()
+        encoders = subprocess.run([exe, "-hide_banner", "-encoders"], capture_output=True, timeout=60, check=True)
+    except (ImportError, RuntimeError, OSError, subprocess.SubprocessError) as error:
+        return Check("H.264 encoder", False, False, f"no video: {type(error).__name__}: {error}", remedy)
+    ok = b"libx264" in encoders.stdout
+    return Check("H.264 encoder", ok, False, f"{exe}" if ok else f"{exe} has no libx264", "" if ok else remedy)
+
+
+def exit_code(checks: list[Check]) -> int:
+    """1 where something needed is missing, else 0."""
+    return int(any(check.needed and not check.ok for check in checks))
+
+
+def table(checks: list[Check]) -> Table:
+    """A row for every check."""
+    rows = Table("check", "state")
+    rows.add_column("found", overflow="fold")
+    rows.add_column("what to do", overflow="fold")
+    for check in checks:
+        state = "[green]ok" if check.ok else "[red]needed" if check.needed else "[yellow]optional"
+        rows.add_row(check.name, state, escape(check.detail), escape(check.remedy))
+    return rows
+
+
+def main(argv: list[str]) -> int:
+    """Prints the table, and what it comes to."""
+    tyro.cli(Args, args=argv, prog="asm-gym doctor")
+    checks = run_checks()
+    console = Console()
+    console.print(table(checks))
+    wrong = [check for check in checks if not check.ok]
+    if exit_code(checks):
+        console.print("[red]asm-gym cannot run here yet:[/] do what stands on the right, from the top.")
+    elif wrong:
+        console.print(f"asm-gym runs here, without {escape(', '.join(check.name for check in wrong))}.")
+    else:
+        console.print("[green]Everything is here.")
+    return exit_code(checks)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

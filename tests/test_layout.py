@@ -1,0 +1,142 @@
+"""Imports point one way, heavy libraries stay where they belong, and an install puts one name in site-packages."""
+
+from __future__ import annotations
+
+import ast
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+LINKS = ("policies", "wrappers", "scripts")
+LAYERS = ("core", *LINKS)  # each may import itself and what stands before it
+AUTOGRAD = ("torch", "jax", "autograd", "tensorflow", "theano")
+
+
+def layer(module: str) -> str:
+    """The layer of a dotted name inside asm_gym."""
+    part = module.split(".")[1] if "." in module else ""
+    return part if part in LINKS else "core"
+
+
+def modules() -> dict[str, ast.Module]:
+    """Every module of the package by its long name, parsed."""
+    files = [f for f in (ROOT / "asm_gym").rglob("*.py") if f.relative_to(ROOT / "asm_gym").parts[0] not in LINKS]
+    named = {".".join(f.relative_to(ROOT).with_suffix("").parts): f for f in files}
+    for link in LINKS:
+        for f in (ROOT / link).rglob("*.py"):
+            named[".".join(("asm_gym", *f.relative_to(ROOT).with_suffix("").parts))] = f
+    return {name: ast.parse(f.read_text(encoding="utf-8"), str(f)) for name, f in sorted(named.items())}
+
+
+def imports(name: str, tree: ast.Module) -> Iterator[str]:
+    """Full dotted names that a module imports, wherever the statement stands; ``from a import b`` gives ``a.b``."""
+    package = name.split(".")[:-1]  # ``asm_gym.envs.__init__`` lies in ``asm_gym.envs`` as ``asm_gym.envs.x`` does
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            source = ".".join([*base, *(node.module or "").split(".")]).strip(".")
+            yield from (f"{source}.{alias.name}" for alias in node.names)
+
+
+MODULES = modules()
+IMPORTS = {name: list(imports(name, tree)) for name, tree in MODULES.items()}
+
+
+def offences(within: str, *roots: str) -> list[str]:
+    """``module imports what`` for each module whose name starts with ``within`` that imports one of the roots."""
+    return [
+        f"{name} imports {what}"
+        for name, whats in IMPORTS.items()
+        for what in whats
+        if name.startswith(within) and what.split(".")[0] in roots
+    ]
+
+
+def test_every_layer_is_looked_at() -> None:
+    assert {layer(name) for name in MODULES} == set(LAYERS)
+    assert "asm_gym.stream" in MODULES
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "what"),
+    [
+        ("asm_gym.envs.a", "from ..stream import Channel", "asm_gym.stream.Channel"),
+        ("asm_gym.envs.__init__", "from . import b", "asm_gym.envs.b"),
+        ("asm_gym.memory.a", "from asm_gym import wrappers", "asm_gym.wrappers"),
+        ("asm_gym.a", "def f():\n  import asm_gym.scripts.cli as c", "asm_gym.scripts.cli"),
+    ],
+)
+def test_an_import_is_resolved_to_its_long_name(name: str, line: str, what: str) -> None:
+    assert list(imports(name, ast.parse(line))) == [what]
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_imports_point_one_way(name: str) -> None:
+    allowed = LAYERS[: LAYERS.index(layer(name)) + 1]
+    upstream = [what for what in IMPORTS[name] if what.split(".")[0] == "asm_gym" and layer(what) not in allowed]
+    assert not upstream, f"{name}, of layer {layer(name)}, may import {', '.join(allowed)}"
+
+
+def test_nothing_is_imported_by_its_short_name() -> None:
+    tests = {f"tests.{f.stem}": ast.parse(f.read_text(encoding="utf-8")) for f in (ROOT / "tests").glob("*.py")}
+    everywhere = IMPORTS | {name: list(imports(name, tree)) for name, tree in tests.items()}
+    short = [f"{name} imports {w}" for name, whats in everywhere.items() for w in whats if w.split(".")[0] in LINKS]
+    assert not short, "write asm_gym.wrappers, asm_gym.policies, asm_gym.scripts"
+
+
+def test_the_memory_learns_without_automatic_differentiation() -> None:
+    assert not offences("asm_gym.memory", *AUTOGRAD)
+
+
+def test_only_envs_imports_robosuite() -> None:
+    assert not [line for line in offences("asm_gym", "robosuite") if not line.startswith("asm_gym.envs.")]
+
+
+def test_importing_the_package_is_cheap() -> None:
+    code = (
+        "import sys, asm_gym;"
+        "sys.exit(' '.join({'robosuite', 'mujoco', 'torch', 'stable_baselines3'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr.strip() == ""
+
+
+@pytest.mark.parametrize("link", LINKS)
+def test_the_links_are_relative_and_resolve(link: str) -> None:
+    path = ROOT / "asm_gym" / link
+    assert os.readlink(path) == f"../{link}"
+    assert (path / "__init__.py").is_file()
+
+
+@pytest.mark.slow
+def test_a_wheel_holds_real_files_under_one_name(tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    # Only what the wheel is made of; build/ and *.egg-info would bring in files since deleted.
+    for name in ("asm_gym", *LINKS):
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source / name)
+    pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "--wheel-dir", str(tmp_path), str(source)], check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        files = archive.infolist()
+        names = {f.filename for f in files}
+        modes = {f.filename: f.external_attr >> 16 & 0o170000 for f in files}
+    assert {name.split("/")[0] for name in names} == {
+        "asm_gym",
+        next(n for n in names if "dist-info" in n).split("/")[0],
+    }
+    for link in LINKS:
+        assert f"asm_gym/{link}/__init__.py" in names
+    assert all(mode == 0o100000 for mode in modes.values()), "regular files, no links"
+    assert {f"{name.replace('.', '/')}.py" for name in MODULES} <= names
