@@ -1,0 +1,8 @@
+"""Gymnasium wrappers: safety, faults, streams and pictures."""
+
+from asm_gym.wrappers.fault_injection import FaultInjection
+from asm_gym.wrappers.safety import NeuralASMSafety
+from asm_gym.wrappers.stream_recorder import StreamRecorder
+from asm_gym.wrappers.surprise_overlay import SurpriseOverlay
+
+__all__ = ["FaultInjection", "NeuralASMSafety", "StreamRecorder", "SurpriseOverlay"]

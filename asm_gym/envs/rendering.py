@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
 import weakref
@@ -10,6 +11,14 @@ from typing import Any
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
+
+_live: weakref.WeakSet[OffscreenRenderer] = weakref.WeakSet()
+
+
+def _close_all() -> None:
+    for renderer in list(_live):
+        renderer.close()
 
 
 class OffscreenRenderer:
@@ -49,8 +58,10 @@ class OffscreenRenderer:
     def _open(self, model: mujoco.MjModel) -> None:
         self.close()
         self._gl = _gl_context(self.width, self.height)
-        # At exit too, before OpenGL's own modules are torn down.
-        self._free = weakref.finalize(self, self._gl.free)
+        # At exit too: registered after OpenGL was imported, so it runs before OpenGL's own clean-up.
+        if not _live:
+            atexit.register(_close_all)
+        _live.add(self)
         self._gl.make_current()
         model.vis.quality.offsamples = 0
         model.vis.global_.offwidth, model.vis.global_.offheight = self.width, self.height
@@ -68,7 +79,7 @@ class OffscreenRenderer:
         if self._gl is not None:
             if self._model is not None:
                 self._context.free()
-            self._free()
+            self._gl.free()
         self._gl = self._model = None
 
 

@@ -136,6 +136,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._qpos_noise = self.robosuite_env.robots[0].initialization_noise["magnitude"]
         self._bind()
         self._build_spaces()
+        self.gripper_actions = _gripper_actions(self.robosuite_env.robots)
+        """Which numbers of the action command grippers."""
 
     # ------------------------------------------------------------------ spaces
 
@@ -170,6 +172,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         observed = [c.name for c in everything if c.name in _OBSERVED or c.group == "object"]
         self._to_observation = _indices(slices, observed)
         self._named = {name: slices[name] for name in observed}
+        self.observation_layout = {name: s.stop - s.start for name, s in self._named.items()}
+        """The observation's parts in order, and how many numbers each has."""
         self._noise = self.measured_spec.noise * self.sensor_noise
         self.observation_space = (
             _box(len(self._to_observation))
@@ -305,6 +309,11 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """The row measured last, laid out as ``measured_spec`` says; a copy."""
         return self._row.copy()
 
+    @property
+    def motors(self) -> NDArray[np.intp]:
+        """The actuators of the arm's joints, from the base on."""
+        return np.concatenate([arm.motors for arm in self._arms])
+
     # ------------------------------------------------------------------ pictures
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
@@ -321,6 +330,17 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             self.robosuite_env.close()
             self.robosuite_env = None
         self._ended = True
+
+
+def _gripper_actions(robots: list[Any]) -> tuple[int, ...]:
+    found: list[int] = []
+    start = 0
+    for robot in robots:
+        for part, (low, high) in robot._action_split_indexes.items():
+            if "gripper" in part:
+                found += range(start + low, start + high)
+        start += robot.action_dim
+    return tuple(found)
 
 
 def _box(size: int) -> spaces.Box:

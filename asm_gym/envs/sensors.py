@@ -64,7 +64,7 @@ class ArmSensors:
             per_arm = slice(0, half) if arm == "right" else slice(half, None)
         self._qpos = np.asarray(robot._ref_joint_pos_indexes)[per_arm]
         self._qvel = np.asarray(robot._ref_joint_vel_indexes)[per_arm]
-        self._motors = np.asarray(robot._ref_actuators_indexes_dict[arm])
+        self.motors = np.asarray(robot._ref_actuators_indexes_dict[arm])
         self._site = robot.eef_site_id[arm]
         self._hand = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, robot.robot_model.eef_name[arm])
         gripper = robot.gripper[arm]
@@ -142,7 +142,7 @@ class ArmSensors:
         parts = [
             data.qpos[self._qpos],
             data.qvel[self._qvel],
-            data.ctrl[self._motors],
+            data.ctrl[self.motors],
             mean[n : 2 * n],
             mean[:n],
             peak[:n],

@@ -1,0 +1,25 @@
+"""What everything that acts has in common: stable-baselines3's ``predict``."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+PolicyState = Any
+"""What a policy carries from step to step: a value, passed in and handed back. None starts an episode."""
+
+
+class Policy(Protocol):
+    """Acts. Every stable-baselines3 model is one."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], PolicyState]:
+        """The action for ``observation``, and the state to pass in next time."""
+        ...

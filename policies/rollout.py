@@ -1,0 +1,36 @@
+"""Runs a policy in an environment for one episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from asm_gym.policies.base import Policy
+
+
+def rollout(
+    env: gym.Env[Any, Any],
+    policy: Policy,
+    seed: int | None = None,
+    on_step: Callable[[dict[str, Any]], None] | None = None,
+) -> bool:
+    """One episode, from ``reset(seed)`` until it is terminated or truncated; whether it succeeded at some step.
+
+    Args:
+        on_step: is shown every step's ``info``.
+    """
+    observation, _ = env.reset(seed=seed)
+    state, success, done = None, False, False
+    start = np.ones(1, dtype=bool)
+    while not done:
+        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=False)
+        observation, _, terminated, truncated, info = env.step(action)
+        start = np.zeros(1, dtype=bool)
+        done = bool(terminated or truncated)
+        success = success or bool(info.get("success", False))
+        if on_step is not None:
+            on_step(info)
+    return success

@@ -1,0 +1,101 @@
+"""What scripted experts share: reading an observation by name, moving the hand, and varying as people do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+# What one unit of action moves the hand's set-point by, in robosuite's OSC_POSE: 5 cm, 0.5 rad.
+_METRES, _RADIANS = 0.05, 0.5
+OPEN, CLOSE = -1.0, 1.0
+
+
+@dataclass(frozen=True)
+class Style:
+    """How an expert varies; each is drawn anew for every episode.
+
+    Args:
+        noise: standard deviation of the action noise, in action units; correlated over about 0.2 s, as a hand's is.
+        speed: hand speed relative to the expert's usual one.
+        speed_spread: standard deviation of the speed between episodes.
+        spread: standard deviation of way-points between episodes [m].
+    """
+
+    noise: float = 0.05
+    speed: float = 1.0
+    speed_spread: float = 0.08
+    spread: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "speed_spread", "spread"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
+        if not self.speed > 0:
+            raise ValueError(f"speed must be > 0, got {self.speed}")
+
+
+class ObservationReader:
+    """Named parts of an environment's flat or dict observation."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        self._flat = isinstance(env.observation_space, spaces.Box)
+        self._slices: dict[str, slice] = {}
+        start = 0
+        for name, size in env.unwrapped.observation_layout.items():  # type: ignore[attr-defined]
+            self._slices[name] = slice(start, start + size)
+            start += size
+
+    def __call__(self, observation: Any, name: str) -> Vector:
+        part = observation[self._slices[name]] if self._flat else observation[name]
+        return np.asarray(part, dtype=np.float64)
+
+
+def rotation(columns: Vector) -> Vector:
+    """(3, 3) rotation from its first two columns (6,), made orthonormal again after sensor noise."""
+    x = columns[:3] / np.linalg.norm(columns[:3])
+    y = columns[3:] - (x @ columns[3:]) * x
+    y /= np.linalg.norm(y)
+    return np.stack([x, y, np.cross(x, y)], axis=1)
+
+
+def matrix(quaternion: Vector) -> Vector:
+    """(3, 3) rotation from a unit quaternion (x, y, z, w)."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def pointing_down(hand: Vector, object_rotation: Vector | None = None) -> Vector:
+    """(3, 3) the rotation nearest ``hand`` (3, 3) whose fingers point down and close along a side of the object."""
+    closing = hand[:2, 1]  # fingers move along the hand's y axis
+    yaw = np.arctan2(closing[1], closing[0])
+    if object_rotation is not None:
+        # The side that lies flattest gives the object's heading; a cube looks the same every quarter turn.
+        side = object_rotation[:2, int(np.abs(object_rotation[2]).argmin())]
+        heading = np.arctan2(side[1], side[0])
+        yaw = heading + np.round((yaw - heading) / (np.pi / 2)) * (np.pi / 2)
+    y = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    z = np.array([0.0, 0.0, -1.0])
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def move(position: Vector, target: Vector, hand: Vector, target_rotation: Vector, speed: float) -> Vector:
+    """(6,) the hand's command: towards a pose, at no more than ``speed`` (in action units)."""
+    step = (target - position) / _METRES
+    norm = np.linalg.norm(step)
+    if norm > speed:
+        step *= speed / norm
+    turn = 0.5 * np.cross(hand, target_rotation, axis=0).sum(axis=1) / _RADIANS
+    return np.concatenate([step, np.clip(turn, -0.5, 0.5)])

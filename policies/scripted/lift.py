@@ -1,0 +1,113 @@
+"""Lifts the cube: over it, down, grasp, up, stay."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.policies.scripted.base import (
+    CLOSE,
+    OPEN,
+    ObservationReader,
+    Style,
+    Vector,
+    matrix,
+    move,
+    pointing_down,
+    rotation,
+)
+
+REACH, DESCEND, GRASP, LIFT = range(4)
+
+
+class _State(NamedTuple):
+    """Where one episode stands."""
+
+    phase: int
+    since: int  # steps spent in the phase
+    speed: float  # action units
+    hover: Vector  # (3,) way-point above the cube, relative to it [m]
+    goal: Vector  # (3,) where to carry it, relative to where it was grasped [m]
+    depth: float  # how far below the cube's centre to grasp [m]
+    grasped_at: Vector  # (3,) [m]
+    drift: Vector  # (7,) correlated action noise
+
+
+class LiftExpert:
+    """A scripted expert for Lift.
+
+    Args:
+        env: tells where things stand in the observation.
+        seed: of the noise and of the style drawn for each episode.
+        style: how much it varies.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
+        self.style = style or Style()
+        self.np_random = np.random.default_rng(seed)
+        self._read = ObservationReader(env)
+        self._action_space = env.action_space
+
+    def predict(
+        self,
+        observation: Any,
+        state: _State | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], _State]:
+        """The action (7,); ``deterministic`` leaves the action noise out, not the style."""
+        if state is None or (episode_start is not None and np.any(episode_start)):
+            state = self._begin()
+        hand_at = self._read(observation, "hand_position")
+        hand = rotation(self._read(observation, "hand_orientation"))
+        cube_at = self._read(observation, "cube_pos")
+        cube = matrix(self._read(observation, "cube_quat"))
+
+        state = self._advance(state, hand_at, cube_at)
+        target, grip = self._target(state, cube_at)
+        aligned = pointing_down(hand, cube if state.phase <= DESCEND else None)
+        command = np.append(move(hand_at, target, hand, aligned, state.speed), grip)
+        if not deterministic:
+            command[:6] += state.drift[:6]
+        return np.clip(command, -1.0, 1.0).astype(np.float32), state
+
+    def _begin(self) -> _State:
+        style, rng = self.style, self.np_random
+        return _State(
+            phase=REACH,
+            since=0,
+            speed=0.45 * style.speed * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.5, 1.5)),
+            hover=np.array([0.0, 0.0, 0.07]) + style.spread * rng.standard_normal(3),
+            goal=np.array([0.0, 0.0, 0.13]) + style.spread * rng.standard_normal(3),
+            depth=float(np.clip(0.005 + 0.3 * style.spread * rng.standard_normal(), 0.0, 0.01)),
+            grasped_at=np.zeros(3),
+            drift=np.zeros(7),
+        )
+
+    def _advance(self, state: _State, hand_at: Vector, cube_at: Vector) -> _State:
+        # An AR(1) process whose standard deviation is `noise` and whose memory is about 4 steps.
+        rho = 0.78
+        fresh = self.style.noise * np.sqrt(1 - rho**2) * self.np_random.standard_normal(7)
+        state = state._replace(since=state.since + 1, drift=rho * state.drift + fresh)
+        offset = hand_at - cube_at
+        if state.phase == REACH and np.linalg.norm(offset - state.hover) < 0.02:
+            return state._replace(phase=DESCEND, since=0)
+        if state.phase == DESCEND and abs(offset[2] + state.depth) < 0.008 and np.linalg.norm(offset[:2]) < 0.015:
+            return state._replace(phase=GRASP, since=0, grasped_at=hand_at)
+        if state.phase == GRASP and state.since >= 6:
+            return state._replace(phase=LIFT, since=0)
+        if state.phase == LIFT and np.linalg.norm(offset) > 0.05:  # lost it
+            return state._replace(phase=REACH, since=0)
+        return state
+
+    def _target(self, state: _State, cube_at: Vector) -> tuple[Vector, float]:
+        if state.phase == REACH:
+            return cube_at + state.hover, OPEN
+        if state.phase == DESCEND:
+            return cube_at - [0.0, 0.0, state.depth], OPEN
+        if state.phase == GRASP:
+            return state.grasped_at, CLOSE
+        return state.grasped_at + state.goal, CLOSE

@@ -1,0 +1,71 @@
+"""Makes things go wrong on time, says so in ``info["fault"]``, and puts everything back at reset."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+from gymnasium.utils import RecordConstructorArgs
+
+from asm_gym.envs.robosuite_env import RobosuiteEnv
+from asm_gym.faults import Fault
+
+
+class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Injects timed faults.
+
+    ``info["fault"]`` is a tuple of the names of the faults that were active during the step: the ground truth.
+
+    Args:
+        env: a robosuite environment of this package, wrapped or not.
+        faults: what goes wrong in every episode.
+
+    Raises:
+        TypeError: the environment is not one of this package's, or an item is not a Fault.
+        ValueError: a fault that this environment cannot have (an unknown body or joint, an onset past the horizon).
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], faults: Sequence[Fault]) -> None:
+        RecordConstructorArgs.__init__(self, faults=faults)
+        gym.Wrapper.__init__(self, env)
+        inner = env.unwrapped
+        if not isinstance(inner, RobosuiteEnv):
+            raise TypeError(f"faults are injected into robosuite environments of asm_gym, got {inner}")
+        for fault in faults:
+            if not isinstance(fault, Fault):
+                raise TypeError(f"faults must be asm_gym.faults.Fault objects, got {fault!r}")
+            fault.check(inner)
+            if fault.onset >= inner.horizon:
+                raise ValueError(f"{fault} starts at or after the horizon of {inner.horizon} steps")
+        self.faults = tuple(faults)
+        self._inner = inner
+        self._running: dict[int, Generator[None, None, None]] = {}
+        self._step = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self._undo()  # before the reset: a hard one replaces the model, a soft one keeps it
+        self._step = 0
+        observation, info = self.env.reset(seed=seed, options=options)
+        info["fault"] = ()
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        for k, fault in enumerate(self.faults):
+            if fault.active(self._step):
+                next(self._running.setdefault(k, fault.inject(self._inner)))
+            elif k in self._running:
+                self._running.pop(k).close()
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        info["fault"] = tuple(self.faults[k].name for k in self._running)
+        self._step += 1
+        return observation, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        self._undo()
+        super().close()
+
+    def _undo(self) -> None:
+        # Last begun, first undone, so that edits of one number come off in the order they went on.
+        while self._running:
+            self._running.popitem()[1].close()

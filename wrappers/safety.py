@@ -1,0 +1,146 @@
+"""Watches a policy's every step, and takes over or stops when what the robot feels is not what it expected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
+
+from asm_gym.monitors import Monitor, Surprise
+from asm_gym.policies.base import Policy
+from asm_gym.policies.reflexes import Hold
+from asm_gym.wrappers.stream_recorder import StreamSource
+
+REFLEXES: dict[str, Callable[[gym.Env[Any, Any]], Policy]] = {"hold": Hold}
+"""Reflexes by name: policies that act from the step after an alarm."""
+ON_ALARM = ("monitor", *REFLEXES, "terminate")
+"""Names that ``on_alarm`` takes."""
+
+
+class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """A safety layer around any environment with a Box action space, under any policy.
+
+    After each step the monitor compares what was sensed with what it expected. From the step after an alarm on, a
+    reflex acts in the policy's place, until surprise has stayed under the threshold for ``release_after`` steps.
+
+    ``info["asm"]`` holds ``surprise``, ``threshold``, ``alarm`` (surprise is over the threshold now), ``intervened``
+    (the reflex acted in this step), ``executed_action``, and ``attribution``: what each number of the stream adds to
+    the surprise. ``info["cost"]`` is 1.0 on every step spent in alarm and 0.0 otherwise, as safe-RL libraries expect.
+
+    Args:
+        env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream.
+        monitor: a fitted and calibrated monitor.
+        on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip; ``"terminate"`` ends the episode;
+            any other policy acts itself.
+        release_after: control steps of quiet after which control is handed back.
+        truncate: ``"terminate"`` ends the episode as truncated rather than terminated.
+
+    Raises:
+        ValueError: an unknown ``on_alarm``, or a monitor fitted for another stream (the message names the channels).
+        RuntimeError: the monitor is not calibrated.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        monitor: Monitor,
+        on_alarm: str | Policy = "hold",
+        *,
+        release_after: int = 10,
+        truncate: bool = False,
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, monitor=monitor, on_alarm=on_alarm, release_after=release_after, truncate=truncate
+        )
+        gym.Wrapper.__init__(self, env)
+        if not isinstance(env.action_space, gym.spaces.Box):
+            raise TypeError(f"NeuralASMSafety needs a Box action space, got {env.action_space}")
+        if release_after < 1:
+            raise ValueError(f"release_after must be at least 1, got {release_after}")
+        self._source = StreamSource(env)
+        monitor.spec.require(self._source.spec, "the monitor")
+        self.monitor = monitor
+        self.threshold = monitor.threshold
+        self.release_after = release_after
+        self._ends = "truncated" if truncate else "terminated"
+        self._on_alarm = on_alarm if isinstance(on_alarm, str) else "policy"
+        self._reflex = _reflex(on_alarm, env)
+        self._ended = True
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._state = self.monitor.initial_state(batch=1)
+        self._observation = observation
+        self._overriding, self._quiet, self._reflex_state = False, 0, None
+        self._ended = False
+        none = np.zeros((1, self.monitor.spec.size))
+        return observation, self._report(info, Surprise(np.zeros(1), none), None, False)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        if self._ended:
+            raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
+        intervened = self._overriding
+        executed = self._override() if intervened else np.asarray(action, dtype=np.float32)
+        observation, reward, terminated, truncated, info = self.env.step(executed)
+        self._observation = observation
+        row = self._source.row(observation, executed, info)
+        self._state, surprise = self.monitor.observe(self._state, row[None])
+        alarm = self._report(info, surprise, executed, intervened)["asm"]["alarm"]
+        self._arbitrate(alarm, executed)
+        if alarm and self._on_alarm == "terminate":
+            terminated, truncated = terminated or self._ends == "terminated", truncated or self._ends == "truncated"
+        self._ended = bool(terminated or truncated)
+        return observation, reward, terminated, truncated, info
+
+    def _override(self) -> NDArray[np.float32]:
+        assert self._reflex is not None
+        start = np.array([self._fresh])
+        self._fresh = False
+        action, self._reflex_state = self._reflex.predict(
+            self._observation, state=self._reflex_state, episode_start=start, deterministic=True
+        )
+        return np.asarray(action, dtype=np.float32)
+
+    def _arbitrate(self, alarm: bool, executed: NDArray[np.float32]) -> None:
+        """Who acts next."""
+        if self._reflex is None:
+            return
+        self._quiet = 0 if alarm else self._quiet + 1
+        if alarm and not self._overriding:
+            self._overriding = self._fresh = True
+            # Our own reflexes start from what was last done; a user's policy starts as in a new episode.
+            begin = getattr(self._reflex, "begin", None)
+            self._reflex_state = begin(executed) if begin else None
+        elif self._overriding and self._quiet >= self.release_after:
+            self._overriding = False
+
+    def _report(
+        self, info: dict[str, Any], surprise: Surprise, executed: NDArray[np.float32] | None, intervened: bool
+    ) -> dict[str, Any]:
+        value = float(surprise.value[0])
+        alarm = value > self.threshold
+        info["asm"] = {
+            "surprise": value,
+            "threshold": self.threshold,
+            "alarm": alarm,
+            "intervened": intervened,
+            "executed_action": executed,
+            "attribution": dict(zip(self.monitor.spec.labels, surprise.attribution[0].tolist(), strict=True)),
+        }
+        info["cost"] = 1.0 if alarm else 0.0
+        return info
+
+
+def _reflex(on_alarm: str | Policy, env: gym.Env[Any, Any]) -> Policy | None:
+    """The policy that acts during an alarm; None where none does."""
+    if not isinstance(on_alarm, str):
+        if not callable(getattr(on_alarm, "predict", None)):
+            raise ValueError(f"on_alarm must be one of {', '.join(ON_ALARM)} or have a predict(), got {on_alarm!r}")
+        return on_alarm
+    if on_alarm not in ON_ALARM:
+        raise ValueError(f"unknown on_alarm {on_alarm!r}; known: {', '.join(ON_ALARM)}, or any policy")
+    return REFLEXES[on_alarm](env) if on_alarm in REFLEXES else None

@@ -1,0 +1,115 @@
+"""Any environment's sensorimotor stream, and a recorder that keeps it."""
+
+from __future__ import annotations
+
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
+
+from asm_gym.episodes import Episode
+from asm_gym.stream import StreamSpec
+
+
+class StreamSource:
+    """Where an environment's stream comes from: ``info["stream"]``, or else its observation and the action.
+
+    Raises:
+        TypeError: the environment has no stream and its spaces are not Boxes.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        self._own = env.has_wrapper_attr("stream_spec")
+        self.spec: StreamSpec = (
+            env.get_wrapper_attr("stream_spec")
+            if self._own
+            else StreamSpec.from_spaces(env.observation_space, env.action_space, _control_period(env))
+        )
+
+    def row(self, observation: Any, action: Any, info: dict[str, Any]) -> NDArray[np.float32]:
+        """(D,) what was sensed after ``action``, and the action."""
+        if self._own:
+            row: NDArray[np.float32] = info["stream"]
+            return row
+        return np.concatenate([np.ravel(observation), np.ravel(action)]).astype(np.float32)
+
+
+def _control_period(env: gym.Env[Any, Any]) -> float:
+    """[s]; 1 where the environment does not say."""
+    dt = getattr(env.unwrapped, "dt", None)
+    if isinstance(dt, int | float) and dt > 0:
+        return float(dt)
+    fps = env.metadata.get("render_fps")
+    return 1.0 / fps if fps else 1.0
+
+
+class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Keeps every finished episode in ``episodes``, and gives environments without a stream one.
+
+    ``info["stream"]`` and ``stream_spec`` exist on the wrapped environment whatever it is.
+
+    Args:
+        env: an environment with a stream, or with Box spaces.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
+        self._source = StreamSource(env)
+        self.stream_spec = self._source.spec
+        self.episodes: list[Episode] = []
+        """What was recorded; an episode that was cut short by ``reset`` is kept too."""
+        self._clear(None)
+
+    def _clear(self, seed: int | None) -> None:
+        self._seed = seed
+        self._observations: list[Any] = []
+        self._actions: list[NDArray[np.float32]] = []
+        self._rewards: list[float] = []
+        self._rows: list[NDArray[np.float32]] = []
+        self._faults: list[bool] = []
+        self._success = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self._finish()
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._clear(seed)
+        self._observations.append(observation)
+        info["stream"] = self._source.row(observation, np.zeros(self.action_space.shape or (0,)), info)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        info["stream"] = self._source.row(observation, action, info)
+        self._observations.append(observation)
+        self._actions.append(np.asarray(action, np.float32))
+        self._rewards.append(float(reward))
+        self._rows.append(info["stream"])
+        self._faults.append(bool(info.get("fault")))
+        self._success = self._success or bool(info.get("success", False))
+        if terminated or truncated:
+            self._finish()
+        return observation, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        self._finish()
+        super().close()
+
+    def _finish(self) -> None:
+        if self._rows:
+            flat = not isinstance(self._observations[0], dict)
+            self.episodes.append(
+                Episode(
+                    stream=np.stack(self._rows),
+                    spec=self.stream_spec,
+                    success=self._success,
+                    seed=self._seed,
+                    actions=np.stack(self._actions),
+                    observations=np.stack(self._observations) if flat else np.zeros((0, 0), np.float32),
+                    rewards=np.asarray(self._rewards, np.float32),
+                    faults=np.asarray(self._faults),
+                )
+            )
+        self._clear(None)
