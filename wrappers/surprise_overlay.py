@@ -46,6 +46,7 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._seconds = seconds
         self._chart_height = chart_height
         self._dt = _control_period(env)
+        self._chart: StripChart | None = None  # made at the first picture, whose width it needs
         self._clear()
 
     def _clear(self) -> None:
@@ -80,9 +81,11 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """(H + chart height, W, 3) uint8."""
         frame = np.asarray(self.env.render())
         height, width = frame.shape[:2]
-        # In units of the threshold, the chart is the same whatever the monitor.
-        chart = StripChart(width, self._chart_height or max(72, height // 5), max(2, round(self._seconds / self._dt)))
-        strip = chart.draw(self._ratio, self._alarm, self._fault)
+        if self._chart is None or self._chart.width != width:
+            # In units of the threshold, the chart is the same whatever the monitor.
+            steps = max(2, round(self._seconds / self._dt))
+            self._chart = StripChart(width, self._chart_height or max(72, height // 5), steps)
+        strip = self._chart.draw(self._ratio, self._alarm, self._fault)
         return compose(frame, strip, bool(self._alarm and self._alarm[-1]), self._line())
 
     def _line(self) -> str:

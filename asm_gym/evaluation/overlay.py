@@ -8,16 +8,18 @@ and a word, a fault a bar with its name.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from asm_gym.evaluation.trace import spans
 
-_PAPER, _INK, _FAINT = "#14171c", "#f2f2f2", "#8a919c"
+_PAPER, _INK, _FAINT, _RULE = "#14171c", "#f2f2f2", "#a0a8b2", "#343a42"
 _CURVE, _ALARM, _FAULT = "#56B4E9", "#FF4B3E", "#E69F00"
 _LOW, _HIGH = 1e-2, 30.0  # the vertical axis, in thresholds
 _SCALE = 2  # curves are drawn at twice the size and averaged down
@@ -63,41 +65,53 @@ class StripChart:
         alarms, faults = (np.asarray(a[-self.steps :], np.bool_) for a in (alarm, fault))
         if not len(values) == len(alarms) == len(faults):
             raise ValueError(f"histories differ in length: {len(values)}, {len(alarms)}, {len(faults)}")
-        image = Image.new("RGB", (self.width * _SCALE, self.height * _SCALE), _PAPER)
+        image = self._background.copy()
         pen = ImageDraw.Draw(image)
         for start, stop in spans(faults):
             pen.rectangle(self._box(start, stop, len(values), 0), fill=_FAULT)
         for start, stop in spans(alarms):
             pen.rectangle(self._box(start, stop, len(values), self.height - self._bar), fill=_ALARM)
-        y = self._y(1.0)
-        for x in range(0, self.width, 10):
-            pen.line([(x * _SCALE, y * _SCALE), ((x + 6) * _SCALE, y * _SCALE)], fill=_INK, width=_SCALE)
-        points = [
-            (self._x(i + 1, len(values)) * _SCALE, self._y(v) * _SCALE) for i, v in enumerate(values / self.threshold)
-        ]
-        if len(points) > 1:
+        ends = self._x(np.arange(len(values)) + 1, len(values))
+        points = (np.column_stack([ends, self._y(values / self.threshold)]) * _SCALE).ravel().tolist()
+        if len(values) > 1:
             pen.line(points, fill=_CURVE, width=2 * _SCALE, joint="curve")
         image = image.reduce(_SCALE)
-        pen = ImageDraw.Draw(image)
-        small = _font(max(10, self._bar - 2))
-        _label(pen, (6, y - 2), "threshold", small, _INK, "ls")
-        _label(pen, (6, self.height - self._bar - 2), "surprise, log scale", small, _FAINT, "ls")
-        for name, runs, top in (("fault", spans(faults), 0), ("alarm", spans(alarms), self.height - self._bar)):
+        small = max(10, self._bar - 3)
+        for ratio, text in ((10.0, "× 10"), (1.0, "threshold"), (0.1, "× 0.1")):
+            _paste(image, _text(text, small, _INK if ratio == 1.0 else _FAINT), 3, float(self._y(ratio)))
+        for name, runs, top, paper in (
+            ("fault", spans(faults), 0, _FAULT),
+            ("alarm", spans(alarms), self.height - self._bar, _ALARM),
+        ):
+            text_image = _text(name, small, "#000000", paper)
             for start, stop in runs:
-                left, right = (max(4.0, self._x(s, len(values))) for s in (start, stop))
-                if right - left > small.getlength(name) + 8:
-                    pen.text((left + 4, top + self._bar / 2), name, font=small, fill="black", anchor="lm")
+                left, right = (max(0.0, float(self._x(s, len(values)))) for s in (start, stop))
+                if right - left > text_image.width:
+                    _paste(image, text_image, left, top + self._bar / 2)
         return np.asarray(image)
 
-    def _x(self, step: int, shown: int) -> float:
-        """[px] of the beginning of a step, the ``shown``-th ending at the right edge."""
+    @cached_property
+    def _background(self) -> Image.Image:
+        """Paper, a line at each decade, dashes at the threshold; at the scale of the curves."""
+        image = Image.new("RGB", (self.width * _SCALE, self.height * _SCALE), _PAPER)
+        pen = ImageDraw.Draw(image)
+        for ratio in (0.1, 10.0):
+            y = float(self._y(ratio)) * _SCALE
+            pen.line([(0, y), (self.width * _SCALE, y)], fill=_RULE, width=_SCALE)
+        y = float(self._y(1.0)) * _SCALE
+        for x in range(0, self.width * _SCALE, 10 * _SCALE):
+            pen.line([(x, y), (x + 6 * _SCALE, y)], fill=_INK, width=_SCALE)
+        return image
+
+    def _x(self, step: Any, shown: int) -> Any:
+        """[px] of the beginning of a step, or of an array of them; the ``shown``-th ends at the right edge."""
         return self.width * (1.0 - (shown - step) / self.steps)
 
-    def _y(self, ratio: float) -> float:
-        """[px] of a surprise in thresholds, between the two bars."""
+    def _y(self, ratio: Any) -> Any:
+        """[px] of a surprise in thresholds, or of an array of them, between the two bars; NaN at the top."""
         top, bottom = self._bar + 3, self.height - self._bar - 3
-        height = np.log(np.clip(np.nan_to_num(ratio, nan=_HIGH), _LOW, _HIGH) / _LOW) / np.log(_HIGH / _LOW)
-        return float(bottom - (bottom - top) * height)
+        ratio = np.clip(np.where(np.isnan(ratio), _HIGH, ratio), _LOW, _HIGH)
+        return bottom - (bottom - top) * np.log(ratio / _LOW) / np.log(_HIGH / _LOW)
 
     def _box(self, start: int, stop: int, shown: int, top: int) -> tuple[float, float, float, float]:
         left, right = self._x(start, shown) * _SCALE, self._x(stop, shown) * _SCALE
@@ -122,33 +136,34 @@ def compose(frame: NDArray[np.uint8], chart: NDArray[np.uint8], alarm: bool, cap
         raise ValueError(f"the chart must be as wide as the picture, {frame.shape[1]} px, got {chart.shape[1]} px")
     image = Image.fromarray(np.concatenate([frame, chart]))
     height, width = frame.shape[:2]
-    pen = ImageDraw.Draw(image)
-    size = max(11, min(20, width // 30))
-    margin = max(4, width // 100)
-    font = _font(size)
+    size, margin = max(11, min(18, width // 32)), max(4, width // 100)  # [px]
     if caption:
-        text = _fit(caption, font, width - 4 * margin)
-        _label(pen, (2 * margin, 2 * margin), text, font, _INK, "la")
+        picture = _text(_fit(caption, size, width - 5 * margin), size, _INK)
+        _paste(image, picture, 2 * margin, 2 * margin + picture.height / 2)
     if alarm:
-        pen.rectangle((0, 0, width - 1, height - 1), outline=_ALARM, width=margin)
-        word = _font(2 * size)
-        x, y = width - 3 * margin, height - 3 * margin
-        box = pen.textbbox((x, y), "ALARM", font=word, anchor="rs")
-        pad = margin
-        pen.rectangle((box[0] - pad, box[1] - pad, box[2] + pad, box[3] + pad), fill=_ALARM)
-        pen.text((x, y), "ALARM", font=word, fill="black", anchor="rs")
+        ImageDraw.Draw(image).rectangle((0, 0, width - 1, height - 1), outline=_ALARM, width=margin)
+        word = _text("ALARM", 2 * size, "#000000", _ALARM)
+        _paste(image, word, width - word.width, height - word.height / 2)
     return np.asarray(image)
 
 
-def _label(pen: ImageDraw.ImageDraw, at: tuple[float, float], text: str, font: Any, fill: str, anchor: str) -> None:
-    """Text on a backing of its own, readable on any picture."""
-    left, top, right, bottom = pen.textbbox(at, text, font=font, anchor=anchor)
-    pen.rectangle((left - 3, top - 3, right + 3, bottom + 3), fill=_PAPER)
-    pen.text(at, text, font=font, fill=fill, anchor=anchor)
+@lru_cache(maxsize=64)
+def _text(text: str, size: int, ink: str, paper: str = _PAPER) -> Image.Image:
+    """One line on a backing of its own, readable on any picture; most are the same from frame to frame."""
+    font = _font(size)
+    ascent, descent = font.getmetrics()
+    image = Image.new("RGB", (round(font.getlength(text)) + size // 2, ascent + descent // 2 + 1), paper)
+    ImageDraw.Draw(image).text((size // 4, ascent), text, font=font, fill=ink, anchor="ls")
+    return image
 
 
-def _fit(text: str, font: Any, width: float) -> str:
+def _paste(image: Image.Image, text: Image.Image, left: float, middle: float) -> None:
+    image.paste(text, (round(left), round(middle - text.height / 2)))
+
+
+def _fit(text: str, size: int, width: float) -> str:
     """``text``, or as much of its beginning as fits in ``width`` [px], with an ellipsis."""
+    font = _font(size)
     if font.getlength(text) <= width:
         return text
     while text and font.getlength(text + "…") > width:
@@ -157,6 +172,6 @@ def _fit(text: str, font: Any, width: float) -> str:
 
 
 @lru_cache(maxsize=16)
-def _font(size: int) -> Any:
-    """The font that comes with Pillow, at this size [px]: no file to find."""
-    return ImageFont.load_default(size)
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans at this size [px]: it comes with matplotlib, and unlike Pillow's own font has Greek and ×."""
+    return ImageFont.truetype(str(Path(mpl.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"), size)

@@ -71,14 +71,14 @@ def surprise_figure(traces: Sequence[Trace]) -> Figure:
     _require(traces)
     with _figure(height=0.9 + 1.35 * len(traces)) as fig:
         panels = fig.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-        for i, (ax, trace) in enumerate(zip(panels, traces, strict=True)):
-            _surprise_panel(ax, trace, *_look(i)[:1])
+        for ax, trace in zip(panels, traces, strict=True):
+            _surprise_panel(ax, trace)
         floor, ceiling = _limits(traces)
         panels[0].set_yscale("log")
-        panels[0].set_ylim(floor, ceiling * 3)  # the rug of alarms stands in the room at the top
+        panels[0].set_ylim(floor / 1.5, ceiling * 5)  # the rug of alarms stands in the room at the top
         panels[0].yaxis.set_major_locator(LogLocator(numticks=5))
         panels[0].yaxis.set_minor_formatter(NullFormatter())
-        panels[0].set_xlim(0, max(len(t) * t.dt for t in traces))
+        panels[0].set_xlim(0, 1.01 * max(len(t) * t.dt for t in traces))
         panels[-1].set_xlabel("time [s]")
         fig.supylabel("surprise", fontsize=10)
         fig.legend(
@@ -94,10 +94,10 @@ def surprise_figure(traces: Sequence[Trace]) -> Figure:
     return fig
 
 
-def _surprise_panel(ax: Axes, trace: Trace, colour: str) -> None:
+def _surprise_panel(ax: Axes, trace: Trace) -> None:
     floor, ceiling = _limits([trace])
     time = (np.arange(len(trace)) + 1) * trace.dt  # (T,) a row is known at the end of its step
-    ax.plot(time, np.clip(trace.surprise, floor, ceiling), color=colour, linewidth=1.4)
+    ax.plot(time, np.clip(trace.surprise, floor, ceiling), color=BLUE, linewidth=1.5)
     ax.axhline(trace.threshold, color=BLACK, linewidth=1, linestyle=(0, (4, 2)))
     for start, stop in spans(trace.fault):
         ax.axvspan(start * trace.dt, stop * trace.dt, color=ORANGE, alpha=0.3, linewidth=0)
@@ -106,8 +106,8 @@ def _surprise_panel(ax: Axes, trace: Trace, colour: str) -> None:
     for start, stop in spans(trace.alarm):
         ends = [(start + 1) * trace.dt, min(stop + 1, len(trace)) * trace.dt]
         rug = ax.get_xaxis_transform()
-        ax.plot(ends, [0.97, 0.97], color=VERMILLION, linewidth=4, solid_capstyle="butt", transform=rug)
-        ax.plot(ends[0], 0.88, "v", color=VERMILLION, markersize=7, transform=rug)
+        ax.plot(ends, [0.96, 0.96], color=VERMILLION, linewidth=4, solid_capstyle="butt", transform=rug)
+        ax.plot(ends[0], 0.86, "v", color=VERMILLION, markersize=7, transform=rug)
     late = "" if trace.delay is None else f": alarm {1e3 * trace.delay:.0f} ms after the onset"
     missed = ": missed" if trace.onset is not None and trace.delay is None else ""
     ax.set_title(f"{trace.condition}{late}{missed}")
@@ -179,13 +179,13 @@ def attribution_figure(trace: Trace, top: int = 12) -> Figure:
         ax.set_yticks(range(len(rows)), [trace.labels[r] for r in rows])
         ax.set_xlabel("time [s]")
         ax.spines[:].set_visible(False)
-        marks = [(trace.onset * trace.dt, "fault", ORANGE)] if trace.onset is not None else []
+        marks = [(trace.onset * trace.dt, "fault")] if trace.onset is not None else []
         if trace.onset is not None and trace.delay is not None:
-            marks.append((trace.onset * trace.dt + trace.delay, "alarm", VERMILLION))
-        for i, (at, text, colour) in enumerate(marks):
+            marks.append((trace.onset * trace.dt + trace.delay, "alarm"))
+        for i, (at, text) in enumerate(marks):
             ax.axvline(at, color="white", linewidth=1.5, linestyle=("-", (0, (3, 2)))[i])
             side = "right" if i == 0 and len(marks) == 2 else "left"
-            ax.annotate(text, (at, -0.5), (0, 4), textcoords="offset points", ha=side, color=colour, weight="bold")
+            ax.annotate(text, (at, -0.5), (0, 4), textcoords="offset points", ha=side, weight="bold")
         ax.set_title(trace.condition, pad=18)
         fig.colorbar(image, ax=ax, label="share of surprise / threshold", pad=0.02)
     return fig
@@ -197,22 +197,22 @@ def maxima_figure(traces: Sequence[Trace], window_s: float) -> Figure:
     _require(watched)
     groups = {NOMINAL: [t for t in watched if t.condition == NOMINAL], **_faults(watched)}
     groups = {c: g for c, g in groups.items() if g}
-    with _figure(height=1.2 + 0.75 * len(groups)) as fig:
+    worst = {c: np.array([_peak(t, window_s) / t.threshold for t in g]) for c, g in groups.items()}  # (n,) each
+    floor, ceiling = min(0.5, *(w.min() for w in worst.values())), max(2.0, *(w.max() for w in worst.values()))
+    with _figure(height=1.1 + 0.55 * len(groups)) as fig:
         ax = fig.subplots()
-        floor, ceiling = np.inf, 0.0
-        for i, (condition, group) in enumerate(groups.items()):
-            low, high = _limits(group)
-            worst = np.clip([_peak(t, window_s) for t in group], low, high) / [t.threshold for t in group]  # (n,)
+        per_decade = 72 * 5.5 / np.log10(ceiling / floor)  # [pt]
+        for i, (condition, ratios) in enumerate(worst.items()):
             colour, _, marker = ("#666666", "", "o") if condition == NOMINAL else _look(i - (NOMINAL in groups))
-            ax.plot(worst, i + _swarm(np.log10(worst)), marker, color=colour, markersize=5, alpha=0.75, mew=0)
-            above = f"{(worst > 1).sum()} of {len(group)} above"
+            offsets = _swarm(np.log10(ratios) * per_decade, size=5.5) / 40  # a row is 40 pt high
+            ax.plot(ratios, i + offsets, marker, color=colour, markersize=5, alpha=0.8, mew=0)
+            above = f"{(ratios > 1).sum()} of {len(ratios)} above"
             ax.annotate(above, (1.01, i), xycoords=("axes fraction", "data"), va="center", fontsize=9)
-            floor, ceiling = min(floor, worst.min()), max(ceiling, worst.max())
         ax.axvline(1.0, color=BLACK, linewidth=1, linestyle=(0, (4, 2)))
         ax.annotate("threshold", (1.0, 1.0), (0, 3), xycoords=("data", "axes fraction"), textcoords="offset points",
                     ha="center", fontsize=9)  # fmt: skip
         ax.set_xscale("log")
-        ax.set(xlim=(min(floor, 0.5) / 1.3, max(ceiling, 2.0) * 1.3), ylim=(len(groups) - 0.5, -0.5))
+        ax.set(xlim=(floor / 1.3, ceiling * 1.3), ylim=(len(groups) - 0.5, -0.5))
         ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
         ax.set_yticks(range(len(groups)), list(groups))
         ax.tick_params(axis="y", length=0)
@@ -222,19 +222,19 @@ def maxima_figure(traces: Sequence[Trace], window_s: float) -> Figure:
 
 
 def _peak(trace: Trace, window_s: float) -> float:
-    if trace.onset is None:
-        return float(trace.surprise.max())
-    return float(trace.surprise[trace.onset : trace.onset + window_steps(window_s, trace.dt)].max())
+    start = trace.onset or 0
+    stop = len(trace) if trace.onset is None else start + window_steps(window_s, trace.dt)
+    return float(np.clip(trace.surprise[start:stop].max(), *_limits([trace])))
 
 
-def _swarm(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n,) offsets within ±0.35 that set apart values that would lie on one another."""
+def _swarm(values: NDArray[np.float64], size: float) -> NDArray[np.float64]:
+    """(n,) sideways offsets that keep dots of diameter ``size`` apart: each the nearest free place to the middle."""
+    places = size / 4 * np.array(sorted(range(-12, 13), key=abs))
     offsets = np.zeros(len(values))
-    bins = np.floor(values / 0.04).astype(int)
-    for b in np.unique(bins):
-        members = np.flatnonzero(bins == b)
-        spread = min(0.07, 0.7 / len(members))
-        offsets[members[np.argsort(values[members])]] = spread * (np.arange(len(members)) - (len(members) - 1) / 2)
+    for done, i in enumerate(order := np.argsort(values, kind="stable")):
+        near = order[:done][values[i] - values[order[:done]] < size]
+        free = [p for p in places if np.all(np.hypot(values[i] - values[near], p - offsets[near]) >= size)]
+        offsets[i] = free[0] if free else places[done % len(places)]
     return offsets
 
 

@@ -29,7 +29,7 @@ _PAGE = Template("""<!doctype html>
   :root { --paper: #15181c; --ink: #e8eaed; --soft: #a0a8b2; --rule: #343a42; --even: #1c2026; }
 }
 * { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 60rem; padding: 3rem 1.5rem; background: var(--paper); color: var(--ink);
+body { margin: 0 auto; max-width: 64rem; padding: 3rem 1.5rem; background: var(--paper); color: var(--ink);
        font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
 h1 { font-size: 1.9rem; line-height: 1.2; font-weight: 650; margin: 0 0 1rem; }
 h2 { font-size: 1.2rem; font-weight: 600; margin: 3rem 0 1rem; }
@@ -41,9 +41,12 @@ img { display: block; max-width: 100%; height: auto; background: #fff; border-ra
 video { display: block; width: 100%; max-width: 42rem; border-radius: 6px; }
 .scroll { overflow-x: auto; margin-bottom: 2.5rem; break-inside: avoid; }
 table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
-caption { caption-side: top; text-align: left; color: var(--soft); padding-bottom: 0.6rem; }
+caption { caption-side: top; text-align: left; color: var(--soft); padding-bottom: 0.6rem;
+          max-width: min(44rem, 90vw); }
 th, td { padding: 0.45rem 0.8rem; text-align: right; vertical-align: top; }
-th:first-child, td.text { text-align: left; }
+td { white-space: nowrap; }
+th:first-child, .text { text-align: left; }
+td.text { white-space: normal; min-width: 9rem; }
 thead th { border-bottom: 2px solid var(--rule); font-weight: 600; vertical-align: bottom; }
 tbody th { font-weight: 600; white-space: nowrap; }
 tbody tr { border-bottom: 1px solid var(--rule); }
@@ -90,14 +93,13 @@ def detection_table(rows: Sequence[Row], window_s: float) -> Table:
     cells = [
         (
             r.condition,
-            r.episodes,
             _share(r.false_alarm_episodes),
             _number(r.false_alarms_per_hour),
             _interval(r.detected),
             _delay(r.delays.median_ms if r.delays else None, window),
             _delay(r.delays.p95_ms if r.delays else None, window),
             "" if r.auroc is None else f"{r.auroc:.2f}",
-            ", ".join(f"{label} ({n})" for label, n in r.top_labels),
+            ", ".join(f"{label}\u00a0({n})" for label, n in r.top_labels),
         )
         for r in rows
     ]
@@ -105,7 +107,7 @@ def detection_table(rows: Sequence[Row], window_s: float) -> Table:
         f"Detection, the monitor only watching. False alarm: raised before the fault, or at all in nominal episodes. "
         f"Detected: alarm raised within {window:.0f} ms of the onset, with the 95 % Wilson interval; a miss counts as "
         f"infinitely late. AUROC: against nominal episodes over the same steps.",
-        ("Condition", "Episodes", "With false alarm", "False alarms per hour", "Detected", "Median delay [ms]",
+        ("Condition", "With false alarm", "False alarms per hour", "Detected", "Median delay [ms]",
          "95th percentile [ms]", "AUROC", "Most surprising channel at the alarm"),
         cells,
     )  # fmt: skip
@@ -182,7 +184,10 @@ def write_report(
 
 def _table(table: Table) -> str:
     text = [any(_is_text(row[i]) for row in table.rows) for i in range(len(table.headings))]
-    head = "".join(f'<th scope="col">{escape(h)}</th>' for h in table.headings)
+    head = "".join(
+        f'<th scope="col" class="text">{escape(h)}</th>' if words else f'<th scope="col">{escape(h)}</th>'
+        for words, h in zip(text, table.headings, strict=True)
+    )
     open_td = ['<td class="text">' if words else "<td>" for words in text]
     body = "\n".join(
         f'<tr><th scope="row">{escape(str(row[0]))}</th>'
@@ -208,8 +213,9 @@ def _shown(caption: str, figure: Path | Figure) -> str:
         png = buffer.getvalue()
     else:
         png = Path(figure).read_bytes()
+    width = int.from_bytes(png[16:20], "big") * 3 // 4  # 150 dpi on a screen of about 112
     return (
-        f'<figure><img alt="{escape(caption)}" src="{_uri("image/png", png)}">'
+        f'<figure><img alt="{escape(caption)}" width="{width}" src="{_uri("image/png", png)}">'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
 
