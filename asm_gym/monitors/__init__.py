@@ -1,0 +1,30 @@
+"""Everything that can watch a stream: the Neural ASM and its rivals, behind one protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from asm_gym.monitors.base import Monitor, Surprise
+from asm_gym.monitors.neural_asm import NeuralASM
+from asm_gym.stream import StreamSpec
+
+__all__ = ["Monitor", "NeuralASM", "Surprise", "make_monitor"]
+
+_MONITORS: dict[str, Callable[..., Monitor]] = {"neural_asm": NeuralASM}
+
+
+def make_monitor(name: str, spec: StreamSpec, **kwargs: Any) -> Monitor:
+    """A monitor by name, not yet fitted.
+
+    Args:
+        name: for example ``neural_asm``.
+        spec: the stream it is to watch.
+        **kwargs: hyperparameters of that monitor.
+
+    Raises:
+        ValueError: there is no monitor of that name.
+    """
+    if name not in _MONITORS:
+        raise ValueError(f"unknown monitor {name!r}; known are: {', '.join(sorted(_MONITORS))}")
+    return _MONITORS[name](spec, **kwargs)

@@ -1,0 +1,67 @@
+"""Prediction before the senses are read, and inference after.
+
+    μ_t = W_H f(z_{t-1}) + W_U u_t                 expected state; u_t is the commanded action and a constant 1
+    z ← z - η ∂F/∂z,  η = 1.5 / (Π_z + Π_x‖W_F‖² + max|f''| ‖W_Fᵀ Π_x ε_x‖_∞)
+
+The bracket bounds the largest curvature of F, so a step below 2 over it cannot raise F, however W_F grows.
+
+Source: Millidge et al. 2024 (PLOS Comput Biol); Tang et al. 2023 (NeurIPS).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from asm_gym.memory.energy import Array, activate, energy_gradient, kernel, product
+
+STRIDE = np.float32(1.5)
+"""Length of an inference step over the inverse of the curvature; from 2 on it would diverge."""
+
+
+class Weights(NamedTuple):
+    """The synapses. H hidden units, X sensory, A motor; all float32."""
+
+    W_H: Array  # (H, H) from the last state to the next
+    W_U: Array  # (H, A + 1) from the commanded action and a constant 1 to the state
+    W_F: Array  # (X, H) from the state to the senses
+    b_F: Array  # noqa: N815 (X,)
+    W_A: Array  # (A, H) from the expected state to the action
+    W_S: Array  # (X, H) from the expected state to the log variance of each sense
+    b_S: Array  # noqa: N815 (X,)
+
+
+@kernel
+def expect(z: Array, u: Array, W_H: Array, W_U: Array) -> Array:
+    """μ_t (B, H), the state expected after ``z`` (B, H) once ``u`` (B, A + 1) is commanded."""
+    mu = product(activate(z), W_H.T)
+    mu += product(u, W_U.T)
+    return mu
+
+
+@kernel
+def sense(z: Array, W_F: Array, b_F: Array) -> Array:
+    """x̂ (B, X), the senses that ``z`` (B, H) predicts."""
+    x = product(activate(z), W_F.T)
+    x += b_F
+    return x
+
+
+@kernel
+def infer(
+    mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: float, pi_x: Array, curvature: float, iterations: int
+) -> Array:
+    """z_t (B, H): ``iterations`` steps down the energy, from ``mu`` on; arguments as in ``energy``.
+
+    Args:
+        curvature: Π_z + max Π_x ‖W_F‖², spectral norm.
+    """
+    z = mu.copy()
+    for _ in range(iterations):
+        gradient, bend = energy_gradient(z, mu, x, W_F, b_F, pi_z, pi_x)
+        for n in range(z.shape[0]):
+            step = STRIDE / (curvature + bend[n])
+            for j in range(z.shape[1]):
+                z[n, j] -= step * gradient[n, j]
+    return z

@@ -1,0 +1,67 @@
+"""Precision that depends on context: how large an error is to be expected of each sense, here and now.
+
+    log σ²_t = W_S f(μ_t) + b_S          ΔW_S ∝ (ε²/σ² - 1) f(μ_t)ᵀ          ε_t = x_t - W_F f(μ_t) - b_F
+
+ε is the error of the prediction made before x_t was seen. The rule follows the gradient of the Gaussian log
+likelihood, and each synapse needs only its own two ends. It is applied to the finished weights, for the errors of
+weights still learning are larger than those that will be watched.
+
+Source: the maximum-likelihood precision of Friston 2005 (Phil. Trans. R. Soc. B), given a context.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.memory.energy import Array, kernel, product
+from asm_gym.memory.learning import Synapse, coincidence, cosine_decay
+
+SMALLEST, LARGEST = np.float32(-12.0), np.float32(8.0)
+"""Bounds of log σ²: errors of 0.25 % of a channel's spread, and of 55 times its spread."""
+
+SURPRISED = 30.0
+"""What ε²/σ² is cut off at while learning (5.5 σ), so that one contact does not undo what a thousand steps taught."""
+
+PRECISION_EPOCHS = 20
+BATCH = 64
+
+
+@kernel
+def log_variance(f: Array, W_S: Array, b_S: Array) -> Array:
+    """log σ² (B, X) in the context ``f`` = f(μ) (B, H)."""
+    out = product(f, W_S.T)
+    for n in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            out[n, i] = min(max(out[n, i] + b_S[i], SMALLEST), LARGEST)
+    return out
+
+
+def precision_change(f: Array, error: Array, W_S: Array, b_S: Array) -> tuple[Array, Array]:
+    """The local rule for ``W_S`` (X, H) and ``b_S`` (X,), from contexts ``f`` (B, H) and errors (B, X)."""
+    excess = np.minimum(error**2 * np.exp(-log_variance(f, W_S, b_S)), np.float32(SURPRISED)) - np.float32(1.0)
+    return coincidence(excess, f), excess.mean(axis=0)
+
+
+def learn_precision(
+    f: Array,
+    error: Array,
+    W_S: Array,
+    b_S: Array,
+    rate: float,
+    rng: np.random.Generator,
+    tick: Callable[[], None] = lambda: None,
+) -> None:
+    """Fits ``W_S`` and ``b_S`` in place to the contexts ``f`` (N, H) and the errors (N, X) that came in them."""
+    W_S[:] = 0.0
+    b_S[:] = np.clip(np.log(np.mean(error**2, axis=0) + 1e-12), SMALLEST, LARGEST)
+    context, bias = Synapse(W_S), Synapse(b_S)
+    for epoch in range(PRECISION_EPOCHS):
+        order: NDArray[np.intp] = rng.permutation(len(f))
+        for rows in np.array_split(order, max(1, len(order) // BATCH)):
+            change, bias_change = precision_change(f[rows], error[rows], W_S, b_S)
+            context.learn(change, cosine_decay(rate, epoch / PRECISION_EPOCHS))
+            bias.learn(bias_change, cosine_decay(rate, epoch / PRECISION_EPOCHS))
+        tick()

@@ -1,0 +1,295 @@
+"""The Neural Associative Skill Memory as a monitor: it learns what skills feel like, and says when one feels wrong.
+
+row → standardise → memory: predict, compare, infer → ε_t/σ_t → whiten → accumulate → value, attribution
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.detection import (
+    Evidence,
+    accumulate,
+    conformal_episodes,
+    conformal_threshold,
+    no_evidence,
+    shares,
+    whitening,
+)
+from asm_gym.episodes import Episode
+from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
+from asm_gym.memory.inference import Weights
+from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.network import Network, train
+from asm_gym.monitors.base import Surprise
+from asm_gym.stream import StreamSpec
+
+KIND = "neural_asm"
+
+HYPERPARAMETERS = (*Schedule._fields, "hidden_size", "gain", "shrinkage", "seed")
+
+FARTHEST = 1e3
+"""Where standardised numbers are cut off, so that no finite row can overflow."""
+
+SCORED_AT_ONCE = 256
+"""Episodes scored side by side; bounds the memory that takes."""
+
+
+class NeuralASMState(NamedTuple):
+    """What is carried from step to step, one row a stream; a value, never changed in place."""
+
+    hidden: NDArray[np.float32]  # (B, H) the inferred state z
+    evidence: Evidence
+
+
+class Reading(NamedTuple):
+    """Rows of the stream, as the memory reads them."""
+
+    senses: NDArray[np.float32]  # (B, X) standardised
+    commands: NDArray[np.float32]  # (B, A + 1) standardised, then a constant 1
+    finite: NDArray[np.bool_]  # (B, D)
+
+
+class NeuralASM:
+    """A temporal predictive coding network over the stream, learned by local rules, with a calibrated threshold.
+
+    Args:
+        spec: the stream it watches.
+        hidden_size: H, hidden units.
+        iterations: inference steps per control step.
+        learning_rate: largest change of a synapse in one step, decaying to 0 along a cosine.
+        epochs: passes over the training episodes.
+        batch_size: episodes learned from side by side.
+        prior_precision: Π_z, trust in what was expected.
+        sensory_precision: Π_x, trust in what is sensed.
+        carry_prior: probability, reached linearly by the end of training, that the state carried on while learning is
+            the expected one rather than the inferred one. Above 0 the memory learns to run on without senses (recall).
+        gain: a in (0, 1], weight of the newest step in the accumulated evidence.
+        shrinkage: λ in [0, 1] of the whitening, towards no correlation between channels.
+        seed: of the initial weights and of the order of the episodes.
+
+    Attributes:
+        mean_, spread_: (D,) of the training rows [unit of each channel].
+        network_: the memory with its weights.
+        energy_: (epochs,) mean energy of a step.
+        whitening_: (X, X).
+        threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
+    """
+
+    def __init__(
+        self,
+        spec: StreamSpec,
+        hidden_size: int = 256,
+        iterations: int = 20,
+        learning_rate: float = 1e-3,
+        epochs: int = 40,
+        batch_size: int = 32,
+        prior_precision: float = 1.0,
+        sensory_precision: float = 1.0,
+        carry_prior: float = 0.0,
+        gain: float = 0.2,
+        shrinkage: float = 0.01,
+        seed: int = 0,
+    ) -> None:
+        counts = {"hidden_size": hidden_size, "iterations": iterations, "epochs": epochs, "batch_size": batch_size}
+        for name, count in counts.items():
+            if not isinstance(count, (int, np.integer)) or count < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, got {count}")
+        positive = {
+            "learning_rate": learning_rate,
+            "prior_precision": prior_precision,
+            "sensory_precision": sensory_precision,
+        }
+        for name, number in positive.items():
+            if not 0.0 < number < math.inf:
+                raise ValueError(f"{name} must be positive and finite, got {number}")
+        for name, share in {"carry_prior": carry_prior, "shrinkage": shrinkage}.items():
+            if not 0.0 <= share <= 1.0:
+                raise ValueError(f"{name} must be in [0, 1], got {share}")
+        if not 0.0 < gain <= 1.0:
+            raise ValueError(f"gain must be in (0, 1], got {gain}")
+        if not isinstance(seed, (int, np.integer)) or seed < 0:
+            raise ValueError(f"seed must be a whole number of at least 0, got {seed}")
+        self.spec = spec
+        self.hidden_size, self.iterations, self.learning_rate = hidden_size, iterations, learning_rate
+        self.epochs, self.batch_size = epochs, batch_size
+        self.prior_precision, self.sensory_precision = prior_precision, sensory_precision
+        self.carry_prior, self.gain, self.shrinkage, self.seed = carry_prior, gain, shrinkage, seed
+        self.network_: Network | None = None
+        self.threshold_: float | None = None
+
+    def get_params(self) -> dict[str, int | float]:
+        """The hyperparameters by name."""
+        return {name: getattr(self, name) for name in HYPERPARAMETERS}
+
+    @property
+    def threshold(self) -> float:
+        if self.threshold_ is None:
+            raise RuntimeError("this NeuralASM has no threshold yet: call calibrate(nominal_episodes) first")
+        return self.threshold_
+
+    def fit(self, episodes: Sequence[Episode], progress: Callable[[int, int], object] | None = None) -> Self:
+        """Learns from whole nominal episodes of any number of skills; no labels.
+
+        Args:
+            episodes: of this spec, each at least 2 steps long.
+            progress: called as ``progress(done, total)`` after each pass over the data.
+        """
+        self._check(episodes)
+        rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)  # (N, D)
+        self.mean_ = rows.mean(axis=0)
+        self.spread_ = _spread(rows, self.mean_, self.spec.noise)
+        trajectories = [Trajectory(r.senses, r.commands) for r in (self._read(e.stream) for e in episodes)]
+        schedule = Schedule(*(getattr(self, name) for name in Schedule._fields))
+        trained = train(trajectories, self.hidden_size, schedule, np.random.default_rng(self.seed), progress)
+        self.network_, self.energy_ = trained.network, trained.energy
+        self.whitening_ = whitening(trained.normalised_errors, self.shrinkage)
+        self.threshold_ = None
+        return self
+
+    def calibrate(self, episodes: Sequence[Episode], false_alarm_rate: float = 0.01) -> Self:
+        """Sets the threshold from nominal episodes that ``fit`` has not seen.
+
+        Args:
+            episodes: at least ``conformal_episodes(false_alarm_rate)`` of them.
+            false_alarm_rate: P(any alarm in a nominal episode), at most.
+        """
+        self._fitted()
+        conformal_episodes(false_alarm_rate)  # refuses a bad rate before the work begins
+        self._check(episodes)
+        maxima = np.array([surprise.value.max() for surprise in self.score_episodes(episodes)])
+        self.threshold_ = conformal_threshold(maxima, false_alarm_rate)
+        return self
+
+    def initial_state(self, batch: int = 1) -> NeuralASMState:
+        """The state before the first row of ``batch`` streams."""
+        if batch < 1:
+            raise ValueError(f"batch must be at least 1, got {batch}")
+        hidden = np.zeros((batch, self._fitted().hidden_size), np.float32)
+        return NeuralASMState(hidden, no_evidence(batch, len(self.spec.sensory)))
+
+    def observe(self, state: NeuralASMState, stream: NDArray[np.floating[Any]]) -> tuple[NeuralASMState, Surprise]:
+        """The next row of each stream: the new state, and how surprising the row was.
+
+        A number that is not finite makes the value and its own attribution infinite. The memory takes it for unseen,
+        so that later rows can be judged again.
+
+        Args:
+            state: as handed back last; it is not changed.
+            stream: (B, D) one row a stream.
+        """
+        network = self._fitted()
+        stream = np.asarray(stream)
+        self.spec.check_row(stream)
+        if stream.shape != (len(state.hidden), self.spec.size):
+            raise ValueError(f"stream must have the shape {(len(state.hidden), self.spec.size)}, got {stream.shape}")
+        reading = self._read(stream)
+        seen = reading.finite[:, self.spec.sensory].astype(np.float32)  # (B, X)
+        step = network.step(state.hidden, reading.commands, reading.senses, seen)
+        normalised = (step.error * np.exp(-0.5 * step.log_variance)).astype(np.float64)  # (B, X)
+        evidence = accumulate(state.evidence, normalised @ self.whitening_, self.gain)
+        attribution = np.zeros(stream.shape)  # (B, D), 0 for the commanded action
+        attribution[:, self.spec.sensory] = shares(evidence, self.gain)
+        broken = ~reading.finite.all(axis=1)
+        if broken.any():
+            attribution[broken] = np.where(reading.finite[broken], 0.0, np.inf)
+        return NeuralASMState(step.hidden, evidence), Surprise(attribution.sum(axis=1), attribution)
+
+    def score(self, episode: Episode) -> Surprise:
+        """The surprise of each step of an episode: value (T,), attribution (T, D)."""
+        return self.score_episodes([episode])[0]
+
+    def score_episodes(self, episodes: Sequence[Episode]) -> list[Surprise]:
+        """``score`` for many episodes, which are run side by side."""
+        for episode in episodes:
+            self.spec.require(episode.spec, "the episode")
+        scores: list[Surprise | None] = [None] * len(episodes)
+        order = sorted(range(len(episodes)), key=lambda i: -len(episodes[i]))
+        for start in range(0, len(order), SCORED_AT_ONCE):
+            group = order[start : start + SCORED_AT_ONCE]
+            steps = list(self._run([episodes[i].stream for i in group]))
+            for n, i in enumerate(group):
+                mine = steps[: len(episodes[i])]
+                value, attribution = (np.array([s[k][n] for s in mine]) for k in range(2))
+                scores[i] = Surprise(value, attribution.reshape(-1, self.spec.size))
+        return [s for s in scores if s is not None]
+
+    def _run(self, streams: Sequence[NDArray[np.float32]]) -> Iterator[Surprise]:
+        """Observes streams side by side, the longest first; those that have ended are left out."""
+        state = self.initial_state(len(streams))
+        for t in range(len(streams[0])):
+            rows = np.stack([s[t] for s in streams if t < len(s)])  # (n, D)
+            n = len(rows)
+            running = Evidence(state.evidence.vector[:n], state.evidence.steps[:n])
+            state, surprise = self.observe(NeuralASMState(state.hidden[:n], running), rows)
+            yield surprise
+
+    def save(self, path: str | Path) -> None:
+        """Writes everything learned to one file: arrays and JSON."""
+        header = {"spec": self.spec.to_json(), "hyperparameters": self.get_params(), "threshold": self.threshold_}
+        learned = {"mean_": self.mean_, "spread_": self.spread_, "energy_": self.energy_, "whitening_": self.whitening_}
+        write_checkpoint(path, KIND, header, {**learned, **self._fitted().weights._asdict()})
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Reads what ``save`` wrote.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is damaged, from a newer version, or something else.
+        """
+        header, arrays = read_checkpoint(path, KIND)
+        try:
+            asm = cls(StreamSpec.from_json(header["spec"]), **header["hyperparameters"])
+            weights = Weights(**{name: np.ascontiguousarray(arrays.pop(name), np.float32) for name in Weights._fields})
+            asm.network_ = Network(weights, asm.iterations, asm.prior_precision, asm.sensory_precision)
+            asm.threshold_ = header["threshold"]
+            asm.mean_, asm.spread_ = arrays["mean_"], arrays["spread_"]
+            asm.energy_, asm.whitening_ = arrays["energy_"], arrays["whitening_"]
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
+        return asm
+
+    def _fitted(self) -> Network:
+        if self.network_ is None:
+            raise RuntimeError("this NeuralASM has learned nothing yet: call fit(episodes) first")
+        return self.network_
+
+    def _read(self, stream: NDArray[np.floating[Any]]) -> Reading:
+        """Rows (B, D), standardised; a number that is not finite is replaced by its mean."""
+        finite = np.isfinite(stream)
+        reach = FARTHEST * self.spread_
+        rows = np.minimum(np.maximum(stream, self.mean_ - reach), self.mean_ + reach)
+        rows = np.where(finite, (rows - self.mean_) / self.spread_, 0.0).astype(np.float32)  # (B, D)
+        motor = self.spec.motor
+        commands = np.ones((len(rows), len(motor) + 1), np.float32)
+        commands[:, :-1] = rows[:, motor]
+        return Reading(np.ascontiguousarray(rows[:, self.spec.sensory]), commands, finite)
+
+    def _check(self, episodes: Sequence[Episode]) -> None:
+        """Refuses episodes that cannot be learned from."""
+        if len(episodes) == 0:
+            raise ValueError("at least one episode is needed, got none")
+        for n, episode in enumerate(episodes):
+            self.spec.require(episode.spec, f"episode {n}")
+            if len(episode) < 2:
+                raise ValueError(f"episode {n} must be at least 2 steps long, got {len(episode)}")
+            bad = np.argwhere(~np.isfinite(episode.stream))
+            if len(bad):
+                step, column = bad[0]
+                label, value = self.spec.labels[column], episode.stream[step, column]
+                raise ValueError(f"episode {n}, step {step}, {label} must be finite, got {value}")
+
+
+def _spread(rows: NDArray[np.float64], mean: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(D,) standard deviation of each column; of one that never changes its sensor noise, or 1 where that is 0."""
+    spread = rows.std(axis=0)
+    constant = spread <= 1e-6 * np.abs(mean)  # the rounding of float32 is not a signal
+    fallback: NDArray[np.float64] = np.where(noise > 0, noise, 1.0)
+    return np.where(constant, fallback, spread)

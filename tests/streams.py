@@ -1,0 +1,59 @@
+"""Synthetic streams for the tests: several sines seen through many correlated channels, pushed about by an action."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from asm_gym.episodes import Episode
+from asm_gym.stream import Channel, StreamSpec
+
+
+def sine_spec(sensory: int = 12, motor: int = 2) -> StreamSpec:
+    """A stream of ``sensory`` joint positions and ``motor`` actions at 20 Hz."""
+    channels = [Channel("joint_position", sensory, "rad", group="joint")]
+    if motor:
+        channels.append(Channel("command", motor, group="action"))
+    return StreamSpec(tuple(channels), dt=0.05, source="sines")
+
+
+def sine_episodes(
+    count: int, seed: int = 0, spec: StreamSpec | None = None, steps: tuple[int, int] = (40, 60), noise: float = 0.02
+) -> list[Episode]:
+    """Episodes whose channels mix four sines of fixed frequency and random phase, and an integrated action.
+
+    Args:
+        count: how many.
+        seed: of everything random but the mixing, which is the same for every seed.
+        spec: of the stream.
+        steps: shortest and longest episode.
+        noise: standard deviation of white noise on every sense.
+    """
+    spec = spec or sine_spec()
+    sensory, motor = len(spec.sensory), len(spec.motor)
+    world = np.random.default_rng(12345)
+    mixing = world.normal(size=(4 + motor, sensory))
+    frequency = world.uniform(0.05, 0.25, size=4)  # [rad / step]
+    rng = np.random.default_rng(seed)
+    episodes = []
+    for _ in range(count):
+        T = int(rng.integers(steps[0], steps[1] + 1))
+        phase = rng.uniform(0, 0.5, size=4)
+        action = rng.choice([-1.0, 1.0], size=(T, motor))
+        moved = np.zeros((T, motor))
+        for t in range(T):
+            moved[t] = 0.8 * (moved[t - 1] if t else 0.0) + 0.3 * action[t]
+        sources = np.concatenate([np.sin(np.arange(T)[:, None] * frequency + phase), moved], axis=1)
+        stream = np.zeros((T, spec.size))
+        stream[:, spec.sensory] = sources @ mixing + rng.normal(scale=noise, size=(T, sensory))
+        stream[:, spec.motor] = action
+        episodes.append(Episode.from_stream(stream, spec))
+    return episodes
+
+
+def frozen(episode: Episode, column: int, onset: int) -> Episode:
+    """The episode with one sense stuck at its value from ``onset`` on."""
+    stream = episode.stream.copy()
+    stream[onset:, column] = stream[onset, column]
+    return replace(episode, stream=stream)
