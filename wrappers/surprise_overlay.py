@@ -23,7 +23,7 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         env: an environment with ``render_mode="rgb_array"``.
         caption: what to call the episode, such as the condition.
         seconds: time the chart shows [s].
-        chart_height: [px]; a fifth of the picture where None.
+        chart_height: [px]; a quarter of the picture where None.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._chart is None or self._chart.width != width:
             # In units of the threshold, the chart is the same whatever the monitor.
             steps = max(2, round(self._seconds / self._dt))
-            self._chart = StripChart(width, self._chart_height or max(72, height // 5), steps)
+            self._chart = StripChart(width, self._chart_height or max(72, height // 4), steps)
         strip = self._chart.draw(self._ratio, self._alarm, self._fault)
         return compose(frame, strip, bool(self._alarm and self._alarm[-1]), self._line())
 

@@ -21,7 +21,7 @@ from asm_gym.evaluation.trace import spans
 
 _PAPER, _INK, _FAINT, _RULE = "#14171c", "#f2f2f2", "#a0a8b2", "#343a42"
 _CURVE, _ALARM, _FAULT = "#56B4E9", "#FF4B3E", "#E69F00"
-_LOW, _HIGH = 1e-2, 30.0  # the vertical axis, in thresholds
+_LOW, _HIGH = 0.03, 30.0  # the vertical axis, in thresholds
 _SCALE = 2  # curves are drawn at twice the size and averaged down
 
 

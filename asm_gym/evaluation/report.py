@@ -32,7 +32,7 @@ _PAGE = Template("""<!doctype html>
 body { margin: 0 auto; max-width: 64rem; padding: 3rem 1.5rem; background: var(--paper); color: var(--ink);
        font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
 h1 { font-size: 1.9rem; line-height: 1.2; font-weight: 650; margin: 0 0 1rem; }
-h2 { font-size: 1.2rem; font-weight: 600; margin: 3rem 0 1rem; }
+h2 { font-size: 1.2rem; font-weight: 600; margin: 3rem 0 1rem; break-after: avoid; }
 p { max-width: 44rem; margin: 0 0 0.8rem; }
 figure { margin: 0 0 2.5rem; break-inside: avoid; }
 figcaption { color: var(--soft); font-size: 0.9rem; max-width: 44rem; margin-top: 0.5rem; }

@@ -1,0 +1,263 @@
+"""Metrics against hand-computed values, published tables and definitions counted out."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from asm_gym.evaluation.metrics import (
+    Delays,
+    Share,
+    auroc,
+    binomial_interval,
+    delay_summary,
+    delays_ms,
+    false_alarms_per_hour,
+    placements,
+    summarise,
+    time_matched_auroc,
+    top_label,
+    wilson_interval,
+    window_steps,
+)
+from asm_gym.evaluation.trace import Trace, spans
+
+
+def a_trace(
+    surprise: Any, fault: Any = (), condition: str | None = None, acting: str = "policy alone", **fields: Any
+) -> Trace:
+    """A trace of 0.1 s steps and the threshold 10, in alarm wherever surprise is above it."""
+    surprise = np.asarray(surprise, np.float64)
+    active = np.zeros(len(surprise), np.bool_)
+    active[list(fault)] = True
+    attribution = np.column_stack([np.zeros(len(surprise)), surprise])
+    values: dict[str, Any] = {
+        "dt": 0.1,
+        "threshold": 10.0,
+        "alarm": surprise > 10.0,
+        "contact_force": np.zeros(len(surprise)),
+        "attribution": attribution,
+        "labels": ("calm", "loud"),
+        "success": True,
+        "ended_by_alarm": False,
+    }
+    condition = condition or ("push" if active.any() else "nominal")
+    return Trace(condition, acting, seed=0, surprise=surprise, fault=active, **{**values, **fields})
+
+
+def test_spans_are_the_runs_of_true():
+    assert spans(np.array([True, True, False, True])) == [(0, 2), (3, 4)]
+    assert spans(np.zeros(3, bool)) == []
+    assert spans(np.zeros(0, bool)) == []
+
+
+def test_detection_counts_steps_from_the_onset_to_the_alarm():
+    trace = a_trace([1, 1, 1, 1, 20, 20], fault=[2, 3])
+    assert trace.onset == 2
+    assert trace.detected_after == 2
+    assert trace.delay == pytest.approx(0.3)  # the fault begins at 0.2 s, step 4 ends at 0.5 s
+
+
+def test_an_alarm_before_the_onset_is_false_and_no_detection():
+    trace = a_trace([1, 20, 1, 1, 1], fault=[3, 4])
+    assert trace.false_alarms == (1,)
+    assert trace.detected_after is None
+    assert trace.delay is None
+
+
+def test_an_alarm_that_was_up_before_the_onset_is_no_detection_until_it_is_raised_again():
+    assert a_trace([20, 20, 20, 20], fault=[2]).detected_after is None
+    assert a_trace([20, 20, 20, 1, 20], fault=[2]).detected_after == 2
+
+
+def test_a_trace_without_a_fault_has_no_onset_and_only_false_alarms():
+    trace = a_trace([20, 1, 20, 20])
+    assert trace.onset is None
+    assert trace.detected_after is None
+    assert trace.false_alarms == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"alarm": np.zeros(2, bool)}, r"alarm must have the shape \(3,\), got \(2,\)"),
+        ({"attribution": np.zeros((3, 5))}, r"attribution must have the shape \(3, 2\)"),
+        ({"alarm": np.zeros(3, int)}, "alarm must be bool, got int64"),
+        ({"dt": 0.0}, "dt must be > 0, got 0.0"),
+        ({"surprise": np.array([1.0, np.nan, 1.0])}, "surprise must not be NaN"),
+    ],
+)
+def test_a_trace_refuses_what_it_cannot_mean(fields: dict[str, Any], message: str):
+    surprise = fields.pop("surprise", [1, 1, 1])
+    with pytest.raises(ValueError, match=message):
+        a_trace(surprise, **{"alarm": np.zeros(3, bool), **fields})
+
+
+def test_a_nominal_trace_holds_no_fault():
+    with pytest.raises(ValueError, match="nominal trace must not hold a fault"):
+        a_trace([1, 1], fault=[1], condition="nominal")
+
+
+@pytest.mark.parametrize(
+    ("k", "n", "low", "high"),
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+)
+def test_wilson_gives_the_intervals_of_newcombe_1998(k: int, n: int, low: float, high: float):
+    assert wilson_interval(k, n) == pytest.approx((low, high), abs=5e-5)
+
+
+def test_wilson_knows_nothing_from_no_trials_and_is_symmetric():
+    assert wilson_interval(0, 0) == (0.0, 1.0)
+    low, high = wilson_interval(3, 20)
+    assert wilson_interval(17, 20) == pytest.approx((1 - high, 1 - low))
+    assert wilson_interval(20, 20)[1] == 1.0
+
+
+def test_wilson_refuses_impossible_counts():
+    with pytest.raises(ValueError, match=r"k must be in \[0, n\], got 3 of 2"):
+        wilson_interval(3, 2)
+    with pytest.raises(ValueError, match=r"confidence must be in \(0, 1\), got 95"):
+        wilson_interval(1, 2, confidence=95)
+
+
+def test_binomial_interval_of_four_coins_by_hand():
+    # P(0) = P(4) = 1/16: with tails of at most 5 % both stay in, with tails of at most 10 % both fall out.
+    assert binomial_interval(4, 0.5, confidence=0.9) == (0, 4)
+    assert binomial_interval(4, 0.5, confidence=0.8) == (1, 3)
+
+
+@pytest.mark.parametrize(("n", "p", "confidence"), [*product((1, 30, 500), (0.01, 0.3, 0.87), (0.8, 0.95, 0.999))])
+def test_binomial_interval_is_that_of_scipy(n: int, p: float, confidence: float):
+    assert binomial_interval(n, p, confidence) == tuple(map(int, stats.binom.interval(confidence, n, p)))
+
+
+def test_binomial_interval_of_certainty_is_a_point():
+    assert binomial_interval(7, 0.0, 0.95) == (0, 0)
+    assert binomial_interval(7, 1.0, 0.95) == (7, 7)
+    assert binomial_interval(0, 0.5, 0.95) == (0, 0)
+
+
+def test_auroc_counts_pairs_and_half_of_ties():
+    # Of the six pairs 3 > 1, 3 > 2, 2 > 1 are won, 2 = 2 is tied, and 1 < 2 is lost and 1 = 1 tied: 4 of 6.
+    assert auroc([3, 2, 1], [1, 2]) == pytest.approx(4 / 6)
+
+
+def test_auroc_is_the_mann_whitney_statistic():
+    rng = np.random.default_rng(0)
+    pos, neg = rng.integers(0, 9, 40), rng.integers(0, 7, 60)
+    assert auroc(pos, neg) == pytest.approx(stats.mannwhitneyu(pos, neg).statistic / (40 * 60))
+
+
+def test_auroc_takes_infinity_and_refuses_nan_and_nothing():
+    assert auroc([math.inf, math.inf], [1.0, math.inf]) == pytest.approx(0.75)
+    with pytest.raises(ValueError, match="must not be NaN"):
+        auroc([math.nan], [1.0])
+    with pytest.raises(ValueError, match="0 positive and 1 negative"):
+        auroc([], [1.0])
+
+
+def test_a_window_holds_whole_steps_whatever_the_rounding():
+    assert window_steps(0.3, 0.1) == 3  # 0.3 / 0.1 = 2.9999999999999996
+    assert window_steps(1.0, 0.05) == 20
+    assert window_steps(0.01, 0.05) == 1
+    with pytest.raises(ValueError, match="window_s must be > 0, got 0"):
+        window_steps(0, 0.05)
+
+
+def test_time_matching_compares_each_fault_with_the_same_steps_of_nominal_episodes():
+    # Every episode is surprised at step 0, the nominal ones at step 3 too: only steps 1 and 2 may count.
+    faulty = a_trace([99, 5, 7, 1], fault=[1])
+    nominal = [a_trace([90, 6, 1, 90]), a_trace([90, 1, 8, 90]), a_trace([90, 7, 1, 90]), a_trace([90, 1, 1, 90])]
+    assert placements([faulty], nominal, window_s=0.2) == pytest.approx([(1 + 0.5) / 4])  # 8 above, 7 tied
+    assert time_matched_auroc([faulty], nominal, window_s=0.2) == pytest.approx(1 - 1.5 / 4)
+
+
+def test_time_matching_of_one_common_window_is_the_plain_auroc():
+    rng = np.random.default_rng(0)
+    faulty = [a_trace(rng.random(8) + 0.2, fault=range(3, 8)) for _ in range(9)]
+    nominal = [a_trace(rng.random(8)) for _ in range(7)]
+    plain = auroc([t.surprise[3:7].max() for t in faulty], [t.surprise[3:7].max() for t in nominal])
+    assert time_matched_auroc(faulty, nominal, window_s=0.4) == pytest.approx(plain)
+
+
+def test_time_matching_leaves_out_nominal_episodes_that_ended_before_the_onset():
+    faulty = a_trace([1, 1, 5], fault=[2])
+    assert time_matched_auroc([faulty], [a_trace([99, 99])], window_s=1.0) is None
+    assert time_matched_auroc([faulty], [a_trace([99, 99]), a_trace([1, 1, 1])], window_s=1.0) == 1.0
+
+
+def test_a_delay_is_at_least_one_step_and_a_late_alarm_is_a_miss():
+    at_once, late = a_trace([1, 20, 1, 1, 1], fault=[1]), a_trace([1, 1, 1, 20, 1], fault=[1])
+    never, nominal = a_trace([1, 1, 1, 1, 1], fault=[1]), a_trace([20, 20])
+    assert delays_ms([late, at_once, never, nominal], window_s=0.3) == pytest.approx([100, 300, math.inf])
+    assert delays_ms([late], window_s=0.2) == pytest.approx([math.inf])
+
+
+def test_quantiles_of_the_delay_count_misses_as_infinitely_late():
+    traces = [a_trace([1] * k + [20] + [1] * 30, fault=[0]) for k in range(20)]  # 100, 200, … 2000 ms
+    assert delay_summary(traces, window_s=5.0) == pytest.approx(Delays(1000.0, 1900.0, 20, 0))
+    assert delay_summary(traces, window_s=1.5) == pytest.approx(Delays(1000.0, math.inf, 15, 5))
+    assert delay_summary([a_trace([1, 1])], window_s=1.0) is None
+
+
+def test_false_alarms_per_hour_count_only_the_time_before_the_fault():
+    # 40 steps before the fault and 60 nominal ones: 10 s with 2 + 1 alarms raised, so 1080 an hour.
+    faulty = np.ones(70)
+    faulty[[5, 6, 20, 50, 60]] = 20  # two alarms before step 40
+    nominal = np.ones(60)
+    nominal[3] = 20
+    assert false_alarms_per_hour([a_trace(faulty, fault=range(40, 70)), a_trace(nominal)]) == pytest.approx(1080.0)
+    assert math.isnan(false_alarms_per_hour([a_trace([1, 1], fault=[0])]))
+
+
+def test_the_top_label_is_read_at_the_first_alarm_since_the_onset():
+    attribution = np.array([[0, 0], [20, 0], [0, 0], [0, 20]])
+    trace = a_trace([1, 20, 1, 20], fault=[2, 3], attribution=attribution)
+    assert top_label(trace) == "loud"
+    assert top_label(a_trace([1, 20, 1, 20], attribution=attribution)) == "calm"
+    with pytest.raises(ValueError, match="no alarm"):
+        top_label(a_trace([1, 1]))
+
+
+def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_acting():
+    def force(*newtons: float) -> dict[str, Any]:
+        return {"contact_force": np.array(newtons)}
+
+    traces = [
+        a_trace([1, 1, 20, 1], fault=[1, 2], success=False, **force(1, 50, 2, 0)),
+        a_trace([1, 1, 1, 1], fault=[1, 2], success=False, **force(1, 70, 2, 0)),
+        a_trace([20, 1, 1, 20], fault=[1, 2], success=True, **force(1, 90, 2, 0)),
+        # The wrapped episodes see an alarm at once, which must not touch the figures of detection.
+        a_trace([1, 20, 1, 1], fault=[1, 2], acting="hold", **force(1, 10, 0, 0)),
+        a_trace([1, 20, 1, 1], fault=[1, 2], acting="hold", ended_by_alarm=True, **force(1, 20, 0, 0)),
+        a_trace([1, 2, 3, 4]),
+        a_trace([1, 2, 30, 4]),
+    ]
+    nominal, push = summarise(traces, window_s=0.2)
+
+    assert (nominal.condition, nominal.episodes) == ("nominal", 2)
+    assert nominal.false_alarm_episodes == Share(1, 2)
+    assert nominal.detected == Share(0, 0)
+    assert nominal.delays is None
+    assert nominal.auroc is None
+    assert nominal.false_alarms_per_hour == pytest.approx(3600 / 0.8)
+
+    assert (push.condition, push.episodes) == ("push", 3)
+    assert push.false_alarm_episodes == Share(1, 3)
+    assert push.detected == Share(1, 3)  # the third alarm comes 300 ms after the onset
+    assert push.detected.interval == wilson_interval(1, 3)
+    assert push.delays == pytest.approx(Delays(math.inf, math.inf, 1, 2))
+    # Maxima of steps 1 and 2: 20, 1, 1 against 3, 30: of the six pairs one is won.
+    assert push.auroc == pytest.approx(1 / 6)
+    assert push.top_labels == (("loud", 2),)
+
+    alone, held = push.outcomes
+    assert (alone.acting, alone.success, alone.peak_force) == ("policy alone", Share(1, 3), 70.0)
+    assert (held.acting, held.success, held.ended_by_alarm, held.peak_force) == ("hold", Share(2, 2), Share(1, 2), 15.0)
+    assert push.outcome("hold") is held
+    assert push.outcome("terminate") is None

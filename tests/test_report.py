@@ -1,0 +1,234 @@
+"""The report, its figures and its film, read back from the files and the figures' own artists."""
+
+from __future__ import annotations
+
+import base64
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from asm_gym.evaluation import plots
+from asm_gym.evaluation.metrics import summarise, time_matched_auroc
+from asm_gym.evaluation.report import Table, detection_table, headline, outcome_table, write_report
+from asm_gym.evaluation.trace import Trace
+from asm_gym.evaluation.video import write_video
+
+
+def a_trace(condition: str, seed: int, acting: str = "policy alone") -> Trace:
+    """60 steps of 0.05 s; faults begin at step 20 and are seen, or not, as chance has it."""
+    rng = np.random.default_rng([seed, len(condition)])
+    surprise = rng.gamma(3.0, 2.0, 60)
+    fault = np.zeros(60, np.bool_)
+    if condition != "nominal":
+        fault[20:40] = True
+        surprise[20 + rng.integers(8) : 40] += 30 * rng.random()
+    attribution = rng.dirichlet(np.ones(20), 60) * surprise[:, None]
+    return Trace(
+        condition, acting, seed, 0.05, 20.0, surprise, surprise > 20.0, fault, 10 * rng.random(60), attribution,
+        tuple(f"joint_position[{i}]" for i in range(20)), True, False,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def traces() -> list[Trace]:
+    names = ("nominal", "push", "weak joint")
+    return [a_trace(c, s, a) for c in names for s in range(8) for a in ("policy alone", "hold")]
+
+
+def figures_of(traces: list[Trace]) -> dict[str, Figure]:
+    faulty = next(t for t in traces if t.delay is not None)
+    return {
+        "surprise": plots.surprise_figure([traces[0], faulty]),
+        "delay": plots.delay_figure(traces, 1.0),
+        "roc": plots.roc_figure(traces, 1.0),
+        "attribution": plots.attribution_figure(faulty),
+        "maxima": plots.maxima_figure(traces, 1.0),
+    }
+
+
+def test_figures_are_the_same_bytes_each_time_whatever_the_users_style(traces: list[Trace], tmp_path: Path):
+    before = {name: plots.save(f, tmp_path / f"{name}.png").read_bytes() for name, f in figures_of(traces).items()}
+    with mpl.rc_context({"axes.facecolor": "red", "font.size": 30, "lines.linewidth": 9}):
+        again = figures_of(traces)
+    for name, figure in again.items():
+        assert plots.save(figure, tmp_path / "again.png").read_bytes() == before[name], name
+
+
+def test_figures_leave_pyplot_and_the_users_style_alone(traces: list[Trace]):
+    with mpl.rc_context({"font.size": 17.0}):
+        figures_of(traces)
+        assert mpl.rcParams["font.size"] == 17.0
+    assert plt.get_fignums() == []
+
+
+def test_the_roc_curve_encloses_the_auroc_it_names(traces: list[Trace]):
+    ax = plots.roc_figure(traces, 1.0).axes[0]
+    alone = [t for t in traces if t.watched_only]
+    nominal = [t for t in alone if t.condition == "nominal"]
+    for line, condition in zip(ax.lines[1:], ("push", "weak joint"), strict=True):
+        x, y = (np.asarray(v, float) / 100 for v in line.get_data())
+        area = float(np.sum(np.diff(x) * y[:-1]))  # steps hold their value to the right
+        auroc = time_matched_auroc([t for t in alone if t.condition == condition], nominal, 1.0)
+        assert area == pytest.approx(auroc)
+        assert line.get_label() == f"{condition}: AUROC {auroc:.2f}"
+
+
+def test_the_delay_curve_ends_at_the_share_detected_in_the_window(traces: list[Trace]):
+    ax = plots.delay_figure(traces, 0.5).axes[0]
+    rows = [r for r in summarise(traces, 0.5) if r.condition != "nominal"]
+    assert any(0 < r.detected.value < 1 for r in rows)
+    for line, row in zip(ax.lines, rows, strict=True):
+        x, y = line.get_data()
+        assert x[-1] == 500.0
+        assert y[-1] == pytest.approx(100 * row.detected.value)
+
+
+def test_curves_differ_in_colour_and_in_line(traces: list[Trace]):
+    lines = plots.delay_figure(traces, 1.0).axes[0].lines
+    assert len({line.get_color() for line in lines}) == 2
+    assert len({str(line._dash_pattern) for line in lines}) == 2
+
+
+def test_infinite_and_zero_surprise_can_be_drawn(traces: list[Trace], tmp_path: Path):
+    good = next(t for t in traces if t.delay is not None)
+    surprise = good.surprise.copy()
+    surprise[:5], surprise[30:] = 0.0, np.inf
+    attribution = good.attribution.copy()
+    attribution[30:] = np.inf
+    fields = {**vars(good), "surprise": surprise, "alarm": surprise > 20.0, "attribution": attribution}
+    broken = Trace(**{k: v for k, v in fields.items() if k in Trace.__dataclass_fields__})
+    for name, figure in figures_of([broken, *(t for t in traces if t.condition == "nominal")]).items():
+        assert plots.save(figure, tmp_path / f"{name}.png").stat().st_size > 5000
+
+
+def test_attribution_shows_the_channels_with_the_greatest_share_first(traces: list[Trace]):
+    trace = next(t for t in traces if t.delay is not None)
+    labels = [text.get_text() for text in plots.attribution_figure(trace, top=3).axes[0].get_yticklabels()]
+    peaks = trace.attribution[20:].max(axis=0)
+    assert labels == [trace.labels[i] for i in np.argsort(-peaks)[:3]]
+
+
+def test_nothing_to_draw_is_an_error(traces: list[Trace]):
+    with pytest.raises(ValueError, match="no traces to draw"):
+        plots.surprise_figure([])
+    with pytest.raises(ValueError, match="needs nominal traces"):
+        plots.roc_figure([t for t in traces if t.condition == "push"], 1.0)
+
+
+class _Page(HTMLParser):
+    """What a page holds: its text, its tags with their attributes, and its cells."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, Any]]] = []
+        self.text = ""
+        self.feed(source)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, Any]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+    def all(self, tag: str) -> list[dict[str, Any]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def test_a_report_holds_everything_and_fetches_nothing(traces: list[Trace], tmp_path: Path):
+    rows = summarise(traces, 1.0)
+    figures = figures_of(traces)
+    saved = plots.save(figures["roc"], tmp_path / "roc.png")
+    frames = [np.full((32, 48, 3), i, np.uint8) for i in range(5)]
+    film = write_video(tmp_path / "film.mp4", frames, fps=20)
+    out = write_report(
+        tmp_path / "report.html", "Lift", "First.\n\nSecond.",
+        [detection_table(rows, 1.0), outcome_table(rows)],
+        {"As a figure": figures["maxima"], "As a file": saved}, film, {"seed": 0},
+    )  # fmt: skip
+    source = out.read_text(encoding="utf-8")
+    page = _Page(source)
+
+    images = page.all("img")
+    assert [i["alt"] for i in images] == ["As a figure", "As a file"]
+    assert base64.b64decode(images[1]["src"].removeprefix("data:image/png;base64,")) == saved.read_bytes()
+    assert base64.b64decode(page.all("video")[0]["src"].removeprefix("data:video/mp4;base64,")) == film.read_bytes()
+    assert len(page.all("table")) == len(page.all("caption")) == 2
+    assert {a.get("scope") for a in page.all("th")} == {"col", "row"}
+    assert len(page.all("p")) == 2
+    assert not page.all("script")
+    assert not page.all("link")
+    assert not re.search(r"https?://|@import|url\(", source)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["film.mp4", "report.html", "roc.png"]  # nothing unfinished
+
+
+def test_whatever_is_written_is_escaped(tmp_path: Path):
+    evil = '<script>alert("x")</script> $title & co'
+    table = Table(evil, (evil, "b"), [(evil, evil)])
+    out = write_report(tmp_path / "r.html", evil, evil, [table], {evil: Figure()}, None, {evil: evil})
+    page = _Page(out.read_text(encoding="utf-8"))
+    assert not page.all("script")
+    assert page.all("img")[0]["alt"] == evil
+    # In <title>, <h1>, <p>, <caption>, two <th>, one <td>, <figcaption>, <dt> and <dd>.
+    assert page.text.count(evil) == 10
+
+
+def test_a_report_that_fails_leaves_the_last_one(tmp_path: Path):
+    out = write_report(tmp_path / "r.html", "Good", "", [], {})
+    before = out.read_bytes()
+    with pytest.raises(FileNotFoundError):
+        write_report(out, "Bad", "", [], {"gone": tmp_path / "gone.png"})
+    assert out.read_bytes() == before
+
+
+def test_a_row_must_have_as_many_cells_as_there_are_headings():
+    with pytest.raises(ValueError, match="the table has 2 columns, but a row of 1"):
+        Table("t", ("a", "b"), [("x",)])
+
+
+def test_tables_say_what_the_summary_says(traces: list[Trace]):
+    rows = summarise(traces, 0.5)
+    push = rows[1]
+    cells = dict(zip(*((t := detection_table(rows, 0.5)).headings, t.rows[1]), strict=True))
+    low, high = (round(100 * x) for x in push.detected.interval)
+    assert cells["Condition"] == "push"
+    assert cells["Detected"] == f"{push.detected.k} of 8 ({low}–{high} %)"
+    assert cells["AUROC"] == f"{push.auroc:.2f}"
+    assert cells["95th percentile [ms]"] == "> 500"  # there are misses
+    assert detection_table(rows, 0.5).rows[0][3] == ""  # a nominal episode has nothing to detect
+    assert [row[:2] for row in outcome_table(rows).rows][:2] == [("nominal", "policy alone"), ("nominal", "hold")]
+    found = sum(r.detected.k for r in rows)
+    assert headline(rows).startswith(f"{found} of 16 faults detected; {rows[0].false_alarm_episodes.k} of 8 nominal")
+
+
+def test_a_video_reads_back_with_its_frames_rate_and_colours(tmp_path: Path):
+    colours = ((200, 30, 30), (30, 200, 30), (30, 30, 200))
+    frames = [np.broadcast_to(np.array(c, np.uint8), (33, 47, 3)).copy() for c in colours]
+    path = write_video(tmp_path / "v.mp4", frames, fps=10)
+    reader = imageio_ffmpeg.read_frames(str(path))
+    meta = next(reader)
+    back = [np.frombuffer(f, np.uint8).reshape(34, 48, 3) for f in reader]  # padded to even sides
+    assert meta["codec"] == "h264"
+    assert meta["pix_fmt"].startswith("yuv420p")
+    assert meta["fps"] == 10
+    assert len(back) == 3
+    for frame, colour in zip(back, colours, strict=True):
+        assert np.abs(frame.reshape(-1, 3).mean(axis=0) - colour).max() < 12
+    assert path.read_bytes().index(b"moov") < path.read_bytes().index(b"mdat")  # plays before it is all there
+
+
+def test_a_video_that_fails_leaves_nothing_behind(tmp_path: Path):
+    with pytest.raises(ValueError, match="at least one frame"):
+        write_video(tmp_path / "v.mp4", [], fps=10)
+    with pytest.raises(ValueError, match=r"all frames must have the shape \(32, 32, 3\), got \(16, 32, 3\)"):
+        write_video(tmp_path / "v.mp4", [np.zeros((32, 32, 3), np.uint8), np.zeros((16, 32, 3), np.uint8)], fps=10)
+    with pytest.raises(ValueError, match=r"a frame must be \(H, W, 3\) uint8"):
+        write_video(tmp_path / "v.mp4", [np.zeros((32, 32), np.uint8)], fps=10)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,239 @@
+"""The strip chart's pixels, and the wrapper over a scripted environment."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import ImageColor
+
+from asm_gym.evaluation import overlay
+from asm_gym.evaluation.overlay import StripChart, compose
+from asm_gym.wrappers.surprise_overlay import SurpriseOverlay
+
+RED, ORANGE, CURVE = (np.array(ImageColor.getrgb(c)) for c in (overlay._ALARM, overlay._FAULT, overlay._CURVE))
+GREY = np.full((120, 200, 3), 128, np.uint8)
+
+
+def has(picture: NDArray[np.uint8], colour: NDArray[Any]) -> NDArray[np.bool_]:
+    """(H, W) where the picture has exactly this colour."""
+    return (picture == colour).all(axis=-1)
+
+
+def height_of_curve(picture: NDArray[np.uint8]) -> float:
+    """[px] mean row of the curve in the rightmost quarter."""
+    rows, _ = np.nonzero(has(picture[:, -50:], CURVE))
+    return float(rows.mean())
+
+
+def test_equal_ratios_of_surprise_are_equal_distances():
+    chart = StripChart(200, 120, steps=10, threshold=5.0)
+    y = [height_of_curve(chart.draw([v] * 10, [False] * 10, [False] * 10)) for v in (0.5, 5.0, 50.0)]
+    assert y[0] - y[1] == pytest.approx(y[1] - y[2], abs=1.0)
+    assert y[0] - y[1] > 15
+
+
+def test_the_curve_at_the_threshold_lies_on_the_dashes():
+    chart = StripChart(200, 120, steps=10, threshold=7.0)
+    empty = chart.draw([], [], [])
+    dashes = np.nonzero(has(empty[:, 150:], np.array(ImageColor.getrgb(overlay._INK))).any(axis=1))[0]
+    curve = height_of_curve(chart.draw([7.0] * 10, [False] * 10, [False] * 10))
+    assert curve == pytest.approx(dashes.mean(), abs=1.0)
+
+
+def test_surprise_without_bounds_stays_in_the_chart():
+    chart = StripChart(200, 120, steps=4)
+    top = height_of_curve(chart.draw([1, np.inf, np.inf, np.inf], [False] * 4, [False] * 4))
+    bottom = height_of_curve(chart.draw([1, 0, 0, 0], [False] * 4, [False] * 4))
+    assert 0 < top < bottom < 120
+    assert height_of_curve(chart.draw([1, np.nan, np.nan, np.nan], [False] * 4, [False] * 4)) == top
+
+
+def test_bars_stand_where_fault_and_alarm_were():
+    chart = StripChart(200, 120, steps=10)
+    picture = chart.draw([1] * 10, [False] * 8 + [True] * 2, [False] * 5 + [True] * 3 + [False] * 2)
+    columns = np.flatnonzero(has(picture, ORANGE).any(axis=0))
+    assert (columns.min(), columns.max()) == pytest.approx((100, 159), abs=1)  # steps 5 to 7, of 20 px each
+    columns = np.flatnonzero(has(picture, RED).any(axis=0))
+    assert (columns.min(), columns.max()) == pytest.approx((160, 199), abs=1)
+    assert not has(chart.draw([1] * 10, [False] * 10, [False] * 10), ORANGE).any()
+
+
+def test_only_the_last_steps_are_shown_and_the_latest_is_at_the_right():
+    chart = StripChart(200, 120, steps=10)
+    long, fault = [9.0] * 50 + [1.0] * 10, [True] * 50 + [False] * 10
+    assert np.array_equal(chart.draw(long, [False] * 60, fault), chart.draw([1.0] * 10, [False] * 10, [False] * 10))
+    short = chart.draw([1.0], [False], [True])
+    assert np.flatnonzero(has(short, ORANGE).any(axis=0)).min() == pytest.approx(180, abs=1)
+
+
+def test_an_alarm_is_a_border_and_a_word_on_the_picture():
+    chart = StripChart(200, 40).draw([], [], [])
+    calm, alarmed = compose(GREY, chart, alarm=False), compose(GREY, chart, alarm=True)
+    assert calm.shape == alarmed.shape == (160, 200, 3)
+    assert np.array_equal(calm[:120], GREY)
+    assert np.array_equal(calm[120:], chart)
+    border = has(alarmed[:120], RED)
+    assert border[0].all()
+    assert border[:, 0].all()
+    word = alarmed[90:115, 100:195]
+    assert has(word, np.zeros(3)).sum() > 50  # black letters on red
+
+
+def test_a_caption_that_is_too_long_is_cut_inside_the_picture():
+    chart = StripChart(200, 40).draw([], [], [])
+    picture = compose(GREY, chart, alarm=False, caption="a very long caption " * 20)
+    changed = np.flatnonzero((picture[:120] != GREY).any(axis=(0, 2)))
+    assert 100 < changed.max() < 199
+
+
+def test_drawing_changes_none_of_its_arguments():
+    frame, surprise = GREY.copy(), np.ones(5)
+    compose(frame, StripChart(200, 40, 5).draw(surprise, [True] * 5, [True] * 5), alarm=True, caption="x")
+    assert np.array_equal(frame, GREY)
+    assert np.array_equal(surprise, np.ones(5))
+
+
+def test_a_frame_takes_milliseconds():
+    frame, chart = np.zeros((512, 512, 3), np.uint8), StripChart(512, 128)
+    history, flags = np.ones(100), np.ones(100, bool)
+    took = []
+    for i in range(20):
+        start = time.perf_counter()
+        compose(frame, chart.draw(history, flags, flags), True, f"{i} s")
+        took.append(time.perf_counter() - start)
+    assert min(took) < 0.02  # 3 ms where it was written; the slack is for busy machines
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"width": 10}, "at least 64 x 32 pixels, got 10 x 96"),
+        ({"width": 100, "steps": 1}, "steps must be at least 2, got 1"),
+        ({"width": 100, "threshold": 0.0}, "threshold must be finite and > 0 on a log axis, got 0.0"),
+    ],
+)
+def test_a_chart_refuses_what_it_cannot_draw(arguments: dict[str, Any], message: str):
+    with pytest.raises(ValueError, match=message):
+        StripChart(**arguments)
+
+
+def test_pictures_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="as wide as the picture, 200 px, got 100 px"):
+        compose(GREY, StripChart(100, 40).draw([], [], []), alarm=False)
+    with pytest.raises(ValueError, match="histories differ in length: 2, 1, 2"):
+        StripChart(100, 40).draw([1, 1], [True], [True, True])
+
+
+class ScriptedEnv(gym.Env[Any, Any]):
+    """Says what it is told to say, step by step: dicts of info."""
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 20}  # noqa: RUF012
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, script: list[dict[str, Any]] | None = None, render_mode: str | None = "rgb_array") -> None:
+        self.script = script or []
+        self.render_mode = render_mode
+        self.stream_spec = SimpleNamespace(dt=0.1)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.left = list(self.script)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return np.zeros(1, np.float32), 1.5, False, False, self.left.pop(0)
+
+    def render(self) -> NDArray[np.uint8]:  # type: ignore[override]
+        return GREY.copy()
+
+
+def says(surprise: float = 1.0, alarm: bool = False, fault: Any = None, intervened: bool = False) -> dict[str, Any]:
+    asm = {"surprise": surprise, "threshold": 4.0, "alarm": alarm, "intervened": intervened}
+    return {"asm": asm} if fault is None else {"asm": asm, "fault": fault}
+
+
+def played(script: list[dict[str, Any]], **arguments: Any) -> SurpriseOverlay:
+    env = SurpriseOverlay(ScriptedEnv(script), **arguments)
+    env.reset(seed=0)
+    for _ in script:
+        env.step(np.zeros(1, np.float32))
+    return env
+
+
+def test_a_rendered_frame_shows_alarm_and_fault():
+    calm = played([says()] * 5).render()
+    faulty = played([says()] * 4 + [says(9.0, True, fault=("push",))]).render()
+    assert calm.shape == faulty.shape == (192, 200, 3)
+    assert not has(calm, RED).any()
+    assert not has(calm, ORANGE).any()
+    assert has(faulty[:120], RED)[0].all()
+    assert has(faulty[120:], ORANGE).any()
+
+
+@pytest.mark.parametrize("fault", [{}, (), None, []])
+def test_no_active_fault_is_no_bar(fault: Any):
+    assert not has(played([says(fault=fault)] * 5).render(), ORANGE).any()
+
+
+def test_the_chart_is_in_units_of_the_threshold_and_as_long_as_asked():
+    env = played([says(8.0)] * 40, seconds=2.0)
+    strip = StripChart(200, 72, steps=20, threshold=4.0).draw([8.0] * 20, [False] * 20, [False] * 20)
+    assert np.array_equal(env.render()[120:], strip)
+
+
+def test_the_caption_says_condition_time_and_who_acts():
+    assert played([says()] * 3, caption="push")._line() == "push   0.30 s   policy acting"
+    assert played([says(9.0, True), says(9.0, True, intervened=True)])._line() == "0.20 s   override acting"
+
+
+def test_reset_clears_every_trace_of_the_last_episode():
+    env = played([says(9.0, True, fault=("push",), intervened=True)] * 5, caption="push")
+    fresh = SurpriseOverlay(ScriptedEnv(), caption="push")
+    fresh.reset()
+    env.reset()
+    assert np.array_equal(env.render(), fresh.render())
+
+
+def test_the_step_passes_through_untouched():
+    env = SurpriseOverlay(ScriptedEnv([info := says(2.0, fault=("push",))]))
+    env.reset()
+    before = {**info, "asm": dict(info["asm"])}
+    _, reward, terminated, truncated, after = env.step(np.zeros(1, np.float32))
+    assert (reward, terminated, truncated) == (1.5, False, False)
+    assert after is info
+    assert after == before
+
+
+@pytest.mark.parametrize("mode", [None, "human"])
+def test_it_needs_pictures(mode: str | None):
+    with pytest.raises(ValueError, match=f'needs render_mode="rgb_array", got {mode!r}'):
+        SurpriseOverlay(ScriptedEnv(render_mode=mode))
+
+
+def test_it_needs_a_monitor_underneath():
+    env = SurpriseOverlay(ScriptedEnv([{}]))
+    env.reset()
+    with pytest.raises(KeyError, match="put it over NeuralASMSafety"):
+        env.step(np.zeros(1, np.float32))
+
+
+def test_the_spec_makes_it_again():
+    gym.register("asm_gym_test/Scripted-v0", entry_point=ScriptedEnv)
+    try:
+        env = SurpriseOverlay(
+            gym.make("asm_gym_test/Scripted-v0", render_mode="rgb_array"), caption="push", seconds=3.0
+        )
+        assert env.spec is not None
+        again = gym.make(env.spec)
+        assert isinstance(again, SurpriseOverlay)
+        assert again.spec == env.spec
+        assert again.caption == "push"
+    finally:
+        del gym.registry["asm_gym_test/Scripted-v0"]
