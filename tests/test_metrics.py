@@ -75,6 +75,12 @@ def test_an_alarm_that_was_up_before_the_onset_is_no_detection_until_it_is_raise
     assert a_trace([20, 20, 20, 1, 20], fault=[2]).detected_after == 2
 
 
+def test_an_alarm_in_the_very_step_of_the_onset_is_detection_and_not_false():
+    trace = a_trace([1, 1, 20, 1], fault=[2])
+    assert trace.false_alarms == ()
+    assert trace.detected_after == 0
+
+
 def test_a_trace_without_a_fault_has_no_onset_and_only_false_alarms():
     trace = a_trace([20, 1, 20, 20])
     assert trace.onset is None

@@ -56,7 +56,7 @@ def figures_of(traces: list[Trace]) -> dict[str, Figure]:
 
 def test_figures_are_the_same_bytes_each_time_whatever_the_users_style(traces: list[Trace], tmp_path: Path):
     before = {name: plots.save(f, tmp_path / f"{name}.png").read_bytes() for name, f in figures_of(traces).items()}
-    with mpl.rc_context({"axes.facecolor": "red", "font.size": 30, "lines.linewidth": 9}):
+    with mpl.rc_context({"axes.facecolor": "red", "font.size": 30, "axes.labelsize": 30, "ytick.direction": "in"}):
         again = figures_of(traces)
     for name, figure in again.items():
         assert plots.save(figure, tmp_path / "again.png").read_bytes() == before[name], name
