@@ -165,7 +165,10 @@ def roc_figure(traces: Sequence[Trace], window_s: float) -> Figure:
 
 def attribution_figure(trace: Trace, top: int = 12) -> Figure:
     """Where the surprise came from: the shares of the ``top`` channels over time, in units of the threshold."""
-    share = np.nan_to_num(trace.attribution / trace.threshold, nan=0.0, posinf=1e6, neginf=0.0)  # (T, D)
+    share = trace.attribution / trace.threshold  # (T, D)
+    # An infinite share takes the brightest finite colour, or it would leave all others dark.
+    brightest = float(share[np.isfinite(share)].max(initial=1.0))
+    share = np.nan_to_num(share, nan=0.0, posinf=brightest, neginf=0.0)
     rows = np.argsort(-share[trace.onset or 0 :].max(axis=0), kind="stable")[:top]
     high = max(float(share[:, rows].max()), 1.0)
     with _figure(height=1.5 + 0.24 * len(rows)) as fig:
