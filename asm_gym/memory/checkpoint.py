@@ -1,7 +1,7 @@
 """Checkpoints: one file of arrays and JSON, never pickle.
 
-The file is an ``.npz`` (a zip of arrays) with one extra array that holds the bytes of a JSON header. A zip carries a
-checksum of every member, so damage is noticed when it is read.
+The file is a zip of ``.npy`` arrays, as an ``.npz`` is, with a JSON header beside them. A zip carries a checksum of
+every member, so damage is noticed when it is read.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,14 @@ class Checkpoint(NamedTuple):
 
     header: dict[str, Any]
     arrays: dict[str, NDArray[Any]]
+
+    def array(self, name: str, *shape: int) -> NDArray[Any]:
+        """The array of that name. Raises ValueError unless there is one, of numbers and of that shape."""
+        array = self.arrays.get(name)
+        if array is None or array.shape != shape or array.dtype.kind != "f":
+            found = "none" if array is None else f"{array.dtype} {array.shape}"
+            raise ValueError(f"the checkpoint is damaged: {name} should be an array of shape {shape}, found {found}")
+        return array
 
 
 def write_checkpoint(
@@ -47,7 +55,7 @@ def write_checkpoint(
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
-            np.savez(file, allow_pickle=False, **{HEADER: np.frombuffer(text.encode(), np.uint8)}, **arrays)
+            _write(file, text, arrays)
         os.chmod(temporary, 0o644)  # mkstemp makes it readable by its owner alone
         os.replace(temporary, path)
     except BaseException:
@@ -64,8 +72,8 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
     """
     try:
         with zipfile.ZipFile(path) as file:
-            arrays = {n.removesuffix(".npy"): _array(file, n) for n in file.namelist()}
-        header = json.loads(arrays.pop(HEADER).tobytes())
+            header = json.loads(file.read(HEADER))
+            arrays = {n.removesuffix(".npy"): _read(file, n) for n in file.namelist() if n != HEADER}
     except FileNotFoundError:
         raise
     except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, RuntimeError) as error:
@@ -82,7 +90,15 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
     return Checkpoint(header, arrays)
 
 
-def _array(file: zipfile.ZipFile, name: str) -> NDArray[Any]:
+def _write(file: IO[bytes], header: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr(HEADER, header)
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)  # type: ignore[no-untyped-call]
+
+
+def _read(file: zipfile.ZipFile, name: str) -> NDArray[Any]:
     with file.open(name) as member:
         array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)  # type: ignore[no-untyped-call]
         member.read()  # the checksum is compared at the end of the member

@@ -32,6 +32,12 @@ class Weights(NamedTuple):
     b_S: Array  # noqa: N815 (X,)
 
 
+def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
+    """The shape of each array in ``Weights``, by name."""
+    H, X, A = hidden, sensory, motor
+    return {"W_H": (H, H), "W_U": (H, A + 1), "W_F": (X, H), "b_F": (X,), "W_A": (A, H), "W_S": (X, H), "b_S": (X,)}
+
+
 @kernel
 def expect(z: Array, u: Array, W_H: Array, W_U: Array) -> Array:
     """μ_t (B, H), the state expected after ``z`` (B, H) once ``u`` (B, A + 1) is commanded."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from asm_gym.memory.energy import Array, activate
-from asm_gym.memory.inference import Weights, expect, infer, sense
+from asm_gym.memory.inference import Weights, expect, infer, sense, weight_shapes
 from asm_gym.memory.learning import Batch, Schedule, Trajectory, batches, learn
 from asm_gym.memory.precision import PRECISION_EPOCHS, learn_precision, log_variance
 
@@ -26,20 +26,12 @@ class Step(NamedTuple):
 
 
 def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> Weights:
-    """Random weights of about unit gain; a precision that knows no context yet."""
-
-    def normal(rows: int, columns: int) -> Array:
-        return np.asarray(rng.standard_normal((rows, columns)) / np.sqrt(columns), np.float32)
-
-    return Weights(
-        W_H=normal(hidden, hidden),
-        W_U=normal(hidden, motor + 1),
-        W_F=normal(sensory, hidden),
-        b_F=np.zeros(sensory, np.float32),
-        W_A=normal(motor, hidden),
-        W_S=np.zeros((sensory, hidden), np.float32),
-        b_S=np.zeros(sensory, np.float32),
-    )
+    """Random weights of about unit gain; no biases, and a precision that knows no context yet."""
+    weights = {n: np.zeros(shape, np.float32) for n, shape in weight_shapes(hidden, sensory, motor).items()}
+    for name in ("W_H", "W_U", "W_F", "W_A"):
+        W = weights[name]
+        W[:] = rng.standard_normal(W.shape) / np.sqrt(W.shape[1])
+    return Weights(**weights)
 
 
 class Network:

@@ -24,7 +24,7 @@ from asm_gym.detection import (
 )
 from asm_gym.episodes import Episode
 from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
-from asm_gym.memory.inference import Weights
+from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, train
 from asm_gym.monitors.base import Surprise
@@ -37,8 +37,8 @@ HYPERPARAMETERS = (*Schedule._fields, "hidden_size", "gain", "shrinkage", "seed"
 FARTHEST = 1e3
 """Where standardised numbers are cut off, so that no finite row can overflow."""
 
-SCORED_AT_ONCE = 256
-"""Episodes scored side by side; bounds the memory that takes."""
+SCORED_AT_ONCE = 64
+"""Episodes scored side by side; with more the arrays no longer fit the cache."""
 
 
 class NeuralASMState(NamedTuple):
@@ -99,23 +99,14 @@ class NeuralASM:
     ) -> None:
         counts = {"hidden_size": hidden_size, "iterations": iterations, "epochs": epochs, "batch_size": batch_size}
         for name, count in counts.items():
-            if not isinstance(count, (int, np.integer)) or count < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1, got {count}")
-        positive = {
-            "learning_rate": learning_rate,
-            "prior_precision": prior_precision,
-            "sensory_precision": sensory_precision,
-        }
-        for name, number in positive.items():
-            if not 0.0 < number < math.inf:
-                raise ValueError(f"{name} must be positive and finite, got {number}")
+            _require(name, count, isinstance(count, (int, np.integer)) and count >= 1, "a whole number of at least 1")
+        _require("seed", seed, isinstance(seed, (int, np.integer)) and seed >= 0, "a whole number of at least 0")
+        precisions = {"prior_precision": prior_precision, "sensory_precision": sensory_precision}
+        for name, number in {"learning_rate": learning_rate, **precisions}.items():
+            _require(name, number, 0.0 < number < math.inf, "positive and finite")
         for name, share in {"carry_prior": carry_prior, "shrinkage": shrinkage}.items():
-            if not 0.0 <= share <= 1.0:
-                raise ValueError(f"{name} must be in [0, 1], got {share}")
-        if not 0.0 < gain <= 1.0:
-            raise ValueError(f"gain must be in (0, 1], got {gain}")
-        if not isinstance(seed, (int, np.integer)) or seed < 0:
-            raise ValueError(f"seed must be a whole number of at least 0, got {seed}")
+            _require(name, share, 0.0 <= share <= 1.0, "in [0, 1]")
+        _require("gain", gain, 0.0 < gain <= 1.0, "in (0, 1]")
         self.spec = spec
         self.hidden_size, self.iterations, self.learning_rate = hidden_size, iterations, learning_rate
         self.epochs, self.batch_size = epochs, batch_size
@@ -232,9 +223,10 @@ class NeuralASM:
 
     def save(self, path: str | Path) -> None:
         """Writes everything learned to one file: arrays and JSON."""
+        weights = self._fitted().weights._asdict()
         header = {"spec": self.spec.to_json(), "hyperparameters": self.get_params(), "threshold": self.threshold_}
         learned = {"mean_": self.mean_, "spread_": self.spread_, "energy_": self.energy_, "whitening_": self.whitening_}
-        write_checkpoint(path, KIND, header, {**learned, **self._fitted().weights._asdict()})
+        write_checkpoint(path, KIND, header, {**learned, **weights})
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -244,16 +236,19 @@ class NeuralASM:
             FileNotFoundError: there is no such file.
             ValueError: the file is damaged, from a newer version, or something else.
         """
-        header, arrays = read_checkpoint(path, KIND)
+        saved = read_checkpoint(path, KIND)
         try:
-            asm = cls(StreamSpec.from_json(header["spec"]), **header["hyperparameters"])
-            weights = Weights(**{name: np.ascontiguousarray(arrays.pop(name), np.float32) for name in Weights._fields})
-            asm.network_ = Network(weights, asm.iterations, asm.prior_precision, asm.sensory_precision)
-            asm.threshold_ = header["threshold"]
-            asm.mean_, asm.spread_ = arrays["mean_"], arrays["spread_"]
-            asm.energy_, asm.whitening_ = arrays["energy_"], arrays["whitening_"]
+            spec = StreamSpec.from_json(saved.header["spec"])
+            asm = cls(spec, **saved.header["hyperparameters"])
+            asm.threshold_ = saved.header["threshold"]
         except (KeyError, TypeError) as error:
             raise ValueError(f"{path} is damaged: {error}") from error
+        D, X = spec.size, len(spec.sensory)
+        asm.mean_, asm.spread_ = saved.array("mean_", D), saved.array("spread_", D)
+        asm.energy_, asm.whitening_ = saved.array("energy_", asm.epochs), saved.array("whitening_", X, X)
+        shapes = weight_shapes(asm.hidden_size, X, len(spec.motor))
+        weights = Weights(**{n: np.ascontiguousarray(saved.array(n, *s), np.float32) for n, s in shapes.items()})
+        asm.network_ = Network(weights, asm.iterations, asm.prior_precision, asm.sensory_precision)
         return asm
 
     def _fitted(self) -> Network:
@@ -285,6 +280,11 @@ class NeuralASM:
                 step, column = bad[0]
                 label, value = self.spec.labels[column], episode.stream[step, column]
                 raise ValueError(f"episode {n}, step {step}, {label} must be finite, got {value}")
+
+
+def _require(name: str, value: float, fulfilled: bool, what: str) -> None:
+    if not fulfilled:
+        raise ValueError(f"{name} must be {what}, got {value}")
 
 
 def _spread(rows: NDArray[np.float64], mean: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,314 @@
+"""The Neural ASM as a monitor: what it promises to whoever watches a robot with it."""
+
+from __future__ import annotations
+
+import copy
+import json
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from asm_gym.episodes import Episode
+from asm_gym.monitors import Monitor, NeuralASM, make_monitor
+from asm_gym.stream import Channel, StreamSpec
+from tests.streams import frozen, sine_episodes, sine_spec
+
+SMALL = {"hidden_size": 48, "epochs": 25, "seed": 1}
+
+
+@pytest.fixture(scope="module")
+def asm() -> NeuralASM:
+    return NeuralASM(sine_spec(), **SMALL).fit(sine_episodes(50)).calibrate(sine_episodes(60, seed=1), 0.05)
+
+
+def learned_bytes(asm: NeuralASM) -> list[bytes]:
+    arrays = [*asm.network_.weights, asm.mean_, asm.spread_, asm.whitening_, asm.energy_]
+    return [a.tobytes() for a in arrays]
+
+
+def test_a_frozen_sense_is_detected_and_attributed_to_its_channel(asm):
+    hits, named = [], []
+    for n, episode in enumerate(sine_episodes(24, seed=2)):
+        column = n % 12
+        surprise = asm.score(frozen(episode, column, onset=20))
+        after = surprise.attribution[20:].sum(axis=0)
+        hits.append(surprise.value[20:].max() > asm.threshold)
+        named.append(np.argmax(after) == column)
+    assert np.mean(hits) > 0.9
+    assert np.mean(named) > 0.9
+
+
+def test_nominal_episodes_rarely_raise_an_alarm(asm):
+    alarms = [s.value.max() > asm.threshold for s in asm.score_episodes(sine_episodes(200, seed=3))]
+    # A rate of at most 5 % over calibration and test draws: 0.05 ± 3 sd of a beta-binomial (60, 200)
+    assert np.mean(alarms) < 0.05 + 3 * np.sqrt(0.05 * 0.95 * (1 / 60 + 1 / 200))
+
+
+def test_nominal_surprise_of_a_single_step_is_about_one(asm):
+    single = copy.copy(asm)
+    single.gain = 1.0  # no accumulation, so that errors that resemble the last ones do not add up
+    value = np.concatenate([s.value for s in single.score_episodes(sine_episodes(60, seed=4))])
+    assert 0.8 < value.mean() < 1.4
+
+
+def test_attribution_adds_up_to_the_value_and_spares_the_action(asm):
+    surprise = asm.score(sine_episodes(1, seed=5)[0])
+    np.testing.assert_allclose(surprise.attribution.sum(axis=1), surprise.value, rtol=1e-12)
+    assert surprise.attribution.min() >= 0
+    assert not surprise.attribution[:, asm.spec.motor].any()
+
+
+def test_the_action_as_commanded_is_used_to_predict(asm):
+    episode = sine_episodes(1, seed=6)[0]
+    stream = episode.stream.copy()
+    stream[20:, asm.spec.motor] *= -1  # the robot does something else than it was told
+    reversed_action = asm.score(replace(episode, stream=stream))
+    assert reversed_action.value[20:].mean() > 3 * asm.score(episode).value[20:].mean()
+
+
+def test_observing_changes_neither_weights_nor_state_nor_row(asm):
+    before = learned_bytes(asm)
+    rows = np.stack([e.stream[0] for e in sine_episodes(3, seed=7)])
+    state = asm.initial_state(3)
+    state, _ = asm.observe(state, rows)
+    kept = [a.tobytes() for a in (state.hidden, *state.evidence, rows)]
+    asm.observe(state, rows)
+    assert [a.tobytes() for a in (state.hidden, *state.evidence, rows)] == kept
+    assert learned_bytes(asm) == before
+
+
+def test_a_batch_is_as_good_as_its_members_alone(asm):
+    episodes = sine_episodes(7, seed=8)
+    together, alone = asm.score_episodes(episodes), [asm.score(e) for e in episodes]
+    for a, b in zip(together, alone, strict=True):
+        np.testing.assert_allclose(a.value, b.value, rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(a.attribution, b.attribution, rtol=1e-2, atol=1e-3)
+
+
+def test_score_is_what_observing_row_by_row_gives(asm):
+    episode = sine_episodes(1, seed=9)[0]
+    state, values = asm.initial_state(), []
+    for row in episode.stream:
+        state, surprise = asm.observe(state, row[None])
+        values.append(surprise.value[0])
+    np.testing.assert_array_equal(asm.score(episode).value, values)
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf])
+def test_a_number_that_is_not_finite_is_an_alarm_and_passes(asm, broken):
+    episode = sine_episodes(1, seed=10)[0]
+    stream = episode.stream.copy()
+    stream[20, [3, 12]] = broken  # one sense, one action
+    surprise = asm.score(replace(episode, stream=stream))
+    assert surprise.value[20] == np.inf > asm.threshold
+    assert np.array_equal(np.isinf(surprise.attribution[20]), np.isin(np.arange(14), [3, 12]))
+    assert np.all(surprise.attribution[20][np.isfinite(surprise.attribution[20])] == 0)
+    clean = asm.score(episode).value
+    np.testing.assert_array_equal(surprise.value[:20], clean[:20])
+    np.testing.assert_allclose(surprise.value[35:], clean[35:], rtol=0.2, atol=0.2)
+
+
+def test_a_row_of_nothing_but_nan_leaves_a_finite_state(asm):
+    state, surprise = asm.observe(asm.initial_state(2), np.full((2, 14), np.nan))
+    assert np.all(surprise.attribution == np.inf)
+    _, surprise = asm.observe(state, np.stack([e.stream[1] for e in sine_episodes(2, seed=11)]))
+    assert np.all(np.isfinite(surprise.value))
+
+
+@pytest.mark.parametrize("huge", [1e30, -3e38, 1.7e308])
+def test_a_huge_number_is_a_finite_alarm_on_its_channel(asm, huge):
+    rows = sine_episodes(1, seed=12)[0].stream.astype(np.float64)
+    state = asm.initial_state()
+    for row in rows[:10]:
+        state, _ = asm.observe(state, row[None])
+    row = rows[10].copy()
+    row[5] = huge
+    state, surprise = asm.observe(state, row[None])
+    assert asm.threshold < surprise.value[0] < np.inf
+    assert np.argmax(surprise.attribution[0]) == 5
+    for row in rows[11:]:
+        state, surprise = asm.observe(state, row[None])
+        assert np.isfinite(surprise.value[0])
+
+
+def test_one_seed_gives_one_memory_and_another_seed_another():
+    episodes, spec = sine_episodes(6), sine_spec()
+    a, b, c = (NeuralASM(spec, hidden_size=16, epochs=2, seed=s).fit(episodes) for s in (3, 3, 4))
+    assert learned_bytes(a) == learned_bytes(b)
+    assert learned_bytes(a) != learned_bytes(c)
+
+
+def test_fitting_again_forgets_the_threshold(asm):
+    small = NeuralASM(sine_spec(), hidden_size=16, epochs=1).fit(sine_episodes(4)).calibrate(sine_episodes(4), 0.5)
+    assert small.threshold > 0
+    with pytest.raises(RuntimeError, match="calibrate"):
+        _ = small.fit(sine_episodes(4)).threshold
+
+
+def test_threshold_is_the_conformal_rank_of_the_maxima(asm):
+    maxima = np.sort([s.value.max() for s in asm.score_episodes(sine_episodes(60, seed=1))])
+    assert asm.threshold == maxima[57]  # ceil(61 * 0.95) = 58
+
+
+def test_constant_and_copied_channels_are_no_trouble():
+    episodes = []
+    for e in sine_episodes(12):
+        stream = e.stream.copy()
+        stream[:, 1], stream[:, 2] = stream[:, 0], 0.1
+        episodes.append(replace(e, stream=stream))
+    asm = NeuralASM(sine_spec(), hidden_size=24, epochs=5).fit(episodes)
+    assert asm.spread_[2] == 1.0
+    assert np.isfinite(asm.score(episodes[0]).value).all()
+    moved = episodes[0].stream.copy()
+    moved[20:, 2] += 1.0
+    assert np.argmax(asm.score(replace(episodes[0], stream=moved)).attribution[20]) == 2
+
+
+def test_a_constant_channel_is_measured_in_its_sensor_noise():
+    spec = StreamSpec((Channel("temperature", 1, "K", noise=0.5), Channel("x", 1)), dt=0.1)
+    stream = np.random.default_rng(0).normal(size=(20, 2))
+    stream[:, 0] = 293.15
+    asm = NeuralASM(spec, hidden_size=4, epochs=1).fit([Episode.from_stream(stream, spec)])
+    assert asm.spread_[0] == 0.5
+
+
+def test_progress_is_told_after_every_pass():
+    calls = []
+    NeuralASM(sine_spec(), hidden_size=8, epochs=3).fit(sine_episodes(3), progress=lambda *a: calls.append(a))
+    total = len(calls)
+    assert calls == [(n + 1, total) for n in range(total)]
+    assert total >= 3
+
+
+def test_save_and_load_keep_every_bit(asm, tmp_path):
+    asm.save(tmp_path / "memory.asm")
+    back = NeuralASM.load(tmp_path / "memory.asm")
+    assert learned_bytes(back) == learned_bytes(asm)
+    assert (back.spec, back.threshold, back.get_params()) == (asm.spec, asm.threshold, asm.get_params())
+    episode = sine_episodes(1, seed=13)[0]
+    assert back.score(episode).attribution.tobytes() == asm.score(episode).attribution.tobytes()
+    back.save(tmp_path / "again.asm")
+    with zipfile.ZipFile(tmp_path / "memory.asm") as a, zipfile.ZipFile(tmp_path / "again.asm") as b:
+        assert {n: a.read(n) for n in a.namelist()} == {n: b.read(n) for n in b.namelist()}
+
+
+def test_a_memory_without_a_threshold_can_be_saved(tmp_path):
+    NeuralASM(sine_spec(), hidden_size=8, epochs=1).fit(sine_episodes(3)).save(tmp_path / "m.asm")
+    with pytest.raises(RuntimeError, match="calibrate"):
+        _ = NeuralASM.load(tmp_path / "m.asm").threshold
+
+
+def rewritten(source, target, change) -> None:
+    """Copies a checkpoint, with ``change(members)`` made to its {name: bytes}."""
+    with zipfile.ZipFile(source) as file:
+        members = {n: file.read(n) for n in file.namelist()}
+    change(members)
+    with zipfile.ZipFile(target, "w") as file:
+        for name, data in members.items():
+            file.writestr(name, data)
+
+
+@pytest.mark.parametrize("member", ["W_H.npy", "whitening_.npy", "mean_.npy"])
+def test_a_checkpoint_with_a_missing_or_misshapen_array_is_refused(asm, tmp_path, member):
+    asm.save(tmp_path / "m.asm")
+    rewritten(tmp_path / "m.asm", tmp_path / "missing.asm", lambda m: m.pop(member))
+    with pytest.raises(ValueError, match="damaged"):
+        NeuralASM.load(tmp_path / "missing.asm")
+    rewritten(tmp_path / "m.asm", tmp_path / "shape.asm", lambda m: m.update({member: m["energy_.npy"]}))
+    with pytest.raises(ValueError, match="damaged"):
+        NeuralASM.load(tmp_path / "shape.asm")
+
+
+def test_a_checkpoint_with_an_unknown_hyperparameter_is_refused(asm, tmp_path):
+    def change(members):
+        header = json.loads(members["header.json"])
+        header["hyperparameters"]["depth"] = 3
+        members["header.json"] = json.dumps(header).encode()
+
+    asm.save(tmp_path / "m.asm")
+    rewritten(tmp_path / "m.asm", tmp_path / "n.asm", change)
+    with pytest.raises(ValueError, match="depth"):
+        NeuralASM.load(tmp_path / "n.asm")
+
+
+def test_nothing_works_before_it_is_learned(tmp_path):
+    asm = NeuralASM(sine_spec())
+    for call in (
+        asm.initial_state,
+        lambda: asm.observe(None, np.zeros((1, 14))),
+        lambda: asm.calibrate(sine_episodes(3)),
+        lambda: asm.score(sine_episodes(1)[0]),
+        lambda: asm.save(tmp_path / "x.asm"),
+    ):
+        with pytest.raises(RuntimeError, match="fit"):
+            call()
+    with pytest.raises(RuntimeError, match="calibrate"):
+        _ = asm.threshold
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("hidden_size", 0),
+        ("hidden_size", 1.5),
+        ("iterations", 0),
+        ("epochs", 0),
+        ("batch_size", -1),
+        ("learning_rate", 0.0),
+        ("learning_rate", np.nan),
+        ("prior_precision", -1.0),
+        ("sensory_precision", np.inf),
+        ("carry_prior", 1.5),
+        ("gain", 0.0),
+        ("shrinkage", -0.1),
+        ("seed", -1),
+    ],
+)
+def test_a_bad_hyperparameter_is_named_with_what_was_given(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be .* got {value}"):
+        NeuralASM(sine_spec(), **{name: value})
+
+
+def test_bad_episodes_are_refused_by_fit_and_calibrate(asm):
+    good = sine_episodes(3)
+    other = StreamSpec((Channel("joint_position", 11, "rad", group="joint"), Channel("wrench", 3, "N")), dt=0.05)
+    nan = good[1].stream.copy()
+    nan[7, 4] = np.nan
+    cases = [
+        ([], "at least one episode"),
+        ([good[0], replace(good[1], stream=good[1].stream[:1])], "episode 1 must be at least 2 steps long, got 1"),
+        ([good[0], replace(good[1], stream=nan)], r"episode 1, step 7, joint_position\[4\] must be finite, got nan"),
+        ([*good, Episode.from_stream(np.zeros((5, 14)), other)], "(?s)episode 3 does not fit.*command.*wrench"),
+    ]
+    for episodes, message in cases:
+        with pytest.raises(ValueError, match=message):
+            NeuralASM(sine_spec()).fit(episodes)
+        with pytest.raises(ValueError, match=message):
+            asm.calibrate(episodes, 0.5)
+
+
+def test_calibration_says_how_many_episodes_it_needs(asm):
+    before = asm.threshold
+    with pytest.raises(ValueError, match="at least 99 nominal episodes, got 5"):
+        asm.calibrate(sine_episodes(5))
+    with pytest.raises(ValueError, match=r"false_alarm_rate must be in \(0, 1\), got 1.5"):
+        asm.calibrate(sine_episodes(5), 1.5)
+    assert asm.threshold == before
+
+
+def test_rows_of_the_wrong_shape_are_refused(asm):
+    for shape in ((1, 13), (14,), (2, 14), (1, 1, 14)):
+        with pytest.raises(ValueError, match="shape"):
+            asm.observe(asm.initial_state(1), np.zeros(shape))
+    with pytest.raises(ValueError, match="batch must be at least 1, got 0"):
+        asm.initial_state(0)
+
+
+def test_a_monitor_is_made_by_name():
+    monitor: Monitor = make_monitor("neural_asm", sine_spec(), hidden_size=7)
+    assert isinstance(monitor, NeuralASM)
+    assert monitor.hidden_size == 7
+    with pytest.raises(ValueError, match=r"unknown monitor 'oracle'; known are: .*neural_asm"):
+        make_monitor("oracle", sine_spec())
