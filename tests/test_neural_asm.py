@@ -195,7 +195,8 @@ def test_save_and_load_keep_every_bit(asm, tmp_path):
 
 
 def test_a_memory_without_a_threshold_can_be_saved(tmp_path):
-    NeuralASM(sine_spec(), hidden_size=8, epochs=1).fit(sine_episodes(3)).save(tmp_path / "m.asm")
+    numbers = {"hidden_size": np.int64(8), "epochs": np.int64(1), "gain": np.float32(0.5)}
+    NeuralASM(sine_spec(), **numbers).fit(sine_episodes(3)).save(tmp_path / "m.asm")
     with pytest.raises(RuntimeError, match="calibrate"):
         _ = NeuralASM.load(tmp_path / "m.asm").threshold
 

@@ -108,10 +108,11 @@ class NeuralASM:
             _require(name, share, 0.0 <= share <= 1.0, "in [0, 1]")
         _require("gain", gain, 0.0 < gain <= 1.0, "in (0, 1]")
         self.spec = spec
-        self.hidden_size, self.iterations, self.learning_rate = hidden_size, iterations, learning_rate
-        self.epochs, self.batch_size = epochs, batch_size
-        self.prior_precision, self.sensory_precision = prior_precision, sensory_precision
-        self.carry_prior, self.gain, self.shrinkage, self.seed = carry_prior, gain, shrinkage, seed
+        # Plain Python numbers, for a checkpoint holds them as JSON.
+        self.hidden_size, self.iterations, self.seed = int(hidden_size), int(iterations), int(seed)
+        self.epochs, self.batch_size, self.learning_rate = int(epochs), int(batch_size), float(learning_rate)
+        self.prior_precision, self.sensory_precision = float(prior_precision), float(sensory_precision)
+        self.carry_prior, self.gain, self.shrinkage = float(carry_prior), float(gain), float(shrinkage)
         self.network_: Network | None = None
         self.threshold_: float | None = None
 
@@ -176,7 +177,7 @@ class NeuralASM:
             stream: (B, D) one row a stream.
         """
         network = self._fitted()
-        stream = np.asarray(stream)
+        stream = np.asarray(stream, np.float64)
         self.spec.check_row(stream)
         if stream.shape != (len(state.hidden), self.spec.size):
             raise ValueError(f"stream must have the shape {(len(state.hidden), self.spec.size)}, got {stream.shape}")
