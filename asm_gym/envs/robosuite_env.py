@@ -203,8 +203,10 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             _check_choice("reset option", name, ("qpos_noise",))
             noise = float(value)
         env = self.robosuite_env
-        for robot in env.robots:
+        # A hard reset makes the robots anew from their configurations, a soft one keeps them.
+        for robot, configuration in zip(env.robots, env.robot_configs, strict=True):
             robot.initialization_noise["magnitude"] = noise
+            configuration["initialization_noise"] = {"magnitude": noise, "type": "gaussian"}
         if seed is not None or not self._seeded:
             # In place: placement samplers hold the generator itself.
             env.rng.bit_generator.state = np.random.default_rng(self.np_random.integers(2**63)).bit_generator.state

@@ -1,0 +1,296 @@
+"""A robot that notices when something is wrong: the whole safety loop on one robosuite task.
+
+Collects nominal episodes, fits and calibrates a Neural ASM, then runs nominal and faulty episodes with the policy
+alone and under the safety wrapper, paired by seed. Prints one table and writes a report, its plots, a video, the
+fitted memory and every figure as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium as gym
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from asm_gym.evaluation import plots
+from asm_gym.evaluation.metrics import Row, binomial_interval, summarise
+from asm_gym.evaluation.report import Table, detection_table, headline, outcome_table, write_report
+from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
+from asm_gym.evaluation.video import write_video
+from asm_gym.faults import Fault, FrozenEncoder, Push, WeakJoint
+from asm_gym.monitors import NeuralASM
+from asm_gym.policies import make_policy, rollout
+from asm_gym.scripts import doctor
+from asm_gym.scripts.collect import collect, episode_seeds
+from asm_gym.scripts.dispatch import Progress, dispatch
+from asm_gym.scripts.progress import stage
+from asm_gym.scripts.watch import Trial, guarded, watch
+from asm_gym.wrappers import SurpriseOverlay
+
+WINDOW_S = 1.0
+"""How soon after its onset a fault must be noticed to count as detected [s]."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Collect, fit, calibrate, break things, and see who notices."""
+
+    task: str = "asm_gym/Lift-v0"
+    """Environment id."""
+    on_alarm: str = "hold"
+    """What the wrapper does on an alarm: hold or terminate."""
+    false_alarm_rate: float = 0.05
+    """Share of nominal episodes that may raise an alarm."""
+    fit_episodes: int = 60
+    """Nominal episodes to learn from."""
+    calibration_episodes: int = 60
+    """Other nominal episodes that set the threshold."""
+    nominal_episodes: int = 40
+    """Nominal episodes to test on."""
+    faulty_episodes: int = 20
+    """Episodes to test on for each fault."""
+    epochs: int = 40
+    """Passes over the episodes in learning."""
+    workers: int = os.cpu_count() or 1
+    """Processes."""
+    seed: int = 0
+    """Of everything: the same seed gives the same table."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/demo")
+    """Folder to write to."""
+    video: bool = True
+    """Make a video, where this machine can render."""
+    quick: bool = False
+    """A third of the episodes: to see that everything runs, not to judge the figures."""
+
+    def __post_init__(self) -> None:
+        if self.on_alarm not in ("hold", "terminate"):
+            raise ValueError(f"on_alarm must be hold or terminate, got {self.on_alarm!r}")
+        for name in ("fit_episodes", "calibration_episodes", "nominal_episodes", "faulty_episodes", "epochs"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+    def scaled(self) -> Args:
+        """With ``quick``, a third of the work; calibration keeps what the false-alarm rate needs."""
+        if not self.quick:
+            return self
+        counts = {
+            name: max(1, getattr(self, name) // 3)
+            for name in ("fit_episodes", "nominal_episodes", "faulty_episodes", "epochs")
+        }
+        return replace(self, calibration_episodes=max(20, self.calibration_episodes // 3), **counts)
+
+
+def faults(seed: int, episodes: int) -> list[tuple[str, Fault]]:
+    """Each kind of fault ``episodes`` times, at onsets, joints and directions that vary.
+
+    Onsets fall between 0.5 s and 2.3 s, when the arm is on its way.
+    """
+    rng = np.random.default_rng([seed, 7])
+    made: list[tuple[str, Fault]] = []
+    for _ in range(episodes):
+        onset = int(rng.integers(10, 46))
+        direction = rng.standard_normal(3)
+        x, y, z = (float(v) for v in direction / np.linalg.norm(direction))
+        made += [
+            ("push", Push(body="robot0_link5", newtons=20.0, direction=(x, y, z), onset=onset, duration=10)),
+            ("weak joint", WeakJoint(joint=int(rng.integers(7)), strength=0.5, onset=onset)),
+            ("frozen encoder", FrozenEncoder(joint=int(rng.integers(7)), onset=onset)),
+        ]
+    return sorted(made, key=lambda pair: pair[0])
+
+
+def trials(args: Args) -> list[Trial]:
+    """Every episode to test on, each with the policy alone and under the wrapper."""
+    broken = faults(args.seed, args.faulty_episodes)
+    seeds = episode_seeds(args.seed, args.nominal_episodes + len(broken), stage=2)
+    cases = [(NOMINAL, ())] * args.nominal_episodes + [(name, (fault,)) for name, fault in broken]
+    return [
+        Trial(name, faulty, acting, seed)
+        for (name, faulty), seed in zip(cases, seeds, strict=True)
+        for acting in (POLICY_ALONE, args.on_alarm)
+    ]
+
+
+def fit(args: Args, folder: Path, timed: Callable[[str], Any]) -> NeuralASM:
+    """A memory of the task as the expert does it, calibrated, saved in ``folder``."""
+    with timed("collecting nominal episodes") as progress:
+        episodes = collect(
+            args.task,
+            "scripted",
+            args.fit_episodes + args.calibration_episodes,
+            args.seed,
+            args.workers,
+            progress=progress,
+        )
+    memory = NeuralASM(episodes[0].spec, epochs=args.epochs, seed=args.seed)
+    with timed("learning") as progress:
+        memory.fit(episodes[: args.fit_episodes], progress=progress)
+    memory.calibrate(episodes[args.fit_episodes :], false_alarm_rate=args.false_alarm_rate)
+    memory.save(folder / "lift.asm")
+    return memory
+
+
+def observe_latency_us(memory: NeuralASM, calls: int = 2000) -> dict[str, float]:
+    """What one ``observe`` of one environment takes [µs]."""
+    state = memory.initial_state(batch=1)
+    rows = np.random.default_rng(0).standard_normal((calls, 1, memory.spec.size)).astype(np.float32)
+    times = np.empty(calls)
+    for k, row in enumerate(rows):
+        start = time.perf_counter()
+        state, _ = memory.observe(state, row)
+        times[k] = time.perf_counter() - start
+    median, p95 = np.percentile(1e6 * times, [50, 95])
+    return {"median": round(float(median), 1), "p95": round(float(p95), 1)}
+
+
+def film(args: Args, memory: NeuralASM, shown: list[Trial], path: Path, progress: Progress) -> Path:
+    """A video of the trials, one after the other, surprise under the picture."""
+
+    def frames() -> Iterator[NDArray[np.uint8]]:
+        env = gym.make(args.task, render_mode="rgb_array", camera="agentview", render_size=(512, 640))
+        for k, trial in enumerate(shown):
+            caption = f"{trial.condition}, {trial.acting}"
+            watched = SurpriseOverlay(guarded(env, memory, trial), caption=caption)
+            pictures: list[NDArray[np.uint8]] = []
+            policy = make_policy("scripted", watched, seed=trial.seed)
+            rollout(watched, policy, trial.seed, lambda _, p=pictures, w=watched: p.append(w.render()))  # type: ignore[misc]
+            yield from pictures
+            progress(k + 1, len(shown))
+        env.close()
+
+    return write_video(path, frames(), fps=1.0 / memory.spec.dt)
+
+
+def typical(traces: list[Trace]) -> list[Trace]:
+    """For each condition, the watched episode whose greatest surprise is the median one."""
+    chosen = []
+    for condition in dict.fromkeys(t.condition for t in traces):
+        group = [t for t in traces if t.condition == condition and t.watched_only]
+        chosen.append(sorted(group, key=lambda t: float(t.surprise[t.onset or 0 :].max()))[len(group) // 2])
+    return chosen
+
+
+def figures(traces: list[Trace], folder: Path) -> dict[str, Path]:
+    """Draws and saves every plot: {caption: PNG}."""
+    examples = typical(traces)
+    worst = next(t for t in examples if t.condition == "frozen encoder")
+    drawn = {
+        "Surprise over time in a typical episode of each condition": ("surprise", plots.surprise_figure(examples)),
+        "The greatest surprise of every episode against the threshold": (
+            "maxima",
+            plots.maxima_figure(traces, WINDOW_S),
+        ),
+        "How soon faults were noticed": ("delay", plots.delay_figure(traces, WINDOW_S)),
+        "Faults told from nominal episodes at the same time": ("roc", plots.roc_figure(traces, WINDOW_S)),
+        "Where the surprise came from when an encoder froze": ("attribution", plots.attribution_figure(worst)),
+    }
+    return {caption: plots.save(figure, folder / f"{name}.png") for caption, (name, figure) in drawn.items()}
+
+
+def show(console: Console, table: Table) -> None:
+    """Prints a table."""
+    rich = RichTable(title=table.caption, title_justify="left")
+    for heading in table.headings:
+        rich.add_column(heading)
+    for row in table.rows:
+        rich.add_row(*(str(cell) for cell in row))
+    console.print(rich)
+
+
+def write_json(path: Path, args: Args, rows: list[Row], latency: dict[str, float], seconds: dict[str, float]) -> None:
+    """Every figure, with what it takes to make it again."""
+    packages = ("asm-gym", "mujoco", "robosuite", "gymnasium", "numpy", "numba")
+    content = {
+        "arguments": {**asdict(args), "out": str(args.out)},
+        "versions": {"python": platform.python_version(), **{p: metadata.version(p) for p in packages}},
+        "window_s": WINDOW_S,
+        "results": [asdict(row) for row in rows],
+        "observe_us": latency,
+        "seconds": seconds,
+    }
+    unfinished = path.with_suffix(".unfinished")
+    unfinished.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    unfinished.replace(path)
+
+
+def run(args: Args, console: Console) -> list[Row]:
+    """The whole demo."""
+    args = args.scaled()
+    folder = args.out
+    folder.mkdir(parents=True, exist_ok=True)
+    seconds: dict[str, float] = {}
+    timed = partial(stage, console=console, seconds=seconds)
+
+    backend = doctor.rendering_backend() if args.video else None
+    if backend == "osmesa":
+        os.environ["MUJOCO_GL"] = backend  # before this process loads robosuite, which would choose EGL
+    memory = fit(args, folder, timed)
+    todo = trials(args)
+    with timed("testing, policy alone and wrapped") as progress:
+        task = partial(watch, env_id=args.task, policy="scripted", memory=folder / "lift.asm")
+        traces = dispatch(task, todo, args.workers, progress)
+    rows = summarise(traces, WINDOW_S)
+    latency = observe_latency_us(memory)
+    tables = [detection_table(rows, WINDOW_S), outcome_table(rows)]
+    for table in tables:
+        show(console, table)
+    low, high = binomial_interval(args.nominal_episodes, args.false_alarm_rate)
+    expected = (
+        f"At a false-alarm rate of {args.false_alarm_rate:g}, {low} to {high} of {args.nominal_episodes} nominal "
+        f"episodes raise an alarm by chance (95 %)."
+    )
+    console.print(f"{headline(rows)} {expected} One observe() takes {latency['median']:.0f} µs.")
+
+    with timed("drawing"):
+        drawn = figures(traces, folder)
+    video = None
+    if backend is not None:
+        examples = {(t.condition, t.seed) for t in typical(traces)}
+        shown = [t for t in todo if t.acting != POLICY_ALONE and (t.condition, t.seed) in examples]
+        with timed("filming") as progress:
+            video = film(args, memory, shown, folder / "demo.mp4", progress)
+    elif args.video:
+        for check in doctor.run_checks():
+            if not check.ok:
+                console.print(f"[yellow]no video: {check.detail}; {check.remedy}[/yellow]")
+    write_json(folder / "demo.json", args, rows, latency, seconds)
+    write_report(
+        folder / "report.html",
+        f"asm-gym demo: {args.task}",
+        f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "
+        f"watched others, some of them faulty. {headline(rows)} {expected}",
+        tables,
+        drawn,
+        video,
+        {"command": f"asm-gym demo --seed {args.seed}", **asdict(args), "observe() [µs]": latency},
+    )
+    console.print(f"Wrote {folder}/report.html" + (f" and {video}" if video else ""))
+    return rows
+
+
+def main(argv: list[str] | None = None) -> int:
+    try:
+        args = tyro.cli(Args, prog="asm-gym demo", args=argv)
+        run(args, Console())
+    except (ValueError, ImportError) as error:
+        print(f"asm-gym demo: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,14 @@
+"""Environments that several tests share: making one costs more than an episode."""
+
+import gymnasium as gym
+import pytest
+
+import asm_gym  # noqa: F401
+
+
+@pytest.fixture(scope="session")
+def lift():
+    """A Lift environment; a test must reset it before use, and leave nothing behind."""
+    env = gym.make("asm_gym/Lift-v0")
+    yield env
+    env.close()

@@ -1,0 +1,234 @@
+"""The environment's contract, on the real simulator."""
+
+import hashlib
+import os
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+from asm_gym.scripts.doctor import rendering_backend
+from asm_gym.stream import MOTOR
+from asm_gym.tasks import TASKS, task
+
+# Prints the hash of an episode: everything the environment returns for given actions.
+EPISODE = """
+import hashlib, sys, gymnasium, numpy, asm_gym
+def episode(env, seed, steps=25):
+    digest = hashlib.sha256()
+    actions = numpy.random.default_rng(1).uniform(-1, 1, (steps, env.action_space.shape[0])).astype("f4")
+    observation, info = env.reset(seed=seed)
+    digest.update(observation.tobytes() + info["stream"].tobytes())
+    for action in actions:
+        observation, reward, terminated, truncated, info = env.step(action)
+        digest.update(observation.tobytes() + info["stream"].tobytes() + repr((reward, terminated, truncated)).encode())
+    return digest.hexdigest()
+"""
+exec(EPISODE)
+
+
+def test_both_env_checkers_pass_without_a_warning(lift):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(lift.unwrapped, skip_render_check=True, skip_close_check=True)
+        check_env_sb3(lift.unwrapped, skip_render_check=True)
+
+
+def test_one_seed_gives_one_episode_whatever_ran_before(lift):
+    first = episode(lift, 3)  # noqa: F821
+    assert episode(lift, 4) != first  # noqa: F821
+    lift.reset()  # a soft reset in between
+    lift.step(lift.action_space.sample())
+    assert episode(lift, 3) == first  # noqa: F821
+
+
+def test_one_seed_gives_one_episode_in_another_process_with_another_hash_seed(lift):
+    code = EPISODE + 'print(episode(gymnasium.make("asm_gym/Lift-v0"), 3))'
+    environment = {**os.environ, "PYTHONHASHSEED": "7"}
+    out = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == episode(lift, 3)  # noqa: F821
+
+
+def test_unseeded_resets_go_on_from_the_seed(lift):
+    def starts():
+        lift.reset(seed=11)
+        return [lift.reset()[0] for _ in range(3)]
+
+    a, b = starts(), starts()
+    np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(a[0], a[1])
+
+
+def test_the_horizon_truncates_and_never_terminates():
+    env = gym.make("asm_gym/Lift-v0", horizon=3)
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(7, np.float32))[2:4] for _ in range(3)]
+    assert ends == [(False, False), (False, False), (False, True)]
+    with pytest.raises(gym.error.ResetNeeded):
+        env.unwrapped.step(np.zeros(7, np.float32))
+    env.close()
+    env.close()
+
+
+def test_the_stream_is_named_number_by_number(lift):
+    _, info = lift.reset(seed=0)
+    spec = lift.unwrapped.stream_spec
+    assert info["stream"].shape == (spec.size,) == (len(spec.labels),)
+    assert info["stream"].dtype == np.float32
+    assert info["success"] is False
+    assert spec.dt == pytest.approx(0.05)
+    assert {c.group for c in spec.channels} == {"joint", "torque", "hand", "wrench", "gripper", MOTOR}
+
+
+def test_the_stream_carries_the_commanded_action_clipped_to_its_space(lift):
+    lift.reset(seed=0)
+    action = np.array([0.5, -0.25, 3.0, 0, 0, 0, -1], np.float32)
+    info = lift.step(action)[4]
+    np.testing.assert_array_equal(info["stream"][lift.unwrapped.stream_spec.motor], np.clip(action, -1, 1))
+
+
+def test_without_noise_the_stream_reads_the_simulators_own_state():
+    env = gym.make("asm_gym/Lift-v0", sensor_noise=0.0)
+    env.reset(seed=0)
+    stream = env.step(np.array([0.3, 0.1, -0.2, 0, 0, 0.1, 1], np.float32))[4]["stream"]
+    slices, data = env.unwrapped.stream_spec.slices, env.unwrapped.robosuite_env.sim.data
+    robot = env.unwrapped.robosuite_env.robots[0]
+    np.testing.assert_allclose(stream[slices["joint_position"]], data.qpos[:7], rtol=1e-6)
+    np.testing.assert_allclose(stream[slices["commanded_torque"]], data.ctrl[:7], rtol=1e-6)
+    np.testing.assert_allclose(stream[slices["hand_position"]], data.site_xpos[robot.eef_site_id["right"]], rtol=1e-6)
+    env.close()
+
+
+def test_noise_has_the_standard_deviation_that_the_spec_names():
+    env = gym.make("asm_gym/Lift-v0", horizon=1000)
+    exact = gym.make("asm_gym/Lift-v0", horizon=1000, sensor_noise=0.0)
+    rest = np.zeros(7, np.float32)
+    env.reset(seed=0)
+    exact.reset(seed=0)
+    errors = np.array([env.step(rest)[4]["stream"] - exact.step(rest)[4]["stream"] for _ in range(150)])
+    noise = env.unwrapped.stream_spec.noise
+    ratio = errors.std(axis=0)[noise > 0] / noise[noise > 0]
+    # The standard deviation of a standard deviation of 150 draws is 6 %; 75 channels stay within 4 of those.
+    np.testing.assert_allclose(ratio, 1.0, atol=0.25)
+    assert not errors[:, noise == 0].any()
+    env.close()
+    exact.close()
+
+
+def test_external_torque_is_the_force_on_a_body_seen_from_the_joints():
+    """τ_ext = Jᵀ F for a force F on a link, the closed form that the channel estimates."""
+    env = gym.make("asm_gym/Lift-v0", sensor_noise=0.0, horizon=1000)
+    env.reset(seed=0)
+    rest = np.zeros(7, np.float32)
+    for _ in range(20):
+        env.step(rest)
+    model, data = env.unwrapped._model, env.unwrapped._data
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "robot0_link5")
+    force = np.array([3.0, 10.0, -5.0])
+    data.xfrc_applied[body, :3] = force
+    stream = env.step(rest)[4]["stream"]
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jac(model, data, jacobian, None, data.xipos[body], body)
+    expected = (jacobian.T @ force)[:7]
+    got = stream[env.unwrapped.stream_spec.slices["external_torque"]]
+    np.testing.assert_allclose(got, expected, atol=0.15)  # joint friction is external too, about 0.1 N m
+    env.close()
+
+
+def test_the_contact_force_is_the_weight_of_what_presses_on_the_robot(lift):
+    lift.reset(seed=0)
+    info = lift.step(np.zeros(7, np.float32))[4]
+    assert info["contact_force"] == pytest.approx(0.0, abs=1e-6)  # nothing touches the arm at the start
+
+
+def test_a_dict_observation_holds_the_same_numbers_as_the_flat_one(lift):
+    env = gym.make("asm_gym/Lift-v0", observation="dict")
+    flat, named = lift.reset(seed=5)[0], env.reset(seed=5)[0]
+    np.testing.assert_array_equal(np.concatenate(list(named.values())), flat)
+    assert env.observation_space.contains(named)
+    assert {"joint_position", "hand_position", "cube_pos"} <= set(named)
+    env.close()
+
+
+def test_start_noise_is_a_reset_option(lift):
+    env = lift.unwrapped
+    env.reset(seed=0, options={"qpos_noise": 0.0})
+    np.testing.assert_array_equal(env._data.qpos[:7], env.robosuite_env.robots[0].init_qpos)
+    env.reset(seed=0)
+    assert np.abs(env._data.qpos[:7] - env.robosuite_env.robots[0].init_qpos).max() > 1e-3
+    with pytest.raises(ValueError, match="'noise'.*qpos_noise"):
+        env.reset(options={"noise": 1})
+
+
+def test_an_unstable_simulation_ends_the_episode_and_says_so(lift):
+    lift.reset(seed=0)
+    lift.unwrapped._data.qvel[0] = 1e9
+    observation, reward, terminated, truncated, info = lift.step(np.zeros(7, np.float32))
+    assert info["unstable"]
+    assert truncated
+    assert not terminated
+    assert lift.observation_space.contains(observation)
+    assert np.isfinite(reward)
+    assert not lift.reset(seed=0)[1]["unstable"]
+
+
+@pytest.mark.parametrize("action", [np.zeros(6), np.zeros((1, 7)), np.full(7, np.nan)], ids=["short", "batch", "nan"])
+def test_a_bad_action_is_refused(lift, action):
+    lift.reset(seed=0)
+    with pytest.raises(ValueError, match="action"):
+        lift.unwrapped.step(action)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"robot": "Pandora"}, "'Pandora'.*Panda, Sawyer"),
+        ({"control_freq": 40}, "divide.*500.*40"),
+        ({"horizon": 0}, "horizon.*0"),
+        ({"stream": ("joint", "smell")}, "'smell'.*joint, torque"),
+        ({"camera": "backview"}, "'backview'.*frontview"),
+        ({"observation": "list"}, "'list'.*flat, dict"),
+        ({"sensor_noise": -1.0}, "sensor_noise.*-1"),
+    ],
+)
+def test_a_bad_argument_is_refused_with_what_exists(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        gym.make("asm_gym/Lift-v0", **arguments)
+
+
+def test_an_unknown_task_lists_the_known_ones():
+    with pytest.raises(ValueError, match="'Juggle'.*Lift"):
+        task("Juggle")
+    assert task("asm_gym/Lift-v0") is TASKS["Lift"]
+
+
+def test_stream_groups_can_be_chosen():
+    env = gym.make("asm_gym/Lift-v0", stream=("joint", "object", "action"))
+    _, info = env.reset(seed=0)
+    spec = env.unwrapped.stream_spec
+    assert {c.group for c in spec.channels} == {"joint", "object", "action"}
+    observation = env.unwrapped.reset(seed=0)[0]
+    cube = info["stream"][spec.slices["cube_pos"]]
+    assert np.isin(cube, observation).all()
+    env.close()
+
+
+@pytest.mark.skipif(rendering_backend() is None, reason="this machine has no OpenGL to render with")
+def test_rgb_array_shows_the_cube_and_follows_a_new_model():
+    env = gym.make("asm_gym/Lift-v0", render_mode="rgb_array", render_size=(96, 128))
+    pictures = []
+    for seed in (0, 1):
+        env.reset(seed=seed)
+        pictures.append(env.render())
+    assert pictures[0].shape == (96, 128, 3)
+    assert pictures[0].dtype == np.uint8
+    red = [(p[..., 0].astype(int) - p[..., 1] > 60).sum() for p in pictures]
+    assert min(red) > 5
+    assert not np.array_equal(*pictures)
+    env.close()

@@ -1,0 +1,146 @@
+"""The safety wrapper's contract, on an environment and a monitor that follow a script."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.wrappers import NeuralASMSafety
+from tests.fakes import SPEC, CueMonitor, FakeEnv
+
+ACT = np.array([0.3, -0.2, 1.0], np.float32)
+
+
+def run(env, steps, action=ACT):
+    """The infos of ``steps`` steps, reset's first."""
+    _, info = env.reset(seed=0)
+    infos = [info]
+    for _ in range(steps):
+        infos.append(env.step(action)[4])
+    return infos
+
+
+def test_monitor_reports_and_never_touches_the_action():
+    env = NeuralASMSafety(FakeEnv(), CueMonitor([3, 4]), on_alarm="monitor")
+    infos = run(env, 8)
+    assert [i["asm"]["alarm"] for i in infos[1:]] == [False] * 3 + [True] * 2 + [False] * 3
+    assert not any(i["asm"]["intervened"] for i in infos)
+    assert all(np.array_equal(a, ACT) for a in env.unwrapped.actions)
+
+
+def test_cost_is_one_on_exactly_the_steps_in_alarm():
+    infos = run(NeuralASMSafety(FakeEnv(), CueMonitor([2, 5]), on_alarm="monitor"), 8)
+    assert [i["cost"] for i in infos] == [0.0, 0, 0, 1, 0, 0, 1, 0, 0]
+
+
+def test_hold_acts_from_the_next_step_keeps_the_grip_and_hands_back_after_quiet():
+    env = NeuralASMSafety(FakeEnv(), CueMonitor([2]), on_alarm="hold", release_after=3)
+    infos = run(env, 9)
+    held = [False, False, False, True, True, True, False, False, False]
+    assert [i["asm"]["intervened"] for i in infos[1:]] == held
+    rest = np.array([0, 0, 1.0], np.float32)  # the arm rests, the gripper stays closed
+    for action, hold in zip(env.unwrapped.actions, held, strict=True):
+        np.testing.assert_array_equal(action, rest if hold else ACT)
+
+
+def test_an_alarm_during_the_override_starts_the_quiet_time_again():
+    infos = run(NeuralASMSafety(FakeEnv(), CueMonitor([2, 4]), on_alarm="hold", release_after=3), 10)
+    assert [i["asm"]["intervened"] for i in infos[1:]] == [False] * 3 + [True] * 5 + [False] * 2
+
+
+def test_the_memory_sees_the_action_that_was_executed():
+    monitor = CueMonitor([1])
+    env = NeuralASMSafety(FakeEnv(), monitor, on_alarm="hold")
+    infos = run(env, 4)
+    for row, info, action in zip(monitor.rows, infos[1:], env.unwrapped.actions, strict=True):
+        np.testing.assert_array_equal(row[SPEC.motor], action)
+        np.testing.assert_array_equal(info["asm"]["executed_action"], action)
+
+
+@pytest.mark.parametrize(("truncate", "expected"), [(False, (True, False)), (True, (False, True))])
+def test_terminate_ends_the_episode_on_the_alarm(truncate, expected):
+    env = NeuralASMSafety(FakeEnv(), CueMonitor([1]), on_alarm="terminate", truncate=truncate)
+    env.reset()
+    assert env.step(ACT)[2:4] == (False, False)
+    assert env.step(ACT)[2:4] == expected
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(ACT)
+    env.reset()
+    assert env.step(ACT)[2:4] == (False, False)
+
+
+def test_a_policy_of_the_users_takes_over_with_a_fresh_state():
+    class Counter:
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            count = 0 if state is None else state
+            assert bool(episode_start[0]) is (count == 0)
+            return np.full(3, 0.1 * count, np.float32), count + 1
+
+    env = NeuralASMSafety(FakeEnv(), CueMonitor([0]), on_alarm=Counter(), release_after=3)
+    run(env, 6)
+    np.testing.assert_allclose([a[0] for a in env.unwrapped.actions], [0.3, 0.0, 0.1, 0.2, 0.3, 0.3], atol=1e-6)
+
+
+def test_attribution_names_every_number_and_adds_up_to_the_surprise():
+    info = run(NeuralASMSafety(FakeEnv(), CueMonitor([0])), 1)[1]["asm"]
+    assert list(info["attribution"]) == list(SPEC.labels)
+    assert sum(info["attribution"].values()) == pytest.approx(info["surprise"]) == 10.0
+    assert info["threshold"] == 1.0
+
+
+def test_reset_and_step_report_the_same_keys():
+    reset, step = run(NeuralASMSafety(FakeEnv(), CueMonitor()), 1)
+    assert set(reset["asm"]) == set(step["asm"])
+    assert reset["cost"] == 0.0
+    assert not reset["asm"]["alarm"]
+
+
+@settings(max_examples=30, deadline=None)
+@given(cue=st.sets(st.integers(0, 19)), release=st.integers(1, 5))
+def test_reset_forgets_everything_whatever_happened(cue, release):
+    env = NeuralASMSafety(FakeEnv(), CueMonitor(cue), release_after=release)
+    first, second = run(env, 20), run(env, 20)
+    for a, b in zip(first, second, strict=True):
+        assert a["cost"] == b["cost"]
+        assert a["asm"]["intervened"] == b["asm"]["intervened"]
+
+
+def test_an_environment_without_a_stream_is_watched_through_its_spaces():
+    env = FakeEnv(own_stream=False)
+    spec = StreamSpec.from_spaces(env.observation_space, env.action_space, dt=0.05)
+    monitor = CueMonitor(spec=spec)
+    run(NeuralASMSafety(env, monitor), 3)
+    np.testing.assert_allclose(monitor.rows[1], [2, 2, *ACT])
+
+
+def test_unknown_reactions_are_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match="'freeze'.*monitor, hold, terminate"):
+        NeuralASMSafety(FakeEnv(), CueMonitor(), on_alarm="freeze")
+    with pytest.raises(ValueError, match="predict"):
+        NeuralASMSafety(FakeEnv(), CueMonitor(), on_alarm=3)
+
+
+def test_a_memory_for_other_channels_is_refused_by_name():
+    other = StreamSpec((Channel("position", 2, "m"), Channel("weight", 1), Channel("action", 3, group=MOTOR)), 0.05)
+    with pytest.raises(ValueError, match="weight"):
+        NeuralASMSafety(FakeEnv(), CueMonitor(spec=other))
+
+
+def test_an_uncalibrated_monitor_is_refused_before_anything_runs():
+    with pytest.raises(RuntimeError, match="calibrate"):
+        NeuralASMSafety(FakeEnv(), CueMonitor(threshold=None))
+
+
+def test_discrete_actions_are_refused():
+    env = FakeEnv()
+    env.action_space = spaces.Discrete(3)
+    with pytest.raises(TypeError, match="Box"):
+        NeuralASMSafety(env, CueMonitor())
+
+
+def test_stepping_before_reset_is_refused():
+    with pytest.raises(gym.error.ResetNeeded):
+        NeuralASMSafety(FakeEnv(), CueMonitor()).step(ACT)
