@@ -1,11 +1,12 @@
 """From prediction errors to evidence, and from evidence to an alarm.
 
     whitened   e_t = M ε_t/σ_t,   M = ((1 - λ) C + λ tr(C)/X I)^(-½),   C = E[(ε/σ)(ε/σ)ᵀ] over nominal steps
-    evidence   w_t = (1 - a) w_{t-1} + a e_t,   w_0 = 0
+    bounded    ẽ_t = e_t / √(1 + ‖e_t‖²/(ν X))                          ‖ẽ_t‖² < ν X, however large e_t
+    evidence   w_t = (1 - a) w_{t-1} + a ẽ_t,   w_0 = 0
     value      s_t = ‖w_t‖² (2 - a) / (a X (1 - (1 - a)^{2t}))          nominal mean 1 for white errors, for every t
     alarm      s_t > q,   q the ⌈(n + 1)(1 - rate)⌉-th smallest of the maxima of n nominal episodes
 
-Sources: Kessy et al. 2018 (ZCA whitening); Lowry et al. 1992 (multivariate EWMA chart, its exact variance at start-up);
+Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted as under a multivariate t); Lowry et al. 1992 (multivariate EWMA chart, its exact variance at start-up);
 Vovk et al. 2005 and Angelopoulos and Bates 2023 (split conformal prediction).
 """
 
@@ -37,6 +38,14 @@ def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
     values, vectors = np.linalg.eigh((1.0 - shrinkage) * covariance + shrinkage * target)
     matrix: NDArray[np.float64] = (vectors / np.sqrt(values)) @ vectors.T
     return matrix
+
+
+def bounded(errors: Array, bound: float) -> NDArray[np.float64]:
+    """Whitened errors (B, X) pulled in as a whole, directions kept: no step counts more than ν = ``bound`` usual ones."""
+    exact = np.asarray(errors, np.float64)
+    excess = (exact**2).sum(axis=1, keepdims=True) / (bound * exact.shape[1])  # (B, 1)
+    pulled: NDArray[np.float64] = exact / np.sqrt(1.0 + excess)
+    return pulled
 
 
 class Evidence(NamedTuple):

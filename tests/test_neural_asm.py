@@ -24,7 +24,8 @@ def asm() -> NeuralASM:
 
 
 def learned_bytes(asm: NeuralASM) -> list[bytes]:
-    arrays = [*asm.network_.weights, asm.mean_, asm.spread_, asm.whitening_, asm.energy_]
+    senses = asm.senses_
+    arrays = [*asm.network_.weights, senses.mean, senses.spread, senses.change, asm.whitening_, asm.energy_]
     return [a.tobytes() for a in arrays]
 
 
@@ -73,9 +74,9 @@ def test_observing_changes_neither_weights_nor_state_nor_row(asm):
     rows = np.stack([e.stream[0] for e in sine_episodes(3, seed=7)])
     state = asm.initial_state(3)
     state, _ = asm.observe(state, rows)
-    kept = [a.tobytes() for a in (state.hidden, *state.evidence, rows)]
+    kept = [a.tobytes() for a in (state.hidden, *state.evidence, state.before, rows)]
     asm.observe(state, rows)
-    assert [a.tobytes() for a in (state.hidden, *state.evidence, rows)] == kept
+    assert [a.tobytes() for a in (state.hidden, *state.evidence, state.before, rows)] == kept
     assert learned_bytes(asm) == before
 
 
@@ -159,7 +160,7 @@ def test_constant_and_copied_channels_are_no_trouble():
         stream[:, 1], stream[:, 2] = stream[:, 0], 0.1
         episodes.append(replace(e, stream=stream))
     asm = NeuralASM(sine_spec(), hidden_size=24, epochs=5).fit(episodes)
-    assert asm.spread_[2] == 1.0
+    assert asm.senses_.spread[2] == 1.0
     assert np.isfinite(asm.score(episodes[0]).value).all()
     moved = episodes[0].stream.copy()
     moved[20:, 2] += 1.0
@@ -171,7 +172,7 @@ def test_a_constant_channel_is_measured_in_its_sensor_noise():
     stream = np.random.default_rng(0).normal(size=(20, 2))
     stream[:, 0] = 293.15
     asm = NeuralASM(spec, hidden_size=4, epochs=1).fit([Episode.from_stream(stream, spec)])
-    assert asm.spread_[0] == 0.5
+    assert asm.senses_.spread[0] == 0.5
 
 
 def test_progress_is_told_after_every_pass():
@@ -211,13 +212,13 @@ def rewritten(source, target, change) -> None:
             file.writestr(name, data)
 
 
-@pytest.mark.parametrize("member", ["W_H.npy", "whitening_.npy", "mean_.npy"])
+@pytest.mark.parametrize("member", ["W_H.npy", "whitening.npy", "mean.npy"])
 def test_a_checkpoint_with_a_missing_or_misshapen_array_is_refused(asm, tmp_path, member):
     asm.save(tmp_path / "m.asm")
     rewritten(tmp_path / "m.asm", tmp_path / "missing.asm", lambda m: m.pop(member))
     with pytest.raises(ValueError, match="damaged"):
         NeuralASM.load(tmp_path / "missing.asm")
-    rewritten(tmp_path / "m.asm", tmp_path / "shape.asm", lambda m: m.update({member: m["energy_.npy"]}))
+    rewritten(tmp_path / "m.asm", tmp_path / "shape.asm", lambda m: m.update({member: m["energy.npy"]}))
     with pytest.raises(ValueError, match="damaged"):
         NeuralASM.load(tmp_path / "shape.asm")
 

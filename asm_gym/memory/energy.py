@@ -14,6 +14,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
+import scipy.linalg.cython_blas  # noqa: F401  (the BLAS of the kernels; loaded here, so that its threads can be limited)
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]

@@ -21,6 +21,10 @@ from asm_gym.memory.energy import Array, activate, energy, kernel
 from asm_gym.memory.inference import Weights, expect, infer, sense
 
 
+REFERENCE_WIDTH = 256
+"""Hidden units at which ``learning_rate`` is meant."""
+
+
 class Trajectory(NamedTuple):
     """One episode as the network reads it; float32, standardised."""
 
@@ -196,11 +200,12 @@ def learn(
 ) -> NDArray[np.float64]:
     """Learns all but the precision, in place; the mean energy of each epoch (epochs,). Calls ``tick`` each epoch."""
     learner = Learner(weights, schedule, rng)
+    widest = schedule.learning_rate * REFERENCE_WIDTH / weights.W_H.shape[0]
     steps = sum(len(t.senses) for t in trajectories)
     curve = np.zeros(schedule.epochs)
     for epoch in range(schedule.epochs):
         progress = epoch / schedule.epochs
-        rate = cosine_decay(schedule.learning_rate, progress)
+        rate = cosine_decay(widest, progress)
         for batch in batches(trajectories, schedule.batch_size, rng):
             curve[epoch] += learner.run(batch, rate, schedule.carry_prior * progress) / steps
         tick()

@@ -13,7 +13,7 @@ import numpy as np
 from asm_gym.memory.energy import Array, activate
 from asm_gym.memory.inference import Weights, expect, infer, sense, weight_shapes
 from asm_gym.memory.learning import Batch, Schedule, Trajectory, batches, learn
-from asm_gym.memory.precision import PRECISION_EPOCHS, learn_precision, log_variance
+from asm_gym.memory.precision import PRECISION_EPOCHS, RATE, learn_precision, log_variance
 
 
 class Step(NamedTuple):
@@ -112,6 +112,6 @@ def train(
     steps = [s for batch in batches(trajectories, schedule.batch_size, rng) for s in network.run(batch)]
     context = activate(np.concatenate([s.expected for s in steps]))  # (N, H)
     error = np.concatenate([s.error for s in steps])  # (N, X)
-    learn_precision(context, error, weights.W_S, weights.b_S, schedule.learning_rate, rng, tick)
+    learn_precision(context, error, weights.W_S, weights.b_S, RATE, rng, tick)
     normalised = error * np.exp(-0.5 * log_variance(context, weights.W_S, weights.b_S))
     return Trained(network, energy, normalised)

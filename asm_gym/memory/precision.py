@@ -27,6 +27,7 @@ SURPRISED = 30.0
 
 PRECISION_EPOCHS = 20
 BATCH = 64
+RATE = 1e-3
 
 
 @kernel

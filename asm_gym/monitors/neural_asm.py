@@ -12,10 +12,12 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from asm_gym.detection import (
     Evidence,
     accumulate,
+    bounded,
     conformal_episodes,
     conformal_threshold,
     no_evidence,
@@ -27,15 +29,13 @@ from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, train
+from asm_gym.memory.senses import Senses
 from asm_gym.monitors.base import Surprise
 from asm_gym.stream import StreamSpec
 
 KIND = "neural_asm"
 
-HYPERPARAMETERS = (*Schedule._fields, "hidden_size", "gain", "shrinkage", "seed")
-
-FARTHEST = 1e3
-"""Where standardised numbers are cut off, so that no finite row can overflow."""
+HYPERPARAMETERS = (*Schedule._fields, "hidden_size", "gain", "bound", "shrinkage", "seed")
 
 SCORED_AT_ONCE = 64
 """Episodes scored side by side; with more the arrays no longer fit the cache."""
@@ -46,14 +46,7 @@ class NeuralASMState(NamedTuple):
 
     hidden: NDArray[np.float32]  # (B, H) the inferred state z
     evidence: Evidence
-
-
-class Reading(NamedTuple):
-    """Rows of the stream, as the memory reads them."""
-
-    senses: NDArray[np.float32]  # (B, X) standardised
-    commands: NDArray[np.float32]  # (B, A + 1) standardised, then a constant 1
-    finite: NDArray[np.bool_]  # (B, D)
+    before: NDArray[np.float64]  # (B, D) the row seen last
 
 
 class NeuralASM:
@@ -63,7 +56,8 @@ class NeuralASM:
         spec: the stream it watches.
         hidden_size: H, hidden units.
         iterations: inference steps per control step.
-        learning_rate: largest change of a synapse in one step, decaying to 0 along a cosine.
+        learning_rate: largest change of a synapse in one step at 256 hidden units, decaying to 0 along a cosine; scaled
+            by 256 / H, so that a unit's input changes as much at any width.
         epochs: passes over the training episodes.
         batch_size: episodes learned from side by side.
         prior_precision: Π_z, trust in what was expected.
@@ -71,12 +65,13 @@ class NeuralASM:
         carry_prior: probability, reached linearly by the end of training, that the state carried on while learning is
             the expected one rather than the inferred one. Above 0 the memory learns to run on without senses (recall).
         gain: a in (0, 1], weight of the newest step in the accumulated evidence.
+        bound: ν > 0, how many times the nominal surprise one step can add at most, so that a knock that is soon over
+            counts less than what stays.
         shrinkage: λ in [0, 1] of the whitening, towards no correlation between channels.
         seed: of the initial weights and of the order of the episodes.
 
     Attributes:
-        mean_, spread_: (D,) of the training rows [unit of each channel].
-        network_: the memory with its weights.
+            network_: the memory with its weights.
         energy_: (epochs,) mean energy of a step.
         whitening_: (X, X).
         threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
@@ -87,14 +82,15 @@ class NeuralASM:
         spec: StreamSpec,
         hidden_size: int = 256,
         iterations: int = 20,
-        learning_rate: float = 1e-3,
+        learning_rate: float = 3e-3,
         epochs: int = 40,
         batch_size: int = 32,
         prior_precision: float = 1.0,
         sensory_precision: float = 1.0,
         carry_prior: float = 0.0,
         gain: float = 0.2,
-        shrinkage: float = 0.01,
+        bound: float = 50.0,
+        shrinkage: float = 1e-3,
         seed: int = 0,
     ) -> None:
         counts = {"hidden_size": hidden_size, "iterations": iterations, "epochs": epochs, "batch_size": batch_size}
@@ -102,7 +98,7 @@ class NeuralASM:
             _require(name, count, isinstance(count, (int, np.integer)) and count >= 1, "a whole number of at least 1")
         _require("seed", seed, isinstance(seed, (int, np.integer)) and seed >= 0, "a whole number of at least 0")
         precisions = {"prior_precision": prior_precision, "sensory_precision": sensory_precision}
-        for name, number in {"learning_rate": learning_rate, **precisions}.items():
+        for name, number in {"learning_rate": learning_rate, "bound": bound, **precisions}.items():
             _require(name, number, 0.0 < number < math.inf, "positive and finite")
         for name, share in {"carry_prior": carry_prior, "shrinkage": shrinkage}.items():
             _require(name, share, 0.0 <= share <= 1.0, "in [0, 1]")
@@ -112,7 +108,8 @@ class NeuralASM:
         self.hidden_size, self.iterations, self.seed = int(hidden_size), int(iterations), int(seed)
         self.epochs, self.batch_size, self.learning_rate = int(epochs), int(batch_size), float(learning_rate)
         self.prior_precision, self.sensory_precision = float(prior_precision), float(sensory_precision)
-        self.carry_prior, self.gain, self.shrinkage = float(carry_prior), float(gain), float(shrinkage)
+        self.carry_prior, self.gain = float(carry_prior), float(gain)
+        self.bound, self.shrinkage = float(bound), float(shrinkage)
         self.network_: Network | None = None
         self.threshold_: float | None = None
 
@@ -134,14 +131,17 @@ class NeuralASM:
             progress: called as ``progress(done, total)`` after each pass over the data.
         """
         self._check(episodes)
-        rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)  # (N, D)
-        self.mean_ = rows.mean(axis=0)
-        self.spread_ = _spread(rows, self.mean_, self.spec.noise)
-        trajectories = [Trajectory(r.senses, r.commands) for r in (self._read(e.stream) for e in episodes)]
+        self.senses_ = Senses.fit(self.spec, [e.stream for e in episodes])
+        # Before the first row nothing has moved.
+        readings = [self.senses_.read(e.stream, np.vstack([e.stream[:1], e.stream[:-1]])) for e in episodes]
+        trajectories = [Trajectory(r.senses, r.commands) for r in readings]
         schedule = Schedule(*(getattr(self, name) for name in Schedule._fields))
-        trained = train(trajectories, self.hidden_size, schedule, np.random.default_rng(self.seed), progress)
+        rng = np.random.default_rng(self.seed)
+        # One thread: products this small are slowed down by several, and ruined by several that share a core.
+        with threadpool_limits(1):
+            trained = train(trajectories, self.hidden_size, schedule, rng, progress)
         self.network_, self.energy_ = trained.network, trained.energy
-        self.whitening_ = whitening(trained.normalised_errors, self.shrinkage)
+        self.whitening_ = whitening(trained.normalised_errors[:, self.senses_.judged], self.shrinkage)
         self.threshold_ = None
         return self
 
@@ -164,7 +164,8 @@ class NeuralASM:
         if batch < 1:
             raise ValueError(f"batch must be at least 1, got {batch}")
         hidden = np.zeros((batch, self._fitted().hidden_size), np.float32)
-        return NeuralASMState(hidden, no_evidence(batch, len(self.spec.sensory)))
+        unknown = np.zeros((batch, self.spec.size))
+        return NeuralASMState(hidden, no_evidence(batch, len(self.spec.sensory)), unknown)
 
     def observe(self, state: NeuralASMState, stream: NDArray[np.floating[Any]]) -> tuple[NeuralASMState, Surprise]:
         """The next row of each stream: the new state, and how surprising the row was.
@@ -181,17 +182,17 @@ class NeuralASM:
         self.spec.check_row(stream)
         if stream.shape != (len(state.hidden), self.spec.size):
             raise ValueError(f"stream must have the shape {(len(state.hidden), self.spec.size)}, got {stream.shape}")
-        reading = self._read(stream)
-        seen = reading.finite[:, self.spec.sensory].astype(np.float32)  # (B, X)
-        step = network.step(state.hidden, reading.commands, reading.senses, seen)
-        normalised = (step.error * np.exp(-0.5 * step.log_variance)).astype(np.float64)  # (B, X)
-        evidence = accumulate(state.evidence, normalised @ self.whitening_, self.gain)
+        before = np.where(state.evidence.steps[:, None] == 0, stream, state.before)
+        reading = self.senses_.read(stream, before)
+        step = network.step(state.hidden, reading.commands, reading.senses, reading.seen)
+        normalised = (step.error * np.exp(-0.5 * step.log_variance)).astype(np.float64)[:, self.senses_.judged]  # (B, X)
+        evidence = accumulate(state.evidence, bounded(normalised @ self.whitening_, self.bound), self.gain)
         attribution = np.zeros(stream.shape)  # (B, D), 0 for the commanded action
         attribution[:, self.spec.sensory] = shares(evidence, self.gain)
         broken = ~reading.finite.all(axis=1)
         if broken.any():
             attribution[broken] = np.where(reading.finite[broken], 0.0, np.inf)
-        return NeuralASMState(step.hidden, evidence), Surprise(attribution.sum(axis=1), attribution)
+        return NeuralASMState(step.hidden, evidence, stream), Surprise(attribution.sum(axis=1), attribution)
 
     def score(self, episode: Episode) -> Surprise:
         """The surprise of each step of an episode: value (T,), attribution (T, D)."""
@@ -201,6 +202,10 @@ class NeuralASM:
         """``score`` for many episodes, which are run side by side."""
         for episode in episodes:
             self.spec.require(episode.spec, "the episode")
+        with threadpool_limits(1):
+            return self._score(episodes)
+
+    def _score(self, episodes: Sequence[Episode]) -> list[Surprise]:
         scores: list[Surprise | None] = [None] * len(episodes)
         order = sorted(range(len(episodes)), key=lambda i: -len(episodes[i]))
         for start in range(0, len(order), SCORED_AT_ONCE):
@@ -219,14 +224,20 @@ class NeuralASM:
             rows = np.stack([s[t] for s in streams if t < len(s)])  # (n, D)
             n = len(rows)
             running = Evidence(state.evidence.vector[:n], state.evidence.steps[:n])
-            state, surprise = self.observe(NeuralASMState(state.hidden[:n], running), rows)
+            state, surprise = self.observe(NeuralASMState(state.hidden[:n], running, state.before[:n]), rows)
             yield surprise
 
     def save(self, path: str | Path) -> None:
         """Writes everything learned to one file: arrays and JSON."""
         weights = self._fitted().weights._asdict()
         header = {"spec": self.spec.to_json(), "hyperparameters": self.get_params(), "threshold": self.threshold_}
-        learned = {"mean_": self.mean_, "spread_": self.spread_, "energy_": self.energy_, "whitening_": self.whitening_}
+        learned = {
+            "mean": self.senses_.mean,
+            "spread": self.senses_.spread,
+            "change": self.senses_.change,
+            "energy": self.energy_,
+            "whitening": self.whitening_,
+        }
         write_checkpoint(path, KIND, header, {**learned, **weights})
 
     @classmethod
@@ -245,9 +256,9 @@ class NeuralASM:
         except (KeyError, TypeError) as error:
             raise ValueError(f"{path} is damaged: {error}") from error
         D, X = spec.size, len(spec.sensory)
-        asm.mean_, asm.spread_ = saved.array("mean_", D), saved.array("spread_", D)
-        asm.energy_, asm.whitening_ = saved.array("energy_", asm.epochs), saved.array("whitening_", X, X)
-        shapes = weight_shapes(asm.hidden_size, X, len(spec.motor))
+        asm.senses_ = Senses(spec, saved.array("mean", D), saved.array("spread", D), saved.array("change", D))
+        asm.energy_, asm.whitening_ = saved.array("energy", asm.epochs), saved.array("whitening", X, X)
+        shapes = weight_shapes(asm.hidden_size, asm.senses_.size, len(spec.motor))
         weights = Weights(**{n: np.ascontiguousarray(saved.array(n, *s), np.float32) for n, s in shapes.items()})
         asm.network_ = Network(weights, asm.iterations, asm.prior_precision, asm.sensory_precision)
         return asm
@@ -256,17 +267,6 @@ class NeuralASM:
         if self.network_ is None:
             raise RuntimeError("this NeuralASM has learned nothing yet: call fit(episodes) first")
         return self.network_
-
-    def _read(self, stream: NDArray[np.floating[Any]]) -> Reading:
-        """Rows (B, D), standardised; a number that is not finite is replaced by its mean."""
-        finite = np.isfinite(stream)
-        reach = FARTHEST * self.spread_
-        rows = np.minimum(np.maximum(stream, self.mean_ - reach), self.mean_ + reach)
-        rows = np.where(finite, (rows - self.mean_) / self.spread_, 0.0).astype(np.float32)  # (B, D)
-        motor = self.spec.motor
-        commands = np.ones((len(rows), len(motor) + 1), np.float32)
-        commands[:, :-1] = rows[:, motor]
-        return Reading(np.ascontiguousarray(rows[:, self.spec.sensory]), commands, finite)
 
     def _check(self, episodes: Sequence[Episode]) -> None:
         """Refuses episodes that cannot be learned from."""
@@ -286,11 +286,3 @@ class NeuralASM:
 def _require(name: str, value: float, fulfilled: bool, what: str) -> None:
     if not fulfilled:
         raise ValueError(f"{name} must be {what}, got {value}")
-
-
-def _spread(rows: NDArray[np.float64], mean: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(D,) standard deviation of each column; of one that never changes its sensor noise, or 1 where that is 0."""
-    spread = rows.std(axis=0)
-    constant = spread <= 1e-6 * np.abs(mean)  # the rounding of float32 is not a signal
-    fallback: NDArray[np.float64] = np.where(noise > 0, noise, 1.0)
-    return np.where(constant, fallback, spread)
