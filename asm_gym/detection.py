@@ -6,7 +6,8 @@
     value      s_t = ‖w_t‖² (2 - a) / (a X (1 - (1 - a)^{2t}))          nominal mean 1 for white errors, for every t
     alarm      s_t > q,   q the ⌈(n + 1)(1 - rate)⌉-th smallest of the maxima of n nominal episodes
 
-Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted as under a multivariate t); Lowry et al. 1992 (multivariate EWMA chart, its exact variance at start-up);
+Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted as under a multivariate t);
+Lowry et al. 1992 (multivariate EWMA chart, its exact variance at start-up);
 Vovk et al. 2005 and Angelopoulos and Bates 2023 (split conformal prediction).
 """
 
@@ -41,7 +42,7 @@ def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
 
 
 def bounded(errors: Array, bound: float) -> NDArray[np.float64]:
-    """Whitened errors (B, X) pulled in as a whole, directions kept: no step counts more than ν = ``bound`` usual ones."""
+    """Whitened errors (B, X) pulled in as a whole, directions kept: a step counts at most ν = ``bound`` usual ones."""
     exact = np.asarray(errors, np.float64)
     excess = (exact**2).sum(axis=1, keepdims=True) / (bound * exact.shape[1])  # (B, 1)
     pulled: NDArray[np.float64] = exact / np.sqrt(1.0 + excess)

@@ -173,4 +173,3 @@ class StreamSpec:
                 raise TypeError(f"the {name} space must be a Box to be read as a stream, got {space}")
         sizes = [int(np.prod(s.shape)) for s in (observation, action) if s.shape is not None]
         return cls((Channel("observation", sizes[0]), Channel("action", sizes[1], group=MOTOR)), dt, "spaces")
-

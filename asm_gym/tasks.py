@@ -30,8 +30,7 @@ class TaskSpec:
 
 
 TASKS = {
-    task.name: task
-    for task in (TaskSpec("Lift", horizon=100, success="the cube is more than 4 cm above the table"),)
+    task.name: task for task in (TaskSpec("Lift", horizon=100, success="the cube is more than 4 cm above the table"),)
 }
 """Every task by its name."""
 

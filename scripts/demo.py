@@ -28,7 +28,7 @@ from rich.table import Table as RichTable
 
 from asm_gym.evaluation import plots
 from asm_gym.evaluation.metrics import Row, binomial_interval, summarise
-from asm_gym.evaluation.report import Table, detection_table, headline, outcome_table, write_report
+from asm_gym.evaluation.report import detection_table, headline, outcome_table, write_report
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
 from asm_gym.evaluation.video import write_video
 from asm_gym.faults import Fault, FrozenEncoder, Push, WeakJoint
@@ -38,7 +38,7 @@ from asm_gym.scripts import doctor
 from asm_gym.scripts.collect import collect, episode_seeds
 from asm_gym.scripts.dispatch import Progress, dispatch
 from asm_gym.scripts.progress import stage
-from asm_gym.scripts.watch import Trial, guarded, watch
+from asm_gym.scripts.watch import Trial, guarded, watch_pair
 from asm_gym.wrappers import SurpriseOverlay
 
 WINDOW_S = 1.0
@@ -114,15 +114,11 @@ def faults(seed: int, episodes: int) -> list[tuple[str, Fault]]:
 
 
 def trials(args: Args) -> list[Trial]:
-    """Every episode to test on, each with the policy alone and under the wrapper."""
+    """Every episode to test on."""
     broken = faults(args.seed, args.faulty_episodes)
     seeds = episode_seeds(args.seed, args.nominal_episodes + len(broken), stage=2)
     cases = [(NOMINAL, ())] * args.nominal_episodes + [(name, (fault,)) for name, fault in broken]
-    return [
-        Trial(name, faulty, acting, seed)
-        for (name, faulty), seed in zip(cases, seeds, strict=True)
-        for acting in (POLICY_ALONE, args.on_alarm)
-    ]
+    return [Trial(name, faulty, args.on_alarm, seed) for (name, faulty), seed in zip(cases, seeds, strict=True)]
 
 
 def fit(args: Args, folder: Path, timed: Callable[[str], Any]) -> NeuralASM:
@@ -201,14 +197,30 @@ def figures(traces: list[Trace], folder: Path) -> dict[str, Path]:
     return {caption: plots.save(figure, folder / f"{name}.png") for caption, (name, figure) in drawn.items()}
 
 
-def show(console: Console, table: Table) -> None:
-    """Prints a table."""
-    rich = RichTable(title=table.caption, title_justify="left")
-    for heading in table.headings:
-        rich.add_column(heading)
-    for row in table.rows:
-        rich.add_row(*(str(cell) for cell in row))
-    console.print(rich)
+def show(console: Console, rows: list[Row], acting: str) -> None:
+    """Prints one table: what was noticed, and what acting on it changed."""
+    table = RichTable(title=f"Detection with the policy alone; then policy alone → {acting}", title_justify="left")
+    headings = ("", "detected", "delay [ms]", "false alarm", "task solved", "peak force [N]")
+    for heading in headings:
+        table.add_column(heading, justify="left" if not heading else "right")
+    for row in rows:
+        alone, acted = row.outcome(POLICY_ALONE), row.outcome(acting)
+        assert alone is not None
+        assert acted is not None
+        delay = "" if row.delays is None else f"{_ms(row.delays.median_ms)} (95 %: {_ms(row.delays.p95_ms)})"
+        table.add_row(
+            row.condition,
+            f"{row.detected.k}/{row.detected.n}" if row.detected.n else "",
+            delay,
+            f"{row.false_alarm_episodes.k}/{row.false_alarm_episodes.n}",
+            f"{alone.success.k}/{alone.success.n} → {acted.success.k}/{acted.success.n}",
+            f"{alone.peak_force:.1f} → {acted.peak_force:.1f}",
+        )
+    console.print(table)
+
+
+def _ms(delay: float) -> str:
+    return f"{delay:.0f}" if np.isfinite(delay) else f">{1e3 * WINDOW_S:.0f}"
 
 
 def write_json(path: Path, args: Args, rows: list[Row], latency: dict[str, float], seconds: dict[str, float]) -> None:
@@ -241,13 +253,11 @@ def run(args: Args, console: Console) -> list[Row]:
     memory = fit(args, folder, timed)
     todo = trials(args)
     with timed("testing, policy alone and wrapped") as progress:
-        task = partial(watch, env_id=args.task, policy="scripted", memory=folder / "lift.asm")
-        traces = dispatch(task, todo, args.workers, progress)
+        task = partial(watch_pair, env_id=args.task, policy="scripted", memory=folder / "lift.asm")
+        traces = [trace for pair in dispatch(task, todo, args.workers, progress) for trace in pair]
     rows = summarise(traces, WINDOW_S)
     latency = observe_latency_us(memory)
-    tables = [detection_table(rows, WINDOW_S), outcome_table(rows)]
-    for table in tables:
-        show(console, table)
+    show(console, rows, args.on_alarm)
     low, high = binomial_interval(args.nominal_episodes, args.false_alarm_rate)
     expected = (
         f"At a false-alarm rate of {args.false_alarm_rate:g}, {low} to {high} of {args.nominal_episodes} nominal "
@@ -260,7 +270,7 @@ def run(args: Args, console: Console) -> list[Row]:
     video = None
     if backend is not None:
         examples = {(t.condition, t.seed) for t in typical(traces)}
-        shown = [t for t in todo if t.acting != POLICY_ALONE and (t.condition, t.seed) in examples]
+        shown = [t for t in todo if (t.condition, t.seed) in examples]
         with timed("filming") as progress:
             video = film(args, memory, shown, folder / "demo.mp4", progress)
     elif args.video:
@@ -273,7 +283,7 @@ def run(args: Args, console: Console) -> list[Row]:
         f"asm-gym demo: {args.task}",
         f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "
         f"watched others, some of them faulty. {headline(rows)} {expected}",
-        tables,
+        [detection_table(rows, WINDOW_S), outcome_table(rows)],
         drawn,
         video,
         {"command": f"asm-gym demo --seed {args.seed}", **asdict(args), "observe() [µs]": latency},

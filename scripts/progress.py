@@ -19,7 +19,13 @@ def stage(name: str, console: Console, seconds: dict[str, float]) -> Iterator[di
     Yields:
         What the block calls as (done, total).
     """
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     start = time.perf_counter()
     with Progress(*columns, console=console) as progress:
         bar = progress.add_task(name, total=None)

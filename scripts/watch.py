@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,17 @@ def guarded(env: gym.Env[Any, Any], monitor: NeuralASM, trial: Trial) -> gym.Env
     """``env`` with the trial's faults, under the safety wrapper."""
     on_alarm = "monitor" if trial.acting == POLICY_ALONE else trial.acting
     return NeuralASMSafety(FaultInjection(env, trial.faults), monitor, on_alarm=on_alarm)
+
+
+def watch_pair(trial: Trial, env_id: str, policy: str, memory: Path) -> list[Trace]:
+    """The traces of one trial with the policy alone, and as it says.
+
+    The wrapper acts only after an alarm, so without one both are the same episode, and it runs once.
+    """
+    alone = watch(replace(trial, acting=POLICY_ALONE), env_id, policy, memory)
+    if alone.alarm.any():
+        return [alone, watch(trial, env_id, policy, memory)]
+    return [alone, replace(alone, acting=trial.acting)]
 
 
 def watch(trial: Trial, env_id: str, policy: str, memory: Path) -> Trace:

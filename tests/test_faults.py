@@ -35,43 +35,25 @@ def test_a_fault_acts_on_time_and_only_then(lift, fault):
     assert np.abs(faulty - healthy)[ONSET : ONSET + 4, touched].max() > 0.01
 
 
-@pytest.mark.parametrize("soft", [False, True], ids=["seeded reset", "soft reset"])
+@pytest.mark.parametrize("seed", [0, None], ids=["seeded reset", "soft reset"])
 @pytest.mark.parametrize("fault", EVERY, ids=lambda f: f.name)
-def test_a_reset_in_the_middle_of_a_fault_leaves_nothing_of_it(lift, fault, soft):
-    def after(env):
+def test_a_reset_in_the_middle_of_a_fault_leaves_nothing_of_it(lift, fault, seed):
+    def second_episode(env):
         """The episode after one that was cut short while the fault was active."""
         env.reset(seed=1)
         for _ in range(ONSET + 2):
             env.step(np.zeros(7, np.float32))
-        if not soft:
-            return record(lift)[0]
-        lift.reset()
-        return np.array([lift.step(np.full(7, 0.2, np.float32))[4]["stream"] for _ in range(STEPS)])
+        env.reset(seed=seed)
+        return np.array([env.step(np.full(7, 0.2, np.float32))[4]["stream"] for _ in range(ONSET)])
 
-    env = FaultInjection(lift, [fault])
-    model, data = lift.unwrapped._model, lift.unwrapped._data
-    got = after(env)
-    env._undo()  # what env.reset would do first
-    clean = after(lift)
-    env.reset(seed=1)
-    if not soft:
-        np.testing.assert_array_equal(got, clean)
+    # A soft reset goes on with the generators, so both first episodes must be of one length, not of one course.
+    np.testing.assert_array_equal(second_episode(FaultInjection(lift, [fault])), second_episode(lift))
     assert lift.unwrapped.corruptions == []
-    assert not data.xfrc_applied.any()
-    np.testing.assert_array_equal(model.actuator_gear[:7, 0], 1.0)
+    assert not lift.unwrapped._data.xfrc_applied.any()
+    np.testing.assert_array_equal(lift.unwrapped._model.actuator_gear[:7, 0], 1.0)
 
 
-def test_a_reset_through_the_wrapper_is_bit_identical_to_a_fresh_episode(lift):
-    healthy, _ = record(lift)
-    env = FaultInjection(lift, [Push(onset=0), WeakJoint(onset=0), FrozenEncoder(onset=0)])
-    record(env)
-    never = FaultInjection(env, [])
-    env.faults = ()
-    np.testing.assert_array_equal(record(never)[0], healthy)
-
-
-def test_a_soft_reset_through_the_wrapper_puts_the_model_back(lift):
-    gear = lift.unwrapped.robosuite_env.sim.model._model.actuator_gear
+def test_an_active_weak_joint_is_an_edit_of_the_model_that_a_soft_reset_undoes(lift):
     env = FaultInjection(lift, [WeakJoint(joint=2, strength=0.25, onset=0)])
     env.reset(seed=0)
     env.step(np.zeros(7, np.float32))

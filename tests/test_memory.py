@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
-from asm_gym.memory.energy import activate, energy, energy_gradient, product
+from asm_gym.memory.energy import activate, backward, energy, energy_gradient, outward
 from asm_gym.memory.inference import STRIDE, expect, infer, sense
 from asm_gym.memory.learning import (
     Learner,
@@ -69,10 +69,11 @@ def test_activation_is_tanh():
 
 
 @pytest.mark.parametrize("batch", [1, 2, 7])
-def test_product_is_the_matrix_product(batch):
+def test_products_along_and_against_synapses_are_matrix_products(batch):
     rng = np.random.default_rng(0)
     a, W = rng.normal(size=(batch, 6)), rng.normal(size=(4, 6))
-    np.testing.assert_allclose(product(a, W.T), a @ W.T, rtol=1e-12)
+    np.testing.assert_allclose(outward(a, W), a @ W.T, rtol=1e-12)
+    np.testing.assert_allclose(backward(a @ W.T, W), a @ W.T @ W, rtol=1e-12)
 
 
 def test_energy_is_the_sum_of_both_weighted_squares():

@@ -1,6 +1,5 @@
 """The environment's contract, on the real simulator."""
 
-import hashlib
 import os
 import subprocess
 import sys
@@ -162,7 +161,7 @@ def test_start_noise_is_a_reset_option(lift):
     np.testing.assert_array_equal(env._data.qpos[:7], env.robosuite_env.robots[0].init_qpos)
     env.reset(seed=0)
     assert np.abs(env._data.qpos[:7] - env.robosuite_env.robots[0].init_qpos).max() > 1e-3
-    with pytest.raises(ValueError, match="'noise'.*qpos_noise"):
+    with pytest.raises(ValueError, match=r"'noise'.*qpos_noise"):
         env.reset(options={"noise": 1})
 
 
@@ -203,7 +202,7 @@ def test_a_bad_argument_is_refused_with_what_exists(arguments, message):
 
 
 def test_an_unknown_task_lists_the_known_ones():
-    with pytest.raises(ValueError, match="'Juggle'.*Lift"):
+    with pytest.raises(ValueError, match=r"'Juggle'.*Lift"):
         task("Juggle")
     assert task("asm_gym/Lift-v0") is TASKS["Lift"]
 

@@ -17,10 +17,7 @@ ACT = np.array([0.3, -0.2, 1.0], np.float32)
 def run(env, steps, action=ACT):
     """The infos of ``steps`` steps, reset's first."""
     _, info = env.reset(seed=0)
-    infos = [info]
-    for _ in range(steps):
-        infos.append(env.step(action)[4])
-    return infos
+    return [info, *(env.step(action)[4] for _ in range(steps))]
 
 
 def test_monitor_reports_and_never_touches_the_action():
@@ -117,7 +114,7 @@ def test_an_environment_without_a_stream_is_watched_through_its_spaces():
 
 
 def test_unknown_reactions_are_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match="'freeze'.*monitor, hold, terminate"):
+    with pytest.raises(ValueError, match=r"'freeze'.*monitor, hold, terminate"):
         NeuralASMSafety(FakeEnv(), CueMonitor(), on_alarm="freeze")
     with pytest.raises(ValueError, match="predict"):
         NeuralASMSafety(FakeEnv(), CueMonitor(), on_alarm=3)

@@ -76,6 +76,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._state = self.monitor.initial_state(batch=1)
         self._observation = observation
         self._overriding, self._quiet, self._reflex_state = False, 0, None
+        self._fresh = False
         self._ended = False
         none = np.zeros((1, self.monitor.spec.size))
         return observation, self._report(info, Surprise(np.zeros(1), none), None, False)

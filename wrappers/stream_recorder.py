@@ -33,7 +33,8 @@ class StreamSource:
         if self._own:
             row: NDArray[np.float32] = info["stream"]
             return row
-        return np.concatenate([np.ravel(observation), np.ravel(action)]).astype(np.float32)
+        both: NDArray[np.float32] = np.concatenate([np.ravel(observation), np.ravel(action)]).astype(np.float32)
+        return both
 
 
 def _control_period(env: gym.Env[Any, Any]) -> float:

@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-
 _live: weakref.WeakSet[OffscreenRenderer] = weakref.WeakSet()
 
 

@@ -155,9 +155,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     def _build_spaces(self) -> None:
         low, high = self.robosuite_env.action_spec
         self.action_space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
-        objects = tuple(
-            Channel(name, values.size, "1", 0.0, "object") for name, values in self._read_objects().items()
-        )
+        objects = tuple(Channel(name, values.size, "1", 0.0, "object") for name, values in self._read_objects().items())
         action = Channel("action", low.size, "1", 0.0, MOTOR)
         source = f"{self.robot}"
         everything = (*(c for arm in self._arms for c in arm.channels), *objects, action)
@@ -183,9 +181,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
     # ------------------------------------------------------------------ episodes
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode.
 
         Args:
@@ -222,9 +218,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._measure(np.zeros(self.action_space.shape[0], np.float32))  # type: ignore[index]
         return self._observation(), self._info()
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Runs one control step.
 
         Args:
@@ -271,7 +265,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             raise ValueError(f"{self.task.name} takes an action of shape {self.action_space.shape}, got {action.shape}")
         if not np.isfinite(action).all():
             raise ValueError(f"the action must be finite, got {action}")
-        return np.clip(action, self.action_space.low, self.action_space.high)  # type: ignore[attr-defined, no-any-return]
+        return np.clip(action, self.action_space.low, self.action_space.high)  # type: ignore[attr-defined]
 
     # ------------------------------------------------------------------ senses
 
@@ -318,7 +312,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
     # ------------------------------------------------------------------ pictures
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """(height, width, 3) uint8, or None without a ``render_mode``."""
         if self.render_mode is None:
             gym.logger.warn("render() does nothing without a render_mode: gym.make(…, render_mode='rgb_array')")

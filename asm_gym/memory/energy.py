@@ -53,13 +53,34 @@ def activate(z: Array) -> Array:
 
 
 @kernel
-def product(a: Array, W: Array) -> Array:
-    """a @ W; one row is a matrix times a vector, which BLAS does faster than a matrix of one row."""
-    out = np.empty((a.shape[0], W.shape[1]), a.dtype)
-    if a.shape[0] == 1:
-        np.dot(a[0], W, out[0])
-    else:
+def outward(a: Array, W: Array) -> Array:
+    """a @ W.T: (B, P) from (B, Q), along the synapses ``W`` (P, Q).
+
+    A single row is summed here and not by BLAS, whose threads cost more than so small a product.
+    """
+    out = np.empty((a.shape[0], W.shape[0]), a.dtype)
+    if a.shape[0] > 1:
+        np.dot(a, W.T, out)
+        return out
+    for i in range(W.shape[0]):
+        total = np.float32(0)
+        for j in range(W.shape[1]):
+            total += a[0, j] * W[i, j]
+        out[0, i] = total
+    return out
+
+
+@kernel
+def backward(a: Array, W: Array) -> Array:
+    """a @ W: (B, Q) from (B, P), against the synapses ``W`` (P, Q)."""
+    out = np.zeros((a.shape[0], W.shape[1]), a.dtype)
+    if a.shape[0] > 1:
         np.dot(a, W, out)
+        return out
+    for i in range(W.shape[0]):
+        strength = a[0, i]
+        for j in range(W.shape[1]):
+            out[0, j] += strength * W[i, j]
     return out
 
 
@@ -86,11 +107,11 @@ def energy_gradient(
 ) -> tuple[Array, Array]:
     """∂F/∂z (B, H), and what the bend of f can add to the curvature of F at most (B,); arguments as in ``energy``."""
     f = activate(z)  # (B, H)
-    error = product(f, W_F.T)  # (B, X), x̂ without its bias for now
+    error = outward(f, W_F)  # (B, X), x̂ without its bias for now
     for n in range(error.shape[0]):
         for i in range(error.shape[1]):
             error[n, i] = pi_x[n, i] * (x[n, i] - b_F[i] - error[n, i])
-    gradient = product(error, W_F)  # (B, H), the feedback W_Fᵀ Π_x ε_x for now
+    gradient = backward(error, W_F)  # (B, H), the feedback W_Fᵀ Π_x ε_x for now
     bend = np.empty(z.shape[0], z.dtype)
     for n in range(z.shape[0]):
         steepest = abs(gradient[n, 0])

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asm_gym.memory.energy import Array, activate, energy_gradient, kernel, product
+from asm_gym.memory.energy import Array, activate, energy_gradient, kernel, outward
 
 STRIDE = np.float32(1.5)
 """Length of an inference step over the inverse of the curvature; from 2 on it would diverge."""
@@ -41,15 +41,15 @@ def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int,
 @kernel
 def expect(z: Array, u: Array, W_H: Array, W_U: Array) -> Array:
     """μ_t (B, H), the state expected after ``z`` (B, H) once ``u`` (B, A + 1) is commanded."""
-    mu = product(activate(z), W_H.T)
-    mu += product(u, W_U.T)
+    mu = outward(activate(z), W_H)
+    mu += outward(u, W_U)
     return mu
 
 
 @kernel
 def sense(z: Array, W_F: Array, b_F: Array) -> Array:
     """x̂ (B, X), the senses that ``z`` (B, H) predicts."""
-    x = product(activate(z), W_F.T)
+    x = outward(activate(z), W_F)
     x += b_F
     return x
 

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from asm_gym.memory.energy import Array, activate, energy, kernel
 from asm_gym.memory.inference import Weights, expect, infer, sense
 
-
 REFERENCE_WIDTH = 256
-"""Hidden units at which ``learning_rate`` is meant."""
+"""Hidden units up to which ``learning_rate`` is taken as it is; beyond them learning would diverge."""
 
 
 class Trajectory(NamedTuple):
@@ -200,7 +199,7 @@ def learn(
 ) -> NDArray[np.float64]:
     """Learns all but the precision, in place; the mean energy of each epoch (epochs,). Calls ``tick`` each epoch."""
     learner = Learner(weights, schedule, rng)
-    widest = schedule.learning_rate * REFERENCE_WIDTH / weights.W_H.shape[0]
+    widest = schedule.learning_rate * min(1.0, REFERENCE_WIDTH / weights.W_H.shape[0])
     steps = sum(len(t.senses) for t in trajectories)
     curve = np.zeros(schedule.epochs)
     for epoch in range(schedule.epochs):

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, kernel, product
+from asm_gym.memory.energy import Array, kernel, outward
 from asm_gym.memory.learning import Synapse, coincidence, cosine_decay
 
 SMALLEST, LARGEST = np.float32(-12.0), np.float32(8.0)
@@ -33,7 +33,7 @@ RATE = 1e-3
 @kernel
 def log_variance(f: Array, W_S: Array, b_S: Array) -> Array:
     """log σ² (B, X) in the context ``f`` = f(μ) (B, H)."""
-    out = product(f, W_S.T)
+    out = outward(f, W_S)
     for n in range(out.shape[0]):
         for i in range(out.shape[1]):
             out[n, i] = min(max(out[n, i] + b_S[i], SMALLEST), LARGEST)

@@ -56,8 +56,8 @@ class NeuralASM:
         spec: the stream it watches.
         hidden_size: H, hidden units.
         iterations: inference steps per control step.
-        learning_rate: largest change of a synapse in one step at 256 hidden units, decaying to 0 along a cosine; scaled
-            by 256 / H, so that a unit's input changes as much at any width.
+        learning_rate: largest change of a synapse in one step, decaying to 0 along a cosine; scaled by 256 / H where H
+            is larger, so that a unit's input does not change more for having more synapses.
         epochs: passes over the training episodes.
         batch_size: episodes learned from side by side.
         prior_precision: Π_z, trust in what was expected.
@@ -185,7 +185,9 @@ class NeuralASM:
         before = np.where(state.evidence.steps[:, None] == 0, stream, state.before)
         reading = self.senses_.read(stream, before)
         step = network.step(state.hidden, reading.commands, reading.senses, reading.seen)
-        normalised = (step.error * np.exp(-0.5 * step.log_variance)).astype(np.float64)[:, self.senses_.judged]  # (B, X)
+        normalised = (step.error * np.exp(-0.5 * step.log_variance)).astype(np.float64)[
+            :, self.senses_.judged
+        ]  # (B, X)
         evidence = accumulate(state.evidence, bounded(normalised @ self.whitening_, self.bound), self.gain)
         attribution = np.zeros(stream.shape)  # (B, D), 0 for the commanded action
         attribution[:, self.spec.sensory] = shares(evidence, self.gain)
