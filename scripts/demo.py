@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table as RichTable
 
+from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import plots
-from asm_gym.evaluation.metrics import Row, binomial_interval, summarise
+from asm_gym.evaluation.metrics import Row, Share, binomial_interval, summarise
 from asm_gym.evaluation.report import detection_table, headline, outcome_table, write_report
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
 from asm_gym.evaluation.video import write_video
@@ -39,6 +40,7 @@ from asm_gym.scripts.collect import collect, episode_seeds
 from asm_gym.scripts.dispatch import Progress, dispatch
 from asm_gym.scripts.progress import stage
 from asm_gym.scripts.watch import Trial, guarded, watch_pair
+from asm_gym.tasks import task
 from asm_gym.wrappers import SurpriseOverlay
 
 WINDOW_S = 1.0
@@ -82,6 +84,12 @@ class Args:
         for name in ("fit_episodes", "calibration_episodes", "nominal_episodes", "faulty_episodes", "epochs"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        task(self.task)
+        if self.calibration_episodes < conformal_episodes(self.false_alarm_rate):
+            raise ValueError(
+                f"a false-alarm rate of {self.false_alarm_rate:g} needs at least "
+                f"{conformal_episodes(self.false_alarm_rate)} calibration episodes, got {self.calibration_episodes}"
+            )
 
     def scaled(self) -> Args:
         """With ``quick``, a third of the work; calibration keeps what the false-alarm rate needs."""
@@ -91,7 +99,8 @@ class Args:
             name: max(1, getattr(self, name) // 3)
             for name in ("fit_episodes", "nominal_episodes", "faulty_episodes", "epochs")
         }
-        return replace(self, calibration_episodes=max(20, self.calibration_episodes // 3), **counts)
+        needed = conformal_episodes(self.false_alarm_rate)
+        return replace(self, calibration_episodes=max(needed, self.calibration_episodes // 3), **counts)
 
 
 def faults(seed: int, episodes: int) -> list[tuple[str, Fault]]:
@@ -121,8 +130,8 @@ def trials(args: Args) -> list[Trial]:
     return [Trial(name, faulty, args.on_alarm, seed) for (name, faulty), seed in zip(cases, seeds, strict=True)]
 
 
-def fit(args: Args, folder: Path, timed: Callable[[str], Any]) -> NeuralASM:
-    """A memory of the task as the expert does it, calibrated, saved in ``folder``."""
+def fit(args: Args, folder: Path, timed: Callable[[str], Any]) -> tuple[NeuralASM, Share]:
+    """A memory of the task as the expert does it, calibrated and saved; and how often the expert succeeded."""
     with timed("collecting nominal episodes") as progress:
         episodes = collect(
             args.task,
@@ -137,7 +146,7 @@ def fit(args: Args, folder: Path, timed: Callable[[str], Any]) -> NeuralASM:
         memory.fit(episodes[: args.fit_episodes], progress=progress)
     memory.calibrate(episodes[args.fit_episodes :], false_alarm_rate=args.false_alarm_rate)
     memory.save(folder / "lift.asm")
-    return memory
+    return memory, Share.of([e.success for e in episodes])
 
 
 def observe_latency_us(memory: NeuralASM, calls: int = 2000) -> dict[str, float]:
@@ -223,7 +232,9 @@ def _ms(delay: float) -> str:
     return f"{delay:.0f}" if np.isfinite(delay) else f">{1e3 * WINDOW_S:.0f}"
 
 
-def write_json(path: Path, args: Args, rows: list[Row], latency: dict[str, float], seconds: dict[str, float]) -> None:
+def write_json(
+    path: Path, args: Args, rows: list[Row], expert: Share, latency: dict[str, float], seconds: dict[str, float]
+) -> None:
     """Every figure, with what it takes to make it again."""
     packages = ("asm-gym", "mujoco", "robosuite", "gymnasium", "numpy", "numba")
     content = {
@@ -231,6 +242,7 @@ def write_json(path: Path, args: Args, rows: list[Row], latency: dict[str, float
         "versions": {"python": platform.python_version(), **{p: metadata.version(p) for p in packages}},
         "window_s": WINDOW_S,
         "results": [asdict(row) for row in rows],
+        "expert_success": expert._asdict(),
         "observe_us": latency,
         "seconds": seconds,
     }
@@ -250,11 +262,11 @@ def run(args: Args, console: Console) -> list[Row]:
     backend = doctor.rendering_backend() if args.video else None
     if backend == "osmesa":
         os.environ["MUJOCO_GL"] = backend  # before this process loads robosuite, which would choose EGL
-    memory = fit(args, folder, timed)
+    memory, expert = fit(args, folder, timed)
     todo = trials(args)
     with timed("testing, policy alone and wrapped") as progress:
-        task = partial(watch_pair, env_id=args.task, policy="scripted", memory=folder / "lift.asm")
-        traces = [trace for pair in dispatch(task, todo, args.workers, progress) for trace in pair]
+        work = partial(watch_pair, env_id=args.task, policy="scripted", memory=folder / "lift.asm")
+        traces = [trace for pair in dispatch(work, todo, args.workers, progress) for trace in pair]
     rows = summarise(traces, WINDOW_S)
     latency = observe_latency_us(memory)
     show(console, rows, args.on_alarm)
@@ -263,7 +275,10 @@ def run(args: Args, console: Console) -> list[Row]:
         f"At a false-alarm rate of {args.false_alarm_rate:g}, {low} to {high} of {args.nominal_episodes} nominal "
         f"episodes raise an alarm by chance (95 %)."
     )
-    console.print(f"{headline(rows)} {expected} One observe() takes {latency['median']:.0f} µs.")
+    console.print(f"{headline(rows)} {expected}")
+    console.print(
+        f"The expert succeeded in {expert.k} of {expert.n} episodes; one observe() takes {latency['median']:.0f} µs."
+    )
 
     with timed("drawing"):
         drawn = figures(traces, folder)
@@ -277,7 +292,7 @@ def run(args: Args, console: Console) -> list[Row]:
         for check in doctor.run_checks():
             if not check.ok:
                 console.print(f"[yellow]no video: {check.detail}; {check.remedy}[/yellow]")
-    write_json(folder / "demo.json", args, rows, latency, seconds)
+    write_json(folder / "demo.json", args, rows, expert, latency, seconds)
     write_report(
         folder / "report.html",
         f"asm-gym demo: {args.task}",

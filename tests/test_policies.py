@@ -1,0 +1,117 @@
+"""Experts, reflexes and policies by name."""
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+
+from asm_gym.policies import make_policy, rollout
+from asm_gym.policies.reflexes import Hold
+from asm_gym.policies.scripted.base import Style, matrix, pointing_down, rotation
+from asm_gym.scripts.collect import collect
+from tests.fakes import FakeEnv
+
+
+def test_the_expert_lifts_the_cube_and_keeps_it_up(lift):
+    for seed in range(3):
+        lifted = []
+        assert rollout(lift, make_policy("scripted", lift, seed=seed), seed, lambda i, k=lifted: k.append(i["success"]))
+        assert lifted[-1]
+
+
+@pytest.mark.slow
+def test_the_expert_succeeds_on_98_of_100_seeds():
+    assert sum(e.success for e in collect("asm_gym/Lift-v0", episodes=100, seed=1234, workers=2)) >= 98
+
+
+def test_the_expert_reads_dict_observations_too():
+    import gymnasium as gym
+
+    env = gym.make("asm_gym/Lift-v0", observation="dict")
+    assert rollout(env, make_policy("scripted", env, seed=0), 0)
+    env.close()
+
+
+def test_one_seed_gives_one_course_and_another_seed_another(lift):
+    observation, _ = lift.reset(seed=0)
+
+    def actions(seed):
+        policy, state = make_policy("scripted", lift, seed=seed), None
+        made = []
+        for _ in range(5):
+            action, state = policy.predict(observation, state)
+            made.append(action)
+        return np.array(made)
+
+    np.testing.assert_array_equal(actions(1), actions(1))
+    assert not np.array_equal(actions(1), actions(2))
+
+
+def test_deterministic_leaves_out_the_noise(lift):
+    observation, _ = lift.reset(seed=0)
+    quiet = make_policy("scripted", lift, seed=1, style=Style(noise=0.0))
+    noisy = make_policy("scripted", lift, seed=1, style=Style(noise=0.5))
+    state = noisy.predict(observation)[1]
+    np.testing.assert_array_equal(
+        noisy.predict(observation, state, deterministic=True)[0],
+        quiet.predict(observation, quiet.predict(observation)[1])[0],
+    )
+
+
+def test_rotations_are_made_orthonormal_again():
+    exact = matrix(np.array([0.1, 0.2, 0.3, np.sqrt(1 - 0.14)]))
+    noisy = rotation(np.concatenate([exact[:, 0], exact[:, 1]]) + 1e-3 * np.arange(6))
+    np.testing.assert_allclose(noisy.T @ noisy, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(noisy, exact, atol=0.02)
+    assert np.linalg.det(noisy) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("degrees", [0, 30, 44, 46, 80, 135])
+def test_fingers_close_along_the_nearest_side_of_a_cube(degrees):
+    angle = np.radians(degrees)
+    cube = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    hand = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+    target = pointing_down(hand, cube)
+    np.testing.assert_allclose(target[:, 2], [0, 0, -1])
+    assert np.linalg.det(target) == pytest.approx(1.0)
+    sides = np.abs(cube.T @ target[:, 1])
+    assert sides.max() == pytest.approx(1.0)
+    assert hand[:, 1] @ target[:, 1] >= np.cos(np.pi / 4) - 1e-9  # never turned further than half a quarter
+
+
+def test_hold_rests_and_keeps_the_grip():
+    env = FakeEnv()
+    hold = Hold(env)
+    state = hold.begin(np.array([0.5, 0.5, -0.7], np.float32))
+    action, state = hold.predict(None, state)
+    np.testing.assert_allclose(action, [0, 0, -0.7])
+    np.testing.assert_allclose(hold.predict(None, state)[0], [0, 0, -0.7])
+
+
+def test_hold_takes_the_users_safe_action_as_it_is():
+    hold = Hold(FakeEnv(), safe_action=np.array([0.1, 0.2, 0.3]))
+    action, _ = hold.predict(None, hold.begin(np.ones(3, np.float32)))
+    np.testing.assert_allclose(action, [0.1, 0.2, 0.3], rtol=1e-6)
+    with pytest.raises(ValueError, match="safe_action"):
+        Hold(FakeEnv(), safe_action=np.array([2.0, 0, 0]))
+
+
+def test_a_saved_agent_is_a_policy(tmp_path):
+    env = FakeEnv()
+    PPO("MlpPolicy", env, n_steps=8, batch_size=8).save(tmp_path / "fake_ppo.zip")
+    action, _ = make_policy(str(tmp_path / "fake_ppo.zip"), env).predict(np.zeros(2, np.float32), deterministic=True)
+    assert env.action_space.contains(action)
+
+
+def test_what_cannot_be_made_is_refused_with_what_exists(lift, tmp_path):
+    with pytest.raises(ValueError, match=r"'teleop'.*scripted, hold"):
+        make_policy("teleop", lift)
+    with pytest.raises(ValueError, match="no scripted expert"):
+        make_policy("scripted", FakeEnv())
+    with pytest.raises(FileNotFoundError, match="none_sac"):
+        make_policy(str(tmp_path / "none_sac.zip"), lift)
+    (tmp_path / "agent.zip").touch()
+    with pytest.raises(ValueError, match="algorithm"):
+        make_policy(str(tmp_path / "agent.zip"), lift)
+    for bad in ({"noise": -1}, {"speed": 0}):
+        with pytest.raises(ValueError, match="must be"):
+            Style(**bad)

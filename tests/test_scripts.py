@@ -1,0 +1,133 @@
+"""Collecting and the demo, end to end on the real simulator with few episodes."""
+
+import json
+
+import numpy as np
+import pytest
+
+from asm_gym.evaluation.trace import POLICY_ALONE
+from asm_gym.faults import Push
+from asm_gym.scripts import demo
+from asm_gym.scripts.cli import main
+from asm_gym.scripts.collect import collect, episode_seeds
+from asm_gym.scripts.dispatch import dispatch
+from asm_gym.scripts.watch import Trial, watch
+from asm_gym.wrappers import StreamRecorder
+from tests.fakes import FakeEnv
+
+TINY = [
+    *("--fit-episodes", "6", "--calibration-episodes", "19", "--nominal-episodes", "2"),
+    *("--faulty-episodes", "1", "--epochs", "3", "--workers", "2"),
+]
+
+
+def test_collected_episodes_do_not_depend_on_the_number_of_workers():
+    one, two = (collect("asm_gym/Lift-v0", episodes=2, seed=5, workers=n, horizon=15) for n in (1, 2))
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a.stream, b.stream)
+        np.testing.assert_array_equal(a.observations, b.observations)
+    assert one[0].stream.shape == (15, one[0].spec.size)
+    assert one[0].observations.shape[0] == 16
+    assert one[0].actions.shape == (15, 7)
+    assert one[0].seed == episode_seeds(5, 2)[0]
+    assert not np.array_equal(one[0].stream, one[1].stream)
+
+
+def test_stages_share_no_seed():
+    assert not set(episode_seeds(0, 200)) & set(episode_seeds(0, 200, stage=1))
+
+
+def test_bad_counts_are_refused():
+    with pytest.raises(ValueError, match=r"episodes.*0"):
+        collect("asm_gym/Lift-v0", episodes=0)
+    with pytest.raises(ValueError, match=r"workers.*0"):
+        dispatch(abs, [1], workers=0)
+
+
+def test_dispatch_keeps_the_order_and_reports_progress():
+    seen = []
+    assert dispatch(abs, [-3, 1, -2], 2, lambda done, total: seen.append((done, total))) == [3, 1, 2]
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_what_a_task_raises_is_raised_here():
+    with pytest.raises(TypeError):
+        dispatch(abs, ["a"], 2)
+
+
+def test_the_recorder_keeps_whole_and_cut_short_episodes():
+    env = StreamRecorder(FakeEnv(length=4, own_stream=False))
+    for steps in (4, 2):
+        env.reset(seed=steps)
+        for _ in range(steps):
+            info = env.step(np.array([0.1, 0.2, 0.3], np.float32))[4]
+    env.close()
+    assert [len(e) for e in env.episodes] == [4, 2]
+    assert [e.seed for e in env.episodes] == [4, 2]
+    np.testing.assert_allclose(info["stream"], [2, 2, 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(env.episodes[1].stream[-1], info["stream"])
+    np.testing.assert_array_equal(env.episodes[0].observations[:, 0], np.arange(5))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """What a tiny demo writes."""
+    out = tmp_path_factory.mktemp("demo")
+    assert main(["demo", *TINY, "--no-video", "--out", str(out)]) == 0
+    return out
+
+
+def test_the_demo_writes_everything_it_promises(folder):
+    written = {p.name for p in folder.iterdir()}
+    pictures = {f"{name}.png" for name in ("surprise", "maxima", "delay", "roc", "attribution")}
+    assert written == {"report.html", "demo.json", "lift.asm", *pictures}
+    figures = json.loads((folder / "demo.json").read_text())
+    assert [row["condition"] for row in figures["results"]] == ["nominal", "frozen encoder", "push", "weak joint"]
+    assert figures["observe_us"]["median"] > 0
+    assert figures["arguments"]["seed"] == 0
+    assert figures["versions"]["robosuite"] == "1.5.2"
+
+
+def test_the_same_seed_gives_the_same_table(folder, tmp_path):
+    assert main(["demo", *TINY, "--no-video", "--out", str(tmp_path)]) == 0
+    first, second = (json.loads((f / "demo.json").read_text())["results"] for f in (folder, tmp_path))
+    assert first == second
+
+
+def test_an_episode_without_an_alarm_is_the_same_under_the_wrapper(folder):
+    trial = Trial("nominal", (), POLICY_ALONE, seed=77)
+    alone = watch(trial, "asm_gym/Lift-v0", "scripted", folder / "lift.asm")
+    held = watch(Trial("nominal", (), "hold", seed=77), "asm_gym/Lift-v0", "scripted", folder / "lift.asm")
+    until = int(np.argmax(alone.alarm)) + 1 if alone.alarm.any() else len(alone)
+    np.testing.assert_array_equal(alone.surprise[:until], held.surprise[:until])
+
+
+def test_a_hard_push_raises_an_alarm_even_in_a_memory_that_has_learned_little(folder):
+    trial = Trial("push", (Push(newtons=100.0, onset=10, duration=10),), "terminate", seed=3)
+    trace = watch(trial, "asm_gym/Lift-v0", "scripted", folder / "lift.asm")
+    assert trace.ended_by_alarm
+    assert trace.detected_after is not None
+    assert trace.detected_after <= 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--on-alarm", "dance"], "hold or terminate"),
+        (["--epochs", "0"], "epochs"),
+        (["--task", "asm_gym/Juggle-v0"], "Juggle"),
+        (["--calibration-episodes", "10"], "19"),
+    ],
+)
+def test_a_bad_argument_is_refused_before_anything_is_written(arguments, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["demo", *arguments, "--no-video", "--out", str(tmp_path / "out")])
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_quick_keeps_the_calibration_that_the_rate_needs():
+    args = demo.Args(quick=True).scaled()
+    assert args.calibration_episodes >= 19
+    assert args.faulty_episodes < demo.Args().faulty_episodes
