@@ -208,21 +208,20 @@ def figures(traces: list[Trace], folder: Path) -> dict[str, Path]:
 
 def show(console: Console, rows: list[Row], acting: str) -> None:
     """Prints one table: what was noticed, and what acting on it changed."""
-    table = RichTable(title=f"Detection with the policy alone; then policy alone → {acting}", title_justify="left")
-    headings = ("", "detected", "delay [ms]", "false alarm", "task solved", "peak force [N]")
-    for heading in headings:
-        table.add_column(heading, justify="left" if not heading else "right")
+    table = RichTable(title=f"Noticed with the policy alone, and what {acting} changes", title_justify="left")
+    headings = ("", "detected", "delay [ms]\nmedian / 95 %", "false\nalarm", f"task solved\nalone → {acting}")
+    for heading in (*headings, f"peak force [N]\nalone → {acting}"):
+        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
     for row in rows:
         alone, acted = row.outcome(POLICY_ALONE), row.outcome(acting)
         assert alone is not None
         assert acted is not None
-        delay = "" if row.delays is None else f"{_ms(row.delays.median_ms)} (95 %: {_ms(row.delays.p95_ms)})"
         table.add_row(
             row.condition,
             f"{row.detected.k}/{row.detected.n}" if row.detected.n else "",
-            delay,
+            "" if row.delays is None else f"{_ms(row.delays.median_ms)} / {_ms(row.delays.p95_ms)}",
             f"{row.false_alarm_episodes.k}/{row.false_alarm_episodes.n}",
-            f"{alone.success.k}/{alone.success.n} → {acted.success.k}/{acted.success.n}",
+            f"{alone.success.k} → {acted.success.k} of {alone.success.n}",
             f"{alone.peak_force:.1f} → {acted.peak_force:.1f}",
         )
     console.print(table)
