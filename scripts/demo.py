@@ -208,9 +208,19 @@ def figures(traces: list[Trace], folder: Path) -> dict[str, Path]:
 
 def show(console: Console, rows: list[Row], acting: str) -> None:
     """Prints one table: what was noticed, and what acting on it changed."""
-    table = RichTable(title=f"Noticed with the policy alone, and what {acting} changes", title_justify="left")
-    headings = ("", "detected", "delay [ms]\nmedian / 95 %", "false\nalarm", f"task solved\nalone → {acting}")
-    for heading in (*headings, f"peak force [N]\nalone → {acting}"):
+    title = f"Noticed while the policy acts alone; solved and force: alone → {acting}"
+    console.print()
+    table = RichTable(title=title, box=None, padding=(0, 2, 0, 0))
+    headings = (
+        "",
+        "\nepisodes",
+        "\ndetected",
+        "delay [ms]\nmedian, 95 %",
+        "false\nalarms",
+        "tasks\nsolved",
+        "peak\nforce [N]",
+    )
+    for heading in headings:
         table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
     for row in rows:
         alone, acted = row.outcome(POLICY_ALONE), row.outcome(acting)
@@ -218,13 +228,15 @@ def show(console: Console, rows: list[Row], acting: str) -> None:
         assert acted is not None
         table.add_row(
             row.condition,
-            f"{row.detected.k}/{row.detected.n}" if row.detected.n else "",
-            "" if row.delays is None else f"{_ms(row.delays.median_ms)} / {_ms(row.delays.p95_ms)}",
-            f"{row.false_alarm_episodes.k}/{row.false_alarm_episodes.n}",
-            f"{alone.success.k} → {acted.success.k} of {alone.success.n}",
+            str(row.episodes),
+            str(row.detected.k) if row.detected.n else "",
+            "" if row.delays is None else f"{_ms(row.delays.median_ms)}, {_ms(row.delays.p95_ms)}",
+            str(row.false_alarm_episodes.k),
+            f"{alone.success.k} → {acted.success.k}",
             f"{alone.peak_force:.1f} → {acted.peak_force:.1f}",
         )
     console.print(table)
+    console.print()
 
 
 def _ms(delay: float) -> str:
@@ -250,6 +262,17 @@ def write_json(
     unfinished.replace(path)
 
 
+def prepare_film(console: Console) -> bool:
+    """Whether this machine can render and encode; says what it lacks, and the command that installs it."""
+    needed = (doctor.rendering(), doctor.encoder())
+    for check in needed:
+        if not check.ok:
+            console.print(f"[yellow]{check.detail}. To have one: {check.remedy}[/yellow]")
+    if doctor.rendering_backend() == "osmesa":
+        os.environ["MUJOCO_GL"] = "osmesa"  # before this process loads robosuite, which would choose EGL
+    return all(check.ok for check in needed)
+
+
 def run(args: Args, console: Console) -> list[Row]:
     """The whole demo."""
     args = args.scaled()
@@ -258,9 +281,7 @@ def run(args: Args, console: Console) -> list[Row]:
     seconds: dict[str, float] = {}
     timed = partial(stage, console=console, seconds=seconds)
 
-    backend = doctor.rendering_backend() if args.video else None
-    if backend == "osmesa":
-        os.environ["MUJOCO_GL"] = backend  # before this process loads robosuite, which would choose EGL
+    can_film = args.video and prepare_film(console)
     memory, expert = fit(args, folder, timed)
     todo = trials(args)
     with timed("testing, policy alone and wrapped") as progress:
@@ -282,15 +303,11 @@ def run(args: Args, console: Console) -> list[Row]:
     with timed("drawing"):
         drawn = figures(traces, folder)
     video = None
-    if backend is not None:
+    if can_film:
         examples = {(t.condition, t.seed) for t in typical(traces)}
         shown = [t for t in todo if (t.condition, t.seed) in examples]
         with timed("filming") as progress:
             video = film(args, memory, shown, folder / "demo.mp4", progress)
-    elif args.video:
-        for check in doctor.run_checks():
-            if not check.ok:
-                console.print(f"[yellow]no video: {check.detail}; {check.remedy}[/yellow]")
     write_json(folder / "demo.json", args, rows, expert, latency, seconds)
     write_report(
         folder / "report.html",

@@ -118,10 +118,10 @@ def wanted_versions(name: str) -> SpecifierSet:
 
 
 def library(name: str, package: str) -> Check:
-    """A shared library that opencv links to, which robosuite imports."""
+    """A shared library that opencv links to, which only robosuite's own viewer uses."""
     ok = loads(name)
-    detail = "found" if ok else "missing, and `import robosuite` needs it"
-    return Check(name, ok, True, detail, "" if ok else f"apt-get install {package}")
+    detail = "found" if ok else "missing: opencv, which robosuite's viewer uses, cannot be imported"
+    return Check(name, ok, False, detail, "" if ok else f"apt-get install {package}")
 
 
 def loads(library: str) -> bool:

@@ -63,12 +63,14 @@ def test_a_complete_machine_passes_every_check(machine: Any, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize("name", PACKAGE_OF)
-def test_a_missing_library_of_opencv_is_needed_and_names_its_debian_package(machine: Any, name: str) -> None:
+def test_a_missing_library_of_opencv_is_named_with_its_debian_package_and_can_be_done_without(
+    machine: Any, name: str
+) -> None:
     machine(lacks=(name,))
     check = failed().pop(name)
-    assert check.needed
+    assert not check.needed
     assert check.remedy == f"apt-get install {PACKAGE_OF[name]}"
-    assert doctor.main([]) == 1
+    assert doctor.main([]) == 0
 
 
 def test_without_a_rendering_backend_only_video_is_missing(machine: Any, capsys: pytest.CaptureFixture[str]) -> None:

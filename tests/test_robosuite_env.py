@@ -54,6 +54,20 @@ def test_one_seed_gives_one_episode_in_another_process_with_another_hash_seed(li
     assert out.stdout.strip() == episode(lift, 3)  # noqa: F821
 
 
+def test_an_environment_runs_where_opencv_cannot_be_imported(tmp_path):
+    (tmp_path / "cv2.py").write_text("raise ImportError('libGL.so.1: cannot open shared object file')")
+    code = """
+import sys, gymnasium, asm_gym
+env = gymnasium.make("asm_gym/Lift-v0")
+env.reset(seed=0)
+assert "cv2" not in sys.modules, "the stand-in must not be left to others"
+print(len(env.step(env.action_space.sample())))
+"""
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    out = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "5"
+
+
 def test_unseeded_resets_go_on_from_the_seed(lift):
     def starts():
         lift.reset(seed=11)
