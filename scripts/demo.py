@@ -173,6 +173,7 @@ def film(args: Args, memory: NeuralASM, shown: list[Trial], path: Path, progress
             pictures: list[NDArray[np.uint8]] = []
             policy = make_policy("scripted", watched, seed=trial.seed)
             rollout(watched, policy, trial.seed, lambda _, p=pictures, w=watched: p.append(w.render()))  # type: ignore[misc]
+            watched.get_wrapper_attr("undo_faults")()
             yield from pictures
             progress(k + 1, len(shown))
         env.close()
@@ -258,8 +259,19 @@ def write_json(
         "seconds": seconds,
     }
     unfinished = path.with_suffix(".unfinished")
-    unfinished.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    unfinished.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     unfinished.replace(path)
+
+
+def _finite(value: Any) -> Any:
+    """``value`` as JSON can hold it: a delay that never ended, or a rate of nothing, is null."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if hasattr(value, "_asdict"):
+        return _finite(value._asdict())
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def prepare_film(console: Console) -> bool:

@@ -36,7 +36,8 @@ class Trial:
 
 
 @lru_cache(maxsize=1)
-def _memory(path: Path) -> NeuralASM:
+def _memory(path: Path, written_ns: int) -> NeuralASM:
+    """Loaded once a process, and again when the file has been written anew."""
     return NeuralASM.load(path)
 
 
@@ -63,10 +64,13 @@ def watch(trial: Trial, env_id: str, policy: str, memory: Path) -> Trace:
     Args:
         memory: where the calibrated memory was saved.
     """
-    monitor = _memory(memory)
+    monitor = _memory(memory, memory.stat().st_mtime_ns)
     env = guarded(environment(env_id), monitor, trial)
     infos: list[dict[str, Any]] = []
-    success = rollout(env, make_policy(policy, env, seed=trial.seed), trial.seed, infos.append)
+    try:
+        success = rollout(env, make_policy(policy, env, seed=trial.seed), trial.seed, infos.append)
+    finally:
+        env.get_wrapper_attr("undo_faults")()  # the next trial has wrappers of its own around the same environment
     asm = [info["asm"] for info in infos]
     return Trace(
         condition=trial.condition,

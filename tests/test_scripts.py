@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from asm_gym.evaluation.metrics import Share
 from asm_gym.evaluation.trace import POLICY_ALONE
-from asm_gym.faults import Push
+from asm_gym.faults import FrozenEncoder, Push
 from asm_gym.scripts import demo
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.collect import collect, episode_seeds
@@ -127,7 +128,23 @@ def test_a_bad_argument_is_refused_before_anything_is_written(arguments, message
     assert not (tmp_path / "out").exists()
 
 
+def test_what_is_infinite_or_undefined_is_null_in_the_json():
+    content = {"delay": float("inf"), "rates": [float("nan"), 1.0], "share": Share(1, 2), "n": 3, "s": "inf"}
+    assert demo._finite(content) == {"delay": None, "rates": [None, 1.0], "share": {"k": 1, "n": 2}, "n": 3, "s": "inf"}
+
+
 def test_quick_keeps_the_calibration_that_the_rate_needs():
     args = demo.Args(quick=True).scaled()
     assert args.calibration_episodes >= 19
     assert args.faulty_episodes < demo.Args().faulty_episodes
+
+
+def test_a_fault_of_one_trial_does_not_reach_into_the_next(folder):
+    def trace(condition, faults):
+        return watch(Trial(condition, faults, POLICY_ALONE, seed=9), "asm_gym/Lift-v0", "scripted", folder / "lift.asm")
+
+    before = trace("nominal", ())
+    faulty = trace("frozen", (FrozenEncoder(onset=10),))
+    after = trace("nominal", ())
+    assert not np.array_equal(before.surprise, faulty.surprise)
+    np.testing.assert_array_equal(before.surprise, after.surprise)

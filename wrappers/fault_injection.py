@@ -44,7 +44,7 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._step = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        self._undo()  # before the reset: a hard one replaces the model, a soft one keeps it
+        self.undo_faults()  # before the reset: a hard one replaces the model, a soft one keeps it
         self._step = 0
         observation, info = self.env.reset(seed=seed, options=options)
         info["fault"] = ()
@@ -62,10 +62,11 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
-        self._undo()
+        self.undo_faults()
         super().close()
 
-    def _undo(self) -> None:
+    def undo_faults(self) -> None:
+        """Ends every fault that acts now and puts back what it changed, as ``reset`` and ``close`` do."""
         # Last begun, first undone, so that edits of one number come off in the order they went on.
         while self._running:
             self._running.popitem()[1].close()
