@@ -6,6 +6,9 @@ import atexit
 import os
 import sys
 import weakref
+from contextlib import suppress
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 import mujoco
@@ -88,6 +91,10 @@ def _gl_context(width: int, height: int) -> Any:
     Raises:
         RuntimeError: there is none to be had on this machine.
     """
+    # PyTorch's CUDA builds bring triton, whose LLVM ends the process when it is loaded after Mesa's; before it is fine.
+    if find_spec("triton") is not None:
+        with suppress(ImportError):
+            import_module("triton")
     try:
         # mujoco.Renderer would take GLFW here, which needs a display, unless MUJOCO_GL was set before MuJoCo's import.
         if sys.platform == "darwin":
