@@ -109,6 +109,9 @@ def test_a_fault_that_the_robot_cannot_have_is_refused(lift, fault, message):
         (lambda: Push(duration=0), "duration.*0"),
         (lambda: Push(newtons=float("nan")), "newtons.*nan"),
         (lambda: Push(direction=(0, 0, 0)), "direction"),
+        (lambda: Push(direction=(float("inf"), 0, 0)), "direction"),
+        (lambda: Push(onset=2.5), "onset.*2.5"),
+        (lambda: WeakJoint(joint=1.5), "joint.*1.5"),
         (lambda: WeakJoint(strength=1.5), "strength.*1.5"),
     ],
 )
@@ -127,6 +130,13 @@ def test_faults_need_one_of_our_environments(lift):
         FaultInjection(FakeEnv(), [])
     with pytest.raises(TypeError, match="push"):
         FaultInjection(lift, ["push"])
+
+
+def test_faults_that_could_not_be_undone_one_by_one_are_refused(lift):
+    with pytest.raises(ValueError, match="one joint"):
+        FaultInjection(lift, [WeakJoint(joint=3, onset=0), WeakJoint(joint=3, onset=5)])
+    with pytest.raises(ValueError, match="FaultInjection already"):
+        FaultInjection(FaultInjection(lift, []), [Push()])
 
 
 def test_closing_undoes_a_running_fault():

@@ -9,7 +9,7 @@ import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults import Fault
+from asm_gym.faults import Fault, WeakJoint
 
 
 class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -23,7 +23,8 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Raises:
         TypeError: the environment is not one of this package's, or an item is not a Fault.
-        ValueError: a fault that this environment cannot have (an unknown body or joint, an onset past the horizon).
+        ValueError: a fault that this environment cannot have (an unknown body or joint, an onset past the horizon),
+            two weaknesses of one joint, or an environment that has a FaultInjection already.
     """
 
     def __init__(self, env: gym.Env[Any, Any], faults: Sequence[Fault]) -> None:
@@ -32,6 +33,11 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         inner = env.unwrapped
         if not isinstance(inner, RobosuiteEnv):
             raise TypeError(f"faults are injected into robosuite environments of asm_gym, got {inner}")
+        if env.has_wrapper_attr("undo_faults"):
+            raise ValueError("this environment has a FaultInjection already: give one of them all the faults")
+        weak = [fault.joint for fault in faults if isinstance(fault, WeakJoint)]
+        if len(set(weak)) < len(weak):
+            raise ValueError(f"two WeakJoint faults on one joint cannot be undone one by one, got joints {weak}")
         for fault in faults:
             if not isinstance(fault, Fault):
                 raise TypeError(f"faults must be asm_gym.faults.Fault objects, got {fault!r}")

@@ -28,6 +28,10 @@ class Fault(ABC):
     duration: int | None = None
 
     def __post_init__(self) -> None:
+        for name in ("onset", "duration", "joint"):
+            value = getattr(self, name, None)
+            if value is not None and (isinstance(value, bool) or not isinstance(value, int | np.integer)):
+                raise ValueError(f"{name} must be a whole number, got {value!r}")
         if self.onset < 0:
             raise ValueError(f"onset must be >= 0, got {self.onset}")
         if self.duration is not None and self.duration < 1:

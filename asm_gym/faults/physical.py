@@ -29,8 +29,8 @@ class Push(Fault):
         super().__post_init__()
         if not np.isfinite(self.newtons):
             raise ValueError(f"newtons must be finite, got {self.newtons}")
-        if len(self.direction) != 3 or not np.linalg.norm(self.direction) > 0:
-            raise ValueError(f"direction must be three numbers, not all zero, got {self.direction}")
+        if len(self.direction) != 3 or not 0 < np.linalg.norm(self.direction) < np.inf:
+            raise ValueError(f"direction must be three finite numbers, not all zero, got {self.direction}")
 
     def check(self, env: RobosuiteEnv) -> None:
         body_id(env, self.body)
