@@ -16,21 +16,45 @@ class TaskSpec:
         name: robosuite's name; the Gymnasium id is ``asm_gym/<name>-v0``.
         horizon: control steps before an episode is truncated, at the default 20 Hz.
         success: what ``info["success"]`` means.
-        robot: the default arm.
+        arms: how many robots it takes.
     """
 
     name: str
     horizon: int
     success: str
-    robot: str = "Panda"
+    arms: int = 1
 
     @property
     def id(self) -> str:
         return f"asm_gym/{self.name}-v0"
 
 
+_ON_PEG = "its nut is around its peg, and the hand has let go of it"
+_IN_BIN = "its object is in its bin, and the hand has left it"
+
 TASKS = {
-    task.name: task for task in (TaskSpec("Lift", horizon=100, success="the cube is more than 4 cm above the table"),)
+    task.name: task
+    for task in (
+        TaskSpec("Lift", 100, "the cube is more than 4 cm above the table"),
+        TaskSpec("Stack", 200, "the red cube lies on the green one, and the hand has let go of it"),
+        TaskSpec("Door", 200, "the door stands open by more than 0.3 rad"),
+        TaskSpec("Wipe", 400, "every marker on the table is wiped off"),
+        TaskSpec("ToolHang", 700, "the frame stands in its base and the tool hangs on it"),
+        TaskSpec("NutAssembly", 700, "both nuts are around their pegs, and the hand has let go of them"),
+        TaskSpec("NutAssemblySingle", 350, _ON_PEG),
+        TaskSpec("NutAssemblySquare", 350, _ON_PEG),
+        TaskSpec("NutAssemblyRound", 350, _ON_PEG),
+        TaskSpec("PickPlace", 1000, "all four objects are in their bins, and the hand has left them"),
+        TaskSpec("PickPlaceSingle", 300, _IN_BIN),
+        TaskSpec("PickPlaceCan", 300, _IN_BIN),
+        TaskSpec("PickPlaceMilk", 300, _IN_BIN),
+        TaskSpec("PickPlaceBread", 300, _IN_BIN),
+        TaskSpec("PickPlaceCereal", 300, _IN_BIN),
+        TaskSpec("TwoArmLift", 200, "the pot is more than 10 cm above the table", arms=2),
+        TaskSpec("TwoArmPegInHole", 300, "the peg is in the hole and aligned with it", arms=2),
+        TaskSpec("TwoArmHandover", 400, "the second arm alone holds the hammer by its handle, off the table", arms=2),
+        TaskSpec("TwoArmTransport", 700, "the payload is in the target bin and the trash in the trash bin", arms=2),
+    )
 }
 """Every task by its name."""
 

@@ -105,7 +105,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         render_size: tuple[int, int] = (480, 480),
     ) -> None:
         self.task = task_spec(task)
-        self.robot = robot or self.task.robot
+        self.robot = robot or "Panda"
         _check_choice("robot", self.robot, ROBOTS)
         _check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         _check_choice("observation", observation, ("flat", "dict"))
@@ -160,9 +160,10 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         env = self.robosuite_env
         self._arms = [ArmSensors(r, a, "", self.substeps) for r in env.robots for a in r.arms if a in r.gripper]
         self._contact = ContactForce(env.robots)
-        self._objects = {n: o for n, o in env._observables.items() if o.modality == "object"}
+        self._objects = {n: o for n, o in env._observables.items() if o.modality == "object" and o.is_active()}
         # Object observables compute positions relative to the hand out of these.
-        self._object_inputs = [o for n, o in env._observables.items() if n.endswith(("eef_pos", "eef_quat"))]
+        inputs = ("robot0_eef_pos", "robot0_eef_quat", "world_pose_in_gripper")
+        self._object_inputs = [env._observables[n] for n in inputs if n in env._observables]
         self._data: mujoco.MjData = env.sim.data._data
         self._model: mujoco.MjModel = env.sim.model._model
 
