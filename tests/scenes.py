@@ -15,6 +15,7 @@ from asm_gym.envs.rewards import Rewards, RewardTerms
 from asm_gym.envs.robosuite_env import _import_robosuite
 from asm_gym.tasks import TASKS
 
+UP = np.array([0.0, 0.0, 1.0])
 STATE = ("wiped_markers", "collisions", "f_excess", "objects_on_pegs", "objects_in_bins")
 """What robosuite's rewards remember."""
 
@@ -136,3 +137,8 @@ class Scene:
         for name, value in before.items():
             setattr(self.env, name, value)
         return self.compare()
+
+
+def of(*tasks: str) -> pytest.MarkDecorator:
+    """Runs a test in a scene of each of these tasks."""
+    return pytest.mark.parametrize("kept_scene", tasks, indirect=True)

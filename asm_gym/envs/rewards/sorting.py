@@ -34,7 +34,7 @@ class Sorting(TaskReward):
         self._contacts = Contacts(env, *fingerpads(env.robots[0]), *(o.contact_geoms for o in objects))
 
     @abstractmethod
-    def _placed(self) -> Any:
+    def _remembered(self) -> Any:
         """robosuite's own array of which objects are placed."""
 
     @abstractmethod
@@ -55,11 +55,12 @@ class Sorting(TaskReward):
     def __call__(self) -> RewardTerms:
         hand = self.data.site_xpos[self.hand].tolist()
         positions = self.data.xpos[self._bodies].tolist()
-        placed = self._placed()
-        for i, position in enumerate(positions):
-            away = 1 - math.tanh(10.0 * math.dist(hand, position)) < _LET_GO
-            placed[i] = int(away and self._is_at_target(i, position))
-        done = float(placed.sum())
+        placed = [
+            1 - math.tanh(10.0 * math.dist(hand, position)) < _LET_GO and self._is_at_target(i, position)
+            for i, position in enumerate(positions)
+        ]
+        self._remembered()[:] = placed
+        done = sum(placed)
         solved = done == len(positions) if self._all else done > 0
         if not self.dense:
             return self.reward(solved, success=done)
@@ -97,7 +98,7 @@ class NutAssembly(Sorting):
         self._table = env.table_body_id
         self._table_top = env.table_offset[2]
 
-    def _placed(self) -> Any:
+    def _remembered(self) -> Any:
         return self.env.objects_on_pegs
 
     def _is_at_target(self, i: int, position: Sequence[float]) -> bool:
@@ -126,7 +127,7 @@ class PickPlace(Sorting):
         self._quarter = width / 4.0, depth / 4.0
         self._targets = [env.target_bin_placements[env.object_to_id[o.name.lower()], :2].tolist() for o in env.objects]
 
-    def _placed(self) -> Any:
+    def _remembered(self) -> Any:
         return self.env.objects_in_bins
 
     def _is_at_target(self, i: int, position: Sequence[float]) -> bool:
