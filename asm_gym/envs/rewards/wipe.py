@@ -100,16 +100,16 @@ class Wipe(TaskReward):
         y = (c - origin) / math.dist(c, origin)
         normal = np.array([x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]])
         normal /= math.hypot(*normal)
-        plane = np.stack([x, y], axis=1)  # (3, 2)
+        plane = np.array([x, y]).T  # (3, 2)
         height = (positions - origin) @ normal  # (markers,)
         near: NDArray[np.bool_] = (height > 0.0) & (height < 0.02)
         if not near.any():
             return near
         points = (positions - height[:, None] * normal - origin) @ plane  # (markers, 2)
-        corners = (np.stack([a, origin, c, b]) - origin) @ plane  # (4, 2), in the order they stand around the face
-        edges = np.roll(corners, -1, axis=0) - corners
-        across = points[:, None] - corners  # (markers, 4, 2)
-        within: NDArray[np.bool_] = (edges[:, 0] * across[..., 1] - across[..., 0] * edges[:, 1] < 0).all(axis=1)
+        corners = (np.array([a, origin, c, b]) - origin) @ plane  # (4, 2), in the order they stand around the face
+        edges = corners[[1, 2, 3, 0]] - corners
+        dx, dy = points[:, :1] - corners[:, 0], points[:, 1:] - corners[:, 1]  # (markers, 4)
+        within: NDArray[np.bool_] = (edges[:, 0] * dy < dx * edges[:, 1]).all(axis=1)
         return near & within
 
     def _shaping(self, dirt: NDArray[np.float64]) -> dict[str, float]:
