@@ -9,13 +9,20 @@ import weakref
 from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-_live: weakref.WeakSet[OffscreenRenderer] = weakref.WeakSet()
+
+class Closeable(Protocol):
+    """What holds a part of OpenGL."""
+
+    def close(self) -> None: ...
+
+
+_live: weakref.WeakSet[Closeable] = weakref.WeakSet()
 
 
 def _close_all() -> None:
@@ -24,15 +31,14 @@ def _close_all() -> None:
 
 
 class OffscreenRenderer:
-    """Renders one camera without a display; follows the model when a hard reset replaces it.
+    """Pictures without a display, of any camera and size through one OpenGL context; follows a model's replacement.
 
     OpenGL comes from EGL, or from OSMesa where the environment variable ``MUJOCO_GL`` says ``osmesa``. Shadows,
     reflections and multisampling are off: on a CPU they cost three times the rest.
 
     Args:
-        camera: a camera of the model.
-        width: [pixels].
-        height: [pixels].
+        camera: the camera of a picture that names none.
+        width, height: the size of a picture that names none [pixels].
     """
 
     def __init__(self, camera: str, width: int, height: int) -> None:
@@ -40,30 +46,75 @@ class OffscreenRenderer:
         self._model: mujoco.MjModel | None = None
         self._gl: Any = None
         self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._options = mujoco.MjvOption()
         self._options.geomgroup[0] = 0  # collision shapes
-        self._viewport = mujoco.MjrRect(0, 0, width, height)
 
-    def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """(height, width, 3) uint8."""
+    def render(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        camera: str | None = None,
+        size: tuple[int, int] | None = None,
+    ) -> NDArray[np.uint8]:
+        """(height, width, 3) uint8.
+
+        Args:
+            size: (height, width) [pixels].
+
+        Raises:
+            ValueError: the model has no such camera.
+            RuntimeError: this machine has no OpenGL.
+        """
+        viewport = self._draw(model, data, camera, size)
+        picture = np.empty((viewport.height, viewport.width, 3), np.uint8)
+        mujoco.mjr_readPixels(picture, None, viewport, self._context)
+        return np.flipud(picture).copy()
+
+    def depth(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        camera: str | None = None,
+        size: tuple[int, int] | None = None,
+    ) -> NDArray[np.float32]:
+        """(height, width) float32: distance from the camera along its viewing direction [m], not along each ray.
+
+        The buffer holds b, which is linear in 1/z from 1 at the near plane to 0 at the far one, so
+
+            1/z = 1/far + b (1/near - 1/far).
+
+        Where there is nothing, z is the far plane's. Arguments and errors are those of ``render``.
+        """
+        viewport = self._draw(model, data, camera, size)
+        buffer = np.empty((viewport.height, viewport.width), np.float32)
+        mujoco.mjr_readPixels(None, buffer, viewport, self._context)
+        near, far = (plane * model.stat.extent for plane in (model.vis.map.znear, model.vis.map.zfar))
+        inverse = 1 / far + buffer.astype(np.float64) * (1 / near - 1 / far)
+        return np.flipud(1 / inverse).astype(np.float32)
+
+    def _draw(
+        self, model: mujoco.MjModel, data: mujoco.MjData, camera: str | None, size: tuple[int, int] | None
+    ) -> mujoco.MjrRect:
+        height, width = size or (self.height, self.width)
+        self._camera.fixedcamid = camera_id(model, self.camera if camera is None else camera)
         if self._model is not model:
             self._open(model)
         self._gl.make_current()
-        mujoco.mjv_updateScene(
-            model, data, self._options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
-        )
-        mujoco.mjr_render(self._viewport, self._scene, self._context)
-        frame = np.empty((self.height, self.width, 3), np.uint8)
-        mujoco.mjr_readPixels(frame, None, self._viewport, self._context)
-        return np.flipud(frame).copy()
+        if width > self._context.offWidth or height > self._context.offHeight:
+            mujoco.mjr_resizeOffscreen(
+                max(width, self._context.offWidth), max(height, self._context.offHeight), self._context
+            )
+        every = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(model, data, self._options, None, self._camera, every, self._scene)
+        viewport = mujoco.MjrRect(0, 0, width, height)
+        mujoco.mjr_render(viewport, self._scene, self._context)
+        return viewport
 
     def _open(self, model: mujoco.MjModel) -> None:
         self.close()
         self._gl = _gl_context(self.width, self.height)
-        # At exit too: registered after OpenGL was imported, so it runs before OpenGL's own clean-up.
-        if not _live:
-            atexit.register(_close_all)
-        _live.add(self)
+        close_at_exit(self)
         self._gl.make_current()
         model.vis.quality.offsamples = 0
         model.vis.global_.offwidth, model.vis.global_.offheight = self.width, self.height
@@ -71,9 +122,9 @@ class OffscreenRenderer:
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[flag] = 0
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        # Zero far away, where floats are dense, keeps depth exact at a distance.
+        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, self.camera)
         self._model = model
 
     def close(self) -> None:
@@ -83,6 +134,27 @@ class OffscreenRenderer:
                 self._context.free()
             self._gl.free()
         self._gl = self._model = None
+
+
+def close_at_exit(renderer: Closeable) -> None:
+    """Closes what uses OpenGL before OpenGL itself is cleaned up, if it still exists then."""
+    _live.add(renderer)
+    # The last to be registered is the first to run, and OpenGL has registered its own by now.
+    atexit.unregister(_close_all)
+    atexit.register(_close_all)
+
+
+def camera_id(model: mujoco.MjModel, name: str) -> int:
+    """The id of a camera.
+
+    Raises:
+        ValueError: there is none of this name; the message lists those that exist.
+    """
+    found = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name))
+    if found < 0:
+        known = (str(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, i)) for i in range(model.ncam))
+        raise ValueError(f"unknown camera {name!r}; known: {', '.join(known)}")
+    return found
 
 
 def _gl_context(width: int, height: int) -> Any:

@@ -1,0 +1,215 @@
+"""Pictures and depths of a scene whose geometry is known, and the window for humans."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from asm_gym.envs import viewer
+from asm_gym.envs.rendering import OffscreenRenderer
+from asm_gym.envs.viewer import HumanViewer
+from asm_gym.scripts.doctor import rendering_backend
+
+SCENE = """
+<mujoco>
+  <statistic extent="3"/>
+  <visual><map znear="0.01" zfar="30"/></visual>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <camera name="above" pos="0 0 2"/>
+    <camera name="aslant" pos="0 -2 1.5" xyaxes="1 0 0 0 0.6 0.8"/>
+    <camera name="sky" pos="0 0 1" euler="180 0 0"/>
+    <geom type="plane" size="5 5 0.1" group="1" rgba="0.2 0.2 0.8 1"/>
+    <geom type="box" size="0.3 0.2 0.25" pos="0 0 0.25" group="1" rgba="{} 1"/>
+    <geom type="box" size="1 1 0.1" pos="0 0 1" group="0"/>
+  </worldbody>
+</mujoco>
+"""
+with_opengl = pytest.mark.skipif(rendering_backend() is None, reason="this machine has no OpenGL to render with")
+
+
+def scene(colour: str = "0.9 0.1 0.1") -> tuple[mujoco.MjModel, mujoco.MjData]:
+    model = mujoco.MjModel.from_xml_string(SCENE.format(colour))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+@pytest.fixture
+def renderer() -> Any:
+    renderer = OffscreenRenderer("above", 64, 48)
+    yield renderer
+    renderer.close()
+
+
+@with_opengl
+def test_cameras_and_sizes_share_one_context(renderer: OffscreenRenderer) -> None:
+    model, data = scene()
+    first = renderer.render(model, data)
+    assert first.shape == (48, 64, 3)
+    assert first.dtype == np.uint8
+    assert first[24, 32, 0] > first[24, 32, 2], "the box, red; the shape above it is for collisions alone"
+    assert first[2, 2, 2] > first[2, 2, 0], "the floor, blue"
+    context = renderer._gl
+    for camera, size in (("aslant", (240, 100)), ("above", (10, 12)), ("aslant", (50, 300))):
+        picture = renderer.render(model, data, camera, size)
+        assert picture.shape == (*size, 3)
+        assert picture.std() > 10
+        assert not np.array_equal(picture, renderer.render(model, data, "above", size)) or camera == "above"
+    np.testing.assert_array_equal(renderer.render(model, data), first)
+    assert renderer._gl is context
+
+
+@with_opengl
+def test_another_model_is_followed_and_closing_twice_is_harmless(renderer: OffscreenRenderer) -> None:
+    red = renderer.render(*scene())
+    green = renderer.render(*scene("0.1 0.9 0.1"))
+    assert green[24, 32, 1] > green[24, 32, 0]
+    renderer.close()
+    renderer.close()
+    np.testing.assert_array_equal(renderer.render(*scene()), red)
+
+
+@with_opengl
+def test_depth_is_the_height_above_what_lies_below(renderer: OffscreenRenderer) -> None:
+    depth = renderer.depth(*scene())
+    assert depth.shape == (48, 64)
+    assert depth.dtype == np.float32
+    assert depth[24, 32] == pytest.approx(1.5, abs=1e-4)
+    # The floor is 2 m away along the viewing direction in the corners too, though further along their rays.
+    np.testing.assert_allclose(depth[[0, 0, -1, -1], [0, -1, 0, -1]], 2.0, atol=1e-4)
+
+
+@with_opengl
+def test_depth_agrees_with_rays(renderer: OffscreenRenderer) -> None:
+    model, data = scene()
+    height, width = 60, 80
+    depth = renderer.depth(model, data, "aslant", (height, width))
+    camera = model.camera("aslant").id
+    slope = np.tan(np.radians(model.cam_fovy[camera]) / 2) / (height / 2)
+    visible, hit = np.array([0, 1, 1, 1, 1, 1], np.uint8), np.zeros(1, np.int32)
+    rays = np.empty((height, width))
+    for v, u in np.ndindex(height, width):
+        ray = np.array([(u + 0.5 - width / 2) * slope, (height / 2 - v - 0.5) * slope, -1.0])
+        length = np.linalg.norm(ray)
+        towards = data.cam_xmat[camera].reshape(3, 3) @ ray / length
+        along = mujoco.mj_ray(model, data, data.cam_xpos[camera], towards, visible, 1, -1, hit)
+        rays[v, u] = along / length
+    assert rays.min() > 0
+    # Pixels on an edge may show either side of it.
+    assert np.mean(np.abs(depth - rays) < 1e-3 * rays) > 0.97
+
+
+@with_opengl
+def test_depth_of_nothing_is_the_far_plane(renderer: OffscreenRenderer) -> None:
+    np.testing.assert_allclose(renderer.depth(*scene(), "sky"), 90.0, rtol=1e-5)
+
+
+@with_opengl
+def test_an_unknown_camera_is_refused(renderer: OffscreenRenderer) -> None:
+    with pytest.raises(ValueError, match="unknown camera 'below'; known: above, aslant, sky"):
+        renderer.render(*scene(), "below")
+
+
+class Window:
+    """Stands for MuJoCo's viewer; notes what is shown."""
+
+    opened: list[Window] = []  # noqa: RUF012
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, **_: Any) -> None:
+        self.m: Any = model
+        self.data = data
+        self.shown: list[float] = []
+        self.cam, self.opt = mujoco.MjvCamera(), mujoco.MjvOption()
+        Window.opened.append(self)
+
+    def is_running(self) -> bool:
+        return self.m is not None
+
+    def lock(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
+    def sync(self) -> None:
+        self.shown.append(self.data.time)
+
+    def close(self) -> None:
+        self.m = None
+
+
+@pytest.fixture
+def windows(monkeypatch: pytest.MonkeyPatch) -> list[Window]:
+    monkeypatch.setattr(viewer, "_window_launcher", lambda: Window)
+    monkeypatch.setattr(Window, "opened", [])
+    return Window.opened
+
+
+def test_a_window_shows_every_state_and_follows_another_model(windows: list[Window]) -> None:
+    human = HumanViewer("aslant")
+    assert not human.is_open
+    for k in range(2):
+        model, data = scene()
+        for time in (0.1, 0.2):
+            data.time = time
+            human.show(model, data)
+        assert human.is_open
+        assert len(windows) == k + 1
+        assert windows[k].shown == [0.1, 0.2]
+        assert windows[k].data is not data, "what is done in the window must not reach the simulation"
+        assert windows[k].cam.fixedcamid == model.camera("aslant").id
+    assert not windows[0].is_running()
+    human.close()
+    human.close()
+    assert not windows[1].is_running()
+
+
+def test_a_window_its_user_closed_stays_closed(windows: list[Window]) -> None:
+    human, (model, data) = HumanViewer(), scene()
+    human.show(model, data)
+    windows[0].close()
+    human.show(model, data)
+    assert not human.is_open
+    assert len(windows) == 1
+
+
+SHOW = """
+import sys
+from tests.test_rendering import HumanViewer, scene
+human = HumanViewer("aslant")
+for model, data in (scene(), scene("0.1 0.9 0.1")):
+    before = data.qacc_warmstart.tobytes() + data.xpos.tobytes()
+    for _ in range(20):
+        human.show(model, data)
+    assert human.is_open
+    assert before == data.qacc_warmstart.tobytes() + data.xpos.tobytes()
+human.close()
+human.close()
+human.show(model, data)  # left open: it closes at exit
+print("shown")
+"""
+
+
+def show(**environment: str) -> subprocess.CompletedProcess[str]:
+    clean = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    command = [sys.executable, "-c", SHOW]
+    return subprocess.run(command, env=clean | environment, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
+def test_without_a_display_the_error_says_what_is_missing() -> None:
+    done = show()
+    assert done.returncode == 1
+    assert "RuntimeError: no window for render_mode='human'" in done.stderr
+    assert "DISPLAY" in done.stderr
+
+
+@pytest.mark.skipif(not os.environ.get("DISPLAY"), reason="no display")
+def test_a_real_window_opens_twice_and_closes() -> None:
+    done = show(DISPLAY=os.environ["DISPLAY"])
+    assert (done.returncode, done.stdout) == (0, "shown\n"), done.stderr
