@@ -179,14 +179,15 @@ def test_a_window_its_user_closed_stays_closed(windows: list[Window]) -> None:
 
 
 SHOW = """
-import sys
-from tests.test_rendering import HumanViewer, scene
+from tests.test_rendering import HumanViewer, OffscreenRenderer, rendering_backend, scene
 human = HumanViewer("aslant")
 for model, data in (scene(), scene("0.1 0.9 0.1")):
     before = data.qacc_warmstart.tobytes() + data.xpos.tobytes()
     for _ in range(20):
         human.show(model, data)
     assert human.is_open
+    if rendering_backend():  # leaves its own context current in this thread
+        OffscreenRenderer("above", 64, 48).render(model, data)
     assert before == data.qacc_warmstart.tobytes() + data.xpos.tobytes()
 human.close()
 human.close()

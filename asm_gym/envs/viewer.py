@@ -6,8 +6,10 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from copy import copy
+from functools import cache
 from typing import Any, cast
 
 import mujoco
@@ -75,6 +77,7 @@ class HumanViewer:
         self._viewer = self._model = None
 
 
+@cache
 def _window_launcher() -> Callable[..., Any]:
     """MuJoCo's own, once it is known to work: it waits for ever for a window that cannot be opened.
 
@@ -87,18 +90,26 @@ def _window_launcher() -> Callable[..., Any]:
     except ImportError as error:
         raise RuntimeError(f"no window for render_mode='human': {error}") from error
     if sys.platform != "darwin":  # there MuJoCo says itself what it needs
-        with warnings.catch_warnings(record=True) as complaints:
-            warnings.simplefilter("always")
-            window = None
-            if glfw.init():
-                glfw.window_hint(glfw.VISIBLE, False)
-                window = glfw.create_window(64, 64, "", None, None)
-                glfw.default_window_hints()
-        if window is None:
-            reasons = "; ".join(str(complaint.message) for complaint in complaints) or "GLFW does not say why"
+        # In a thread of its own: one that has an offscreen context current cannot make a window's current.
+        with ThreadPoolExecutor(1) as thread:
+            complaint = thread.submit(_complaint_about_windows, glfw).result()
+        if complaint:
             raise RuntimeError(
-                f"no window for render_mode='human': {reasons}. It needs a display with OpenGL, which the environment "
-                "variable DISPLAY or WAYLAND_DISPLAY names; render_mode='rgb_array' needs none."
+                f"no window for render_mode='human': {complaint}. It needs a display with OpenGL, which the "
+                "environment variable DISPLAY or WAYLAND_DISPLAY names; render_mode='rgb_array' needs none."
             )
-        glfw.destroy_window(window)
     return cast(Callable[..., Any], launch_passive)
+
+
+def _complaint_about_windows(glfw: Any) -> str:
+    """Why no window can be opened; empty where one can."""
+    with warnings.catch_warnings(record=True) as complaints:
+        warnings.simplefilter("always")
+        if glfw.init():
+            glfw.window_hint(glfw.VISIBLE, False)
+            window = glfw.create_window(64, 64, "", None, None)
+            glfw.default_window_hints()
+            if window:
+                glfw.destroy_window(window)
+                return ""
+    return "; ".join(str(complaint.message) for complaint in complaints) or "GLFW does not say why"
