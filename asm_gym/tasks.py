@@ -17,12 +17,14 @@ class TaskSpec:
         horizon: control steps before an episode is truncated, at the default 20 Hz.
         success: what ``info["success"]`` means.
         arms: how many robots it takes.
+        draws_shapes: robosuite draws the shapes of its objects, and can do so only when it loads the model.
     """
 
     name: str
     horizon: int
     success: str
     arms: int = 1
+    draws_shapes: bool = False
 
     @property
     def id(self) -> str:
@@ -35,7 +37,7 @@ _IN_BIN = "its object is in its bin, and the hand has left it"
 TASKS = {
     task.name: task
     for task in (
-        TaskSpec("Lift", 100, "the cube is more than 4 cm above the table"),
+        TaskSpec("Lift", 100, "the cube is more than 4 cm above the table", draws_shapes=True),
         TaskSpec("Stack", 200, "the red cube lies on the green one, and the hand has let go of it"),
         TaskSpec("Door", 200, "the door stands open by more than 0.3 rad"),
         TaskSpec("Wipe", 400, "every marker on the table is wiped off"),
@@ -51,9 +53,21 @@ TASKS = {
         TaskSpec("PickPlaceBread", 300, _IN_BIN),
         TaskSpec("PickPlaceCereal", 300, _IN_BIN),
         TaskSpec("TwoArmLift", 200, "the pot is more than 10 cm above the table", arms=2),
-        TaskSpec("TwoArmPegInHole", 300, "the peg is in the hole and aligned with it", arms=2),
-        TaskSpec("TwoArmHandover", 400, "the second arm alone holds the hammer by its handle, off the table", arms=2),
-        TaskSpec("TwoArmTransport", 700, "the payload is in the target bin and the trash in the trash bin", arms=2),
+        TaskSpec("TwoArmPegInHole", 300, "the peg is in the hole and aligned with it", arms=2, draws_shapes=True),
+        TaskSpec(
+            "TwoArmHandover",
+            400,
+            "the second arm alone holds the hammer by its handle, off the table",
+            arms=2,
+            draws_shapes=True,
+        ),
+        TaskSpec(
+            "TwoArmTransport",
+            700,
+            "the payload is in the target bin and the trash in the trash bin",
+            arms=2,
+            draws_shapes=True,
+        ),
     )
 }
 """Every task by its name."""

@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from asm_gym.envs.backend import import_robosuite
 from asm_gym.envs.rewards import Rewards, RewardTerms
-from asm_gym.envs.robosuite_env import _import_robosuite
 from asm_gym.tasks import TASKS
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -25,7 +25,7 @@ class Scene:
 
     def __init__(self, task: str) -> None:
         self.task = task
-        self.env = _import_robosuite().make(
+        self.env = import_robosuite().make(
             task,
             robots=["Panda"] * TASKS[task].arms if TASKS[task].arms > 1 else "Panda",
             has_renderer=False,

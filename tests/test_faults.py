@@ -49,15 +49,15 @@ def test_a_reset_in_the_middle_of_a_fault_leaves_nothing_of_it(lift, fault, seed
     # A soft reset goes on with the generators, so both first episodes must be of one length, not of one course.
     np.testing.assert_array_equal(second_episode(FaultInjection(lift, [fault])), second_episode(lift))
     assert lift.unwrapped.corruptions == []
-    assert not lift.unwrapped._data.xfrc_applied.any()
-    np.testing.assert_array_equal(lift.unwrapped._model.actuator_gear[:7, 0], 1.0)
+    assert not lift.unwrapped.simulation.data.xfrc_applied.any()
+    np.testing.assert_array_equal(lift.unwrapped.simulation.model.actuator_gear[:7, 0], 1.0)
 
 
 def test_an_active_weak_joint_is_an_edit_of_the_model_that_a_soft_reset_undoes(lift):
     env = FaultInjection(lift, [WeakJoint(joint=2, strength=0.25, onset=0)])
     env.reset(seed=0)
     env.step(np.zeros(7, np.float32))
-    gear = lift.unwrapped._model.actuator_gear
+    gear = lift.unwrapped.simulation.model.actuator_gear
     assert gear[2, 0] == 0.25
     env.reset()
     assert gear[2, 0] == 1.0

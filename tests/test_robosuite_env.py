@@ -141,7 +141,7 @@ def test_external_torque_is_the_force_on_a_body_seen_from_the_joints():
     rest = np.zeros(7, np.float32)
     for _ in range(20):
         env.step(rest)
-    model, data = env.unwrapped._model, env.unwrapped._data
+    model, data = env.unwrapped.simulation.model, env.unwrapped.simulation.data
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "robot0_link5")
     force = np.array([3.0, 10.0, -5.0])
     data.xfrc_applied[body, :3] = force
@@ -172,16 +172,16 @@ def test_a_dict_observation_holds_the_same_numbers_as_the_flat_one(lift):
 def test_start_noise_is_a_reset_option(lift):
     env = lift.unwrapped
     env.reset(seed=0, options={"qpos_noise": 0.0})
-    np.testing.assert_array_equal(env._data.qpos[:7], env.robosuite_env.robots[0].init_qpos)
+    np.testing.assert_array_equal(env.simulation.data.qpos[:7], env.robosuite_env.robots[0].init_qpos)
     env.reset(seed=0)
-    assert np.abs(env._data.qpos[:7] - env.robosuite_env.robots[0].init_qpos).max() > 1e-3
+    assert np.abs(env.simulation.data.qpos[:7] - env.robosuite_env.robots[0].init_qpos).max() > 1e-3
     with pytest.raises(ValueError, match=r"'noise'.*qpos_noise"):
         env.reset(options={"noise": 1})
 
 
 def test_an_unstable_simulation_ends_the_episode_and_says_so(lift):
     lift.reset(seed=0)
-    lift.unwrapped._data.qvel[0] = 1e9
+    lift.unwrapped.simulation.data.qvel[0] = 1e9
     observation, reward, terminated, truncated, info = lift.step(np.zeros(7, np.float32))
     assert info["unstable"]
     assert truncated

@@ -1,12 +1,8 @@
-"""Robosuite tasks with Gymnasium's contract and a sensorimotor stream. The only module that imports robosuite."""
+"""Robosuite tasks with Gymnasium's contract and a sensorimotor stream."""
 
 from __future__ import annotations
 
-import logging
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from types import ModuleType
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -15,104 +11,84 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.envs.rendering import OffscreenRenderer
-from asm_gym.envs.sensors import GROUPS, ArmSensors, ContactForce
+from asm_gym.envs import backend
+from asm_gym.envs.choices import check_choice
+from asm_gym.envs.layout import Layout
+from asm_gym.envs.pictures import RENDER_MODES, Pictures
+from asm_gym.envs.rewards import Rewards
+from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS
+from asm_gym.envs.simulation import Simulation
 from asm_gym.stream import MOTOR, Channel, StreamSpec
-from asm_gym.tasks import ROBOTS
 from asm_gym.tasks import task as task_spec
 
-PHYSICS_FREQ = 500
-"""Robosuite's physics rate [Hz]."""
-
-# What of the stream a policy sees: the robot's configuration and motion, not its torques.
-_OBSERVED = (
-    "joint_position",
-    "joint_velocity",
-    "hand_position",
-    "hand_orientation",
-    "gripper_opening",
-    "gripper_velocity",
-)
-# Observations are clipped to this, which keeps the Box true; nothing a task does comes near it.
-_BOUND = 100.0
 _BAD = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-
-
-def _import_robosuite() -> Any:
-    """Robosuite, without the warnings it prints at import about optional parts."""
-    logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
-    with _opencv_or_none():
-        import robosuite
-    return robosuite
-
-
-@contextmanager
-def _opencv_or_none() -> Iterator[None]:
-    """Lets robosuite be imported where opencv cannot be, for want of libGL: only its own viewer would use it."""
-    try:
-        import cv2  # noqa: F401
-    except ImportError:
-        sys.modules["cv2"] = ModuleType("cv2")
-        try:
-            yield
-        finally:
-            del sys.modules["cv2"]
-    else:
-        yield
 
 
 class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     """One robosuite task.
 
     The observation is what the robot's own sensors report of its configuration and motion, noise included, followed by
-    the task's objects. ``info["stream"]`` (D,) float32 is one row of the sensorimotor stream that ``stream_spec``
-    names; ``info["success"]`` says whether the task is solved now; ``info["contact_force"]`` is the largest net contact
-    force on the robot within the step [N]; ``info["unstable"]`` is True when the simulation diverged, which ends the
-    episode as truncated.
+    the task's objects. ``info`` holds on reset and on every step:
+
+    - ``stream`` (D,) float32: one row of the sensorimotor stream that ``stream_spec`` names;
+    - ``success``: whether the task is solved now;
+    - ``reward_terms``: the parts of the reward by name, which add up to it (not on reset);
+    - ``contact_force``: the largest net contact force on an arm within the step [N];
+    - ``unstable``: the simulation diverged, which ends the episode as truncated.
 
     Args:
         task: a name in ``asm_gym.tasks.TASKS``.
-        robot: the arm, one of ``asm_gym.tasks.ROBOTS``.
-        render_mode: ``None`` or ``"rgb_array"``.
+        robot: the arm, one of ``asm_gym.tasks.ROBOTS``; for a task with two arms a pair, or one name for both.
+        render_mode: ``None``, ``"rgb_array"``, ``"depth_array"`` or ``"human"``.
         observation: ``"flat"`` for one Box, ``"dict"`` for named arrays.
+        cameras: adds a picture of each, ``<camera>_image`` (height, width, 3) uint8; a flat observation then becomes
+            ``state`` in a dict.
+        camera_size: (height, width) of these pictures [pixels].
         control_freq: actions a second [Hz]; must divide 500.
+        controller: one of ``asm_gym.envs.backend.CONTROLLERS``, or a robosuite controller configuration.
         horizon: control steps before truncation; the task's own where None.
-        reward_shaping: dense reward where True, 1 for success where False.
+        reward_shaping: dense reward where True, for success alone where False.
         terminate_on_success: end the episode (``terminated``) when the task is solved.
-        stream: channel groups that make up the stream, of ``joint torque hand wrench gripper object action``.
+        stream: channel groups that make up the stream, of ``joint torque hand wrench gripper action contact object``;
+            empty for none.
         sensor_noise: scales the noise of every channel; 0 for exact readings.
         camera, render_size: what ``render`` shows, and its (height, width) [pixels].
 
     Raises:
-        ValueError: an unknown task, robot, render mode, channel group or camera, or a rate that does not divide 500.
+        ValueError: an unknown task, robot, controller, render mode, channel group or camera, the wrong number of
+            robots, or a rate that does not divide 500.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 20}  # noqa: RUF012
 
     def __init__(
         self,
         task: str = "Lift",
-        robot: str | None = None,
+        robot: str | Sequence[str] | None = None,
         render_mode: str | None = None,
         observation: Literal["flat", "dict"] = "flat",
+        cameras: Sequence[str] = (),
+        camera_size: tuple[int, int] = (84, 84),
         control_freq: int = 20,
+        controller: str | dict[str, Any] = "OSC_POSE",
         horizon: int | None = None,
         reward_shaping: bool = True,
         terminate_on_success: bool = False,
-        stream: tuple[str, ...] = GROUPS,
+        stream: Sequence[str] = GROUPS,
         sensor_noise: float = 1.0,
         camera: str = "frontview",
         render_size: tuple[int, int] = (480, 480),
     ) -> None:
         self.task = task_spec(task)
-        self.robot = robot or "Panda"
-        _check_choice("robot", self.robot, ROBOTS)
-        _check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
-        _check_choice("observation", observation, ("flat", "dict"))
+        self.robots = backend.robots_for(self.task, robot)
+        check_choice("render_mode", render_mode, (None, *RENDER_MODES))
+        check_choice("observation", observation, ("flat", "dict"))
         for group in stream:
-            _check_choice("stream group", group, (*GROUPS, "object"))
-        if control_freq <= 0 or PHYSICS_FREQ % control_freq:
-            raise ValueError(f"control_freq must divide the physics rate of {PHYSICS_FREQ} Hz, got {control_freq}")
+            check_choice("stream group", group, (*GROUPS, *EXTRA_GROUPS))
+        if control_freq <= 0 or backend.PHYSICS_FREQ % control_freq:
+            raise ValueError(
+                f"control_freq must divide the physics rate of {backend.PHYSICS_FREQ} Hz, got {control_freq}"
+            )
         if sensor_noise < 0:
             raise ValueError(f"sensor_noise must be >= 0, got {sensor_noise}")
         self.horizon = self.task.horizon if horizon is None else horizon
@@ -124,28 +100,21 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.sensor_noise = sensor_noise
         self.corruptions: list[Callable[[NDArray[np.float64]], None]] = []
         """Sensor faults: each edits the measured row (channels of ``measured_spec``) in place, after the noise."""
-        self.substeps = PHYSICS_FREQ // control_freq
+        self.substep_hook: Callable[[int], None] | None = None
+        """Called after every physics substep with its number in the control step; ``measure()`` says what the sensors
+        read then, and ``command()`` gives the controllers another action for the rest of the step."""
+        self.substeps = backend.PHYSICS_FREQ // control_freq
         self._groups = tuple(stream)
         self._flat = observation == "flat"
-        self._renderer = OffscreenRenderer(camera, render_size[1], render_size[0])
         self._seeded = False
         self._ended = True
         self._steps = 0
 
-        robosuite = _import_robosuite()
-        self.robosuite_env: Any = robosuite.make(
-            self.task.name,
-            robots=self.robot,
-            has_renderer=False,
-            has_offscreen_renderer=False,
-            use_camera_obs=False,
-            control_freq=control_freq,
-            reward_shaping=reward_shaping,
-            ignore_done=True,
-        )
+        self.robosuite_env: Any = backend.make(self.task, self.robots, controller, control_freq, reward_shaping)
         """The simulator underneath."""
-        cameras = self.robosuite_env.sim.model.camera_names
-        _check_choice("camera", camera, cameras)
+        for name in (camera, *cameras):
+            check_choice("camera", name, self.robosuite_env.sim.model.camera_names)
+        self._pictures = Pictures(render_mode, camera, render_size, cameras, camera_size, 1.0 / control_freq)
         # Episodes are given their motion by the joints alone, so the initial noise is one number for every robot.
         self._qpos_noise = self.robosuite_env.robots[0].initialization_noise["magnitude"]
         self._bind()
@@ -156,43 +125,26 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     # ------------------------------------------------------------------ spaces
 
     def _bind(self) -> None:
-        """Looks up everything that belongs to the present model, which a hard reset replaces."""
-        env = self.robosuite_env
-        self._arms = [ArmSensors(r, a, "", self.substeps) for r in env.robots for a in r.arms if a in r.gripper]
-        self._contact = ContactForce(env.robots)
-        self._objects = {n: o for n, o in env._observables.items() if o.modality == "object" and o.is_active()}
-        # Object observables compute positions relative to the hand out of these.
-        inputs = ("robot0_eef_pos", "robot0_eef_quat", "world_pose_in_gripper")
-        self._object_inputs = [env._observables[n] for n in inputs if n in env._observables]
-        self._data: mujoco.MjData = env.sim.data._data
-        self._model: mujoco.MjModel = env.sim.model._model
+        """Takes up what belongs to the present model, which a hard reset replaces."""
+        self.simulation = Simulation(self.robosuite_env, self.substeps)
+        """Physics, controllers and sensors of the loaded model."""
+        self._objects = backend.ObjectSensors(self.robosuite_env, self.task)
+        self._rewards = Rewards(self.task.name, self.robosuite_env)
+        self.simulation.keeps_history = self._rewards.reads_history
 
     def _build_spaces(self) -> None:
-        low, high = self.robosuite_env.action_spec
-        self.action_space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
-        objects = tuple(Channel(name, values.size, "1", 0.0, "object") for name, values in self._read_objects().items())
-        action = Channel("action", low.size, "1", 0.0, MOTOR)
-        source = f"{self.robot}"
-        everything = (*(c for arm in self._arms for c in arm.channels), *objects, action)
-        self.measured_spec = StreamSpec(everything, self.substeps / PHYSICS_FREQ, source)
+        self._action_low, self._action_high = self.robosuite_env.action_spec
+        self.action_space = spaces.Box(-1.0, 1.0, self._action_low.shape, np.float32)
+        action = Channel("action", self._action_low.size, "1", 0.0, MOTOR)
+        everything = (*self.simulation.proprioception.channels, *self._objects.channels, action)
+        dt, source = self.substeps / backend.PHYSICS_FREQ, "+".join(self.robots)
+        self.measured_spec = StreamSpec(everything, dt, source)
         """Everything that is measured, whether or not the stream carries it."""
-        self.stream_spec = StreamSpec(
-            tuple(c for c in everything if c.group in self._groups), self.measured_spec.dt, source
-        )
-        """Names the numbers in ``info["stream"]``."""
-        slices = self.measured_spec.slices
-        self._to_stream = _indices(slices, [c.name for c in self.stream_spec.channels])
-        observed = [c.name for c in everything if c.name in _OBSERVED or c.group == "object"]
-        self._to_observation = _indices(slices, observed)
-        self._named = {name: slices[name] for name in observed}
-        self.observation_layout = {name: s.stop - s.start for name, s in self._named.items()}
-        """The observation's parts in order, and how many numbers each has."""
         self._noise = self.measured_spec.noise * self.sensor_noise
-        self.observation_space = (
-            _box(len(self._to_observation))
-            if self._flat
-            else spaces.Dict({name: _box(s.stop - s.start) for name, s in self._named.items()})
-        )
+        self._layout = Layout(self.measured_spec, self._groups, self._flat)
+        self.observation_layout = self._layout.sizes
+        """The observation's parts in order, and how many numbers each has."""
+        self.observation_space = self._layout.space(self._pictures.spaces)
 
     # ------------------------------------------------------------------ episodes
 
@@ -200,9 +152,9 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """Starts an episode.
 
         Args:
-            seed: makes the episode exact: same seed, same episode to the last bit, whatever ran before. Object shapes
-                are then drawn anew, which means loading the model again (~0.2 s). An unseeded reset goes on with the
-                same generator and keeps the model (a few ms).
+            seed: makes the episode exact: same seed, same episode to the last bit, whatever ran before. Where a task
+                draws the shapes of its objects, they are drawn anew, which means loading the model again (~0.2 s). An
+                unseeded reset goes on with the same generator and keeps the model (a few ms).
             options: ``qpos_noise``: standard deviation of the initial joint positions [rad], 0.02 by default.
 
         Raises:
@@ -211,7 +163,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         super().reset(seed=seed)
         noise = self._qpos_noise
         for name, value in (options or {}).items():
-            _check_choice("reset option", name, ("qpos_noise",))
+            check_choice("reset option", name, ("qpos_noise",))
             noise = float(value)
         env = self.robosuite_env
         # A hard reset makes the robots anew from their configurations, a soft one keeps them.
@@ -219,19 +171,22 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             robot.initialization_noise["magnitude"] = noise
             configuration["initialization_noise"] = {"magnitude": noise, "type": "gaussian"}
         if seed is not None or not self._seeded:
-            # In place: placement samplers hold the generator itself.
-            env.rng.bit_generator.state = np.random.default_rng(self.np_random.integers(2**63)).bit_generator.state
+            backend.reseed(env, self.np_random)
             self._seeded = True
-        env.hard_reset = seed is not None
+        backend.choose_object(env, self.task)
+        env.hard_reset = seed is not None and self.task.draws_shapes
         env.reset()
-        self._bind()
+        if env.hard_reset:
+            self._bind()
+        else:
+            self.simulation.begin_episode()
         self._warnings = self._bad_count()
         self._steps, self._ended = 0, False
-        self._contact.start()
-        for arm in self._arms:
-            arm.start()
-        self._measure(np.zeros(self.action_space.shape[0], np.float32))  # type: ignore[index]
-        return self._observation(), self._info()
+        self._action = np.zeros(self.action_space.shape, np.float32)  # type: ignore[arg-type]
+        self._row = self.measure()
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), self._info(bool(env._check_success()))
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Runs one control step.
@@ -248,31 +203,37 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
         env = self.robosuite_env
         env.timestep += 1
-        self._simulate(action)
+        self._action = action
+        self.simulation.begin(self._scaled(action))
+        if self.substep_hook is None:
+            self.simulation.advance(self.substeps)
+        else:
+            for k in range(self.substeps):
+                self.simulation.advance(1)
+                self.substep_hook(k)
         env.cur_time += env.control_timestep
-        reward = float(env.reward(action))
+        reward = self._rewards(self._action)
         self._steps += 1
-        self._measure(action)
-        info = self._info()
+        self._row = self.measure()
+        info = self._info(reward.success)
+        info["reward_terms"] = reward.terms
         info["unstable"] = self._bad_count() != self._warnings or not np.isfinite(self._row).all()
         terminated = self.terminate_on_success and info["success"] and not info["unstable"]
         truncated = self._steps >= self.horizon or info["unstable"]
         self._ended = terminated or truncated
-        return self._observation(), reward if np.isfinite(reward) else 0.0, terminated, truncated, info
+        total = sum(reward.terms.values())
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), total if np.isfinite(total) else 0.0, terminated, truncated, info
 
-    def _simulate(self, action: NDArray[np.float32]) -> None:
-        """The substeps of one control step, sensors sampled after each."""
-        env, sim, contact, arms = self.robosuite_env, self.robosuite_env.sim, self._contact, self._arms
-        contact.start()
-        for arm in arms:
-            arm.start()
-        for k in range(self.substeps):
-            sim.step1()
-            env._pre_action(action, k == 0)
-            sim.step2()
-            contact.sample()
-            for arm in arms:
-                arm.sample()
+    def command(self, action: NDArray[np.float32]) -> None:
+        """From within a substep hook: another action for the rest of the control step, efference copy included.
+
+        Raises:
+            ValueError: a wrong shape, or an action that is not finite.
+        """
+        self._action = self._checked(action)
+        self.simulation.command(self._scaled(self._action))
 
     def _checked(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         action = np.asarray(action, dtype=np.float32)
@@ -280,40 +241,49 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             raise ValueError(f"{self.task.name} takes an action of shape {self.action_space.shape}, got {action.shape}")
         if not np.isfinite(action).all():
             raise ValueError(f"the action must be finite, got {action}")
-        return np.clip(action, self.action_space.low, self.action_space.high)  # type: ignore[attr-defined]
+        return np.clip(action, -1.0, 1.0)
+
+    def _scaled(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
+        """In the units robosuite's controllers take, which for most are the same."""
+        half = 0.5 * (self._action_high - self._action_low)
+        scaled: NDArray[np.float64] = self._action_low + half * (action.astype(np.float64) + 1.0)
+        return scaled
 
     # ------------------------------------------------------------------ senses
 
-    def _read_objects(self) -> dict[str, NDArray[np.float64]]:
-        env = self.robosuite_env
-        for observable in (*self._object_inputs, *self._objects.values()):
-            observable.update(timestep=env.model_timestep, obs_cache=env._obs_cache, force=True)
-        return {name: np.atleast_1d(o.obs) for name, o in self._objects.items()}
-
-    def _measure(self, action: NDArray[np.float32]) -> None:
-        """Reads every sensor once; noise, then faults."""
-        objects = self._read_objects().values()
-        row = np.concatenate([*(arm.read() for arm in self._arms), *objects, action])
+    def measure(self) -> NDArray[np.float64]:
+        """Reads every sensor once: the row that ``measured_spec`` names, with noise, then faults."""
+        row = np.concatenate([self.simulation.sense(), *self._objects.read(), self._action])
         row += self._noise * self.np_random.standard_normal(row.size)
         for corrupt in self.corruptions:
             corrupt(row)
-        self._row = row
+        return row
+
+    def to_stream(self, row: NDArray[np.float64]) -> NDArray[np.float32]:
+        """(D,) what of a measured row the stream carries."""
+        return self._layout.stream(row)
 
     def _observation(self) -> Any:
-        row = np.clip(np.nan_to_num(self._row), -_BOUND, _BOUND).astype(np.float32)
-        return row[self._to_observation] if self._flat else {name: row[s] for name, s in self._named.items()}
+        return self._layout.observation(self._row, self._pictures.images(self.simulation.model, self.simulation.data))
 
-    def _info(self) -> dict[str, Any]:
-        return {
-            "stream": self._row[self._to_stream].astype(np.float32),
-            "success": bool(self.robosuite_env._check_success()),
-            "contact_force": self._contact.peak,
-            "unstable": False,
-        }
+    def _info(self, success: bool) -> dict[str, Any]:
+        info: dict[str, Any] = {"stream": self.to_stream(self._row)} if self._layout.stream_spec else {}
+        return info | {"success": success, "contact_force": self.simulation.contact_force, "unstable": False}
 
     def _bad_count(self) -> int:
         """How often MuJoCo found the simulation unstable; it resets itself then, and says so nowhere else."""
-        return sum(int(self._data.warning[w].number) for w in _BAD)
+        return sum(int(self.simulation.data.warning[w].number) for w in _BAD)
+
+    @property
+    def stream_spec(self) -> StreamSpec:
+        """Names the numbers in ``info["stream"]``.
+
+        Raises:
+            AttributeError: there is no stream.
+        """
+        if self._layout.stream_spec is None:
+            raise AttributeError("this environment was made with stream=(), so it has no stream")
+        return self._layout.stream_spec
 
     @property
     def measured(self) -> NDArray[np.float64]:
@@ -322,21 +292,25 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
     @property
     def motors(self) -> NDArray[np.intp]:
-        """The actuators of the arm's joints, from the base on."""
-        return np.concatenate([arm.motors for arm in self._arms])
+        """The actuators of the arms' joints, from the base on."""
+        return self.simulation.motors
 
     # ------------------------------------------------------------------ pictures
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """(height, width, 3) uint8, or None without a ``render_mode``."""
-        if self.render_mode is None:
-            gym.logger.warn("render() does nothing without a render_mode: gym.make(…, render_mode='rgb_array')")
-            return None
-        return self._renderer.render(self._model, self._data)
+    def render(self) -> NDArray[Any] | None:
+        """One picture of the environment, by its ``render_mode``.
+
+        ``rgb_array`` gives (height, width, 3) uint8, ``depth_array`` (height, width) float32 [m]; ``human`` gives None,
+        and its window keeps to real time.
+
+        Raises:
+            RuntimeError: this machine has nothing to draw with.
+        """
+        return self._pictures.frame(self.simulation.model, self.simulation.data)
 
     def close(self) -> None:
         """Frees the renderer and the simulation; may be called more than once."""
-        self._renderer.close()
+        self._pictures.close()
         if self.robosuite_env is not None:
             self.robosuite_env.close()
             self.robosuite_env = None
@@ -352,16 +326,3 @@ def _gripper_actions(robots: list[Any]) -> tuple[int, ...]:
                 found += range(start + low, start + high)
         start += robot.action_dim
     return tuple(found)
-
-
-def _box(size: int) -> spaces.Box:
-    return spaces.Box(-_BOUND, _BOUND, (size,), np.float32)
-
-
-def _indices(slices: dict[str, slice], names: list[str]) -> NDArray[np.intp]:
-    return np.concatenate([np.arange(slices[n].start, slices[n].stop) for n in names])
-
-
-def _check_choice(what: str, got: Any, known: Any) -> None:
-    if got not in known:
-        raise ValueError(f"unknown {what} {got!r}; known: {', '.join(map(str, known))}")

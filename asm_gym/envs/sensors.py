@@ -1,33 +1,33 @@
-r"""Proprioception: reads a robot arm's sensors from the simulator, at every physics substep where it matters.
+"""Proprioception: which channels an arm has, and where in the simulation each is read.
 
-A contact can come and go inside one control step, so torques and wrenches are summarised over its substeps (mean, and
-signed peak: the value of largest magnitude) while positions and velocities are read at its end.
-
-External joint torque is what the motors and the nominal dynamics do not explain,
-
-    τ_ext = M(q) q̈ + h(q, q̇) - τ_passive - τ_motor,
-
-the quantity a momentum observer estimates (Haddadin, De Luca, Albu-Schäffer 2017, Eq. 15 at infinite gain).
+A contact can come and go inside one control step, so torques, wrenches and contacts are sampled after every physics
+substep and summarised (mean, and signed peak: the value of largest magnitude), while positions and velocities are read
+at the end of the step.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.envs import kernels
+from asm_gym.envs.views import Views
 from asm_gym.stream import MOTOR, Channel
 
 GROUPS = ("joint", "torque", "hand", "wrench", "gripper", MOTOR)
-"""Channel groups in the order they stand in a row; ``object`` can be asked for besides."""
+"""The channel groups of a stream by default, in the order they stand in a row."""
+
+EXTRA_GROUPS = ("contact", "object")
+"""What no real robot measures about itself, for those who ask."""
 
 # Standard deviations of the noise, about what a research arm's own sensors have (Franka, Robotiq and ATI data sheets).
 _NOISE = {
     "joint_position": 2e-4,
     "joint_velocity": 3e-3,
-    "commanded_torque": 0.0,
     "measured_torque": 0.1,
     "external_torque": 0.15,
     "external_torque_peak": 0.3,
@@ -45,142 +45,92 @@ _NOISE = {
 }
 
 
-class ArmSensors:
-    """The sensors of one arm with its gripper.
+@dataclass
+class _Table:
+    """Channels, and the index of each of their numbers in what ``Proprioception.sources`` lays end to end."""
+
+    starts: dict[str, int]
+    prefix: str
+    channels: list[Channel] = field(default_factory=list)
+    indices: list[NDArray[np.intp]] = field(default_factory=list)
+
+    def add(self, group: str, name: str, unit: str, source: str, where: Any) -> None:
+        index = np.atleast_1d(np.asarray(where, dtype=np.intp)) + self.starts[source]
+        if index.size:
+            self.channels.append(Channel(self.prefix + name, index.size, unit, _NOISE.get(name, 0.0), group))
+            self.indices.append(index)
+
+
+class Proprioception:
+    """Everything that the arms of one loaded model measure.
 
     Args:
-        robot: robosuite's robot.
-        arm: ``right`` or ``left``.
-        prefix: stands before each channel's name, empty for a lone arm.
+        parts: robosuite's robots, and which arm of each.
+        views: of the model and its data.
     """
 
-    def __init__(self, robot: Any, arm: str, prefix: str, substeps: int) -> None:
-        sim = robot.sim
-        self.model: mujoco.MjModel = sim.model._model
-        self.data: mujoco.MjData = sim.data._data
-        per_arm = slice(None)
-        if len(robot.arms) > 1:
-            half = len(robot._ref_joint_pos_indexes) // 2
-            per_arm = slice(0, half) if arm == "right" else slice(half, None)
-        self._qpos = np.asarray(robot._ref_joint_pos_indexes)[per_arm]
-        self._qvel = np.asarray(robot._ref_joint_vel_indexes)[per_arm]
-        self.motors = np.asarray(robot._ref_actuators_indexes_dict[arm])
-        self._site = robot.eef_site_id[arm]
-        self._hand = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, robot.robot_model.eef_name[arm])
-        gripper = robot.gripper[arm]
-        self._fingers = np.asarray(robot._ref_gripper_joint_pos_indexes[arm] if gripper.joints else [], dtype=int)
-        self._finger_vel = np.asarray(robot._ref_gripper_joint_vel_indexes[arm] if gripper.joints else [], dtype=int)
-        self._wrench = self._sensor_slice(gripper)
-        self.joint_names = tuple(str(name) for name in np.asarray(robot.robot_joints)[per_arm])
-        n = len(self._qpos)
-        self._n = n
-        self.channels = self._channels(prefix, n)
-        # Per substep: external torque, measured torque, wrist force and torque, gripper force.
-        self._fast = np.zeros((substeps, 2 * n + 6))
-        self._ma = np.zeros(self.model.nv)
-        self._k = 0
-        self._velocity = np.zeros(6)
-
-    def _sensor_slice(self, gripper: Any) -> slice:
-        sensors = gripper.important_sensors
-        adr = self.model.sensor_adr
-        ids = [mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SENSOR, sensors[k]) for k in ("force_ee", "torque_ee")]
-        if adr[ids[1]] != adr[ids[0]] + 3:
-            raise RuntimeError("the wrist's force and torque sensors are expected side by side")
-        return slice(int(adr[ids[0]]), int(adr[ids[0]]) + 6)
-
-    def _channels(self, prefix: str, n: int) -> tuple[Channel, ...]:
-        rows: list[tuple[str, str, int, str]] = [
-            ("joint", "joint_position", n, "rad"),
-            ("joint", "joint_velocity", n, "rad/s"),
-            ("torque", "commanded_torque", n, "N m"),
-            ("torque", "measured_torque", n, "N m"),
-            ("torque", "external_torque", n, "N m"),
-            ("torque", "external_torque_peak", n, "N m"),
-            ("hand", "hand_position", 3, "m"),
-            ("hand", "hand_orientation", 6, "1"),
-            ("hand", "hand_velocity", 3, "m/s"),
-            ("hand", "hand_angular_velocity", 3, "rad/s"),
-            ("wrench", "wrist_force", 3, "N"),
-            ("wrench", "wrist_torque", 3, "N m"),
-            ("wrench", "wrist_force_peak", 3, "N"),
-            ("wrench", "wrist_torque_peak", 3, "N m"),
-        ]
-        if len(self._fingers):
-            rows += [
-                ("gripper", "gripper_opening", len(self._fingers), "m"),
-                ("gripper", "gripper_velocity", len(self._fingers), "m/s"),
-                ("gripper", "gripper_force", len(self._fingers), "N"),
-            ]
-        return tuple(Channel(prefix + name, size, unit, _NOISE[name], group) for group, name, size, unit in rows)
-
-    def start(self) -> None:
-        """Before a control step."""
-        self._k = 0
-
-    def sample(self) -> None:
-        """After a physics substep."""
-        model, data, n = self.model, self.data, self._n
-        row = self._fast[self._k]
-        mujoco.mj_mulM(model, data, self._ma, data.qacc)
-        motor = data.qfrc_actuator[self._qvel]
-        row[:n] = self._ma[self._qvel] + data.qfrc_bias[self._qvel] - data.qfrc_passive[self._qvel] - motor
-        row[n : 2 * n] = motor
-        row[2 * n :] = data.sensordata[self._wrench]
-        self._k += 1
+    def __init__(self, parts: list[tuple[Any, str]], views: Views, data: mujoco.MjData) -> None:
+        shape = (len(parts), kernels.SAMPLE)
+        self.mean, self.peak, self.last = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        self._sources = {
+            "qpos": views.qpos,
+            "qvel": views.qvel,
+            "ctrl": views.ctrl,
+            "force": views.actuator,
+            "site": views.site_xpos.ravel(),
+            "body": data.xmat.ravel(),
+            "mean": self.mean.ravel(),
+            "peak": self.peak.ravel(),
+            "last": self.last.ravel(),
+        }
+        ends = np.cumsum([a.size for a in self._sources.values()])
+        starts = {n: int(e) - a.size for (n, a), e in zip(self._sources.items(), ends, strict=True)}
+        tables = [_Table(starts, f"robot{i}_" if len(parts) > 1 else "") for i in range(len(parts))]
+        for i, ((robot, arm), table) in enumerate(zip(parts, tables, strict=True)):
+            _fill(table, robot, arm, i * kernels.SAMPLE)
+        self.channels = tuple(c for t in tables for c in t.channels)
+        self._index = np.concatenate([index for t in tables for index in t.indices])
 
     def read(self) -> NDArray[np.float64]:
-        """One value for every element of ``channels``, over the substeps sampled since ``start``; noiseless."""
-        data, n = self.data, self._n
-        fast = self._fast[: self._k] if self._k else np.zeros((1, self._fast.shape[1]))
-        mean = fast.mean(axis=0)
-        peak = np.take_along_axis(fast, np.abs(fast).argmax(axis=0)[None], axis=0)[0]
-        mujoco.mj_objectVelocity(
-            self.model, data, mujoco.mjtObj.mjOBJ_SITE, self._site, self._velocity, 0
-        )  # angular first, in the world's axes
-        rotation = data.xmat[self._hand].reshape(3, 3)
-        parts = [
-            data.qpos[self._qpos],
-            data.qvel[self._qvel],
-            data.ctrl[self.motors],
-            mean[n : 2 * n],
-            mean[:n],
-            peak[:n],
-            data.site_xpos[self._site],
-            rotation[:, 0],
-            rotation[:, 1],
-            self._velocity[3:],
-            self._velocity[:3],
-            mean[2 * n :],
-            peak[2 * n :],
-        ]
-        if len(self._fingers):
-            parts += [data.qpos[self._fingers], data.qvel[self._finger_vel], data.qfrc_actuator[self._finger_vel]]
-        return np.concatenate(parts)
+        """One number for every element of ``channels``; noiseless."""
+        values: NDArray[np.float64] = np.concatenate(list(self._sources.values()))[self._index]
+        return values
 
 
-class ContactForce:
-    """Net contact force on the robot: the norm of the summed contact forces on all its bodies [N].
+def _fill(table: _Table, robot: Any, arm: str, sample: int) -> None:
+    """Adds one arm's channels; ``sample`` is where its samples begin."""
+    model = robot.sim.model._model
+    site = 3 * robot.eef_site_id[arm]
+    body = 9 * mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, robot.robot_model.eef_name[arm])
+    gripper = robot.gripper[arm]
+    fingers = robot._ref_gripper_joint_pos_indexes[arm] if gripper.joints else []
+    finger_velocity = robot._ref_gripper_joint_vel_indexes[arm] if gripper.joints else []
+    dofs = np.asarray(robot._ref_joint_vel_indexes)
+    n = len(dofs)
 
-    A grasp's own squeeze cancels in the sum; what the world does to the robot stays. Loads that a fault applies are
-    not contacts and are left out.
-    """
+    def sampled(part: slice, count: int | None = None, skip: int = 0) -> NDArray[np.intp]:
+        return np.arange(part.start + skip, part.stop)[:count] + sample
 
-    def __init__(self, robots: list[Any]) -> None:
-        sim = robots[0].sim
-        self.data: mujoco.MjData = sim.data._data
-        model: mujoco.MjModel = sim.model._model
-        roots = {r.robot_model.root_body for r in robots}
-        root_ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in roots]
-        self._bodies = np.flatnonzero(np.isin(model.body_rootid, root_ids))
-        self.peak = 0.0
-
-    def start(self) -> None:
-        self.peak = 0.0
-
-    def sample(self) -> None:
-        force = self.data.cfrc_ext[self._bodies, 3:].sum(axis=0) - self.data.xfrc_applied[self._bodies, :3].sum(axis=0)
-        norm = float(np.sqrt(force @ force))
-        # NaN compares false, so an unstable simulation cannot hide behind an old peak.
-        if not norm <= self.peak:
-            self.peak = norm
+    table.add("joint", "joint_position", "rad", "qpos", robot._ref_joint_pos_indexes)
+    table.add("joint", "joint_velocity", "rad/s", "qvel", dofs)
+    table.add("torque", "commanded_torque", "N m", "ctrl", robot._ref_actuators_indexes_dict[arm])
+    table.add("torque", "measured_torque", "N m", "mean", sampled(kernels.MOTOR, n))
+    table.add("torque", "external_torque", "N m", "mean", sampled(kernels.EXTERNAL, n))
+    table.add("torque", "external_torque_peak", "N m", "peak", sampled(kernels.EXTERNAL, n))
+    table.add("hand", "hand_position", "m", "site", site + np.arange(3))
+    # The first two columns of the rotation: six numbers that turn smoothly, where a quaternion flips its sign.
+    table.add("hand", "hand_orientation", "1", "body", body + np.array([0, 3, 6, 1, 4, 7]))
+    table.add("hand", "hand_velocity", "m/s", "last", sampled(kernels.VELOCITY, 3))
+    table.add("hand", "hand_angular_velocity", "rad/s", "last", sampled(kernels.VELOCITY, 3, 3))
+    table.add("wrench", "wrist_force", "N", "mean", sampled(kernels.WRENCH, 3))
+    table.add("wrench", "wrist_torque", "N m", "mean", sampled(kernels.WRENCH, 3, 3))
+    table.add("wrench", "wrist_force_peak", "N", "peak", sampled(kernels.WRENCH, 3))
+    table.add("wrench", "wrist_torque_peak", "N m", "peak", sampled(kernels.WRENCH, 3, 3))
+    # Fingers slide or turn, by the gripper.
+    slides = [model.jnt_type[model.dof_jntid[d]] == mujoco.mjtJoint.mjJNT_SLIDE for d in finger_velocity]
+    length, force = ("m", "N") if all(slides) else ("rad", "N m")
+    table.add("gripper", "gripper_opening", length, "qpos", fingers)
+    table.add("gripper", "gripper_velocity", f"{length}/s", "qvel", finger_velocity)
+    table.add("gripper", "gripper_force", force, "force", finger_velocity)
+    table.add("contact", "contact_force", "N", "mean", sampled(kernels.CONTACT))
+    table.add("contact", "contact_force_peak", "N", "peak", sampled(kernels.CONTACT))

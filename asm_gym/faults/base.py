@@ -86,7 +86,9 @@ def check_joint(env: RobosuiteEnv, joint: int) -> None:
     """Raises ValueError unless the arm has a joint with this index."""
     count = env.measured_spec.slices["joint_position"]
     if not 0 <= joint < count.stop - count.start:
-        raise ValueError(f"joint must be 0 to {count.stop - count.start - 1} for {env.robot}, got {joint}")
+        raise ValueError(
+            f"joint must be 0 to {count.stop - count.start - 1} for {env.measured_spec.source}, got {joint}"
+        )
 
 
 @contextmanager

@@ -10,12 +10,13 @@ standardised stream (1 = one standard deviation over the training episodes) and 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
-import numba
 import numpy as np
 import scipy.linalg.cython_blas  # noqa: F401  (the BLAS of the kernels; loaded here, so that its threads can be limited)
 from numpy.typing import NDArray
+
+from asm_gym.compilation import compiled
 
 Array = NDArray[np.floating[Any]]
 
@@ -28,7 +29,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def kernel(function: F) -> F:
     """Compiles ``function``, once a machine; its inputs must be finite, so that loops can use vector registers."""
-    return cast(F, numba.njit(cache=True, fastmath=True, error_model="numpy")(function))
+    return compiled(function, fastmath=True)
 
 
 @kernel

@@ -47,6 +47,8 @@ class Rewards:
         # PickPlaceCan and its like differ from PickPlace in their objects alone.
         family = next(f for f in _FAMILIES if name.startswith(f.__name__))
         self._reward = family(env)
+        self.reads_history = family is Wipe
+        """Whether it reads the robots' buffers of recent forces and accelerations (``recent_ee_…``)."""
 
     def __call__(self, action: Any) -> RewardTerms:
         """What ``env.reward(action)`` would return, term by term; changes in ``env`` what that would change, once.

@@ -1,0 +1,47 @@
+"""Compiled functions, cached on disk for the whole folder they belong to."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def compiled(function: F, fastmath: bool = False) -> F:
+    """Compiles ``function``, once a machine.
+
+    Args:
+        fastmath: lets loops use vector registers; inputs must then be finite.
+    """
+    dispatcher: Any = numba.njit(cache=True, fastmath=fastmath, error_model="numpy")(function)
+    cache = _cache_of(dispatcher)
+    if cache is not None:
+        # numba looks at the function's own file alone, and would keep code that another file's change made stale.
+        cache._source_stamp = _digest(Path(function.__code__.co_filename).parent)
+    return cast(F, dispatcher)
+
+
+def must_compile(function: Any) -> bool:
+    """Whether the next call of a compiled function will take seconds, as far as can be told."""
+    cache = _cache_of(function)
+    return cache is not None and not function.signatures and not cache._load_index()
+
+
+def _cache_of(dispatcher: Any) -> Any:
+    """numba's own index of a function's compiled code; None with a numba that keeps it elsewhere, or compiles none."""
+    return getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+
+
+@lru_cache
+def _digest(folder: Path) -> str:
+    """Of every source file in a folder."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for path in sorted(folder.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

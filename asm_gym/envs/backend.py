@@ -1,0 +1,155 @@
+"""Robosuite underneath: imported quietly, built for a task, and seeded where it does not seed itself."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.envs.choices import check_choice
+from asm_gym.stream import Channel
+from asm_gym.tasks import ROBOTS, TaskSpec
+
+PHYSICS_FREQ = 500
+"""Robosuite's physics rate [Hz]."""
+
+CONTROLLERS = ("OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "JOINT_TORQUE", "IK_POSE")
+"""Robosuite's controllers of an arm, less JOINT_VELOCITY, which fails inside robosuite 1.5."""
+
+# Tasks that choose one of several objects for each episode, and the attribute that holds the choice.
+_CHOSEN = {"PickPlaceSingle": "object_id", "NutAssemblySingle": "nut_id"}
+
+
+def import_robosuite() -> Any:
+    """Robosuite, without the warnings it prints at import about optional parts."""
+    logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
+    with _opencv_or_none():
+        import robosuite
+    return robosuite
+
+
+@contextmanager
+def _opencv_or_none() -> Iterator[None]:
+    """Lets robosuite be imported where opencv cannot be, for want of libGL: only its own viewer would use it."""
+    try:
+        import cv2  # noqa: F401
+    except ImportError:
+        sys.modules["cv2"] = ModuleType("cv2")
+        try:
+            yield
+        finally:
+            del sys.modules["cv2"]
+    else:
+        yield
+
+
+def robots_for(task: TaskSpec, robot: str | Sequence[str] | None) -> tuple[str, ...]:
+    """One robot for each of the task's arms; one name stands for as many as the task takes.
+
+    Raises:
+        ValueError: an unknown robot, or the wrong number of them.
+    """
+    names = (
+        ("Panda",) * task.arms if robot is None else (robot,) * task.arms if isinstance(robot, str) else tuple(robot)
+    )
+    for name in names:
+        check_choice("robot", name, ROBOTS)
+    if len(names) != task.arms:
+        raise ValueError(f"{task.name} takes {task.arms} robot{'s' * (task.arms > 1)}, got {', '.join(names)}")
+    return names
+
+
+def make(
+    task: TaskSpec,
+    robots: tuple[str, ...],
+    controller: str | dict[str, Any],
+    control_freq: int,
+    reward_shaping: bool,
+) -> Any:
+    """Robosuite's environment; every limit of an episode is left to the caller.
+
+    Raises:
+        ValueError: an unknown controller.
+    """
+    robosuite = import_robosuite()
+    if isinstance(controller, str):
+        check_choice("controller", controller, CONTROLLERS)
+    return robosuite.make(
+        task.name,
+        robots=list(robots),
+        controller_configs=None if controller == "OSC_POSE" else [_configuration(controller, r) for r in robots],
+        has_renderer=False,
+        has_offscreen_renderer=False,
+        use_camera_obs=False,
+        control_freq=control_freq,
+        reward_shaping=reward_shaping,
+        ignore_done=True,
+    )
+
+
+def _configuration(controller: str | dict[str, Any], robot: str) -> dict[str, Any]:
+    from robosuite.controllers import load_part_controller_config
+    from robosuite.controllers.composite.composite_controller_factory import refactor_composite_controller_config
+
+    part = load_part_controller_config(default_controller=controller) if isinstance(controller, str) else controller
+    configuration: dict[str, Any] = refactor_composite_controller_config(part, robot, ["right"])
+    return configuration
+
+
+def reseed(env: Any, rng: np.random.Generator) -> None:
+    """Seeds the generator that all of robosuite's randomness comes from."""
+    # In place: placement samplers hold the generator itself.
+    env.rng.bit_generator.state = np.random.default_rng(rng.integers(2**63)).bit_generator.state
+
+
+def choose_object(env: Any, task: TaskSpec) -> None:
+    """Draws the object of the next episode, where the task has a choice.
+
+    Robosuite would draw from the order of a set of strings, which differs from process to process.
+    """
+    if task.name in _CHOSEN:
+        candidates = env.objects if task.name == "PickPlaceSingle" else env.nuts
+        env.single_object_mode = 2  # "the object that is named", where 1 is "draw one"
+        setattr(env, _CHOSEN[task.name], int(env.rng.integers(len(candidates))))
+
+
+class ObjectSensors:
+    """Poses of the task's objects, as robosuite's own observables give them.
+
+    Where the task chooses one of several objects, every one has its channels, and those out of play read 0.
+    """
+
+    def __init__(self, env: Any, task: TaskSpec) -> None:
+        observables = env._observables
+        of_objects = {n: o for n, o in observables.items() if o.modality == "object"}
+        hands = [f"robot{i}_eef_{what}" for i in range(len(env.robots)) for what in ("pos", "quat")]
+        # Never shown, but others compute from them.
+        hidden = [n for n in of_objects if n.startswith("world_pose_in")]
+        self._inputs = [observables[n] for n in (*hands, *hidden) if n in observables]
+        chosen = task.name in _CHOSEN
+        self._observables = [o for n, o in of_objects.items() if n not in hidden and (chosen or o.is_active())]
+        sizes = [int(np.prod(o._data_shape)) or 1 for o in self._observables]
+        self.channels = tuple(
+            Channel(o.name, size, "1", 0.0, "object") for o, size in zip(self._observables, sizes, strict=True)
+        )
+        self._rest = [np.zeros(size) for size in sizes]
+
+    def read(self) -> list[NDArray[np.float64]]:
+        """One array for each of ``channels``."""
+        seen: dict[str, Any] = {}
+        for observable in self._inputs:
+            seen[observable.name] = observable._sensor(seen)
+        # Relative poses are computed from absolute ones, which robosuite lists after them.
+        for observable in sorted(self._observables, key=lambda o: "_to_" in o.name):
+            if observable.is_active():
+                seen[observable.name] = observable._sensor(seen)
+        return [
+            np.asarray(seen[o.name], np.float64).reshape(-1) if o.name in seen else rest
+            for o, rest in zip(self._observables, self._rest, strict=True)
+        ]

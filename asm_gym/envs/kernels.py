@@ -1,0 +1,165 @@
+"""The compiled substep loop: physics, control and sensors in one call.
+
+External joint torque is what the motors and the nominal dynamics do not explain,
+
+    τ_ext = M(q) q̈ + h(q, q̇) - τ_passive - τ_motor,
+
+the quantity a momentum observer estimates (Haddadin, De Luca, Albu-Schäffer 2017, Eq. 15 at infinite gain).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from llvmlite import binding
+from numba import types
+
+from asm_gym.compilation import compiled
+from asm_gym.envs.control import control, hand_velocity, set_goal
+from asm_gym.envs.views import JOINTS, Arms, Floats, Goals, Ints, Nominal, Views
+
+# What one arm's sensors give in a substep, side by side.
+EXTERNAL = slice(0, JOINTS)
+MOTOR = slice(JOINTS, 2 * JOINTS)
+WRENCH = slice(2 * JOINTS, 2 * JOINTS + 6)
+CONTACT = slice(2 * JOINTS + 6, 2 * JOINTS + 9)
+VELOCITY = slice(2 * JOINTS + 9, 2 * JOINTS + 15)
+SAMPLE = VELOCITY.stop
+
+# MuJoCo's own functions, linked by name so that the compiled loop can be cached on disk.
+binding.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
+_on_data = types.void(types.intp, types.intp)
+_step1: Any = types.ExternalFunction("mj_step1", _on_data)
+_step2: Any = types.ExternalFunction("mj_step2", _on_data)
+_kinematics: Any = types.ExternalFunction("mj_kinematics", _on_data)
+_com_pos: Any = types.ExternalFunction("mj_comPos", _on_data)
+_com_vel: Any = types.ExternalFunction("mj_comVel", _on_data)
+_crb: Any = types.ExternalFunction("mj_crb", _on_data)
+_rne: Any = types.ExternalFunction("mj_rne", types.void(types.intp, types.intp, types.int32, types.intp))
+
+
+@compiled
+def _believe(views: Views, nominal: Nominal) -> None:
+    """Brings the nominal model's dynamics to the live joint positions and velocities."""
+    nominal.qpos[:] = views.qpos
+    nominal.qvel[:] = views.qvel
+    _kinematics(nominal.model, nominal.data)
+    _com_pos(nominal.model, nominal.data)
+    _crb(nominal.model, nominal.data)
+    _com_vel(nominal.model, nominal.data)
+    _rne(nominal.model, nominal.data, 0, nominal.bias.ctypes.data)
+
+
+@compiled
+def sample(views: Views, nominal: Nominal, arms: Arms, k: int, samples: Floats) -> None:
+    """Writes what the sensors of every arm give after substep ``k`` into samples (A, K, SAMPLE)."""
+    edited = nominal.model != 0
+    mass = nominal.mass if edited else views.mass
+    bias = nominal.bias if edited else views.bias
+    needed = np.empty(JOINTS)
+    for a in range(len(arms.joints)):
+        row = samples[a, k]
+        n = arms.joints[a]
+        needed[:] = 0.0
+        for t in range(arms.tree.shape[1]):
+            i = arms.tree[a, t]
+            if i < 0:
+                break
+            j, at = i, views.mass_address[i]
+            while j >= 0:
+                for r in range(n):
+                    if arms.dofs[a, r] == i:
+                        needed[r] += mass[at] * views.qacc[j]
+                    elif arms.dofs[a, r] == j:
+                        needed[r] += mass[at] * views.qacc[i]
+                at += 1
+                j = views.parent[j]
+        for i in range(n):
+            dof = arms.dofs[a, i]
+            damped = views.passive[dof] + (views.damping[dof] - nominal.damping[dof]) * views.qvel[dof]
+            row[i] = needed[i] + bias[dof] - damped - views.actuator[dof]
+            row[JOINTS + i] = views.actuator[dof]
+        at = arms.wrench[a]
+        for i in range(6):
+            row[2 * JOINTS + i] = views.sensordata[at + i]
+        for i in range(3):
+            row[2 * JOINTS + 6 + i] = 0.0
+        for t in range(arms.bodies.shape[1]):
+            body = arms.bodies[a, t]
+            if body < 0:
+                break
+            for i in range(3):
+                row[2 * JOINTS + 6 + i] += views.contact[body, 3 + i] - views.applied[body, i]
+        hand_velocity(views, arms, a, views.subtree_com[arms.root[a]], row[2 * JOINTS + 9 :])
+
+
+@compiled
+def run(
+    views: Views,
+    nominal: Nominal,
+    arms: Arms,
+    goals: Goals,
+    deltas: Floats,
+    turns: Floats,
+    fresh: bool,
+    first: int,
+    count: int,
+    samples: Floats,
+) -> None:
+    """Runs ``count`` physics substeps, controllers and sensors included.
+
+    Args:
+        deltas: (A, JOINTS) the action in metres and radians.
+        turns: (A, 3, 3) the rotation it asks for, under operational space control.
+        fresh: the set-points are to be moved by these in the first of these substeps.
+        first: which substep of the control step comes next.
+        samples: (A, K, SAMPLE) written at ``first`` and after.
+    """
+    for k in range(first, first + count):
+        _step1(views.model, views.data)
+        if nominal.model != 0:
+            _believe(views, nominal)
+        for a in range(len(arms.joints)):
+            if fresh and k == first:
+                set_goal(views, arms, goals, a, deltas[a], turns[a])
+            control(views, nominal, arms, goals, a)
+        _step2(views.model, views.data)
+        sample(views, nominal, arms, k, samples)
+
+
+@compiled
+def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Floats) -> float:
+    """Writes the mean, signed peak and last of the first ``count`` substeps into mean, peak and last (A, SAMPLE).
+
+    Returns:
+        The largest contact force on an arm [N], the norm of its vector; not finite where a sample is not.
+    """
+    largest = 0.0
+    for a in range(len(samples)):
+        mean[a] = 0.0
+        peak[a] = 0.0
+        last[a] = samples[a, count - 1]
+        for k in range(count):
+            row = samples[a, k]
+            for i in range(SAMPLE):
+                mean[a, i] += row[i] / count
+                # NaN compares false: it is taken when it comes, and stays.
+                if not abs(row[i]) <= abs(peak[a, i]) and peak[a, i] == peak[a, i]:
+                    peak[a, i] = row[i]
+            force = np.sqrt(np.sum(row[2 * JOINTS + 6 : 2 * JOINTS + 9] ** 2))
+            if not force <= largest and largest == largest:
+                largest = force
+    return largest
+
+
+@compiled
+def edited(live: Floats, frozen: Floats, rows: Ints) -> bool:
+    """Whether two arrays (N, M) differ in any of ``rows``."""
+    for r in rows:
+        for c in range(live.shape[1]):
+            if live[r, c] != frozen[r, c]:
+                return True
+    return False

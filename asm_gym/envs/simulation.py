@@ -1,0 +1,204 @@
+"""One loaded model: its physics, its controllers, and what the sensors see in every substep."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import sys
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.compilation import must_compile
+from asm_gym.envs import kernels
+from asm_gym.envs.arms import bodies, compilable, describe
+from asm_gym.envs.sensors import Proprioception
+from asm_gym.envs.views import JOINTS, Goals, Nominal, Views
+
+# What the controllers and the torque estimate know of the robot. Whoever edits these in the model edits the world, not
+# the robot's knowledge of it.
+_INERTIA = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
+
+
+class Simulation:
+    """Runs control steps of one loaded model.
+
+    robosuite's OSC_POSE and JOINT_POSITION controllers on one-armed robots run compiled; every other controller is
+    robosuite's own code, between the same physics substeps.
+
+    Args:
+        env: robosuite's environment, its episode just reset.
+        substeps: physics substeps of a control step.
+    """
+
+    def __init__(self, env: Any, substeps: int) -> None:
+        self.env = env
+        self.substeps = substeps
+        self.model: mujoco.MjModel = env.sim.model._model
+        self.data: mujoco.MjData = env.sim.data._data
+        self._rotations = importlib.import_module("robosuite.utils.transform_utils")
+        self._parts = [(robot, arm) for robot in env.robots for arm in robot.arms]
+        self._views = _views(self.model, self.data)
+        self._robots = np.unique(np.concatenate([bodies(self.model, robot) for robot, _ in self._parts]))
+        self._live = {name: getattr(self.model, name).reshape(self.model.nbody, -1) for name in _INERTIA}
+        self._frozen = {name: live.copy() for name, live in self._live.items()}
+        v = self._views
+        self._pristine = Nominal(0, 0, v.qpos, v.qvel, v.mass, v.bias, v.damping.copy())
+        self._believed: tuple[mujoco.MjModel, mujoco.MjData, Nominal] | None = None
+        self._samples = np.zeros((len(self._parts), substeps, kernels.SAMPLE))
+        self.proprioception = Proprioception(self._parts, self._views, self.data)
+        self.contact_force = 0.0
+        """The largest net contact force on an arm within the control step [N]: the norm of the summed contact forces on
+        its bodies. A grasp's own squeeze cancels in the sum, and loads that a fault applies are left out."""
+        self.keeps_history = False
+        """Whether robosuite's buffers of recent forces and velocities are kept up, which cost more than a substep."""
+        self.begin_episode()
+
+    def begin_episode(self) -> None:
+        """Takes up the controllers, which robosuite makes anew in every reset."""
+        robots = self.env.robots
+        self._done = 0
+        self._fresh = False
+        self._action = np.zeros(sum(robot.action_dim for robot in robots))
+        self._controllers = [robot.composite_controller.part_controllers[arm] for robot, arm in self._parts]
+        self.compiled = all(compilable(robot, arm) for robot, arm in self._parts)
+        """Whether control runs compiled."""
+        self._arms = describe(self._parts, self.model)
+        n = len(self._parts)
+        self._goals = Goals(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, JOINTS)))
+        self._deltas = np.zeros((n, JOINTS))
+        self._turns = np.tile(np.eye(3), (n, 1, 1))
+        self._samples[:] = 0.0
+        if must_compile(kernels.run):
+            print("asm-gym: compiling the simulation loop, once on this machine (about 20 s)", file=sys.stderr)
+            self._run(0)
+        kernels.sample(self._views, self._nominal(), self._arms, 0, self._samples)
+        self._summarise(1)
+
+    # ------------------------------------------------------------------ control steps
+
+    def begin(self, action: NDArray[np.float64]) -> None:
+        """Begins a control step."""
+        self._done = 0
+        self.command(action)
+
+    def command(self, action: NDArray[np.float64]) -> None:
+        """Gives the controllers a new set-point, which they take up in the next substep."""
+        self._action = action
+        self._fresh = True
+        if self.compiled:
+            start = 0
+            for a, (robot, arm) in enumerate(self._parts):
+                part = self._action[start : start + robot.action_dim]
+                low, high = robot._action_split_indexes[arm]
+                self._deltas[a, : high - low] = self._controllers[a].scale_action(part[low:high])
+                # robosuite rounds this rotation to single precision, which shows after a while.
+                self._turns[a] = self._rotations.quat2mat(self._rotations.axisangle2quat(self._deltas[a, 3:6]))
+                self._move_gripper(robot, arm, part)
+                start += robot.action_dim
+
+    def advance(self, count: int) -> None:
+        """Runs ``count`` substeps of the control step that was begun."""
+        if self.compiled:
+            wrenches = [self.data.sensordata[at : at + 6].copy() for at in self._arms.wrench]
+            self._run(count)
+            if self.keeps_history and self._done == 0:
+                self._remember(wrenches)
+        else:
+            for k in range(self._done, self._done + count):
+                self.env.sim.step1()
+                self.env._pre_action(self._action, self._fresh)
+                self.env.sim.step2()
+                kernels.sample(self._views, self._nominal(), self._arms, k, self._samples)
+                self._fresh = False
+        self._fresh = False
+        self._done += count
+
+    def _run(self, count: int) -> None:
+        steps = (self._fresh, self._done, count, self._samples)
+        kernels.run(self._views, self._nominal(), self._arms, self._goals, self._deltas, self._turns, *steps)
+
+    def sense(self) -> NDArray[np.float64]:
+        """What the arms' sensors read now, summarised over the substeps since the control step began; noiseless."""
+        if self._done:
+            self._summarise(self._done)
+        return self.proprioception.read()
+
+    def _remember(self, wrenches: list[NDArray[np.float64]]) -> None:
+        """Fills the buffers that robosuite fills in the first substep; the acceleration is its running estimate."""
+        for (robot, arm), wrench, sample in zip(self._parts, wrenches, self._samples[:, 0], strict=True):
+            velocities = robot.recent_ee_vel_buffer[arm]
+            robot.recent_ee_forcetorques[arm].push(wrench)
+            velocities.push(sample[kernels.VELOCITY])
+            changes = robot.control_freq * np.diff(velocities.buf, axis=0)
+            recent = np.vstack([robot.recent_ee_acc[arm].current, changes])
+            robot.recent_ee_acc[arm].push(recent.mean(axis=0))
+
+    def _summarise(self, count: int) -> None:
+        p = self.proprioception
+        self.contact_force = kernels.summarise(self._samples, count, p.mean, p.peak, p.last)
+
+    def _move_gripper(self, robot: Any, arm: str, action: NDArray[np.float64]) -> None:
+        name = robot.get_gripper_name(arm)
+        if name not in robot._action_split_indexes:
+            return
+        low, high = robot._action_split_indexes[name]
+        if low == high:
+            return
+        controller = robot.composite_controller.part_controllers[name]
+        controller.set_goal(robot.gripper[arm].format_action(action[low:high]))
+        motors = robot._ref_actuators_indexes_dict[name]
+        limits = self.model.actuator_ctrlrange[motors]
+        self.data.ctrl[motors] = np.clip(controller.run_controller(), limits[:, 0], limits[:, 1])
+
+    # ------------------------------------------------------------------ knowledge of the robot
+
+    def _nominal(self) -> Nominal:
+        """The dynamics the robot believes in: the live ones, until somebody edits its masses."""
+        if not any(kernels.edited(self._live[n], self._frozen[n], self._robots) for n in _INERTIA):
+            return self._pristine
+        if self._believed is None:
+            model = copy.copy(self.model)
+            for name in _INERTIA:
+                getattr(model, name)[:] = self._frozen[name].reshape(getattr(model, name).shape)
+            data = mujoco.MjData(model)
+            bias = np.zeros(model.nv)
+            nominal = Nominal(
+                model._address, data._address, data.qpos, data.qvel, data.qM, bias, self._pristine.damping
+            )
+            self._believed = (model, data, nominal)
+        return self._believed[2]
+
+    @property
+    def motors(self) -> NDArray[np.intp]:
+        """The actuators of the arms' joints, from the base on."""
+        return np.concatenate([robot._ref_actuators_indexes_dict[arm] for robot, arm in self._parts])
+
+
+def _views(model: mujoco.MjModel, data: mujoco.MjData) -> Views:
+    return Views(
+        model=model._address,
+        data=data._address,
+        qpos=data.qpos,
+        qvel=data.qvel,
+        qacc=data.qacc,
+        ctrl=data.ctrl,
+        mass=data.qM,
+        bias=data.qfrc_bias,
+        passive=data.qfrc_passive,
+        actuator=data.qfrc_actuator,
+        cdof=data.cdof,
+        cvel=data.cvel,
+        subtree_com=data.subtree_com,
+        site_xpos=data.site_xpos,
+        site_xmat=data.site_xmat,
+        sensordata=data.sensordata,
+        contact=data.cfrc_ext,
+        applied=data.xfrc_applied,
+        ctrlrange=model.actuator_ctrlrange,
+        damping=model.dof_damping,
+        mass_address=model.dof_Madr,
+        parent=model.dof_parentid,
+    )

@@ -1,0 +1,85 @@
+"""What the compiled code works on: MuJoCo's arrays, and where the arms stand in them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+JOINTS = 7
+"""The most joints an arm may have; shorter arms leave the rest unused."""
+
+OSC_POSE, JOINT_POSITION = 0, 1
+
+
+class Views(NamedTuple):
+    """MuJoCo's own arrays of one model and its data, not copies, and the addresses of both."""
+
+    model: int
+    data: int
+    qpos: Floats  # (nq,)
+    qvel: Floats  # (nv,)
+    qacc: Floats  # (nv,)
+    ctrl: Floats  # (nu,)
+    mass: Floats  # (nM,) the sparse mass matrix
+    bias: Floats  # (nv,) Coriolis, centrifugal and gravity
+    passive: Floats  # (nv,)
+    actuator: Floats  # (nv,)
+    cdof: Floats  # (nv, 6)
+    cvel: Floats  # (nbody, 6)
+    subtree_com: Floats  # (nbody, 3)
+    site_xpos: Floats  # (nsite, 3)
+    site_xmat: Floats  # (nsite, 9)
+    sensordata: Floats
+    contact: Floats  # (nbody, 6) contact and applied force: torque, then force
+    applied: Floats  # (nbody, 6) applied force: force, then torque
+    ctrlrange: Floats  # (nu, 2)
+    damping: Floats  # (nv,)
+    mass_address: NDArray[np.int32]  # (nv,) where a row of `mass` begins
+    parent: NDArray[np.int32]  # (nv,) the next joint towards the base, -1 at its end
+
+
+class Nominal(NamedTuple):
+    """The dynamics that the controllers and the torque estimate believe in, frozen when the model was loaded."""
+
+    model: int  # 0 while the live model is the nominal one
+    data: int
+    qpos: Floats
+    qvel: Floats
+    mass: Floats
+    bias: Floats
+    damping: Floats
+
+
+class Arms(NamedTuple):
+    """Where each arm stands in the arrays, and its controller's settings; one row an arm."""
+
+    joints: Ints  # (A,) how many
+    qpos: Ints  # (A, JOINTS)
+    dofs: Ints  # (A, JOINTS)
+    motors: Ints  # (A, JOINTS)
+    site: Ints  # (A,) between the fingers
+    site_body: Ints  # (A,) that it belongs to
+    root: Ints  # (A,) the robot's outermost body
+    base: Ints  # (A,) the site that actions are relative to, -1 for the world
+    wrench: Ints  # (A,) where the wrist's force and torque begin in sensordata
+    bodies: Ints  # (A, B) bodies whose contacts count, padded with -1
+    tree: Ints  # (A, T) dofs of the arm and all that hangs on it, padded with -1
+    kind: Ints  # (A,) OSC_POSE or JOINT_POSITION
+    kp: Floats  # (A, JOINTS)
+    kd: Floats  # (A, JOINTS)
+    compensate: NDArray[np.bool_]  # (A,) joint control that knows the arm's dynamics
+    rest: Floats  # (A, JOINTS) the posture that spare joints tend to [rad]
+    limits: Floats  # (A, JOINTS, 2) of the joint set-point [rad]
+
+
+class Goals(NamedTuple):
+    """The controllers' set-points, changed in place."""
+
+    position: Floats  # (A, 3) relative to the base
+    orientation: Floats  # (A, 3, 3) relative to the base
+    joints: Floats  # (A, JOINTS)
