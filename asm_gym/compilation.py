@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import mujoco
 import numba
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -40,8 +41,8 @@ def _cache_of(dispatcher: Any) -> Any:
 
 @lru_cache
 def _digest(folder: Path) -> str:
-    """Of every source file in a folder."""
-    digest = hashlib.sha256(numba.__version__.encode())
+    """Of every source file in a folder, and of what its code is compiled by and linked to."""
+    digest = hashlib.sha256(f"{numba.__version__} {mujoco.__version__}".encode())
     for path in sorted(folder.glob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()

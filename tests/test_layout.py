@@ -98,7 +98,9 @@ def test_the_memory_learns_without_automatic_differentiation() -> None:
 
 
 def test_only_envs_imports_robosuite() -> None:
-    assert not [line for line in offences("asm_gym", "robosuite") if not line.startswith("asm_gym.envs.")]
+    # The benchmark times robosuite as a rival.
+    allowed = ("asm_gym.envs.", "asm_gym.scripts.benchmark")
+    assert not [line for line in offences("asm_gym", "robosuite") if not line.startswith(allowed)]
 
 
 def test_importing_the_package_is_cheap() -> None:

@@ -6,52 +6,17 @@ import sys
 import warnings
 
 import gymnasium as gym
+import imageio_ffmpeg
 import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
+from asm_gym.policies import make_policy
 from asm_gym.scripts.doctor import rendering_backend
 from asm_gym.stream import MOTOR
-from asm_gym.tasks import TASKS, task
-
-# Prints the hash of an episode: everything the environment returns for given actions.
-EPISODE = """
-import hashlib, sys, gymnasium, numpy, asm_gym
-def episode(env, seed, steps=25):
-    digest = hashlib.sha256()
-    actions = numpy.random.default_rng(1).uniform(-1, 1, (steps, env.action_space.shape[0])).astype("f4")
-    observation, info = env.reset(seed=seed)
-    digest.update(observation.tobytes() + info["stream"].tobytes())
-    for action in actions:
-        observation, reward, terminated, truncated, info = env.step(action)
-        digest.update(observation.tobytes() + info["stream"].tobytes() + repr((reward, terminated, truncated)).encode())
-    return digest.hexdigest()
-"""
-exec(EPISODE)
-
-
-def test_both_env_checkers_pass_without_a_warning(lift):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(lift.unwrapped, skip_render_check=True, skip_close_check=True)
-        check_env_sb3(lift.unwrapped, skip_render_check=True)
-
-
-def test_one_seed_gives_one_episode_whatever_ran_before(lift):
-    first = episode(lift, 3)  # noqa: F821
-    assert episode(lift, 4) != first  # noqa: F821
-    lift.reset()  # a soft reset in between
-    lift.step(lift.action_space.sample())
-    assert episode(lift, 3) == first  # noqa: F821
-
-
-def test_one_seed_gives_one_episode_in_another_process_with_another_hash_seed(lift):
-    code = EPISODE + 'print(episode(gymnasium.make("asm_gym/Lift-v0"), 3))'
-    environment = {**os.environ, "PYTHONHASHSEED": "7"}
-    out = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == episode(lift, 3)  # noqa: F821
+from asm_gym.tasks import ROBOTS, TASKS, task
 
 
 def test_an_environment_runs_where_opencv_cannot_be_imported(tmp_path):
@@ -187,7 +152,8 @@ def test_an_unstable_simulation_ends_the_episode_and_says_so(lift):
     assert truncated
     assert not terminated
     assert lift.observation_space.contains(observation)
-    assert np.isfinite(reward)
+    assert (reward, info["success"]) == (0.0, False)
+    assert np.isnan(info["stream"]).all()  # nothing that a monitor could take for a measurement
     assert not lift.reset(seed=0)[1]["unstable"]
 
 
@@ -208,6 +174,11 @@ def test_a_bad_action_is_refused(lift, action):
         ({"camera": "backview"}, "'backview'.*frontview"),
         ({"observation": "list"}, "'list'.*flat, dict"),
         ({"sensor_noise": -1.0}, "sensor_noise.*-1"),
+        ({"robot": "panda"}, "'panda'.*did you mean 'Panda'"),
+        ({"robot": ("Panda", "Panda")}, "Lift takes 1 robot, got Panda, Panda"),
+        ({"controller": "JOINT_VELOCITY"}, "'JOINT_VELOCITY'.*OSC_POSE"),
+        ({"cameras": ("agentview", "cellar")}, "'cellar'.*agentview"),
+        ({"render_mode": "ansi"}, "'ansi'.*rgb_array"),
     ],
 )
 def test_a_bad_argument_is_refused_with_what_exists(arguments, message):
@@ -244,4 +215,108 @@ def test_rgb_array_shows_the_cube_and_follows_a_new_model():
     red = [(p[..., 0].astype(int) - p[..., 1] > 60).sum() for p in pictures]
     assert min(red) > 5
     assert not np.array_equal(*pictures)
+    env.close()
+
+
+def test_a_task_with_two_arms_takes_a_pair_or_one_name_for_both():
+    with pytest.raises(ValueError, match="TwoArmLift takes 2 robots, got Panda, Sawyer, Jaco"):
+        gym.make("asm_gym/TwoArmLift-v0", robot=("Panda", "Sawyer", "Jaco"))
+    env = gym.make("asm_gym/TwoArmLift-v0", robot="Sawyer")
+    assert env.unwrapped.robots == ("Sawyer", "Sawyer")
+    env.close()
+
+
+def test_success_ends_the_episode_where_asked():
+    env = gym.make("asm_gym/Lift-v0", terminate_on_success=True, reward_shaping=False)
+    expert, state = make_policy("scripted", env, seed=0), None
+    observation, _ = env.reset(seed=0)
+    terminated = False
+    while not terminated:
+        action, state = expert.predict(observation, state)
+        observation, reward, terminated, truncated, info = env.step(action)
+        assert not truncated
+        assert reward == info["success"] == terminated
+        assert info["reward_terms"] == {"success": reward}
+    env.close()
+
+
+def test_without_a_stream_there_is_none():
+    env = gym.make("asm_gym/Lift-v0", stream=())
+    _, info = env.reset(seed=0)
+    assert "stream" not in info
+    with pytest.raises(AttributeError, match=r"stream=\(\)"):
+        _ = env.unwrapped.stream_spec
+    env.close()
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_vectors_of_environments_agree_with_single_ones(lift, mode):
+    vector = gym.make_vec("asm_gym/Lift-v0", num_envs=2, vectorization_mode=mode)
+    observations, info = vector.reset(seed=[3, 4])
+    np.testing.assert_array_equal(observations[1], lift.reset(seed=4)[0])
+    action = np.full((2, 7), 0.2, np.float32)
+    observations, rewards, *_, info = vector.step(action)
+    observation, reward, *_, single = lift.step(action[1])
+    np.testing.assert_array_equal(observations[1], observation)
+    assert rewards[1] == reward
+    np.testing.assert_array_equal(info["stream"][1], single["stream"])
+    vector.close()
+
+
+needs_opengl = pytest.mark.skipif(rendering_backend() is None, reason="this machine has no OpenGL to render with")
+
+
+@needs_opengl
+@pytest.mark.parametrize("observation", ["flat", "dict"])
+def test_cameras_add_pictures_to_the_observation(observation):
+    cameras = ("agentview", "robot0_eye_in_hand")
+    env = gym.make("asm_gym/Lift-v0", observation=observation, cameras=cameras, camera_size=(40, 48))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped, skip_render_check=True, skip_close_check=True)
+        check_env_sb3(env.unwrapped, skip_render_check=True)
+    seen, _ = env.reset(seed=0)
+    pictures = [seen[f"{c}_image"] for c in cameras]
+    assert all(p.shape == (40, 48, 3) and p.dtype == np.uint8 and p.std() > 5 for p in pictures)
+    assert not np.array_equal(*pictures)
+    assert ("state" in seen) == (observation == "flat")
+    env.close()
+
+
+@needs_opengl
+def test_depth_is_rendered_in_metres():
+    env = gym.make("asm_gym/Lift-v0", render_mode="depth_array", camera="birdview", render_size=(32, 32))
+    env.reset(seed=0)
+    depth = env.render()
+    data = env.unwrapped.simulation.data
+    above_table = data.camera("birdview").xpos[2] - 0.8
+    assert depth.dtype == np.float32
+    assert np.abs(depth - above_table).min() < 0.01
+    env.close()
+
+
+@needs_opengl
+def test_a_video_is_recorded(tmp_path):
+    env = gym.make("asm_gym/Lift-v0", render_mode="rgb_array", render_size=(64, 64), horizon=4)
+    env = gym.wrappers.RecordVideo(env, str(tmp_path), disable_logger=True)
+    env.reset(seed=0)
+    while not env.step(np.zeros(7, np.float32))[3]:
+        pass
+    env.close()
+    (video,) = tmp_path.glob("*.mp4")
+    assert imageio_ffmpeg.count_frames_and_secs(video)[0] == 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("name", TASKS)
+def test_every_robot_does_every_task(name, robot):
+    env = gym.make(TASKS[name].id, robot=robot)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    for _ in range(5):
+        observation, *_, info = env.step(env.action_space.sample())
+    assert env.observation_space.contains(observation)
+    assert not info["unstable"]
+    assert env.unwrapped.simulation.compiled
     env.close()

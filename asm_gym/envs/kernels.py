@@ -37,7 +37,7 @@ _step2: Any = types.ExternalFunction("mj_step2", _on_data)
 _kinematics: Any = types.ExternalFunction("mj_kinematics", _on_data)
 _com_pos: Any = types.ExternalFunction("mj_comPos", _on_data)
 _com_vel: Any = types.ExternalFunction("mj_comVel", _on_data)
-_crb: Any = types.ExternalFunction("mj_crb", _on_data)
+_mass: Any = types.ExternalFunction("mj_makeM" if hasattr(mujoco, "mj_makeM") else "mj_crb", _on_data)
 _rne: Any = types.ExternalFunction("mj_rne", types.void(types.intp, types.intp, types.int32, types.intp))
 
 
@@ -48,7 +48,7 @@ def _believe(views: Views, nominal: Nominal) -> None:
     nominal.qvel[:] = views.qvel
     _kinematics(nominal.model, nominal.data)
     _com_pos(nominal.model, nominal.data)
-    _crb(nominal.model, nominal.data)
+    _mass(nominal.model, nominal.data)
     _com_vel(nominal.model, nominal.data)
     _rne(nominal.model, nominal.data, 0, nominal.bias.ctypes.data)
 

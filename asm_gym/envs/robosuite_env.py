@@ -15,7 +15,7 @@ from asm_gym.envs import backend
 from asm_gym.envs.choices import check_choice
 from asm_gym.envs.layout import Layout
 from asm_gym.envs.pictures import RENDER_MODES, Pictures
-from asm_gym.envs.rewards import Rewards
+from asm_gym.envs.rewards import Rewards, RewardTerms
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS
 from asm_gym.envs.simulation import Simulation
 from asm_gym.stream import MOTOR, Channel, StreamSpec
@@ -34,7 +34,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     - ``success``: whether the task is solved now;
     - ``reward_terms``: the parts of the reward by name, which add up to it (not on reset);
     - ``contact_force``: the largest net contact force on an arm within the step [N];
-    - ``unstable``: the simulation diverged, which ends the episode as truncated.
+    - ``unstable``: the simulation diverged, which ends the episode as truncated. Its last stream is then NaN, its last
+      observation 0.
 
     Args:
         task: a name in ``asm_gym.tasks.TASKS``.
@@ -212,19 +213,21 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
                 self.simulation.advance(1)
                 self.substep_hook(k)
         env.cur_time += env.control_timestep
-        reward = self._rewards(self._action)
         self._steps += 1
+        reward = self._rewards(self._action)
         self._row = self.measure()
-        info = self._info(reward.success)
+        if unstable := self._bad_count() != self._warnings or not np.isfinite(self._row).all():
+            # What the simulation holds now, MuJoCo's initial state as a rule, is nothing that the robot could sense.
+            self._row[:] = np.nan
+            reward = RewardTerms(dict.fromkeys(reward.terms, 0.0), False)
+        info = self._info(reward.success, unstable)
         info["reward_terms"] = reward.terms
-        info["unstable"] = self._bad_count() != self._warnings or not np.isfinite(self._row).all()
-        terminated = self.terminate_on_success and info["success"] and not info["unstable"]
-        truncated = self._steps >= self.horizon or info["unstable"]
+        terminated = self.terminate_on_success and reward.success
+        truncated = self._steps >= self.horizon or unstable
         self._ended = terminated or truncated
-        total = sum(reward.terms.values())
         if self.render_mode == "human":
             self.render()
-        return self._observation(), total if np.isfinite(total) else 0.0, terminated, truncated, info
+        return self._observation(), float(sum(reward.terms.values())), terminated, truncated, info
 
     def command(self, action: NDArray[np.float32]) -> None:
         """From within a substep hook: another action for the rest of the control step, efference copy included.
@@ -266,9 +269,10 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     def _observation(self) -> Any:
         return self._layout.observation(self._row, self._pictures.images(self.simulation.model, self.simulation.data))
 
-    def _info(self, success: bool) -> dict[str, Any]:
+    def _info(self, success: bool, unstable: bool = False) -> dict[str, Any]:
         info: dict[str, Any] = {"stream": self.to_stream(self._row)} if self._layout.stream_spec else {}
-        return info | {"success": success, "contact_force": self.simulation.contact_force, "unstable": False}
+        force = np.nan if unstable else self.simulation.contact_force
+        return info | {"success": success, "contact_force": force, "unstable": unstable}
 
     def _bad_count(self) -> int:
         """How often MuJoCo found the simulation unstable; it resets itself then, and says so nowhere else."""

@@ -1,0 +1,215 @@
+"""Control steps of the compiled loop against robosuite's own."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+import asm_gym  # noqa: F401
+from asm_gym.envs import backend
+from asm_gym.tasks import task
+
+
+def pair(name, controller="OSC_POSE"):
+    """Our environment and robosuite's own, at the start of the same episode."""
+    ours = gym.make(f"asm_gym/{name}-v0", controller=controller, sensor_noise=0.0, horizon=10_000).unwrapped
+    theirs = backend.make(task(name), ours.robots, controller, 20, reward_shaping=True)
+    ours.reset(seed=4)
+    for env in (theirs, ours.robosuite_env):
+        env.rng.bit_generator.state = np.random.default_rng(9).bit_generator.state
+        env.hard_reset = True
+        env.reset()
+    ours._bind()
+    return ours, theirs
+
+
+def gentle(size, steps, seed=0):
+    """Smooth movements about where the arm starts, the gripper opening and closing."""
+    t = np.arange(steps)[:, None] / 20.0
+    rng = np.random.default_rng(seed)
+    return 0.25 * np.sin(2 * np.pi * rng.uniform(0.1, 0.5, size) * t + rng.uniform(0, 2 * np.pi, size))
+
+
+def hands(env):
+    return np.array([env.sim.data.site_xpos[r.eef_site_id[a]] for r in env.robots for a in r.arms])
+
+
+@pytest.mark.parametrize("name", ["Lift", "Stack", "Door", "NutAssemblySquare", "Wipe", "TwoArmLift"])
+def test_the_hand_moves_as_under_robosuites_own_step(name):
+    ours, theirs = pair(name)
+    assert ours.simulation.compiled
+    start = hands(theirs)
+    apart = moved = 0.0
+    for action in gentle(theirs.action_dim, 200).astype(np.float32):
+        _, reward, *_ = ours.step(action)
+        expected = theirs.step(action.astype(np.float64))[1]
+        apart = max(apart, np.abs(hands(theirs) - hands(ours.robosuite_env)).max())
+        moved = max(moved, np.abs(hands(theirs) - start).max())
+        assert reward == pytest.approx(expected, abs=1e-6)
+    assert apart < 1e-6
+    assert moved > 0.05
+    ours.close()
+
+
+@pytest.mark.parametrize(
+    ("controller", "compiled"),
+    [("JOINT_POSITION", True), ("OSC_POSITION", False), ("JOINT_TORQUE", False), ("IK_POSE", False)],
+)
+def test_other_controllers_move_as_under_robosuites_own_step(controller, compiled):
+    ours, theirs = pair("Lift", controller)
+    assert ours.simulation.compiled is compiled
+    for action in gentle(theirs.action_dim, 50).astype(np.float32):
+        ours.step(action)
+        theirs.step(ours._scaled(action))
+    np.testing.assert_allclose(hands(theirs), hands(ours.robosuite_env), atol=1e-6)
+    ours.close()
+
+
+def test_wipes_reward_follows_the_force_that_robosuite_remembers():
+    """Its reward reads buffers that robosuite fills within a step, pressing on the table included."""
+    ours, theirs = pair("Wipe")
+    down = np.array([0.1, 0.0, -0.3, 0, 0, 0], np.float32)
+    pressed = 0
+    for _ in range(60):
+        terms = ours.step(down)[4]["reward_terms"]
+        assert sum(terms.values()) == pytest.approx(theirs.step(down.astype(np.float64))[1], abs=1e-6)
+        pressed += terms["press"] > 0 or terms["excess_force"] < 0
+    assert pressed > 5
+    ours.close()
+
+
+def test_a_substep_hook_runs_after_every_substep_and_changes_nothing_by_itself(lift):
+    env = lift.unwrapped
+    action = np.array([0.3, 0.2, -0.1, 0, 0, 0, 1], np.float32)
+    env.reset(seed=0)
+    without = [env.step(action)[0] for _ in range(3)]
+    called = []
+    env.substep_hook = called.append
+    env.reset(seed=0)
+    try:
+        hooked = [env.step(action)[0] for _ in range(3)]
+    finally:
+        env.substep_hook = None
+    np.testing.assert_array_equal(without, hooked)
+    assert called == list(range(25)) * 3
+
+
+def test_a_substep_hook_can_take_over_at_once(lift):
+    env = lift.unwrapped
+    rest, forth = np.zeros(7, np.float32), np.array([1, 0, 0, 0, 0, 0, 0], np.float32)
+
+    def travel(hook):
+        env.reset(seed=0)
+        before = hands(env.robosuite_env)[0, 0]
+        env.substep_hook = hook
+        try:
+            stream = env.step(forth)[4]["stream"]
+        finally:
+            env.substep_hook = None
+        for _ in range(4):
+            env.step(rest)
+        return hands(env.robosuite_env)[0, 0] - before, stream[env.stream_spec.motor]
+
+    free, _ = travel(None)
+    stopped, commanded = travel(lambda k: env.command(rest) if k == 4 else None)
+    assert stopped < 0.5 * free
+    np.testing.assert_array_equal(commanded, rest)  # the efference copy is what was commanded last
+
+
+def test_a_hook_reads_the_sensors_within_the_step(lift):
+    env = lift.unwrapped
+    env.reset(seed=0)
+    rows = []
+    env.substep_hook = lambda k: rows.append(env.measure())
+    try:
+        env.step(np.array([1, 0, 0, 0, 0, 0, 0], np.float32))
+    finally:
+        env.substep_hook = None
+    x = np.array(rows)[:, env.measured_spec.slices["hand_position"]][:, 0]
+    assert x[-1] - x[0] > 5e-4
+    assert len(rows) == 25
+
+
+def test_nobody_tells_the_robot_of_a_payload():
+    """τ_ext = Jᵀ m (g - a): observer and controller go on with the masses they were built with."""
+    env = gym.make("asm_gym/Lift-v0", sensor_noise=0.0, horizon=1000).unwrapped
+    env.reset(seed=0)
+    rest = np.zeros(7, np.float32)
+    for _ in range(20):
+        env.step(rest)
+    model, data = env.simulation.model, env.simulation.data
+    hand = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "robot0_right_hand")
+    slices, height = env.stream_spec.slices, hands(env.robosuite_env)[0, 2]
+    jacobian = np.zeros((3, model.nv))
+
+    def momentum(k):
+        mujoco.mj_jac(model, data, jacobian, None, data.xipos[hand], hand)
+        velocities.append(jacobian @ data.qvel)
+
+    before = env.step(rest)[4]["stream"][slices["external_torque"]]
+    model.body_mass[hand] += 1.0
+    velocities = [np.zeros(3)]
+    env.substep_hook = momentum
+    for _ in range(3):
+        stream = env.step(rest)[4]["stream"]
+    env.substep_hook = None
+    fall = (velocities[-1] - velocities[-26]) / 0.05
+    expected = (jacobian.T @ ([0, 0, -9.81] - fall))[:7]
+    np.testing.assert_allclose(stream[slices["external_torque"]] - before, expected, atol=0.15)
+    assert np.abs(expected).max() > 1.0
+    for _ in range(10):
+        env.step(rest)
+    assert height - hands(env.robosuite_env)[0, 2] > 0.01  # not compensated: the arm sags
+    model.body_mass[hand] -= 1.0
+    assert env.simulation._nominal() is env.simulation._pristine
+    env.close()
+
+
+def test_added_joint_friction_is_an_external_torque():
+    env = gym.make("asm_gym/Lift-v0", sensor_noise=0.0, horizon=1000).unwrapped
+    env.reset(seed=0)
+    env.simulation.model.dof_damping[3] += 5.0
+    velocities = []
+    env.substep_hook = lambda k: velocities.append(env.simulation.data.qvel[3])
+    for _ in range(5):
+        stream = env.step(np.array([0, 0, 0.5, 0, 0, 0, 0], np.float32))[4]["stream"]
+    expected = -5.0 * np.mean(velocities[-26:-1])
+    # Joint friction, which the model has as well, is about 0.1 N m.
+    assert stream[env.stream_spec.slices["external_torque"]][3] == pytest.approx(expected, abs=0.12)
+    assert abs(expected) > 0.3
+    env.close()
+
+
+def test_contact_channels_are_there_for_who_asks():
+    env = gym.make("asm_gym/Wipe-v0", stream=("wrench", "contact"), sensor_noise=0.0)
+    env.reset(seed=0)
+    for _ in range(60):
+        stream = env.step(np.array([0, 0, -0.3, 0, 0, 0], np.float32))[4]["stream"]
+    slices = env.unwrapped.stream_spec.slices
+    assert stream[slices["contact_force"]][2] > 5.0  # the table pushes up
+    env.close()
+
+
+def test_two_arms_give_two_sets_of_channels():
+    env = gym.make("asm_gym/TwoArmLift-v0", robot=("Panda", "UR5e"), sensor_noise=0.0)
+    env.reset(seed=0)
+    spec = env.unwrapped.stream_spec
+    sizes = {c.name: c.size for c in spec.channels}
+    assert (sizes["robot0_joint_position"], sizes["robot1_joint_position"]) == (7, 6)
+    action = np.zeros(14, np.float32)
+    action[7 + 2] = 0.5  # the second arm, upwards
+    before = env.step(np.zeros(14, np.float32))[4]["stream"]
+    for _ in range(8):
+        stream = env.step(action)[4]["stream"]
+    moved = {n: np.abs(stream - before)[spec.slices[f"{n}_hand_position"]].max() for n in ("robot0", "robot1")}
+    assert moved["robot1"] > 0.03 > 5 * moved["robot0"]
+    env.close()
+
+
+def test_the_gripper_speaks_in_its_own_units():
+    fingers = {"Panda": "m", "Jaco": "rad"}
+    for robot, unit in fingers.items():
+        env = gym.make("asm_gym/Lift-v0", robot=robot).unwrapped
+        units = {c.name: c.unit for c in env.stream_spec.channels}
+        assert units["gripper_opening"] == unit
+        env.close()
