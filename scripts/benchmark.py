@@ -141,8 +141,8 @@ class Env:
 
 
 @dataclass
-class Memory:
-    """Whether an environment's memory grows over steps and resets."""
+class Leaks:
+    """Whether the process grows over an environment's steps and resets."""
 
     task: str = "Lift"
     """a task's name"""
@@ -199,7 +199,7 @@ class Args:
     """Speeds as ratios, each against a named rival in the same run."""
 
     what: Annotated[
-        Annotated[Env, tyro.conf.subcommand("env")] | Annotated[Memory, tyro.conf.subcommand("memory")],
+        Annotated[Env, tyro.conf.subcommand("env")] | Annotated[Leaks, tyro.conf.subcommand("leaks")],
         tyro.conf.arg(name=""),
     ] = field(default_factory=Env)
 
