@@ -11,8 +11,16 @@ import gymnasium as gym
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold
 from asm_gym.policies.scripted.lift import LiftExpert
+from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
+from asm_gym.policies.scripted.pick_place import PickPlaceExpert
+from asm_gym.policies.scripted.stack import StackExpert
 
-EXPERTS: dict[str, Callable[..., Policy]] = {"Lift": LiftExpert}
+EXPERTS: dict[str, Callable[..., Policy]] = {
+    "Lift": LiftExpert,
+    "Stack": StackExpert,
+    **{f"NutAssembly{which}": NutAssemblyExpert for which in ("", "Single", "Square", "Round")},
+    **{f"PickPlace{which}": PickPlaceExpert for which in ("", "Single", "Can", "Milk", "Bread", "Cereal")},
+}
 """The scripted expert of each task."""
 
 POLICIES = ("scripted", "hold")

@@ -50,7 +50,7 @@ _STYLE: dict[Any, Any] = {
 
 
 @contextmanager
-def _figure(height: float, width: float = _WIDTH) -> Iterator[Figure]:
+def figure(height: float, width: float = _WIDTH) -> Iterator[Figure]:
     """A figure in the style above, whatever the user's matplotlibrc says; sizes in [in]."""
     with mpl.rc_context():
         mpl.rcdefaults()
@@ -69,7 +69,7 @@ def save(fig: Figure, path: str | Path) -> Path:
 def surprise_figure(traces: Sequence[Trace]) -> Figure:
     """Surprise over time, a panel a trace on common axes: the threshold, the fault's span and onset, the alarms."""
     _require(traces)
-    with _figure(height=0.9 + 1.35 * len(traces)) as fig:
+    with figure(height=0.9 + 1.35 * len(traces)) as fig:
         panels = fig.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         for ax, trace in zip(panels, traces, strict=True):
             _surprise_panel(ax, trace)
@@ -117,7 +117,7 @@ def _surprise_panel(ax: Axes, trace: Trace) -> None:
 def delay_figure(traces: Sequence[Trace], window_s: float) -> Figure:
     """The share of faults detected within so many ms of the onset, a curve a fault, with its 95 % Wilson band."""
     faults = _faults(traces)
-    with _figure(height=4.2) as fig:
+    with figure(height=4.2) as fig:
         ax = fig.subplots()
         for i, (condition, group) in enumerate(faults.items()):
             delays = delays_ms(group, window_s)
@@ -125,7 +125,7 @@ def delay_figure(traces: Sequence[Trace], window_s: float) -> Figure:
             counts = np.concatenate([[0], np.arange(len(found)) + 1, [len(found)]])  # at 0, at each alarm, at the end
             x = np.concatenate([[0.0], found, [1e3 * window_s]])
             low, high = np.array([wilson_interval(int(k), len(delays)) for k in counts]).T
-            colour, line, _ = _look(i)
+            colour, line, _ = look(i)
             label = f"{condition} ({len(found)} of {len(delays)})"
             ax.fill_between(x, 100 * low, 100 * high, step="post", color=colour, alpha=0.12, linewidth=0)
             ax.step(x, 100 * counts / len(delays), where="post", color=colour, linestyle=line, linewidth=2, label=label)
@@ -141,14 +141,14 @@ def roc_figure(traces: Sequence[Trace], window_s: float) -> Figure:
     nominal = [t for t in traces if t.watched_only and t.condition == NOMINAL]
     if not nominal:
         raise ValueError("a ROC curve needs nominal traces")
-    with _figure(height=5.2, width=5.6) as fig:
+    with figure(height=5.2, width=5.6) as fig:
         ax = fig.subplots()
         ax.plot([0, 100], [0, 100], color="#999999", linewidth=1)
         for i, (condition, group) in enumerate(_faults(traces).items()):
             values = np.sort(placements(group, nominal, window_s))
             if not values.size:
                 continue
-            colour, line, _ = _look(i)
+            colour, line, _ = look(i)
             x = np.concatenate([[0], values, [1]])
             y = np.concatenate([[0], np.arange(values.size) + 1, [values.size]]) / values.size
             label = f"{condition}: AUROC {1 - values.mean():.2f}"
@@ -171,7 +171,7 @@ def attribution_figure(trace: Trace, top: int = 12) -> Figure:
     share = np.nan_to_num(share, nan=0.0, posinf=brightest, neginf=0.0)
     rows = np.argsort(-share[trace.onset or 0 :].max(axis=0), kind="stable")[:top]
     high = max(float(share[:, rows].max()), 1.0)
-    with _figure(height=1.5 + 0.24 * len(rows)) as fig:
+    with figure(height=1.5 + 0.24 * len(rows)) as fig:
         ax = fig.subplots()
         ends = (0.0, len(trace) * trace.dt, len(rows) - 0.5, -0.5)
         norm = LogNorm(min(0.01, high / 100), high)
@@ -202,11 +202,11 @@ def maxima_figure(traces: Sequence[Trace], window_s: float) -> Figure:
     groups = {c: g for c, g in groups.items() if g}
     worst = {c: np.array([_peak(t, window_s) / t.threshold for t in g]) for c, g in groups.items()}  # (n,) each
     floor, ceiling = min(0.5, *(w.min() for w in worst.values())), max(2.0, *(w.max() for w in worst.values()))
-    with _figure(height=1.1 + 0.55 * len(groups)) as fig:
+    with figure(height=1.1 + 0.55 * len(groups)) as fig:
         ax = fig.subplots()
         per_decade = 72 * 5.5 / np.log10(ceiling / floor)  # [pt]
         for i, (condition, ratios) in enumerate(worst.items()):
-            colour, _, marker = ("#666666", "", "o") if condition == NOMINAL else _look(i - (NOMINAL in groups))
+            colour, _, marker = ("#666666", "", "o") if condition == NOMINAL else look(i - (NOMINAL in groups))
             offsets = _swarm(np.log10(ratios) * per_decade, size=5.5) / 40  # a row is 40 pt high
             ax.plot(ratios, i + offsets, marker, color=colour, markersize=5, alpha=0.8, mew=0)
             above = f"{(ratios > 1).sum()} of {len(ratios)} above"
@@ -258,9 +258,10 @@ def _faults(traces: Sequence[Trace]) -> dict[str, list[Trace]]:
     return {c: [t for t in faulty if t.condition == c] for c in dict.fromkeys(t.condition for t in faulty)}
 
 
-def _look(i: int) -> tuple[str, Any, str]:
+def look(i: int) -> tuple[str, Any, str]:
     """Colour, line style and marker of the i-th curve."""
-    return _COLOURS[i % len(_COLOURS)], _LINES[i % len(_LINES)], _MARKERS[i % len(_MARKERS)]
+    n = len(_COLOURS)
+    return _COLOURS[i % n], _LINES[(i + i // n) % n], _MARKERS[(i + i // n) % n]
 
 
 def _require(traces: Sequence[Trace]) -> None:

@@ -40,6 +40,12 @@ class Style:
         if not self.speed > 0:
             raise ValueError(f"speed must be > 0, got {self.speed}")
 
+    def drifted(self, drift: Vector, rng: np.random.Generator) -> Vector:
+        """The next action noise after ``drift``: an AR(1) process that forgets in about 4 steps."""
+        rho = 0.78
+        step: Vector = rho * drift + self.noise * np.sqrt(1 - rho**2) * rng.standard_normal(len(drift))
+        return step
+
 
 class ObservationReader:
     """Named parts of an environment's flat or dict observation."""
@@ -79,21 +85,38 @@ def matrix(quaternion: Vector) -> Vector:
 
 def pointing_down(hand: Vector, object_rotation: Vector | None = None) -> Vector:
     """(3, 3) the rotation nearest ``hand`` (3, 3) whose fingers point down and close along a side of the object."""
-    closing = hand[:2, 1]  # fingers move along the hand's y axis
-    yaw = np.arctan2(closing[1], closing[0])
-    if object_rotation is not None:
-        # The side that lies flattest gives the object's heading; a cube looks the same every quarter turn.
-        side = object_rotation[:2, int(np.abs(object_rotation[2]).argmin())]
-        heading = np.arctan2(side[1], side[0])
-        yaw = heading + np.round((yaw - heading) / (np.pi / 2)) * (np.pi / 2)
+    if object_rotation is None:
+        return gripping(hand, None)
+    # The side that lies flattest gives the object's heading; a cube looks the same every quarter turn.
+    side = object_rotation[:, int(np.abs(object_rotation[2]).argmin())]
+    return gripping(hand, side, np.pi / 2)
+
+
+def gripping(hand: Vector, closing: Vector | None, turns: float = np.pi) -> Vector:
+    """(3, 3) the rotation nearest ``hand`` (3, 3) whose fingers point down and close along ``closing``.
+
+    Args:
+        closing: (3,) in the world; the hand's own direction where None.
+        turns: after how much of a turn the direction is as good again [rad].
+    """
+    own = hand[:2, 1]  # fingers move along the hand's y axis
+    yaw = np.arctan2(own[1], own[0])
+    if closing is not None:
+        heading = np.arctan2(closing[1], closing[0])
+        yaw = heading + np.round((yaw - heading) / turns) * turns
     y = np.array([np.cos(yaw), np.sin(yaw), 0.0])
     z = np.array([0.0, 0.0, -1.0])
     return np.stack([np.cross(y, z), y, z], axis=1)
 
 
-def move(position: Vector, target: Vector, hand: Vector, target_rotation: Vector, speed: float) -> Vector:
-    """(6,) the hand's command: towards a pose, at no more than ``speed`` (in action units)."""
-    step = (target - position) / _METRES
+def move(
+    position: Vector, target: Vector, hand: Vector, target_rotation: Vector, speed: float, gain: float = 1.0
+) -> Vector:
+    """(6,) the hand's command: towards a pose, at no more than ``speed`` (in action units).
+
+    The controller covers about a third of what it is asked for in one step, so that a ``gain`` up to 2 does not overshoot.
+    """
+    step = gain * (target - position) / _METRES
     norm = np.linalg.norm(step)
     if norm > speed:
         step *= speed / norm

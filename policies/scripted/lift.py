@@ -88,10 +88,7 @@ class LiftExpert:
         )
 
     def _advance(self, state: _State, hand_at: Vector, cube_at: Vector) -> _State:
-        # An AR(1) process whose standard deviation is `noise` and whose memory is about 4 steps.
-        rho = 0.78
-        fresh = self.style.noise * np.sqrt(1 - rho**2) * self.np_random.standard_normal(7)
-        state = state._replace(since=state.since + 1, drift=rho * state.drift + fresh)
+        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
         offset = hand_at - cube_at
         if state.phase == REACH and np.linalg.norm(offset - state.hover) < 0.02:
             return state._replace(phase=DESCEND, since=0)

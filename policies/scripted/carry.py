@@ -1,0 +1,219 @@
+"""Picks an object up and puts it somewhere: what stacking, sorting and fitting nuts have in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.policies.scripted.base import (
+    CLOSE,
+    OPEN,
+    ObservationReader,
+    Style,
+    Vector,
+    gripping,
+    matrix,
+    move,
+    rotation,
+)
+
+REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT = range(8)
+
+_GAIN = 2.0
+
+
+class Errand(NamedTuple):
+    """What to carry where.
+
+    Args:
+        name: of the object, as observations call it.
+        grip: (3,) where to hold it, in its own frame [m].
+        closing: (3,) along which of its own axes the fingers close; None where every direction does.
+        turns: after how much of a turn about the vertical the grasp is the same again [rad].
+        clearance: how far above its grip to come from [m].
+        place: (3,) where its origin is to go [m].
+        over: how far above ``place`` to carry it [m].
+        headings: those of its x axis that fit the place [rad]; empty where every one does.
+        heading_fit: how exactly it must have one of them before it is lowered [rad].
+        fit: how exactly it must stand over its place before it is lowered [m].
+    """
+
+    name: str
+    grip: Vector
+    closing: Vector | None
+    turns: float
+    clearance: float
+    place: Vector
+    over: float
+    headings: tuple[float, ...] = ()
+    heading_fit: float = 0.06
+    fit: float = 0.02
+
+
+class CarryState(NamedTuple):
+    """Where one episode stands."""
+
+    phase: int
+    since: int  # steps spent in the phase
+    speed: float  # action units
+    spread: Vector  # (3,) how this episode's way-points differ from the plan [m]
+    errand: Errand | None
+    anchor: Vector  # (3,) where the hand was when the phase began [m]
+    drift: Vector  # correlated action noise
+
+
+class CarryExpert(ABC):
+    """An expert that carries objects one after the other.
+
+    Args:
+        env: tells where things stand in the observation.
+        seed: of the noise and of the style drawn for each episode.
+        style: how much it varies.
+    """
+
+    pace = 0.55
+    """Hand speed in action units."""
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
+        self.style = style or Style()
+        self.np_random = np.random.default_rng(seed)
+        self.env = env
+        self._read = ObservationReader(env)
+
+    @abstractmethod
+    def next_errand(self, observation: Any) -> Errand | None:
+        """What to carry next; None where everything is done."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: CarryState | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], CarryState]:
+        """The action (7,); ``deterministic`` leaves the action noise out, not the style."""
+        if state is None or (episode_start is not None and np.any(episode_start)):
+            state = self._begin(observation)
+        hand_at = self._read(observation, "hand_position")
+        hand = rotation(self._read(observation, "hand_orientation"))
+        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
+        state = self._advance(state, observation, hand_at, hand)
+        command = self._command(state, observation, hand_at, hand)
+        if not deterministic:
+            command[:6] += state.drift[:6]
+        return np.clip(command, -1.0, 1.0).astype(np.float32), state
+
+    def _begin(self, observation: Any) -> CarryState:
+        style, rng = self.style, self.np_random
+        pace = self.pace * style.speed * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.5, 1.5))
+        spread = style.spread * rng.standard_normal(3)
+        return CarryState(REACH, 0, pace, spread, self.next_errand(observation), np.zeros(3), np.zeros(7))
+
+    def pose(self, observation: Any, name: str) -> tuple[Vector, Vector]:
+        """(3,) position and (3, 3) rotation of an object."""
+        return self._read(observation, f"{name}_pos"), matrix(self._read(observation, f"{name}_quat"))
+
+    def _advance(self, state: CarryState, observation: Any, hand_at: Vector, hand: Vector) -> CarryState:
+        """The phase that comes next, where this one has done its work."""
+
+        def to(phase: int) -> CarryState:
+            return state._replace(phase=phase, since=0, anchor=hand_at)
+
+        errand, phase = state.errand, state.phase
+        if errand is None:
+            return state
+        at, turned = self.pose(observation, errand.name)
+        grip = at + turned @ errand.grip
+        off = hand_at - grip
+        lost = np.linalg.norm(off) > 0.05
+        if phase == REACH:
+            aligned = _turn_left(hand, self._grasp(errand, hand, turned)) < 0.15
+            above = np.linalg.norm(off[:2] - state.spread[:2] * 0.3) < 0.02 and abs(off[2] - errand.clearance) < 0.03
+            return to(DESCEND) if above and aligned else state
+        if phase == DESCEND:
+            if np.linalg.norm(off) < 0.011 or (state.since > 30 and np.linalg.norm(off) < 0.02):
+                return to(GRASP)
+            return to(REACH) if state.since > 60 or np.linalg.norm(off[:2]) > 0.06 else state
+        if phase == GRASP:
+            return to(RAISE) if state.since >= 7 else state
+        if phase in (RAISE, CARRY, LOWER) and lost:
+            return to(REACH)
+        place = errand.place + np.array([0.0, 0.0, errand.over])
+        if phase == RAISE:
+            return to(CARRY) if at[2] > place[2] - 0.03 or state.since > 60 else state
+        if phase == CARRY:
+            fits = abs(_to_fit(errand.headings, turned)) < errand.heading_fit
+            there = np.linalg.norm(at[:2] - errand.place[:2]) < errand.fit
+            return to(LOWER) if there and fits else state
+        if phase == LOWER:
+            if np.linalg.norm(at[:2] - errand.place[:2]) > errand.fit + 0.02:
+                return to(CARRY)
+            if at[2] < errand.place[2] + 0.006 or (state.since > 50 and at[2] < errand.place[2] + 0.03):
+                return to(RELEASE)
+            return to(CARRY) if state.since > 60 else state  # it stands on something: up, and once more
+        if phase == RELEASE:
+            return to(RETREAT) if state.since >= 6 else state
+        if state.since >= 14:
+            errand = self.next_errand(observation)
+            if errand is not None:
+                return to(REACH)._replace(errand=errand)
+        return state
+
+    def _command(self, state: CarryState, observation: Any, hand_at: Vector, hand: Vector) -> Vector:
+        """(7,) towards what the phase asks for."""
+        errand, phase = state.errand, state.phase
+        if errand is None:
+            return np.append(np.zeros(6), OPEN)
+        at, turned = self.pose(observation, errand.name)
+        grip = at + turned @ errand.grip
+        held = self._held(errand, hand, turned)
+        if phase in (REACH, DESCEND):
+            aligned = self._grasp(errand, hand, turned)
+            above = np.array([0.0, 0.0, errand.clearance]) + 0.3 * state.spread
+            target = grip + above if phase == REACH else grip
+            # From afar, first high: the way may lead over a wall or another object.
+            if phase == REACH and np.linalg.norm((grip - hand_at)[:2]) > 0.1:
+                target = np.array([target[0], target[1], max(target[2], min(hand_at[2], target[2] + 0.1))])
+            return np.append(move(hand_at, target, hand, aligned, state.speed, _GAIN), OPEN)
+        if phase == GRASP:
+            return np.append(move(hand_at, state.anchor, hand, gripping(hand, None), state.speed), CLOSE)
+        goal = errand.place + np.array([0.0, 0.0, errand.over])
+        if phase == RAISE:
+            wanted = np.array([at[0], at[1], goal[2] + 0.3 * state.spread[2]])
+            return np.append(move(at, wanted, hand, gripping(hand, None), state.speed), CLOSE)
+        if phase == CARRY:
+            return np.append(move(at, goal, hand, held, state.speed, _GAIN), CLOSE)
+        if phase == LOWER:
+            return np.append(move(at, errand.place, hand, held, 0.6 * state.speed, _GAIN), CLOSE)
+        up = state.anchor + np.array([0.0, 0.0, 0.0 if phase == RELEASE else 0.12])
+        return np.append(move(hand_at, up, hand, gripping(hand, None), state.speed), OPEN)
+
+    @staticmethod
+    def _grasp(errand: Errand, hand: Vector, turned: Vector) -> Vector:
+        """(3, 3) how to hold the hand for grasping."""
+        return gripping(hand, None if errand.closing is None else turned @ errand.closing, errand.turns)
+
+    @staticmethod
+    def _held(errand: Errand, hand: Vector, turned: Vector) -> Vector:
+        """(3, 3) how to hold the hand so that the object in it comes to fit its place."""
+        down = gripping(hand, None)
+        angle = _to_fit(errand.headings, turned)
+        c, s = np.cos(angle), np.sin(angle)
+        turn: Vector = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ down
+        return turn
+
+
+def _to_fit(headings: tuple[float, ...], turned: Vector) -> float:
+    """The smallest turn about the vertical that gives an object one of the ``headings`` [rad]; 0 without any."""
+    heading = float(np.arctan2(turned[1, 0], turned[0, 0]))
+    left = [(h - heading + np.pi) % (2 * np.pi) - np.pi for h in headings]
+    return float(min(left, key=abs, default=0.0))
+
+
+def _turn_left(hand: Vector, target: Vector) -> float:
+    """The angle between two orientations [rad]."""
+    return float(np.arccos(np.clip((np.trace(hand.T @ target) - 1) / 2, -1.0, 1.0)))

@@ -1,0 +1,84 @@
+"""Sorts milk, bread, cereal and can into their bins."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from asm_gym.policies.scripted.base import Vector
+from asm_gym.policies.scripted.carry import CarryExpert, Errand
+
+_WALL = 0.09  # how high above the bins' floor the fingertips stay clear of the walls' tops with the palm [m]
+
+
+class PickPlaceExpert(CarryExpert):
+    """A scripted expert for PickPlace, with one object or with all four."""
+
+    pace = 0.65
+
+    def next_errand(self, observation: Any) -> Errand | None:
+        """The nearest object that is not in its bin; None where all are."""
+        env = self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
+        hand = self._read(observation, "hand_position")
+        left = []
+        for i, thing in enumerate(env.objects):
+            if env.single_object_mode and i != env.object_id:
+                continue
+            at, _ = self.pose(observation, thing.name)
+            if env.not_in_bin(at, i):
+                left.append((float(np.linalg.norm(at - hand)), i))
+        if not left:
+            return None
+        _, nearest = min(left)
+        name = env.objects[nearest].name
+        at, turned = self.pose(observation, name)
+        half = self._half_extents(name)
+        grip = max(0.0, half[2] - 0.02)
+        return Errand(
+            name=name,
+            grip=np.array([0.0, 0.0, grip]),
+            closing=self._closing(half, at, turned, env.bin1_pos, env.bin_size),
+            turns=np.pi,
+            clearance=0.1,
+            place=self._place(env, nearest, half[2], grip),
+            over=0.12,
+            fit=0.03,
+        )
+
+    @staticmethod
+    def _closing(half: Vector, at: Vector, turned: Vector, bin_at: Vector, bin_size: Vector) -> Vector:
+        """(3,) along which of the object's axes to close: of those it is narrow enough along, away from the walls."""
+        axes = [np.eye(3)[i] for i in (0, 1) if half[i] < 0.035]
+
+        def room(axis: Vector) -> float:
+            along = np.abs((turned @ axis)[:2])
+            return float(np.min((bin_size[:2] / 2 - np.abs(at[:2] - bin_at[:2])) / np.maximum(along, 1e-6)))
+
+        return max(axes, key=room)
+
+    @staticmethod
+    def _place(env: Any, compartment: int, half_height: float, grip: float) -> Vector:
+        """(3,) where to let go: near the arm, because it is stretched out at the far side of the bins."""
+        place = np.array(env.target_bin_placements[compartment], np.float64)
+        away = place[:2] - env.robots[0].base_pos[:2]
+        place[:2] -= 0.04 * away / np.linalg.norm(away)
+        # Lower, and the palm would stand on a wall.
+        place[2] += max(half_height + 0.015, _WALL - grip)
+        return place
+
+    def _half_extents(self, name: str) -> Vector:
+        """(3,) half the object's size along its own axes [m]."""
+        model = self.env.unwrapped.simulation.model  # type: ignore[attr-defined]
+        body = model.body(f"{name}_main").id
+        (geom,) = (g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_group[g] == 0)
+        w, x, y, z = model.geom_quat[geom]
+        turn = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        half: Vector = np.abs(turn) @ model.geom_aabb[geom, 3:]
+        return half
