@@ -10,6 +10,7 @@ import gymnasium as gym
 
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold
+from asm_gym.policies.scripted.door import DoorExpert
 from asm_gym.policies.scripted.lift import LiftExpert
 from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
@@ -18,6 +19,7 @@ from asm_gym.policies.scripted.stack import StackExpert
 EXPERTS: dict[str, Callable[..., Policy]] = {
     "Lift": LiftExpert,
     "Stack": StackExpert,
+    "Door": DoorExpert,
     **{f"NutAssembly{which}": NutAssemblyExpert for which in ("", "Single", "Square", "Round")},
     **{f"PickPlace{which}": PickPlaceExpert for which in ("", "Single", "Can", "Milk", "Bread", "Cereal")},
 }

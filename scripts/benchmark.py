@@ -1,4 +1,4 @@
-"""``python -m asm_gym.scripts.benchmark <what>``: speeds as ratios, each against a named rival in the same run.
+"""``python -m asm_gym.scripts.benchmark <what>``: speeds as ratios, each against a named rival in the same run; experts.
 
 Machines differ and are noisy: rivals take turns, step by step, and the medians of their turns are compared.
 """
@@ -22,6 +22,10 @@ from rich.table import Table
 
 import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
+from asm_gym.evaluation.metrics import Share
+from asm_gym.policies.registry import EXPERTS
+from asm_gym.scripts.collect import collect
+from asm_gym.scripts.progress import stage
 from asm_gym.tasks import task as task_spec
 
 
@@ -171,6 +175,44 @@ class Leaks:
         return int(growth > 0.05)
 
 
+@dataclass
+class Experts:
+    """How often each scripted expert succeeds."""
+
+    tasks: tuple[str, ...] = tuple(EXPERTS)
+    """names of tasks"""
+    robot: str = "Panda"
+    """the arm"""
+    episodes: int = 100
+    """of each"""
+    workers: int = 2
+    """processes"""
+    seed: int = 0
+    """of the episodes"""
+
+    def run(self, console: Console) -> int:
+        """Prints a row for each task."""
+        table = Table(title=f"scripted experts, {self.robot}")
+        for column in ("task", "solved", "95 % interval", "solved at the end", "median time [s]"):
+            table.add_column(column, justify="left" if column == "task" else "right", no_wrap=True)
+        for name in self.tasks:
+            bar = f"{name}, {self.robot}"
+            with stage(bar, console, {}) as progress:
+                episodes = collect(
+                    f"asm_gym/{name}-v0", "scripted", self.episodes, self.seed, self.workers,
+                    progress=progress, robot=self.robot, reward_shaping=False,
+                )  # fmt: skip
+            solved = [e.rewards > 0 for e in episodes]  # the sparse reward is paid in every step that is solved
+            share = Share.of([s.any() for s in solved])
+            low, high = share.interval
+            times = [float(np.argmax(s) + 1) * e.spec.dt for s, e in zip(solved, episodes, strict=True) if s.any()]
+            last = Share.of([s[-1] for s in solved])
+            time_s = f"{np.median(times):.1f}" if times else ""
+            table.add_row(name, f"{share.k} of {share.n}", f"{low:.2f} to {high:.2f}", f"{last.k}", time_s)
+        console.print(table)
+        return 0
+
+
 def _resident() -> float:
     """Resident memory of this process [MB]."""
     with open("/proc/self/statm") as file:
@@ -199,7 +241,9 @@ class Args:
     """Speeds as ratios, each against a named rival in the same run."""
 
     what: Annotated[
-        Annotated[Env, tyro.conf.subcommand("env")] | Annotated[Leaks, tyro.conf.subcommand("leaks")],
+        Annotated[Env, tyro.conf.subcommand("env")]
+        | Annotated[Leaks, tyro.conf.subcommand("leaks")]
+        | Annotated[Experts, tyro.conf.subcommand("experts")],
         tyro.conf.arg(name=""),
     ] = field(default_factory=Env)
 

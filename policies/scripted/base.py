@@ -114,7 +114,7 @@ def move(
 ) -> Vector:
     """(6,) the hand's command: towards a pose, at no more than ``speed`` (in action units).
 
-    The controller covers about a third of what it is asked for in one step, so that a ``gain`` up to 2 does not overshoot.
+    The controller covers about a third of what it is asked for in one step, so a ``gain`` of 2 does not overshoot.
     """
     step = gain * (target - position) / _METRES
     norm = np.linalg.norm(step)

@@ -1,0 +1,179 @@
+"""Opens the door: in front of the handle, grasp it, press it down, pull."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.policies.scripted.base import (
+    CLOSE,
+    OPEN,
+    ObservationReader,
+    Style,
+    Vector,
+    move,
+    rotation,
+)
+
+REACH, APPROACH, GRASP, TURN, PULL, REST = range(6)
+
+_TURNED = 1.4  # how far the handle is pressed before the latch is out of its hole for sure [rad]
+_BEFORE = 0.09  # how far in front of the handle to come from [m]
+_OPENED = 0.36  # [rad]; the task asks for 0.3
+
+
+class Hardware(NamedTuple):
+    """The door as it stood closed: what the observation does not say."""
+
+    hinge: Vector  # (3,) a point on the hinge's axis, which is vertical
+    pivot: Vector  # (3,) a point on the latch's axis
+    axis: Vector  # (3,) the latch's axis, so that the handle goes down at positive angles
+    grip: Vector  # (3,) where to hold the handle
+    normal: Vector  # (3,) out of the door, towards the robot
+    sign: float  # of the latch's joint, where the handle goes down
+
+
+class DoorState(NamedTuple):
+    """Where one episode stands."""
+
+    phase: int
+    since: int  # steps spent in the phase
+    speed: float  # action units
+    spread: Vector  # (3,) how this episode's way-points differ from the plan [m]
+    hardware: Hardware
+    anchor: Vector  # (3,) where the hand was when the phase began [m]
+    drift: Vector  # (7,) correlated action noise
+
+
+class DoorExpert:
+    """A scripted expert for Door.
+
+    Args:
+        env: tells where things stand in the observation, and where the door stands in the room.
+        seed: of the noise and of the style drawn for each episode.
+        style: how much it varies.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
+        self.style = style or Style()
+        self.np_random = np.random.default_rng(seed)
+        self._env = env
+        self._read = ObservationReader(env)
+
+    def predict(
+        self,
+        observation: Any,
+        state: DoorState | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], DoorState]:
+        """The action (7,); ``deterministic`` leaves the action noise out, not the style."""
+        if state is None or (episode_start is not None and np.any(episode_start)):
+            state = self._begin()
+        hand_at = self._read(observation, "hand_position")
+        hand = rotation(self._read(observation, "hand_orientation"))
+        turned = state.hardware.sign * float(self._read(observation, "handle_qpos")[0])
+        opened = float(self._read(observation, "hinge_qpos")[0])
+        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
+        left = _between(hand, self._facing(state, turned, opened))
+        state = self._advance(state, hand_at, turned, opened, left)
+        target, grip = self._target(state, turned, opened)
+        facing = self._facing(state, turned, opened)
+        command = np.append(move(hand_at, target, hand, facing, state.speed, gain=2.0), grip)
+        if not deterministic:
+            command[:6] += state.drift[:6]
+        return np.clip(command, -1.0, 1.0).astype(np.float32), state
+
+    def _begin(self) -> DoorState:
+        style, rng = self.style, self.np_random
+        speed = 0.4 * style.speed * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.5, 1.5))
+        spread = 0.3 * style.spread * rng.standard_normal(3)
+        return DoorState(REACH, 0, speed, spread, self._look(spread[0]), np.zeros(3), np.zeros(7))
+
+    def _look(self, along: float) -> Hardware:
+        """The door as it stands at the beginning of an episode, closed; the grip is moved ``along`` the handle [m]."""
+        simulation = self._env.unwrapped.simulation  # type: ignore[attr-defined]
+        model, data = simulation.model, simulation.data
+        hinge, latch = model.joint("Door_hinge").id, model.joint("Door_latch_joint").id
+        handle = model.geom("Door_handle").id
+        frame = data.geom_xmat[handle].reshape(3, 3)
+        middle, pivot, axis = data.geom_xpos[handle], data.xanchor[latch], data.xaxis[latch]
+        outwards = frame[:, 0] * np.sign(frame[:, 0] @ (middle - pivot))  # along the handle, away from the pivot
+        sign = -float(np.sign(np.cross(axis, middle - pivot)[2]))
+        grip = middle + (0.025 + along) * outwards
+        normal = frame[:, 1] * np.sign(frame[:, 1] @ (middle - pivot))
+        return Hardware(data.xanchor[hinge].copy(), pivot.copy(), sign * axis, grip, normal, sign)
+
+    def _advance(self, state: DoorState, hand_at: Vector, turned: float, opened: float, left: float) -> DoorState:
+        """The phase that comes next; ``left`` is how far the hand is from facing the door [rad]."""
+        off = hand_at - self._grip(state.hardware, turned, opened)
+        far = float(np.linalg.norm(off))
+
+        def to(phase: int) -> DoorState:
+            return state._replace(phase=phase, since=0, anchor=hand_at)
+
+        before = off - _BEFORE * state.hardware.normal
+        if state.phase == REACH and np.linalg.norm(before) < 0.02 and left < 0.15:
+            return to(APPROACH)
+        if state.phase == APPROACH and (far < 0.012 or (state.since > 25 and far < 0.025)):
+            return to(GRASP)
+        if state.phase == APPROACH and state.since > 60:
+            return to(REACH)
+        if state.phase == GRASP and state.since >= 7:
+            return to(TURN)
+        if state.phase in (TURN, PULL) and far > 0.07:  # slipped off
+            return to(REACH)
+        if state.phase == TURN and turned > _TURNED - 0.1:
+            return to(PULL)
+        if state.phase == PULL and opened > _OPENED - 0.02:
+            return to(REST)
+        return state
+
+    def _target(self, state: DoorState, turned: float, opened: float) -> tuple[Vector, float]:
+        hardware, phase = state.hardware, state.phase
+        grip = self._grip(hardware, turned, opened)
+        if phase == REACH:
+            return grip + _BEFORE * hardware.normal, OPEN
+        if phase == APPROACH:
+            return grip, OPEN
+        if phase == GRASP:
+            return state.anchor, CLOSE
+        if phase == TURN:
+            return self._grip(hardware, min(turned + 0.4, _TURNED + 0.05), opened), CLOSE
+        if phase == PULL:
+            return self._grip(hardware, _TURNED, min(opened + 0.12, _OPENED + 0.04)), CLOSE
+        return state.anchor, CLOSE
+
+    @staticmethod
+    def _facing(state: DoorState, turned: float, opened: float) -> Vector:
+        """(3, 3) the hand in front of the door, fingers above and below the handle; it turns with what it holds."""
+        z = -state.hardware.normal
+        y = np.array([0.0, 0.0, 1.0])
+        facing = np.stack([np.cross(y, z), y, z], axis=1)
+        if state.phase >= TURN:
+            facing = _about(state.hardware.axis, turned) @ facing
+        turn: Vector = _about([0.0, 0.0, 1.0], opened) @ facing
+        return turn
+
+    @staticmethod
+    def _grip(hardware: Hardware, turned: float, opened: float) -> Vector:
+        """(3,) where to hold the handle, when it is pressed and the door is open by these angles [rad]."""
+        held = hardware.pivot + _about(hardware.axis, turned) @ (hardware.grip - hardware.pivot)
+        grip: Vector = hardware.hinge + _about([0.0, 0.0, 1.0], opened) @ (held - hardware.hinge)
+        return grip
+
+
+def _between(a: Vector, b: Vector) -> float:
+    """The angle between two orientations [rad]."""
+    return float(np.arccos(np.clip((np.trace(a.T @ b) - 1) / 2, -1.0, 1.0)))
+
+
+def _about(axis: Any, angle: float) -> Vector:
+    """(3, 3) rotation about a unit ``axis`` by ``angle`` [rad] (Rodrigues)."""
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turn: Vector = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
+    return turn

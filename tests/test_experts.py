@@ -1,0 +1,70 @@
+"""Every scripted expert solves its task, keeps it solved, and varies."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import asm_gym  # noqa: F401
+from asm_gym.policies import make_policy
+from asm_gym.policies.registry import EXPERTS
+from asm_gym.policies.scripted.base import Style, gripping
+from asm_gym.policies.scripted.door import _about
+from asm_gym.scripts.collect import collect
+
+QUICK = ["Stack", "Door", "NutAssemblySquare", "NutAssemblyRound", "PickPlaceCan", "PickPlaceMilk", "PickPlaceCereal"]
+
+
+@pytest.mark.parametrize("task", QUICK)
+def test_an_expert_solves_its_task_and_leaves_it_solved(task):
+    env = gym.make(f"asm_gym/{task}-v0")
+    for seed in (0, 1):
+        expert, state = make_policy("scripted", env, seed=seed), None
+        observation, _ = env.reset(seed=seed)
+        over, solved = False, False
+        while not over:
+            action, state = expert.predict(observation, state)
+            observation, _, _, over, info = env.step(action)
+            solved |= info["success"]
+        assert solved
+        assert info["success"]
+    env.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", sorted(EXPERTS))
+def test_an_expert_succeeds_on_95_of_100_seeds(task):
+    least = 80 if task in ("PickPlace", "NutAssembly") else 95
+    assert sum(e.success for e in collect(f"asm_gym/{task}-v0", episodes=100, seed=99, workers=2)) >= least
+
+
+def test_speed_and_noise_change_the_course():
+    env = gym.make("asm_gym/Stack-v0")
+
+    def steps(**style):
+        expert, state = make_policy("scripted", env, seed=0, style=Style(speed_spread=0.0, **style)), None
+        observation, _ = env.reset(seed=0)
+        for step in range(200):
+            action, state = expert.predict(observation, state)
+            observation, *_, info = env.step(action)
+            if info["success"]:
+                return step
+        return 200
+
+    slow, usual, fast = steps(speed=0.7), steps(), steps(speed=1.3)
+    assert slow > usual > fast
+    assert steps(noise=0.2) != usual
+    env.close()
+
+
+def test_a_grasp_takes_the_nearest_of_equal_directions():
+    hand = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # fingers close along -y
+    target = gripping(hand, np.array([0.1, 1.0, 0.0]))
+    assert np.degrees(np.arccos(target[:, 1] @ hand[:, 1])) == pytest.approx(5.71, abs=0.01)
+    np.testing.assert_allclose(target.T @ target, np.eye(3), atol=1e-12)
+
+
+def test_a_rotation_about_an_axis_keeps_it():
+    axis = np.array([0.6, 0.0, 0.8])
+    turn = _about(axis, 0.7)
+    np.testing.assert_allclose(turn @ axis, axis, atol=1e-12)
+    assert np.trace(turn) == pytest.approx(1 + 2 * np.cos(0.7))
