@@ -1,4 +1,4 @@
-"""``python -m asm_gym.scripts.benchmark <what>``: speeds as ratios, each against a named rival in the same run; experts.
+"""``python -m asm_gym.scripts.benchmark <what>``: speeds as ratios against a rival in the same run, and experts.
 
 Machines differ and are noisy: rivals take turns, step by step, and the medians of their turns are compared.
 """
@@ -193,7 +193,7 @@ class Experts:
     def run(self, console: Console) -> int:
         """Prints a row for each task."""
         table = Table(title=f"scripted experts, {self.robot}")
-        for column in ("task", "solved", "95 % interval", "solved at the end", "median time [s]"):
+        for column in ("task", "solved", "95 %", "at the end", "time [s]"):
             table.add_column(column, justify="left" if column == "task" else "right", no_wrap=True)
         for name in self.tasks:
             bar = f"{name}, {self.robot}"
@@ -202,13 +202,15 @@ class Experts:
                     f"asm_gym/{name}-v0", "scripted", self.episodes, self.seed, self.workers,
                     progress=progress, robot=self.robot, reward_shaping=False,
                 )  # fmt: skip
-            solved = [e.rewards > 0 for e in episodes]  # the sparse reward is paid in every step that is solved
-            share = Share.of([s.any() for s in solved])
+            solved = [e.rewards > 0.999 for e in episodes]  # the sparse reward, whole in every step that is solved
+            share = Share.of([bool(s.any()) for s in solved])
             low, high = share.interval
             times = [float(np.argmax(s) + 1) * e.spec.dt for s, e in zip(solved, episodes, strict=True) if s.any()]
-            last = Share.of([s[-1] for s in solved])
+            last = Share.of([bool(s[-1]) for s in solved])
             time_s = f"{np.median(times):.1f}" if times else ""
-            table.add_row(name, f"{share.k} of {share.n}", f"{low:.2f} to {high:.2f}", f"{last.k}", time_s)
+            table.add_row(
+                name, f"{share.k} of {share.n}", f"{100 * low:.0f} to {100 * high:.0f} %", f"{last.k}", time_s
+            )
         console.print(table)
         return 0
 

@@ -1,89 +1,232 @@
 """Faults change the simulation while they act, nothing before, and nothing after a reset."""
 
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from asm_gym.faults import FAULTS, FrozenEncoder, Push, WeakJoint, make_fault
+from asm_gym import faults
+from asm_gym.envs.ledger import Ledger
+from asm_gym.faults import Bias, FrozenEncoder, GripperOpens, Push, StuckJoint, WeakJoint, make_fault
+from asm_gym.faults.base import SHAPES
+from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, harmless_variation, possible, suite_fault
+from asm_gym.policies import make_policy
 from asm_gym.wrappers import FaultInjection
 from tests.fakes import FakeEnv
 
-STEPS, ONSET = 14, 5
-EVERY = [
-    Push(body="robot0_link5", newtons=20, onset=ONSET, duration=4),
-    WeakJoint(joint=1, strength=0.5, onset=ONSET, duration=4),
-    FrozenEncoder(joint=3, onset=ONSET, duration=4),
-]
+ONSET, STEPS = 60, 78
+"""In the middle of carrying the cube, and until well after."""
+
+INVISIBLE = {"lighting", "camera_shift", "smoother_object"}
+"""What no proprioceptive sense can tell; of two surfaces the rougher counts, so a smoother cube changes nothing."""
 
 
-def record(env, seed=0):
-    """(STEPS, D) stream of fixed actions, and which faults were said to act."""
-    actions = np.random.default_rng(2).uniform(-0.5, 0.5, (STEPS, 7)).astype(np.float32)
+@pytest.fixture(scope="module")
+def stack():
+    """Stack, whose resets are fast, with all that can be measured in the stream."""
+    groups = ("joint", "torque", "hand", "wrench", "gripper", "action", "contact", "object")
+    env = gym.make("asm_gym/Stack-v0", stream=groups)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def course(stack):
+    """The actions of an expert, played back whatever happens, and the healthy episode they make."""
+    expert, state, actions = make_policy("scripted", stack, seed=3), None, []
+    observation, _ = stack.reset(seed=3)
+    for _ in range(STEPS):
+        action, state = expert.predict(observation, state)
+        actions.append(action)
+        observation = stack.step(action)[0]
+    return actions, play(stack, actions)[0]
+
+
+def play(env, actions, seed=3):
+    """(T, D) stream of given actions, and what was said to be active."""
     env.reset(seed=seed)
-    infos = [env.step(a)[4] for a in actions]
-    return np.array([i["stream"] for i in infos]), [i.get("fault", ()) for i in infos]
+    infos = [env.step(action)[4] for action in actions]
+    return np.array([i["stream"] for i in infos]), [(i.get("fault", ()), i.get("variation", ())) for i in infos]
 
 
-@pytest.mark.parametrize("fault", EVERY, ids=lambda f: f.name)
-def test_a_fault_acts_on_time_and_only_then(lift, fault):
-    healthy, _ = record(lift)
-    faulty, active = record(FaultInjection(lift, [fault]))
-    assert active == [(fault.name,) if ONSET <= t < ONSET + 4 else () for t in range(STEPS)]
-    np.testing.assert_array_equal(faulty[:ONSET], healthy[:ONSET])
-    assert not np.array_equal(faulty[ONSET], healthy[ONSET])
-    touched = [f for f, label in enumerate(lift.unwrapped.stream_spec.labels) if label in fault.labels(lift.unwrapped)]
-    assert np.abs(faulty - healthy)[ONSET : ONSET + 4, touched].max() > 0.01
+def every(env):
+    """Each kind at its strongest, and each harmless variation."""
+    made = {k: suite_fault(k, env.unwrapped, "strong", ONSET, seed=4) for k in KINDS}
+    return made | {k: harmless_variation(k, env.unwrapped, ONSET, seed=4) for k in HARMLESS}
 
 
-@pytest.mark.parametrize("seed", [0, None], ids=["seeded reset", "soft reset"])
-@pytest.mark.parametrize("fault", EVERY, ids=lambda f: f.name)
-def test_a_reset_in_the_middle_of_a_fault_leaves_nothing_of_it(lift, fault, seed):
+@pytest.mark.parametrize("kind", [*KINDS, *HARMLESS])
+def test_a_fault_acts_on_time_and_only_then(stack, course, kind):
+    actions, healthy = course
+    fault = every(stack)[kind]
+    stream, active = play(FaultInjection(stack, [fault]), actions)
+    onset = fault.onset
+    np.testing.assert_array_equal(stream[:onset], healthy[:onset])
+    named = [bool(f) or bool(v) for f, v in active]
+    assert named == [fault.active(t) for t in range(STEPS)]
+    assert all((fault.name in v) is fault.harmless and not (f and v) for f, v in active[onset : onset + 1])
+    changed = not np.array_equal(stream[onset:], healthy[onset:])
+    assert changed is (kind not in INVISIBLE)
+    # Nothing is left of it: the same episode once more, with a soft reset between.
+    again, _ = play(stack, actions)
+    np.testing.assert_array_equal(again, healthy)
+    inner = stack.unwrapped
+    assert (len(inner.edits), inner.corruptions, inner.deliveries, inner.substep_hooks) == (0, [], [], [])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_a_fault_is_said_to_show_in_does_change(stack, course, kind):
+    actions, healthy = course
+    fault = every(stack)[kind]
+    stream, _ = play(FaultInjection(stack, [fault]), actions)
+    labels = fault.labels(stack.unwrapped)
+    where = [i for i, label in enumerate(stack.unwrapped.stream_spec.labels) if label in labels]
+    assert where
+    assert np.abs(stream - healthy)[fault.onset :, where].max() > 0
+
+
+@pytest.mark.parametrize("fault", [Push(), WeakJoint(), FrozenEncoder(), faults.Payload(), faults.HeldByPerson()])
+def test_after_a_hard_reset_the_environment_is_as_new(lift, fault):
     def second_episode(env):
-        """The episode after one that was cut short while the fault was active."""
+        """The episode after one that was cut short while the fault was active, up to its next onset."""
         env.reset(seed=1)
-        for _ in range(ONSET + 2):
+        for _ in range(8):
             env.step(np.zeros(7, np.float32))
-        env.reset(seed=seed)
-        return np.array([env.step(np.full(7, 0.2, np.float32))[4]["stream"] for _ in range(ONSET)])
+        env.reset(seed=2)
+        return np.array([env.step(np.full(7, 0.2, np.float32))[4]["stream"] for _ in range(4)])
 
-    # A soft reset goes on with the generators, so both first episodes must be of one length, not of one course.
-    np.testing.assert_array_equal(second_episode(FaultInjection(lift, [fault])), second_episode(lift))
-    assert lift.unwrapped.corruptions == []
-    assert not lift.unwrapped.simulation.data.xfrc_applied.any()
-    np.testing.assert_array_equal(lift.unwrapped.simulation.model.actuator_gear[:7, 0], 1.0)
+    fresh = gym.make("asm_gym/Lift-v0")
+    fault = dataclasses.replace(fault, onset=4)
+    np.testing.assert_array_equal(second_episode(FaultInjection(lift, [fault])), second_episode(fresh))
+    fresh.close()
 
 
-def test_an_active_weak_joint_is_an_edit_of_the_model_that_a_soft_reset_undoes(lift):
-    env = FaultInjection(lift, [WeakJoint(joint=2, strength=0.25, onset=0)])
+def test_severities_grow(stack, course):
+    actions, healthy = course
+    for kind in ("push", "encoder_bias", "action_bias", "payload", "held_by_person"):
+        sizes = []
+        for severity in SEVERITIES:
+            fault = suite_fault(kind, stack.unwrapped, severity, ONSET, seed=4)
+            stream, _ = play(FaultInjection(stack, [fault]), actions)
+            sizes.append(np.abs((stream - healthy)[ONSET : ONSET + 8, :14]).max())
+        assert sizes[0] < sizes[1] < sizes[2], kind
+
+
+def test_edits_of_one_number_compose_and_end_in_any_order():
+    ledger, array = Ledger(), np.array([0.3, 5.0])
+    nominal = array.copy()
+    double, add = ledger.hold(array, 0), ledger.hold(array, 0)
+    double.change(lambda v: 2 * v)
+    add.change(lambda v: v + 0.1)
+    assert array[0] == 2 * 0.3 + 0.1
+    double.release()
+    assert array[0] == 0.3 + 0.1
+    add.change(lambda v: v + 0.7)
+    assert array[0] == 0.3 + 0.7
+    add.release()
+    np.testing.assert_array_equal(array, nominal)
+    assert len(ledger) == 0
+
+
+def test_two_weaknesses_of_one_joint_multiply_across_wrappers(lift):
+    env = FaultInjection(lift, [WeakJoint(joint=3, strength=0.5, onset=0, duration=3)])
+    env = FaultInjection(env, [WeakJoint(joint=3, strength=0.5, onset=1), Push(onset=1)])
     env.reset(seed=0)
-    env.step(np.zeros(7, np.float32))
-    gear = lift.unwrapped.simulation.model.actuator_gear
-    assert gear[2, 0] == 0.25
+    gear, seen = lift.unwrapped.simulation.model.actuator_gear, []
+    for _ in range(4):
+        info = env.step(np.zeros(7, np.float32))[4]
+        seen.append(gear[3, 0])
+    assert seen == [0.5, 0.25, 0.25, 0.5]
+    assert info["fault"] == ("WeakJoint", "Push")
+    env.reset(seed=0)
+    assert gear[3, 0] == 1.0
+
+
+def test_intensities_have_their_shapes():
+    make = lambda **k: Push(onset=0, **k)  # noqa: E731
+    assert [make().intensity(k) for k in (0, 9)] == [1.0, 1.0]
+    ramp = make(shape="ramp", duration=4)
+    assert [ramp.intensity(k) for k in range(4)] == [0.25, 0.5, 0.75, 1.0]
+    assert make(shape="ramp", period=10).intensity(30) == 1.0
+    pulse = make(shape="pulse", duration=5)
+    assert pulse.intensity(2) == pytest.approx(1.0)
+    assert pulse.intensity(0) == pytest.approx(pulse.intensity(4))
+    wave = make(shape="periodic", period=4)
+    assert [wave.intensity(k) for k in range(4)] == pytest.approx([0.5, 1.0, 0.5, 0.0], abs=1e-12)
+    walk = [make(shape="random_walk", seed=1).intensity(k) for k in range(200)]
+    assert all(0 <= i <= 1 for i in walk)
+    assert np.std(walk) > 0.1
+    assert np.abs(np.diff(walk)).max() < 0.7
+    assert walk == [make(shape="random_walk", seed=1).intensity(k) for k in range(200)]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_shape_scales_the_force(lift, shape):
+    push = Push(newtons=10.0, direction=(0, 0, 1), onset=0, duration=6, shape=shape, period=3)
+    env = FaultInjection(lift, [push])
+    env.reset(seed=0)
+    body = lift.unwrapped.simulation.model.body("robot0_link5").id
+    for k in range(6):
+        env.step(np.zeros(7, np.float32))
+        force = lift.unwrapped.simulation.data.xfrc_applied[body, 2]
+        assert force == pytest.approx(10.0 * push.intensity(k))
+    env.reset(seed=0)
+
+
+def test_the_stream_carries_the_action_as_commanded(lift):
+    env = FaultInjection(lift, [faults.SignFlip(axis=0, onset=0)])
+    env.reset(seed=0)
+    forth = np.array([1, 0, 0, 0, 0, 0, 0], np.float32)
+    x = []
+    for _ in range(6):
+        stream = env.step(forth)[4]["stream"]
+        spec = lift.unwrapped.stream_spec
+        np.testing.assert_array_equal(stream[spec.motor], forth)
+        x.append(stream[spec.slices["hand_position"]][0])
+    assert x[-1] < x[0] - 0.005
     env.reset()
-    assert gear[2, 0] == 1.0
 
 
-def test_a_frozen_encoder_repeats_its_last_reading_in_stream_and_observation_alike(lift):
-    env = FaultInjection(lift, [FrozenEncoder(joint=3, onset=ONSET)])
-    stream, _ = record(env)
-    slices = lift.unwrapped.stream_spec.slices
-    position, velocity = slices["joint_position"].start + 3, slices["joint_velocity"].start + 3
-    assert (stream[ONSET:, position] == stream[ONSET - 1, position]).all()
-    assert (stream[ONSET:, velocity] == 0).all()
-    observation = env.step(np.zeros(7, np.float32))[0]
-    assert observation[3] == stream[-1, position]
+def test_a_person_holds_on_with_no_more_than_their_force(lift):
+    env = FaultInjection(lift, [faults.HeldByPerson(newtons=30.0, stiffness=5000.0, onset=0)])
+    env.reset(seed=0)
+    body = lift.unwrapped.simulation.model.body("robot0_link5").id
+    sizes = []
+    for _ in range(20):
+        env.step(np.array([0, 1, 0, 0, 0, 0, 0], np.float32))
+        sizes.append(np.linalg.norm(lift.unwrapped.simulation.data.xfrc_applied[body, :3]))
+    assert max(sizes) == pytest.approx(30.0, rel=1e-6)
     env.reset()
 
 
-def test_pushes_add_up_and_a_moving_arm_gives_way(lift):
-    def hand(faults):
-        stream, _ = record(FaultInjection(lift, faults))
-        return stream[:, lift.unwrapped.stream_spec.slices["hand_position"]]
+def test_faults_of_the_other_arm_are_numbered_on():
+    env = gym.make("asm_gym/TwoArmLift-v0", sensor_noise=0.0)
+    for fault, label in (
+        (FrozenEncoder(joint=9, onset=0), "robot1_joint_position[2]"),
+        (WeakJoint(joint=7, onset=0), "robot1_measured_torque[0]"),
+    ):
+        assert label in fault.labels(env.unwrapped)
+        FaultInjection(env, [fault])
+    for kind in KINDS:
+        if possible(kind, env.unwrapped):
+            FaultInjection(env, [suite_fault(kind, env.unwrapped, "medium", 3, 0)])
+    with pytest.raises(ValueError, match=r"0 to 13.*14"):
+        FaultInjection(env, [WeakJoint(joint=14)])
+    env.close()
 
-    push = Push(newtons=10, onset=ONSET)
-    rest, one, two = hand([]), hand([push]), hand([push, push])
-    moved = [np.linalg.norm(h[-1] - rest[-1]) for h in (one, two)]
-    assert 0.005 < moved[0] < moved[1]
+
+@pytest.mark.parametrize("task", ["Wipe", "Door", "PickPlaceSingle", "NutAssembly"])
+def test_a_task_has_the_faults_that_it_can_have(task):
+    env = gym.make(f"asm_gym/{task}-v0")
+    env.reset(seed=0)
+    can = {kind for kind in (*KINDS, *HARMLESS) if possible(kind, env.unwrapped)}
+    loose = {"slip", "snatch", "teleport", "heavy_object", "missing_object"}
+    loose |= {"lighter_object", "heavier_object", "smoother_object", "rougher_object"}
+    expected = {"Wipe": loose | {"gripper_opens", "weak_gripper"}, "Door": loose}.get(task, set())
+    assert set(KINDS) | set(HARMLESS) == can | expected
+    assert not can & expected
+    env.close()
 
 
 @pytest.mark.parametrize(
@@ -93,6 +236,10 @@ def test_pushes_add_up_and_a_moving_arm_gives_way(lift):
         (WeakJoint(joint=7), "0 to 6.*7"),
         (FrozenEncoder(joint=-1), "0 to 6.*-1"),
         (Push(onset=100), "horizon of 100"),
+        (Bias(channel="smell"), "'smell'.*joint_position"),
+        (Bias(element=9), "0 to 6, got 9"),
+        (faults.ActionBias(axis=6), "0 to 5, got 6"),
+        (faults.Slip(object="anvil"), "'anvil'.*cube"),
     ],
 )
 def test_a_fault_that_the_robot_cannot_have_is_refused(lift, fault, message):
@@ -100,19 +247,42 @@ def test_a_fault_that_the_robot_cannot_have_is_refused(lift, fault, message):
         FaultInjection(lift, [fault])
 
 
+def test_contradictions_are_refused_where_they_overlap(lift):
+    for two in (
+        [StuckJoint(joint=2, onset=0), StuckJoint(joint=2, onset=5)],
+        [FrozenEncoder(joint=1), faults.Freeze(element=1)],
+        [GripperOpens(onset=0, duration=9), GripperOpens(onset=8)],
+    ):
+        with pytest.raises(ValueError, match="contradict"):
+            FaultInjection(lift, two)
+        with pytest.raises(ValueError, match="contradict"):
+            FaultInjection(FaultInjection(lift, two[:1]), two[1:])
+    FaultInjection(lift, [StuckJoint(joint=2, onset=0, duration=5), StuckJoint(joint=2, onset=5)])
+    FaultInjection(lift, [StuckJoint(joint=2), WeakJoint(joint=2), StuckJoint(joint=3)])
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: make_fault("earthquake"), "'earthquake'.*push, weak_joint, frozen_encoder"),
+        (lambda: make_fault("earthquake"), "'earthquake'.*push, payload"),
         (lambda: make_fault("push", force=3), "'force'.*newtons"),
         (lambda: Push(onset=-1), "onset.*-1"),
         (lambda: Push(duration=0), "duration.*0"),
         (lambda: Push(newtons=float("nan")), "newtons.*nan"),
+        (lambda: Push(newtons="a"), "newtons.*'a'"),
         (lambda: Push(direction=(0, 0, 0)), "direction"),
         (lambda: Push(direction=(float("inf"), 0, 0)), "direction"),
         (lambda: Push(onset=2.5), "onset.*2.5"),
+        (lambda: Push(shape="sawtooth"), "'sawtooth'.*pulse"),
+        (lambda: Push(shape="pulse"), "needs a duration"),
+        (lambda: StuckJoint(shape="ramp"), "all or nothing.*'ramp'"),
         (lambda: WeakJoint(joint=1.5), "joint.*1.5"),
         (lambda: WeakJoint(strength=1.5), "strength.*1.5"),
+        (lambda: faults.Payload(kilograms=0), "kilograms.*0"),
+        (lambda: faults.Spikes(probability=2), "probability.*2"),
+        (lambda: faults.Delay(steps=0), "steps.*0"),
+        (lambda: faults.Touch(newtons=3.0), "2 N.*3.0"),
+        (lambda: faults.NoisySensors(factor=0.5), "factor.*0.5"),
     ],
 )
 def test_a_bad_description_is_refused(make, message):
@@ -120,9 +290,13 @@ def test_a_bad_description_is_refused(make, message):
         make()
 
 
-def test_every_fault_has_a_name_to_be_made_by():
-    assert {type(f) for f in EVERY} == set(FAULTS.values())
-    assert make_fault("push", newtons=5) == Push(newtons=5)
+def test_unknown_kinds_and_severities_list_the_known(lift):
+    with pytest.raises(ValueError, match=r"'flood'.*push"):
+        suite_fault("flood", lift.unwrapped, "mild", 0, 0)
+    with pytest.raises(ValueError, match=r"'deadly'.*mild, medium, strong"):
+        suite_fault("push", lift.unwrapped, "deadly", 0, 0)
+    with pytest.raises(ValueError, match=r"'flood'.*touch"):
+        harmless_variation("flood", lift.unwrapped, 0, 0)
 
 
 def test_faults_need_one_of_our_environments(lift):
@@ -130,13 +304,8 @@ def test_faults_need_one_of_our_environments(lift):
         FaultInjection(FakeEnv(), [])
     with pytest.raises(TypeError, match="push"):
         FaultInjection(lift, ["push"])
-
-
-def test_faults_that_could_not_be_undone_one_by_one_are_refused(lift):
-    with pytest.raises(ValueError, match="one joint"):
-        FaultInjection(lift, [WeakJoint(joint=3, onset=0), WeakJoint(joint=3, onset=5)])
-    with pytest.raises(ValueError, match="FaultInjection already"):
-        FaultInjection(FaultInjection(lift, []), [Push()])
+    with pytest.raises(TypeError, match="sequence"):
+        FaultInjection(lift, Push())
 
 
 def test_closing_undoes_a_running_fault():

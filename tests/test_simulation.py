@@ -60,7 +60,7 @@ def test_other_controllers_move_as_under_robosuites_own_step(controller, compile
     assert ours.simulation.compiled is compiled
     for action in gentle(theirs.action_dim, 50).astype(np.float32):
         ours.step(action)
-        theirs.step(ours._scaled(action))
+        theirs.step(ours._delivered(action))
     np.testing.assert_allclose(hands(theirs), hands(ours.robosuite_env), atol=1e-6)
     ours.close()
 
@@ -84,12 +84,12 @@ def test_a_substep_hook_runs_after_every_substep_and_changes_nothing_by_itself(l
     env.reset(seed=0)
     without = [env.step(action)[0] for _ in range(3)]
     called = []
-    env.substep_hook = called.append
+    env.substep_hooks.append(called.append)
     env.reset(seed=0)
     try:
         hooked = [env.step(action)[0] for _ in range(3)]
     finally:
-        env.substep_hook = None
+        env.substep_hooks.clear()
     np.testing.assert_array_equal(without, hooked)
     assert called == list(range(25)) * 3
 
@@ -101,17 +101,17 @@ def test_a_substep_hook_can_take_over_at_once(lift):
     def travel(hook):
         env.reset(seed=0)
         before = hands(env.robosuite_env)[0, 0]
-        env.substep_hook = hook
+        env.substep_hooks.extend(hook)
         try:
             stream = env.step(forth)[4]["stream"]
         finally:
-            env.substep_hook = None
+            env.substep_hooks.clear()
         for _ in range(4):
             env.step(rest)
         return hands(env.robosuite_env)[0, 0] - before, stream[env.stream_spec.motor]
 
-    free, _ = travel(None)
-    stopped, commanded = travel(lambda k: env.command(rest) if k == 4 else None)
+    free, _ = travel([])
+    stopped, commanded = travel([lambda k: env.command(rest) if k == 4 else None])
     assert stopped < 0.5 * free
     np.testing.assert_array_equal(commanded, rest)  # the efference copy is what was commanded last
 
@@ -120,11 +120,11 @@ def test_a_hook_reads_the_sensors_within_the_step(lift):
     env = lift.unwrapped
     env.reset(seed=0)
     rows = []
-    env.substep_hook = lambda k: rows.append(env.measure())
+    env.substep_hooks.append(lambda k: rows.append(env.measure()))
     try:
         env.step(np.array([1, 0, 0, 0, 0, 0, 0], np.float32))
     finally:
-        env.substep_hook = None
+        env.substep_hooks.clear()
     x = np.array(rows)[:, env.measured_spec.slices["hand_position"]][:, 0]
     assert x[-1] - x[0] > 5e-4
     assert len(rows) == 25
@@ -149,10 +149,10 @@ def test_nobody_tells_the_robot_of_a_payload():
     before = env.step(rest)[4]["stream"][slices["external_torque"]]
     model.body_mass[hand] += 1.0
     velocities = [np.zeros(3)]
-    env.substep_hook = momentum
+    env.substep_hooks.append(momentum)
     for _ in range(3):
         stream = env.step(rest)[4]["stream"]
-    env.substep_hook = None
+    env.substep_hooks.clear()
     fall = (velocities[-1] - velocities[-26]) / 0.05
     expected = (jacobian.T @ ([0, 0, -9.81] - fall))[:7]
     np.testing.assert_allclose(stream[slices["external_torque"]] - before, expected, atol=0.15)
@@ -170,7 +170,7 @@ def test_added_joint_friction_is_an_external_torque():
     env.reset(seed=0)
     env.simulation.model.dof_damping[3] += 5.0
     velocities = []
-    env.substep_hook = lambda k: velocities.append(env.simulation.data.qvel[3])
+    env.substep_hooks.append(lambda k: velocities.append(env.simulation.data.qvel[3]))
     for _ in range(5):
         stream = env.step(np.array([0, 0, 0.5, 0, 0, 0, 0], np.float32))[4]["stream"]
     expected = -5.0 * np.mean(velocities[-26:-1])

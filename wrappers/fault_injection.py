@@ -9,22 +9,23 @@ import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults import Fault, WeakJoint
+from asm_gym.faults import Fault
 
 
 class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Injects timed faults.
 
-    ``info["fault"]`` is a tuple of the names of the faults that were active during the step: the ground truth.
+    ``info["fault"]`` is a tuple of the names of the faults that were active during the step: the ground truth;
+    ``info["variation"]`` the same for harmless variations. Wrappers around one another add up.
 
     Args:
         env: a robosuite environment of this package, wrapped or not.
         faults: what goes wrong in every episode.
 
     Raises:
-        TypeError: the environment is not one of this package's, or an item is not a Fault.
-        ValueError: a fault that this environment cannot have (an unknown body or joint, an onset past the horizon),
-            two weaknesses of one joint, or an environment that has a FaultInjection already.
+        TypeError: the environment is not one of this package's, or ``faults`` is not a sequence of them.
+        ValueError: a fault that this environment cannot have (an unknown body or joint, an onset past the horizon), or
+            two that contradict each other.
     """
 
     def __init__(self, env: gym.Env[Any, Any], faults: Sequence[Fault]) -> None:
@@ -33,17 +34,18 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         inner = env.unwrapped
         if not isinstance(inner, RobosuiteEnv):
             raise TypeError(f"faults are injected into robosuite environments of asm_gym, got {inner}")
-        if env.has_wrapper_attr("undo_faults"):
-            raise ValueError("this environment has a FaultInjection already: give one of them all the faults")
-        weak = [fault.joint for fault in faults if isinstance(fault, WeakJoint)]
-        if len(set(weak)) < len(weak):
-            raise ValueError(f"two WeakJoint faults on one joint cannot be undone one by one, got joints {weak}")
+        if isinstance(faults, Fault):
+            raise TypeError(f"faults must be a sequence, got one fault: [{faults}]")
         for fault in faults:
             if not isinstance(fault, Fault):
                 raise TypeError(f"faults must be asm_gym.faults.Fault objects, got {fault!r}")
             fault.check(inner)
             if fault.onset >= inner.horizon:
                 raise ValueError(f"{fault} starts at or after the horizon of {inner.horizon} steps")
+        before = env.get_wrapper_attr("every_fault") if env.has_wrapper_attr("every_fault") else ()
+        self.every_fault: tuple[Fault, ...] = (*before, *faults)
+        """The faults of this wrapper and of those inside it."""
+        _check_contradictions(self.every_fault, inner)
         self.faults = tuple(faults)
         self._inner = inner
         self._running: dict[int, Generator[None, None, None]] = {}
@@ -53,7 +55,8 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.undo_faults()  # before the reset: a hard one replaces the model, a soft one keeps it
         self._step = 0
         observation, info = self.env.reset(seed=seed, options=options)
-        info["fault"] = ()
+        info.setdefault("fault", ())
+        info.setdefault("variation", ())
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -63,7 +66,9 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             elif k in self._running:
                 self._running.pop(k).close()
         observation, reward, terminated, truncated, info = self.env.step(action)
-        info["fault"] = tuple(self.faults[k].name for k in self._running)
+        active = [self.faults[k] for k in self._running]
+        info["fault"] = (*info.get("fault", ()), *(f.name for f in active if not f.harmless))
+        info["variation"] = (*info.get("variation", ()), *(f.name for f in active if f.harmless))
         self._step += 1
         return observation, reward, terminated, truncated, info
 
@@ -73,6 +78,19 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def undo_faults(self) -> None:
         """Ends every fault that acts now and puts back what it changed, as ``reset`` and ``close`` do."""
-        # Last begun, first undone, so that edits of one number come off in the order they went on.
         while self._running:
             self._running.popitem()[1].close()
+        if self.env.has_wrapper_attr("undo_faults"):
+            self.env.get_wrapper_attr("undo_faults")()
+
+
+def _check_contradictions(faults: Sequence[Fault], env: RobosuiteEnv) -> None:
+    """Raises ValueError where two faults give one thing a value of their own at the same time."""
+    for i, first in enumerate(faults):
+        for second in faults[i + 1 :]:
+            ends = [f.onset + (f.duration or env.horizon) for f in (first, second)]
+            both = first.holds(env) & second.holds(env)
+            if both and max(first.onset, second.onset) < min(ends):
+                raise ValueError(
+                    f"{first} and {second} contradict each other: both decide over {', '.join(sorted(both))}"
+                )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from asm_gym.envs import backend
 from asm_gym.envs.choices import check_choice
 from asm_gym.envs.layout import Layout
+from asm_gym.envs.ledger import Ledger
 from asm_gym.envs.pictures import RENDER_MODES, Pictures
 from asm_gym.envs.rewards import Rewards, RewardTerms
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS
@@ -101,7 +102,11 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.sensor_noise = sensor_noise
         self.corruptions: list[Callable[[NDArray[np.float64]], None]] = []
         """Sensor faults: each edits the measured row (channels of ``measured_spec``) in place, after the noise."""
-        self.substep_hook: Callable[[int], None] | None = None
+        self.deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]] = []
+        """Action faults: each makes of the action that was sent the one that arrives."""
+        self.edits = Ledger()
+        """Changes of the simulator's numbers that are to be undone."""
+        self.substep_hooks: list[Callable[[int], None]] = []
         """Called after every physics substep with its number in the control step; ``measure()`` says what the sensors
         read then, and ``command()`` gives the controllers another action for the rest of the step."""
         self.substeps = backend.PHYSICS_FREQ // control_freq
@@ -205,13 +210,14 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         env = self.robosuite_env
         env.timestep += 1
         self._action = action
-        self.simulation.begin(self._scaled(action))
-        if self.substep_hook is None:
+        self.simulation.begin(self._delivered(action))
+        if not self.substep_hooks:
             self.simulation.advance(self.substeps)
         else:
             for k in range(self.substeps):
                 self.simulation.advance(1)
-                self.substep_hook(k)
+                for hook in self.substep_hooks:
+                    hook(k)
         env.cur_time += env.control_timestep
         self._steps += 1
         reward = self._rewards(self._action)
@@ -236,7 +242,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             ValueError: a wrong shape, or an action that is not finite.
         """
         self._action = self._checked(action)
-        self.simulation.command(self._scaled(self._action))
+        self.simulation.command(self._delivered(self._action))
 
     def _checked(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         action = np.asarray(action, dtype=np.float32)
@@ -246,8 +252,10 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             raise ValueError(f"the action must be finite, got {action}")
         return np.clip(action, -1.0, 1.0)
 
-    def _scaled(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
-        """In the units robosuite's controllers take, which for most are the same."""
+    def _delivered(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
+        """What arrives of the action, in the units robosuite's controllers take, which for most are the same."""
+        for deliver in self.deliveries:
+            action = np.clip(deliver(action), -1.0, 1.0)
         half = 0.5 * (self._action_high - self._action_low)
         scaled: NDArray[np.float64] = self._action_low + half * (action.astype(np.float64) + 1.0)
         return scaled

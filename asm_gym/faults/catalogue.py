@@ -3,13 +3,56 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import Any
 
+from asm_gym.envs.choices import check_choice
+from asm_gym.faults import action, actuator, body, harmless, sensor, thing
 from asm_gym.faults.base import Fault
-from asm_gym.faults.physical import Push, WeakJoint
-from asm_gym.faults.sensing import FrozenEncoder
 
-FAULTS: dict[str, type[Fault]] = {"push": Push, "weak_joint": WeakJoint, "frozen_encoder": FrozenEncoder}
+_EVERY: tuple[type[Fault], ...] = (
+    body.Push,
+    body.Payload,
+    body.Collision,
+    body.CablePull,
+    body.HeldByPerson,
+    actuator.WeakJoint,
+    actuator.StuckJoint,
+    actuator.JointFriction,
+    actuator.Backlash,
+    actuator.GripperOpens,
+    actuator.WeakGripper,
+    sensor.Bias,
+    sensor.Drift,
+    sensor.Scale,
+    sensor.Noise,
+    sensor.Spikes,
+    sensor.Dropout,
+    sensor.Freeze,
+    sensor.Delay,
+    sensor.FrozenEncoder,
+    action.ActionDelay,
+    action.ActionDrop,
+    action.ActionBias,
+    action.ActionRepeat,
+    action.SignFlip,
+    action.ActionNoise,
+    action.Adversary,
+    thing.Slip,
+    thing.Snatch,
+    thing.Teleport,
+    thing.Missing,
+    thing.Heavy,
+    harmless.Touch,
+    harmless.ObjectMass,
+    harmless.ObjectFriction,
+    harmless.NoisySensors,
+    harmless.Lighting,
+    harmless.CameraShift,
+)
+
+FAULTS: dict[str, type[Fault]] = {re.sub(r"(?<!^)(?=[A-Z])", "_", f.__name__).lower(): f for f in _EVERY}
+"""Every fault and harmless variation by its name in lower case: ``weak_joint`` is ``WeakJoint``."""
 
 
 def make_fault(name: str, **parameters: Any) -> Fault:
@@ -18,8 +61,7 @@ def make_fault(name: str, **parameters: Any) -> Fault:
     Raises:
         ValueError: an unknown name or parameter; the message lists what exists.
     """
-    if name not in FAULTS:
-        raise ValueError(f"unknown fault {name!r}; known: {', '.join(FAULTS)}")
+    check_choice("fault", name, FAULTS)
     known = [f.name for f in dataclasses.fields(FAULTS[name])]
     for parameter in parameters:
         if parameter not in known:

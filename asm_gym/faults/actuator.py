@@ -1,0 +1,203 @@
+"""Motors, joints and grippers that do not do what they are told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.envs.robosuite_env import RobosuiteEnv
+from asm_gym.faults.base import Apply, Fault, check_joint, group_labels, held, joint_labels, listed, model_of
+
+_TORQUES = ("measured_torque", "commanded_torque", "external_torque", "external_torque_peak")
+_MOTION = ("joint_velocity", "joint_position")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _OnJoint(Fault):
+    """Acts on one joint.
+
+    Args:
+        joint: counted from the base, 0 first; a second arm's go on after the first one's.
+    """
+
+    joint: int = 3
+
+    def check(self, env: RobosuiteEnv) -> None:
+        check_joint(env, self.joint)
+
+    def labels(self, env: RobosuiteEnv) -> frozenset[str]:
+        return joint_labels(env, self.joint, *_TORQUES, *_MOTION)
+
+    def dof(self, env: RobosuiteEnv) -> int:
+        """The joint's place among the velocities."""
+        model = model_of(env)
+        return int(model.jnt_dofadr[model.actuator_trnid[env.motors[self.joint], 0]])
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeakJoint(_OnJoint):
+    """A joint's motor gives only part of the torque it is told to.
+
+    Args:
+        joint: counted from the base, 0 first.
+        strength: share of the commanded torque that arrives; 0 is a dead motor.
+    """
+
+    strength: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 <= self.strength <= 1.0:
+            raise ValueError(f"strength must be in [0, 1], got {self.strength}")
+
+    @contextmanager
+    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+        with held(env, model_of(env).actuator_gear, (int(env.motors[self.joint]), 0)) as change:
+            yield lambda i: change(lambda gear: gear * (1.0 - i * (1.0 - self.strength)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StuckJoint(_OnJoint):
+    """A joint that is blocked, by friction beyond what its motor can overcome."""
+
+    graded = False
+
+    def holds(self, env: RobosuiteEnv) -> frozenset[str]:
+        return frozenset({f"joint {self.joint}"})
+
+    @contextmanager
+    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+        with held(env, model_of(env).dof_frictionloss, self.dof(env)) as change:
+            yield lambda _: change(lambda friction: friction + 1000.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointFriction(_OnJoint):
+    """A joint that goes stiffly.
+
+    Args:
+        joint: counted from the base, 0 first.
+        newton_metres: dry friction [N m].
+        viscous: friction that grows with speed [N m s/rad].
+    """
+
+    newton_metres: float = 4.0
+    viscous: float = 2.0
+
+    @contextmanager
+    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+        model, dof = model_of(env), self.dof(env)
+        with held(env, model.dof_frictionloss, dof) as dry, held(env, model.dof_damping, dof) as wet:
+
+            def apply(i: float) -> None:
+                dry(lambda friction: friction + i * self.newton_metres)
+                wet(lambda damping: damping + i * self.viscous)
+
+            yield apply
+
+
+@dataclass(frozen=True, kw_only=True)
+class Backlash(_OnJoint):
+    """Play in a joint's gear, before its encoder: the reading follows the joint only after it has crossed the gap.
+
+    Args:
+        joint: counted from the base, 0 first.
+        gap: half the play [rad].
+    """
+
+    gap: float = 0.02
+
+    @contextmanager
+    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+        (position,) = (
+            i for i, label in enumerate(env.measured_spec.labels) if label in joint_labels(env, self.joint, _MOTION[1])
+        )
+        reading, half = float(env.measured[position]), 0.0
+
+        def play(row: NDArray[Any]) -> None:
+            nonlocal reading
+            reading = float(np.clip(reading, row[position] - half, row[position] + half))
+            row[position] = reading
+
+        def apply(intensity: float) -> None:
+            nonlocal half
+            half = intensity * self.gap
+
+        with listed(env.corruptions, play):
+            yield apply
+
+    def labels(self, env: RobosuiteEnv) -> frozenset[str]:
+        return joint_labels(env, self.joint, *_MOTION)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _OnGripper(Fault):
+    """Acts on the grippers."""
+
+    def check(self, env: RobosuiteEnv) -> None:
+        if not env.gripper_actions:
+            raise ValueError(f"{env.task.name} has no gripper that {self.name} could act on")
+
+    def labels(self, env: RobosuiteEnv) -> frozenset[str]:
+        return group_labels(env, "gripper", "wrench")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GripperOpens(_OnGripper):
+    """The grippers open, and stay open whatever they are told."""
+
+    graded = False
+
+    def holds(self, env: RobosuiteEnv) -> frozenset[str]:
+        return frozenset({"the grippers"})
+
+    @contextmanager
+    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+        where = list(env.gripper_actions)
+
+        def deliver(action: NDArray[np.float32]) -> NDArray[np.float32]:
+            opened = action.copy()
+            opened[where] = -1.0
+            return opened
+
+        with listed(env.deliveries, deliver):
+            yield lambda _: None
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeakGripper(_OnGripper):
+    """The grippers close with only part of their force.
+
+    Args:
+        strength: the share that is left.
+    """
+
+    strength: float = 0.2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 <= self.strength <= 1.0:
+            raise ValueError(f"strength must be in [0, 1], got {self.strength}")
+
+    @contextmanager
+    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+        model = model_of(env)
+        motors = [
+            int(m)
+            for robot in env.robosuite_env.robots
+            for arm in robot.arms
+            for m in robot._ref_joint_gripper_actuator_indexes[arm] or ()
+        ]
+        with held(env, model.actuator_gainprm, *motors) as gain, held(env, model.actuator_biasprm, *motors) as bias:
+
+            def apply(i: float) -> None:
+                left = 1.0 - i * (1.0 - self.strength)
+                gain(lambda p: p * left)
+                bias(lambda p: p * left)
+
+            yield apply

@@ -1,0 +1,172 @@
+"""The fault suite: every kind at three severities, drawn for an episode, and the harmless variations beside them.
+
+Which joint, axis, direction or reading is concerned is drawn from the episode's seed; how bad it is says the severity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from asm_gym.envs.choices import check_choice
+from asm_gym.envs.robosuite_env import RobosuiteEnv
+from asm_gym.faults import action, actuator, body, harmless, sensor, thing
+from asm_gym.faults.base import Fault
+
+SEVERITIES = ("mild", "medium", "strong")
+
+
+class Drawn(NamedTuple):
+    """What is drawn for an episode: where a fault strikes."""
+
+    env: RobosuiteEnv
+    prefix: str  # of the first arm's channels
+    joint: int  # of the first arm
+    axis: int  # of the action
+    translation: int  # an axis of the action that moves the hand, not one that turns it
+    direction: tuple[float, float, float]
+    link: str
+    hand: str
+    onset: int
+    seed: int
+
+    @property
+    def encoder(self) -> dict[str, Any]:
+        return {"channel": f"{self.prefix}joint_position", "element": self.joint}
+
+    @property
+    def when(self) -> dict[str, Any]:
+        return {"onset": self.onset, "seed": self.seed}
+
+
+Kind = Callable[[Drawn, int], Fault]
+
+_PUSH = (8.0, 20.0, 40.0)  # [N]
+
+
+def _at(level: int, *values: float) -> float:
+    return values[level]
+
+
+KINDS: dict[str, Kind] = {
+    # body
+    "push": lambda d, s: body.Push(body=d.link, newtons=_PUSH[s], direction=d.direction, duration=10, **d.when),
+    "payload": lambda d, s: body.Payload(body=d.hand, kilograms=_at(s, 0.25, 0.75, 2.0), **d.when),
+    "collision": lambda d, s: body.Collision(body=d.hand, stiffness=_at(s, 500, 2000, 8000), duration=20, **d.when),
+    "cable_pull": lambda d, s: body.CablePull(body=d.hand, stiffness=_at(s, 50, 150, 400), **d.when),
+    "held_by_person": lambda d, s: body.HeldByPerson(
+        body=d.link, stiffness=_at(s, 100, 300, 800), duration=30, **d.when
+    ),
+    # actuator
+    "weak_joint": lambda d, s: actuator.WeakJoint(joint=d.joint, strength=_at(s, 0.9, 0.7, 0.4), **d.when),
+    "stuck_joint": lambda d, s: actuator.StuckJoint(joint=d.joint, duration=(4, 12, None)[s], **d.when),
+    "joint_friction": lambda d, s: actuator.JointFriction(
+        joint=d.joint, newton_metres=_at(s, 0.5, 2, 6), viscous=_at(s, 0.5, 2, 6), **d.when
+    ),
+    "backlash": lambda d, s: actuator.Backlash(joint=d.joint, gap=_at(s, 0.003, 0.01, 0.03), **d.when),
+    "gripper_opens": lambda d, s: actuator.GripperOpens(duration=(2, 8, None)[s], **d.when),
+    "weak_gripper": lambda d, s: actuator.WeakGripper(strength=_at(s, 0.5, 0.2, 0.05), **d.when),
+    # sensor
+    "encoder_bias": lambda d, s: sensor.Bias(**d.encoder, amount=_at(s, 0.01, 0.03, 0.1), **d.when),
+    "encoder_drift": lambda d, s: sensor.Drift(**d.encoder, rate=_at(s, 5e-4, 2e-3, 8e-3), **d.when),
+    "frozen_encoder": lambda d, s: sensor.FrozenEncoder(joint=d.joint, duration=(5, 15, None)[s], **d.when),
+    "encoder_noise": lambda d, s: sensor.Noise(**d.encoder, std=_at(s, 2e-3, 1e-2, 5e-2), **d.when),
+    "encoder_spikes": lambda d, s: sensor.Spikes(**d.encoder, amount=_at(s, 0.02, 0.1, 0.5), **d.when),
+    "encoder_delay": lambda d, s: sensor.Delay(**d.encoder, steps=(1, 2, 5)[s], **d.when),
+    "encoder_dropout": lambda d, s: sensor.Dropout(**d.encoder, probability=_at(s, 0.05, 0.2, 0.5), **d.when),
+    "torque_scale": lambda d, s: sensor.Scale(
+        channel=d.prefix + "measured_torque", element=d.joint, factor=_at(s, 1.05, 1.15, 1.5), **d.when
+    ),
+    "wrist_bias": lambda d, s: sensor.Bias(
+        channel=d.prefix + "wrist_force", element=d.translation, amount=_at(s, 0.5, 2.0, 8.0), **d.when
+    ),
+    "frozen_wrist": lambda d, s: sensor.Freeze(
+        channel="wrist_force", element=None, duration=(5, 15, None)[s], **d.when
+    ),
+    # action
+    "action_delay": lambda d, s: action.ActionDelay(steps=(1, 3, 6)[s], **d.when),
+    "action_drop": lambda d, s: action.ActionDrop(probability=_at(s, 0.1, 0.3, 0.7), **d.when),
+    "action_bias": lambda d, s: action.ActionBias(axis=d.axis, amount=_at(s, 0.05, 0.15, 0.4), **d.when),
+    "action_repeat": lambda d, s: action.ActionRepeat(steps=(2, 4, 8)[s], **d.when),
+    "sign_flip": lambda d, s: action.SignFlip(axis=d.translation, duration=(3, 10, None)[s], **d.when),
+    "action_noise": lambda d, s: action.ActionNoise(share=_at(s, 0.15, 0.4, 1.0), **d.when),
+    "adversary": lambda d, s: action.Adversary(size=_at(s, 0.05, 0.15, 0.4), **d.when),
+    # object
+    "slip": lambda d, s: thing.Slip(friction=_at(s, 0.4, 0.15, 0.03), **d.when),
+    "snatch": lambda d, s: thing.Snatch(newtons=_at(s, 3, 10, 30), direction=d.direction, duration=10, **d.when),
+    "teleport": lambda d, s: thing.Teleport(offset=(_at(s, 0.01, 0.03, 0.08), _at(s, 0.01, 0.03, 0.08), 0.0), **d.when),
+    "heavy_object": lambda d, s: thing.Heavy(kilograms=_at(s, 0.1, 0.4, 1.5), **d.when),
+    "missing_object": lambda d, _: thing.Missing(**d.when),
+}
+"""A fault of each kind for an episode, at severity 0 to 2."""
+
+HARMLESS: dict[str, Callable[[Drawn], Fault]] = {
+    "lighter_object": lambda d: harmless.ObjectMass(factor=0.9, **_always(d)),
+    "heavier_object": lambda d: harmless.ObjectMass(factor=1.1, **_always(d)),
+    "smoother_object": lambda d: harmless.ObjectFriction(factor=0.9, **_always(d)),
+    "rougher_object": lambda d: harmless.ObjectFriction(factor=1.1, **_always(d)),
+    "touch": lambda d: harmless.Touch(body=d.link, direction=d.direction, duration=10, **d.when),
+    "noisy_sensors": lambda d: harmless.NoisySensors(**_always(d)),
+    "lighting": lambda d: harmless.Lighting(**_always(d)),
+    "camera_shift": lambda d: harmless.CameraShift(**_always(d)),
+}
+"""Each harmless variation for an episode; what is a property of the world holds from its beginning."""
+
+
+def _always(drawn: Drawn) -> dict[str, Any]:
+    return {"onset": 0, "seed": drawn.seed}
+
+
+def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
+    """Where the faults of the episode with this seed strike."""
+    rng = np.random.default_rng([seed, 2])
+    robot, model = env.robosuite_env.robots[0], env.simulation.model
+    axes = env.action_space.shape[0] - len(env.gripper_actions)  # type: ignore[index]
+    direction = rng.standard_normal(3)
+    x, y, z = (float(v) for v in direction / np.linalg.norm(direction))
+    elbow = model.jnt_bodyid[model.actuator_trnid[env.motors[4], 0]]
+    return Drawn(
+        env=env,
+        prefix="robot0_" if len(env.robots) > 1 else "",
+        joint=int(rng.integers(len(robot._ref_joint_vel_indexes))),
+        axis=int(rng.integers(axes)),
+        translation=int(rng.integers(3)),
+        direction=(x, y, z),
+        link=model.body(elbow).name,
+        hand=robot.robot_model.eef_name["right"],
+        onset=onset,
+        seed=seed,
+    )
+
+
+def suite_fault(kind: str, env: RobosuiteEnv, severity: str, onset: int, seed: int) -> Fault:
+    """The fault of one kind and severity for the episode with this seed.
+
+    Raises:
+        ValueError: an unknown kind or severity; the message lists what exists.
+    """
+    check_choice("kind of fault", kind, KINDS)
+    check_choice("severity", severity, SEVERITIES)
+    return KINDS[kind](draw(env, onset, seed), SEVERITIES.index(severity))
+
+
+def harmless_variation(kind: str, env: RobosuiteEnv, onset: int, seed: int) -> Fault:
+    """One harmless variation for the episode with this seed.
+
+    Raises:
+        ValueError: an unknown kind; the message lists what exists.
+    """
+    check_choice("harmless variation", kind, HARMLESS)
+    return HARMLESS[kind](draw(env, onset, seed))
+
+
+def possible(kind: str, env: RobosuiteEnv) -> bool:
+    """Whether the environment has what a kind of fault acts on: a loose object, a gripper."""
+    make = KINDS.get(kind) or (lambda d, _: HARMLESS[kind](d))
+    try:
+        make(draw(env, 0, 0), 1).check(env)
+    except ValueError:
+        return False
+    return True
