@@ -16,20 +16,23 @@ def rollout(
     policy: Policy,
     seed: int | None = None,
     on_step: Callable[[dict[str, Any]], None] | None = None,
+    steps: int | None = None,
 ) -> bool:
     """One episode, from ``reset(seed)`` until it is terminated or truncated; whether it succeeded at some step.
 
     Args:
         on_step: is shown every step's ``info``.
+        steps: where to leave it, if it has not ended before.
     """
     observation, _ = env.reset(seed=seed)
-    state, success, done = None, False, False
+    state, success, done, taken = None, False, False, 0
     start = np.ones(1, dtype=bool)
     while not done:
         action, state = policy.predict(observation, state=state, episode_start=start, deterministic=False)
         observation, _, terminated, truncated, info = env.step(action)
         start = np.zeros(1, dtype=bool)
-        done = bool(terminated or truncated)
+        taken += 1
+        done = bool(terminated or truncated) or taken == steps
         success = success or bool(info.get("success", False))
         if on_step is not None:
             on_step(info)

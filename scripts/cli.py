@@ -18,6 +18,7 @@ class Command(NamedTuple):
 
 COMMANDS: dict[str, Command] = {
     "demo": Command("asm_gym.scripts.demo", "a robot that notices when something is wrong, in a few minutes"),
+    "evaluate": Command("asm_gym.scripts.evaluate", "tasks x monitors x faults: who notices what, with a report"),
     "benchmark": Command("asm_gym.scripts.benchmark", "speeds, as ratios against rivals in the same run"),
     "doctor": Command("asm_gym.scripts.doctor", "what this machine lacks, and the command that installs it"),
 }

@@ -22,7 +22,7 @@ def record(seed: int, env_id: str, policy: str, settings: tuple[tuple[str, Any],
     """The episode of ``seed``."""
     env = StreamRecorder(environment(env_id, settings))
     rollout(env, make_policy(policy, env, seed=seed), seed)
-    return env.episodes.pop()
+    return env.finish()
 
 
 def collect(

@@ -94,6 +94,17 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             self._finish()
         return observation, reward, terminated, truncated, info
 
+    def finish(self) -> Episode:
+        """Ends the episode that is being recorded, and hands out the one recorded last; it is not kept.
+
+        Raises:
+            ValueError: nothing was recorded.
+        """
+        self._finish()
+        if not self.episodes:
+            raise ValueError("no step was recorded yet")
+        return self.episodes.pop()
+
     def close(self) -> None:
         self._finish()
         super().close()

@@ -9,9 +9,10 @@ from asm_gym.monitors.base import Monitor, Surprise
 from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.stream import StreamSpec
 
-__all__ = ["Monitor", "NeuralASM", "Surprise", "make_monitor"]
+__all__ = ["MONITORS", "Monitor", "NeuralASM", "Surprise", "make_monitor"]
 
-_MONITORS: dict[str, Callable[..., Monitor]] = {"neural_asm": NeuralASM}
+MONITORS: dict[str, Callable[..., Monitor]] = {"neural_asm": NeuralASM}
+"""Every monitor by its name."""
 
 
 def make_monitor(name: str, spec: StreamSpec, **kwargs: Any) -> Monitor:
@@ -25,6 +26,6 @@ def make_monitor(name: str, spec: StreamSpec, **kwargs: Any) -> Monitor:
     Raises:
         ValueError: there is no monitor of that name.
     """
-    if name not in _MONITORS:
-        raise ValueError(f"unknown monitor {name!r}; known are: {', '.join(sorted(_MONITORS))}")
-    return _MONITORS[name](spec, **kwargs)
+    if name not in MONITORS:
+        raise ValueError(f"unknown monitor {name!r}; known are: {', '.join(sorted(MONITORS))}")
+    return MONITORS[name](spec, **kwargs)

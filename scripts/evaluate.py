@@ -1,0 +1,226 @@
+"""Records nominal, faulty and harmless episodes once, lets every monitor judge them, and reports who noticed what.
+
+A run lives in one folder and can be killed at any time: what was recorded, and what was fitted, is not made again. The
+same arguments give the same table.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium as gym
+import tyro
+from rich.console import Console
+
+import asm_gym
+from asm_gym.detection import conformal_episodes
+from asm_gym.envs.choices import check_choice
+from asm_gym.evaluation.archive import Label
+from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, possible
+from asm_gym.monitors import MONITORS
+from asm_gym.scripts.dispatch import Crew, Progress, dispatch
+from asm_gym.scripts.judge import Judgement, judge
+from asm_gym.scripts.progress import stage
+from asm_gym.scripts.publish import console_tables, publish
+from asm_gym.scripts.record import EXECUTIONS, Course, draw_onset, episode_seeds, record
+from asm_gym.tasks import task as task_spec
+
+_HARMLESS = (*HARMLESS, *EXECUTIONS)
+
+
+@dataclass(frozen=True)
+class Args:
+    """Tasks × monitors × faults: who notices what, how fast, and how often for nothing."""
+
+    tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan", "Door")
+    """Names of tasks."""
+    robot: str = "Panda"
+    """The arm."""
+    policy: str = "scripted"
+    """What acts: scripted, or the path of an agent."""
+    monitors: tuple[str, ...] = tuple(MONITORS)
+    """Names of monitors."""
+    faults: tuple[str, ...] = tuple(KINDS)
+    """Kinds of fault."""
+    severities: tuple[str, ...] = SEVERITIES
+    """How bad each is."""
+    harmless: tuple[str, ...] = _HARMLESS
+    """Harmless variations, which should raise no alarm."""
+    fit_episodes: int = 60
+    """Nominal episodes of each task to learn from."""
+    calibration_episodes: int = 60
+    """Other nominal episodes of each task; the thresholds are set on those of all tasks together."""
+    nominal_episodes: int = 60
+    """Nominal episodes of each task to test on."""
+    faulty_episodes: int = 20
+    """Episodes of each task for each kind and severity; each is the twin of a nominal one."""
+    harmless_episodes: int = 20
+    """Episodes of each task for each harmless variation."""
+    false_alarm_rate: float = 0.01
+    """Share of nominal episodes that may raise an alarm."""
+    window: float = 1.0
+    """How soon after its onset a fault must be noticed [s]."""
+    workers: int = 2
+    """Processes."""
+    backend: str = "loky"
+    """loky for processes on this machine; dask or ray for a cluster that is running."""
+    address: str | None = None
+    """Where the cluster is, such as tcp://host:8786."""
+    seed: int = 0
+    """Of everything."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
+    """Folder of the run."""
+    quick: bool = False
+    """Three tasks and few episodes: to see that everything runs, not to judge the figures."""
+
+    def __post_init__(self) -> None:
+        for name in self.tasks:
+            task_spec(name)
+        for what, names, known in (
+            ("monitor", self.monitors, MONITORS),
+            ("kind of fault", self.faults, KINDS),
+            ("severity", self.severities, SEVERITIES),
+            ("harmless variation", self.harmless, _HARMLESS),
+        ):
+            for name in names:
+                check_choice(what, name, known)
+        for field in fields(self):
+            if field.name.endswith("_episodes") and getattr(self, field.name) < 1:
+                raise ValueError(f"{field.name} must be at least 1, got {getattr(self, field.name)}")
+        if self.faulty_episodes > self.nominal_episodes:
+            raise ValueError(
+                f"every faulty episode is the twin of a nominal one: faulty_episodes must be at most "
+                f"{self.nominal_episodes}, got {self.faulty_episodes}"
+            )
+        needed = conformal_episodes(self.false_alarm_rate)
+        if self.calibration_episodes * len(self.tasks) < needed:
+            raise ValueError(
+                f"a false-alarm rate of {self.false_alarm_rate:g} needs {needed} calibration episodes in all, got "
+                f"{self.calibration_episodes} for each of {len(self.tasks)} tasks"
+            )
+        if not self.window > 0:
+            raise ValueError(f"window must be > 0 s, got {self.window}")
+        if not self.tasks or not self.monitors or not self.faults or not self.severities:
+            raise ValueError("there must be at least one task, monitor, kind of fault and severity")
+
+    def scaled(self) -> Args:
+        """With ``quick``, three tasks and little of everything."""
+        if not self.quick:
+            return self
+        return replace(
+            self,
+            tasks=tuple(t for t in self.tasks if t in ("Lift", "Stack", "Door")) or self.tasks[:3],
+            severities=("strong",) if "strong" in self.severities else self.severities[-1:],
+            fit_episodes=16,
+            calibration_episodes=10,
+            nominal_episodes=8,
+            faulty_episodes=3,
+            harmless_episodes=2,
+            false_alarm_rate=0.05,
+        )
+
+    @property
+    def crew(self) -> Crew:
+        return Crew(self.workers, self.backend, self.address)
+
+
+def labels(args: Args) -> list[Label]:
+    """Every episode of the run, task by task."""
+    made: list[Label] = []
+    for task in args.tasks:
+        env: Any = gym.make(f"asm_gym/{task}-v0", robot=args.robot).unwrapped
+        faults = [k for k in args.faults if possible(k, env)]
+        harmless = [k for k in args.harmless if k in EXECUTIONS or possible(k, env)]
+        horizon = env.horizon
+        env.close()
+        for role in ("fit", "calibration", "nominal"):
+            seeds = episode_seeds(args.seed, task, role, getattr(args, f"{role}_episodes"))
+            made += [Label(task, role, seed=s) for s in seeds]
+        twins = episode_seeds(args.seed, task, "nominal", args.nominal_episodes)[: args.faulty_episodes]
+        onsets = {s: draw_onset(s, horizon) for s in twins}
+        made += [
+            Label(task, "faulty", k, severity, s, onsets[s])
+            for k in faults
+            for severity in args.severities
+            for s in twins
+        ]
+        others = episode_seeds(args.seed, task, "harmless", args.harmless_episodes)
+        made += [Label(task, "harmless", k, "", s, draw_onset(s, horizon)) for k in harmless for s in others]
+    return made
+
+
+def record_all(args: Args, wanted: Sequence[Label], progress: Progress) -> None:
+    """Records the episodes that are not there yet."""
+    missing = [label for label in wanted if not (args.out / label.path).is_file()]
+    done = len(wanted) - len(missing)
+    progress(done, len(wanted))
+    course = Course(args.robot, args.policy)
+    task = partial(record, course=course, folder=args.out.resolve())
+    dispatch(task, missing, args.crew, lambda k, _: progress(done + k, len(wanted)))
+
+
+def claim(args: Args) -> None:
+    """Makes the folder this run's own, or goes on with it.
+
+    Raises:
+        ValueError: it holds a run of other settings; the message names them.
+    """
+    ours = {
+        name: value
+        for name, value in json.loads(json.dumps(asdict(args), default=str)).items()
+        if name in ("robot", "policy", "seed")
+    }
+    versions = {p: metadata.version(p) for p in ("robosuite", "mujoco", "gymnasium", "numpy")}
+    ours |= {"asm_gym": asm_gym.__version__, **versions}
+    path = args.out / "recordings.json"
+    if path.is_file():
+        theirs = json.loads(path.read_text(encoding="utf-8"))
+        other = [f"{n}: {theirs.get(n)!r} there, {ours[n]!r} here" for n in ours if theirs.get(n) != ours[n]]
+        if other:
+            raise ValueError(f"{args.out} holds recordings of other settings ({'; '.join(other)}): name another --out")
+    args.out.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(ours, indent=2) + "\n", encoding="utf-8")
+
+
+def evaluate(args: Args, console: Console) -> Judgement:
+    """Records, fits, judges and publishes."""
+    seconds: dict[str, float] = {}
+    claim(args)
+    with stage("listing episodes", console, seconds):
+        wanted = labels(args)
+    with stage("recording", console, seconds) as progress:
+        record_all(args, wanted, progress)
+    with stage("fitting and judging", console, seconds) as progress:
+        judgement = judge(args.out, wanted, args.monitors, args.false_alarm_rate, args.window, args.seed, progress)
+    with stage("drawing", console, seconds):
+        details = json.loads(json.dumps(asdict(args), default=str))
+        details |= {"python": platform.python_version(), "machine": platform.machine(), "seconds": seconds}
+        publish(args.out, judgement, details)
+    return judgement
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the evaluation; 2 where the arguments make no sense."""
+    console = Console()
+    try:
+        args = tyro.cli(Args, args=argv, prog="asm-gym evaluate", description=__doc__).scaled()
+        judgement = evaluate(args, console)
+    except ValueError as error:
+        print(f"asm-gym evaluate: {error}", file=sys.stderr)
+        return 2
+    for table in console_tables(judgement):
+        console.print(table)
+    console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.parquet'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,169 @@
+"""Fits every monitor on the nominal recordings, and asks each what it makes of all the others."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from asm_gym.detection import conformal_episodes, conformal_threshold
+from asm_gym.evaluation import comparison
+from asm_gym.evaluation.archive import Label, Recording, read
+from asm_gym.evaluation.comparison import IDEAL, RATES, Cell, Score, Sight
+from asm_gym.evaluation.ideal import earliest, noise_floor, separation
+from asm_gym.evaluation.metrics import Share, window_steps
+from asm_gym.evaluation.scoring import Verdict, coverage
+from asm_gym.monitors import Monitor, NeuralASM, make_monitor
+from asm_gym.scripts.dispatch import Progress
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the monitors said of a run's episodes.
+
+    Args:
+        verdicts: of nominal and faulty episodes, by monitor.
+        harmless: of harmless variations, by monitor.
+        thresholds: by monitor and by the false-alarm rate they were set for.
+        sights: what an ideal observer could see.
+        rate, window_s: the run's own.
+    """
+
+    verdicts: Mapping[str, Sequence[Verdict]]
+    harmless: Mapping[str, Sequence[Verdict]]
+    thresholds: Mapping[str, Mapping[float, float]]
+    sights: Sequence[Sight]
+    rate: float
+    window_s: float
+
+    @property
+    def visible(self) -> dict[tuple[str, str], bool]:
+        return comparison.visible_kinds(self.sights)
+
+    def cells(self) -> dict[str, dict[tuple[str, str], Cell]]:
+        """Each monitor's score on each kind, the ideal observer's first."""
+        kinds = self.visible
+        ideal = {k: comparison.ideal_cell([s for s in self.sights if (s.kind, s.severity) == k]) for k in kinds}
+        return {IDEAL: ideal} | {
+            m: comparison.by_kind(v, self.thresholds[m], self.rate, self.window_s) for m, v in self.verdicts.items()
+        }
+
+    def scores(self) -> list[Score]:
+        """A row for each monitor."""
+        return [
+            comparison.score(m, v, self.thresholds[m], self.rate, self.window_s, self.visible)
+            for m, v in self.verdicts.items()
+        ]
+
+    def ideal(self) -> Cell:
+        """The bound, over the kinds that can be seen."""
+        return comparison.ideal_cell([s for s in self.sights if self.visible[(s.kind, s.severity)]])
+
+    def cries(self) -> dict[str, dict[str, Share]]:
+        """Episodes of each harmless variation with an alarm, by monitor."""
+        return {
+            m: {k: coverage([x for x in v if x.kind == k], self.thresholds[m][self.rate]) for k in _kinds(v)}
+            for m, v in self.harmless.items()
+        }
+
+
+def judge(
+    folder: Path,
+    labels: Sequence[Label],
+    monitors: Sequence[str],
+    rate: float,
+    window_s: float,
+    seed: int,
+    progress: Progress,
+) -> Judgement:
+    """Reads the recordings, and lets every monitor judge them.
+
+    Args:
+        folder: of the run.
+        labels: its episodes; those of roles fit and calibration are learned from, all others judged.
+        seed: of the monitors.
+    """
+    recordings = {label: read(folder / label.path) for label in labels}
+    by_role: dict[str, list[Recording]] = {}
+    for label, recording in recordings.items():
+        by_role.setdefault(label.role, []).append(recording)
+    rates = sorted({r for r in (*RATES, rate) if len(by_role["calibration"]) >= conformal_episodes(r)})
+    verdicts, harmless, thresholds = {}, {}, {}
+    for n, name in enumerate(monitors):
+        progress(n, len(monitors))
+        monitor = _fitted(folder, name, by_role["fit"], seed)
+        maxima = np.array([s.value.max() for s in _scores(monitor, by_role["calibration"])])
+        thresholds[name] = {r: conformal_threshold(maxima, r) for r in rates}
+        tested = [*by_role["nominal"], *by_role.get("faulty", [])]
+        verdicts[name] = _verdicts(name, monitor, tested, thresholds[name][rate])
+        harmless[name] = _verdicts(name, monitor, by_role.get("harmless", []), thresholds[name][rate])
+    progress(len(monitors), len(monitors))
+    return Judgement(verdicts, harmless, thresholds, _sights(by_role, window_s), rate, window_s)
+
+
+def _fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) -> Monitor:
+    """The monitor fitted on these episodes; kept in the folder for the next time, under the name of what it learned."""
+    spec = recordings[0].episode.spec
+    digest = hashlib.sha256(json.dumps([name, seed, sorted(str(r.label.path) for r in recordings)]).encode())
+    path = folder / "monitors" / f"{name}-{digest.hexdigest()[:12]}.asm"
+    if path.is_file() and name == "neural_asm":
+        return NeuralASM.load(path)
+    monitor = make_monitor(name, spec, seed=seed).fit([r.episode for r in recordings])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    monitor.save(path)
+    return monitor
+
+
+def _scores(monitor: Any, recordings: Sequence[Recording]) -> list[Any]:
+    return list(monitor.score_episodes([r.episode for r in recordings])) if recordings else []
+
+
+def _verdicts(name: str, monitor: Monitor, recordings: Sequence[Recording], threshold: float) -> list[Verdict]:
+    made = []
+    for recording, surprise in zip(recordings, _scores(monitor, recordings), strict=True):
+        label, episode = recording.label, recording.episode
+        faulty = label.role == "faulty"
+        verdict = Verdict(
+            task=label.task,
+            monitor=name,
+            kind=label.kind or "nominal",
+            severity=label.severity,
+            seed=label.seed,
+            dt=episode.spec.dt,
+            surprise=surprise.value,
+            onset=label.onset if faulty else None,
+            guilty=recording.guilty,
+        )
+        after = verdict.detected_after(threshold)
+        if after is not None and label.onset is not None:
+            blamed = int(np.argmax(surprise.attribution[label.onset + after]))
+            verdict = Verdict(**{**verdict.__dict__, "blamed": episode.spec.labels[blamed]})
+        made.append(verdict)
+    return made
+
+
+def _sights(by_role: Mapping[str, Sequence[Recording]], window_s: float) -> list[Sight]:
+    twins = {(r.label.task, r.label.seed): r.episode.stream for r in by_role["nominal"]}
+    noises: dict[str, Any] = {}
+    sights = []
+    for recording in by_role.get("faulty", []):
+        label, episode = recording.label, recording.episode
+        if label.task not in noises:
+            nominal = [r.episode.stream for r in by_role["nominal"] if r.label.task == label.task]
+            noises[label.task] = noise_floor(episode.spec.noise, nominal)
+        summed = separation(episode.stream, twins[label.task, label.seed], noises[label.task], label.onset or 0)
+        window = summed[: window_steps(window_s, episode.spec.dt)]
+        seen = float(window[-1]) if len(window) else 0.0
+        sights.append(
+            Sight(label.task, label.kind, label.severity, label.seed, seen, earliest(window), episode.spec.dt)
+        )
+    return sights
+
+
+def _kinds(verdicts: Sequence[Verdict]) -> list[str]:
+    return list(dict.fromkeys(v.kind for v in verdicts))
