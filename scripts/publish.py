@@ -62,16 +62,28 @@ def harmless_table(judgement: Judgement) -> Table:
 
 
 def console_tables(judgement: Judgement) -> list[RichTable]:
-    """The main table, and that of harmless variations, for a terminal."""
-    shown = []
-    for table in (main_table(judgement), harmless_table(judgement)):
-        rich = RichTable(caption=table.caption, caption_justify="left")
-        for i, heading in enumerate(table.headings):
-            rich.add_column(heading, justify="left" if i == 0 else "right")
-        for row in table.rows:
-            rich.add_row(*map(str, row))
-        shown.append(rich)
-    return shown
+    """The chief columns of the main table, and the harmless variations, narrow enough for a terminal."""
+    rate = judgement.rate
+    summary = RichTable(title=f"found within {judgement.window_s:g} s at a false-alarm rate of {100 * rate:g} %")
+    for i, heading in enumerate(("monitor", "AUROC", "found", "median [ms]", "alarms/h", "right channel")):
+        summary.add_column(heading, justify="left" if i == 0 else "right", no_wrap=True)
+    for name, cell in ((IDEAL, judgement.ideal()), *((s.monitor, s.cell) for s in judgement.scores())):
+        score = next((s for s in judgement.scores() if s.monitor == name), None)
+        summary.add_row(
+            name,
+            f"{cell.auroc:.3f}",
+            _interval(cell.found.get(rate)),
+            _milliseconds(cell.median_ms),
+            f"{score.false_alarms_per_hour:.1f}" if score else "",
+            _percent(score.attribution) if score else "",
+        )
+    table = harmless_table(judgement)
+    harmless = RichTable(title="episodes with an alarm under harmless variations")
+    for i, heading in enumerate(table.headings):
+        harmless.add_column(heading, justify="left" if i == 0 else "right", no_wrap=True)
+    for row in table.rows:
+        harmless.add_row(*map(str, row))
+    return [summary, harmless]
 
 
 def publish(folder: Path, judgement: Judgement, details: Mapping[str, Any]) -> None:
@@ -166,9 +178,13 @@ def _cell(cell: Cell) -> tuple[str, ...]:
         f"{cell.auroc:.3f}",
         "" if math.isnan(cell.precision) else f"{cell.precision:.3f}",
         *(_interval(cell.found.get(r)) for r in (0.005, 0.01, 0.05)),
-        f"{cell.median_ms:.0f}" if math.isfinite(cell.median_ms) else "missed",
-        f"{cell.p95_ms:.0f}" if math.isfinite(cell.p95_ms) else "missed",
+        _milliseconds(cell.median_ms),
+        _milliseconds(cell.p95_ms),
     )
+
+
+def _milliseconds(delay: float) -> str:
+    return f"{delay:.0f}" if math.isfinite(delay) else "missed"
 
 
 def _percent(share: Share | None) -> str:

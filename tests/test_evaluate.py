@@ -1,0 +1,156 @@
+"""The evaluation goes on after a kill, refuses to mix runs, and gives the same table every time."""
+
+import json
+import re
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from asm_gym.evaluation.archive import Label, read
+from asm_gym.scripts.dispatch import Crew, dispatch
+from asm_gym.scripts.evaluate import Args, labels, main
+from asm_gym.scripts.record import Course, draw_onset, record
+
+SMALL = [
+    *("--tasks", "Stack", "--faults", "push", "frozen_encoder", "gripper_opens", "--severities", "mild", "strong"),
+    *("--harmless", "touch", "slower", "--fit-episodes", "4", "--calibration-episodes", "20"),
+    *("--nominal-episodes", "4", "--faulty-episodes", "2", "--harmless-episodes", "1"),
+    *("--false-alarm-rate", "0.05", "--workers", "1"),
+]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("evaluate")
+    assert main([*SMALL, "--out", str(folder)]) == 0
+    return folder
+
+
+def test_it_writes_what_it_promises(run):
+    rows = pq.read_table(run / "results.parquet").to_pylist()
+    assert len(rows) == 4 + 3 * 2 * 2 + 2
+    push = [r for r in rows if r["kind"] == "push" and r["severity"] == "strong"]
+    assert all(r["ideal_separation"] > 100 and len(r["surprise"]) == r["steps"] for r in push)
+    assert all(r["ideal_delay_s"] == pytest.approx(0.05) for r in push)
+    report = (run / "report.html").read_text()
+    assert report.count("<img") == 4
+    assert "ideal observer" in report
+    assert "http" not in report.replace("http://www.w3.org", "")
+    assert json.loads((run / "results.json").read_text())["settings"]["seed"] == 0
+
+
+def test_faulty_episodes_are_twins_until_the_onset(run):
+    faulty = [read(p) for p in sorted((run / "episodes/Stack/faulty").glob("*.npz"))]
+    assert len(faulty) == 12
+    for recording in faulty:
+        label = recording.label
+        twin = read(run / Label("Stack", "nominal", seed=label.seed).path).episode.stream
+        onset = label.onset
+        np.testing.assert_array_equal(recording.episode.stream[:onset], twin[:onset])
+        assert recording.episode.faults.argmax() == onset
+        assert len(recording.episode) == onset + 40
+
+
+def test_it_goes_on_where_it_was_killed_and_gives_the_same_table(run):
+    table, recordings = (run / "results.md").read_text(), sorted(run.glob("episodes/*/*/*.npz"))
+    kept = {p: p.stat().st_mtime_ns for p in recordings[::2]}
+    for path in recordings[1::2]:
+        path.unlink()
+    (run / "results.parquet").unlink()
+    assert main([*SMALL, "--out", str(run)]) == 0
+    assert sorted(run.glob("episodes/*/*/*.npz")) == recordings
+    assert {p: p.stat().st_mtime_ns for p in kept} == kept
+    assert (run / "results.md").read_text() == table
+
+
+def test_a_folder_of_other_settings_is_refused(run, capsys):
+    before = sorted(run.rglob("*"))
+    assert main([*SMALL, "--out", str(run), "--seed", "1"]) == 2
+    assert "seed: 0 there, 1 here" in capsys.readouterr().err
+    assert sorted(run.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--faults flood", "'flood'.*push"),
+        ("--tasks Juggle", "'Juggle'.*Lift"),
+        ("--monitors oracle", "'oracle'.*neural_asm"),
+        ("--severities deadly", "'deadly'.*mild"),
+        ("--harmless hurricane", "'hurricane'.*touch"),
+        ("--false-alarm-rate 0.001", "needs 999 calibration"),
+        ("--faulty-episodes 5", "at most 4, got 5"),
+        ("--fit-episodes 0", "fit_episodes.*0"),
+        ("--window -1", "window"),
+        ("--backend dask", "address"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_refused(arguments, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        sys.exit(main([*SMALL, *arguments.split(), "--out", str(tmp_path)]))
+    assert ended.value.code == 2
+    shown = "".join(capsys.readouterr())
+    assert re.search(message, re.sub(r"[│╭╮╰╯─\s]+", " ", shown))
+    assert not list(tmp_path.glob("episodes"))
+
+
+def test_quick_is_less_of_everything():
+    quick = Args(quick=True).scaled()
+    assert quick.tasks == ("Lift", "Stack", "Door")
+    assert quick.severities == ("strong",)
+    assert Args().scaled() == Args()
+    made = labels(Args(tasks=("Door",), faults=("push", "slip"), harmless=("touch",), false_alarm_rate=0.05))
+    assert {label.kind for label in made} == {"", "push", "touch"}  # a door is nothing that could slip
+    assert len({label.path for label in made}) == len(made)
+
+
+def test_onsets_leave_room_before_and_after():
+    onsets = [draw_onset(seed, 200) for seed in range(300)]
+    assert min(onsets) >= 10
+    assert max(onsets) < 100
+    assert len(set(onsets)) > 50
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_makes_the_same_recordings(tmp_path):
+    wanted = [Label("Stack", "fit", seed=s) for s in range(12)]
+    distributed = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
+    file = tmp_path / "scheduler.json"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    scheduler = subprocess.Popen([*distributed, "--scheduler-file", str(file), "--host", "127.0.0.1"], **quiet)
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--nthreads", "1"]
+    workers = [subprocess.Popen([*worker, "--no-nanny", "--no-dashboard"], **quiet) for _ in range(2)]
+    try:
+        while not file.is_file():
+            time.sleep(0.2)
+        address = json.loads(file.read_text())["address"]
+        here, there = tmp_path / "here", tmp_path / "there"
+
+        def kill_one(done, _):
+            if done == 3:
+                workers[0].kill()
+
+        job = _Recorder(there)
+        dispatch(job, wanted, Crew(2, "dask", address), kill_one)
+        assert workers[0].wait(10) != 0
+        dispatch(_Recorder(here), wanted, 1)
+        for label in wanted:
+            a, b = read(here / label.path), read(there / label.path)
+            np.testing.assert_array_equal(a.episode.stream, b.episode.stream)
+    finally:
+        for process in (*workers, scheduler):
+            process.kill()
+
+
+class _Recorder:
+    """Records into a folder; a class, so that a cluster can be handed it."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __call__(self, label):
+        return record(label, Course(), self.folder)
