@@ -13,7 +13,7 @@ import gymnasium as gym
 import joblib
 
 import asm_gym  # noqa: F401  (registers the environments in every worker)
-from asm_gym.envs.choices import check_choice
+from asm_gym.choices import check_choice
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -21,8 +21,8 @@ import tyro
 from rich.console import Console
 
 import asm_gym
+from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
-from asm_gym.envs.choices import check_choice
 from asm_gym.evaluation.archive import Label
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, possible
 from asm_gym.monitors import MONITORS

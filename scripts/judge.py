@@ -18,7 +18,7 @@ from asm_gym.evaluation.comparison import IDEAL, RATES, Cell, Score, Sight
 from asm_gym.evaluation.ideal import earliest, noise_floor, separation
 from asm_gym.evaluation.metrics import Share, window_steps
 from asm_gym.evaluation.scoring import Verdict, coverage
-from asm_gym.monitors import Monitor, NeuralASM, make_monitor
+from asm_gym.monitors import MONITORS, Monitor, make_monitor
 from asm_gym.scripts.dispatch import Progress
 
 
@@ -111,8 +111,9 @@ def _fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int)
     spec = recordings[0].episode.spec
     digest = hashlib.sha256(json.dumps([name, seed, sorted(str(r.label.path) for r in recordings)]).encode())
     path = folder / "monitors" / f"{name}-{digest.hexdigest()[:12]}.asm"
-    if path.is_file() and name == "neural_asm":
-        return NeuralASM.load(path)
+    if path.is_file():
+        loaded: Monitor = MONITORS[name].load(path)
+        return loaded
     monitor = make_monitor(name, spec, seed=seed).fit([r.episode for r in recordings])
     path.parent.mkdir(parents=True, exist_ok=True)
     monitor.save(path)

@@ -313,5 +313,5 @@ def test_a_monitor_is_made_by_name():
     monitor: Monitor = make_monitor("neural_asm", sine_spec(), hidden_size=7)
     assert isinstance(monitor, NeuralASM)
     assert monitor.hidden_size == 7
-    with pytest.raises(ValueError, match=r"unknown monitor 'oracle'; known are: .*neural_asm"):
+    with pytest.raises(ValueError, match=r"unknown monitor 'oracle'; known: .*neural_asm"):
         make_monitor("oracle", sine_spec())

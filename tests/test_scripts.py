@@ -42,7 +42,7 @@ def test_bad_counts_are_refused():
     with pytest.raises(ValueError, match=r"episodes.*0"):
         collect("asm_gym/Lift-v0", episodes=0)
     with pytest.raises(ValueError, match=r"workers.*0"):
-        dispatch(abs, [1], workers=0)
+        dispatch(abs, [1], 0)
 
 
 def test_dispatch_keeps_the_order_and_reports_progress():

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.envs.choices import check_choice
+from asm_gym.choices import check_choice
 from asm_gym.stream import Channel
 from asm_gym.tasks import ROBOTS, TaskSpec
 

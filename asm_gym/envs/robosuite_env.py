@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.choices import check_choice
 from asm_gym.envs import backend
-from asm_gym.envs.choices import check_choice
 from asm_gym.envs.layout import Layout
 from asm_gym.envs.ledger import Ledger
 from asm_gym.envs.pictures import RENDER_MODES, Pictures

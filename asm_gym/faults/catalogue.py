@@ -6,7 +6,7 @@ import dataclasses
 import re
 from typing import Any
 
-from asm_gym.envs.choices import check_choice
+from asm_gym.choices import check_choice
 from asm_gym.faults import action, actuator, body, harmless, sensor, thing
 from asm_gym.faults.base import Fault
 

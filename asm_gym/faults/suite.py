@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from asm_gym.envs.choices import check_choice
+from asm_gym.choices import check_choice
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import action, actuator, body, harmless, sensor, thing
 from asm_gym.faults.base import Fault

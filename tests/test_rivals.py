@@ -1,0 +1,138 @@
+"""Every monitor keeps one contract, and each rival does what its source says."""
+
+import numpy as np
+import pytest
+
+from asm_gym.episodes import Episode
+from asm_gym.monitors import MONITORS, make_monitor
+from asm_gym.monitors.autoregression import Autoregression
+from asm_gym.monitors.limits import ExternalTorqueLimit, ForceLimit
+from asm_gym.stream import MOTOR, Channel, StreamSpec
+from tests.streams import sine_episodes, sine_spec
+
+SPEC = StreamSpec(
+    (
+        Channel("external_torque_peak", 3, "N m", 0.1, "torque"),
+        Channel("wrist_force_peak", 3, "N", 0.2, "wrench"),
+        Channel("command", 2, group=MOTOR),
+    ),
+    0.05,
+    "arm",
+)
+
+
+def episodes(count, seed=0):
+    return sine_episodes(count, seed, SPEC)
+
+
+@pytest.fixture(scope="module", params=list(MONITORS))
+def monitor(request):
+    kwargs = {"epochs": 4, "hidden_size": 16} if request.param == "neural_asm" else {}
+    return make_monitor(request.param, SPEC, **kwargs).fit(episodes(20)).calibrate(episodes(40, 1), 0.05)
+
+
+def test_attribution_adds_up_and_scores_are_what_observing_gives(monitor):
+    batch = episodes(3, seed=2)
+    scores = monitor.score_episodes(batch)
+    for episode, score in zip(batch, scores, strict=True):
+        assert score.value.shape == (len(episode),)
+        np.testing.assert_allclose(score.attribution.sum(axis=1), score.value)
+        state, values = monitor.initial_state(1), []
+        for row in episode.stream:
+            state, surprise = monitor.observe(state, row[None])
+            values.append(surprise.value[0])
+        np.testing.assert_allclose(values, score.value, rtol=1e-4)
+
+
+def test_the_calibrated_rate_is_kept(monitor):
+    """At most 5 % of fresh nominal episodes on average; of 200, 24 or more would be a one in 10⁴ chance at 10 %."""
+    alarms = sum(s.value.max() > monitor.threshold for s in monitor.score_episodes(episodes(200, seed=3)))
+    assert alarms < 34
+
+
+def test_what_is_not_finite_is_infinitely_surprising_there_alone(monitor):
+    stream = episodes(1, seed=4)[0].stream.copy()
+    stream[10, 4] = np.nan
+    score = monitor.score(Episode.from_stream(stream, SPEC))
+    assert np.isinf(score.value[10])
+    assert np.flatnonzero(score.attribution[10]).tolist() == [4]
+    assert np.isfinite(score.value[11:]).all()
+
+
+def test_a_checkpoint_keeps_every_bit(monitor, tmp_path):
+    monitor.save(tmp_path / "m.asm")
+    loaded = type(monitor).load(tmp_path / "m.asm")
+    episode = episodes(1, seed=5)[0]
+    np.testing.assert_array_equal(loaded.score(episode).value, monitor.score(episode).value)
+    assert loaded.threshold == monitor.threshold
+    (tmp_path / "m.asm").write_bytes(b"nonsense")
+    with pytest.raises(ValueError, match=r"m\.asm"):
+        type(monitor).load(tmp_path / "m.asm")
+
+
+def test_bad_episodes_and_order_are_refused(monitor):
+    fresh = type(monitor)(SPEC)
+    with pytest.raises(RuntimeError, match="fit"):
+        fresh.calibrate(episodes(2), 0.5)
+    with pytest.raises(ValueError, match="at least one"):
+        fresh.fit([])
+    with pytest.raises(ValueError, match="joint_position"):
+        fresh.fit(sine_episodes(1))
+    broken = episodes(1)[0].stream.copy()
+    broken[3, 1] = np.inf
+    with pytest.raises(ValueError, match=r"episode 0, step 3, external_torque_peak\[1\]"):
+        fresh.fit([Episode.from_stream(broken, SPEC)])
+    if isinstance(fresh, Autoregression):
+        with pytest.raises(ValueError, match="3 steps"):
+            fresh.fit([Episode.from_stream(broken[:2], SPEC)])
+    with pytest.raises(ValueError, match="at least 19"):
+        monitor.calibrate(episodes(3), 0.05)
+    with pytest.raises(ValueError, match="numbers a step"):
+        monitor.observe(monitor.initial_state(1), np.zeros((1, 3)))
+
+
+def test_autoregression_recovers_the_coefficients_of_a_linear_system():
+    """x_t = 0.5 x_{t-1} + 0.3 x_{t-2} + 2 u_t + 0.1 noise: what is left is the noise, and white."""
+    spec = StreamSpec((Channel("x", 1), Channel("u", 1, group=MOTOR)), 0.1)
+    rng = np.random.default_rng(0)
+    made = []
+    for _ in range(20):
+        u, x = rng.standard_normal(200), np.zeros(200)
+        for t in range(2, 200):
+            x[t] = 0.5 * x[t - 1] + 0.3 * x[t - 2] + 2.0 * u[t] + 0.1 * rng.standard_normal()
+        made.append(Episode.from_stream(np.column_stack([x, u])[2:], spec))
+    model = Autoregression(spec).fit(made)
+    spread = float(model.learned_["spread"][0])
+    a1, a2, b, _ = model.learned_["weights"][:, 0]
+    assert (a1, a2, b * spread) == pytest.approx((0.5, 0.3, 2.0), abs=0.01)
+    assert 1 / float(model.learned_["whitening"][0, 0]) * spread == pytest.approx(0.1, rel=0.05)
+    values = np.concatenate([model.score(e).value[20:] for e in made])
+    assert values.mean() == pytest.approx(1.0, abs=0.1)
+
+
+def test_limits_are_what_they_say():
+    force = ForceLimit(SPEC).fit(episodes(5))
+    torque = ExternalTorqueLimit(SPEC).fit(episodes(5))
+    rows = np.concatenate([e.stream for e in episodes(5)]).astype(float)
+    row = np.arange(8.0)[None]
+    weight, mean, spread = rows[:, 3:6].mean(axis=0), rows[:, :3].mean(axis=0), rows[:, :3].std(axis=0)
+    assert force.observe(None, row)[1].value[0] == pytest.approx(((row[0, 3:6] - weight) ** 2).sum())
+    expected = np.abs(row[0, :3] - mean) / spread
+    surprise = torque.observe(None, row)[1]
+    assert surprise.value[0] == pytest.approx(expected.max())
+    assert surprise.attribution[0].argmax() == expected.argmax()
+
+
+@pytest.mark.parametrize(
+    ("name", "lacks"), [("force_limit", "wrist_force"), ("external_torque_limit", "external_torque")]
+)
+def test_a_limit_needs_its_channel(name, lacks):
+    with pytest.raises(ValueError, match=f"no {lacks}.*joint_position"):
+        make_monitor(name, sine_spec())
+
+
+def test_unknown_names_and_hyperparameters_list_the_known():
+    with pytest.raises(ValueError, match=r"'oracle'.*neural_asm, autoregression"):
+        make_monitor("oracle", SPEC)
+    with pytest.raises(ValueError, match=r"'hiden_size'.*did you mean 'hidden_size'"):
+        make_monitor("neural_asm", SPEC, hiden_size=3)
