@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +19,12 @@ from asm_gym.evaluation.comparison import IDEAL, RATES, Cell, Score, Sight
 from asm_gym.evaluation.ideal import earliest, noise_floor, separation
 from asm_gym.evaluation.metrics import Share, window_steps
 from asm_gym.evaluation.scoring import Verdict, coverage
+from asm_gym.evaluation.trace import POLICY_ALONE, Trace
 from asm_gym.monitors import MONITORS, Monitor, make_monitor
 from asm_gym.scripts.dispatch import Progress
+
+EXAMPLES = ("push", "collision", "weak_joint", "frozen_encoder", "snatch")
+"""Kinds of which the report shows an episode."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,7 @@ class Judgement:
         thresholds: by monitor and by the false-alarm rate they were set for.
         sights: what an ideal observer could see.
         rate, window_s: the run's own.
+        examples: a typical faulty episode of some kinds, as the first monitor saw it.
     """
 
     verdicts: Mapping[str, Sequence[Verdict]]
@@ -40,6 +46,7 @@ class Judgement:
     sights: Sequence[Sight]
     rate: float
     window_s: float
+    examples: Sequence[Trace] = ()
 
     @property
     def visible(self) -> dict[tuple[str, str], bool]:
@@ -94,6 +101,7 @@ def judge(
         by_role.setdefault(label.role, []).append(recording)
     rates = sorted({r for r in (*RATES, rate) if len(by_role["calibration"]) >= conformal_episodes(r)})
     verdicts, harmless, thresholds = {}, {}, {}
+    examples: list[Trace] = []
     for n, name in enumerate(monitors):
         progress(n, len(monitors))
         monitor = _fitted(folder, name, by_role["fit"], seed)
@@ -101,9 +109,11 @@ def judge(
         thresholds[name] = {r: conformal_threshold(maxima, r) for r in rates}
         tested = [*by_role["nominal"], *by_role.get("faulty", [])]
         verdicts[name] = _verdicts(name, monitor, tested, thresholds[name][rate])
+        if n == 0:
+            examples = _examples(monitor, verdicts[name], tested, thresholds[name][rate])
         harmless[name] = _verdicts(name, monitor, by_role.get("harmless", []), thresholds[name][rate])
     progress(len(monitors), len(monitors))
-    return Judgement(verdicts, harmless, thresholds, _sights(by_role, window_s), rate, window_s)
+    return Judgement(verdicts, harmless, thresholds, _sights(by_role, window_s), rate, window_s, examples)
 
 
 def _fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) -> Monitor:
@@ -146,6 +156,40 @@ def _verdicts(name: str, monitor: Monitor, recordings: Sequence[Recording], thre
             verdict = Verdict(**{**verdict.__dict__, "blamed": episode.spec.labels[blamed]})
         made.append(verdict)
     return made
+
+
+def _examples(
+    monitor: Any, verdicts: Sequence[Verdict], recordings: Sequence[Recording], threshold: float
+) -> list[Trace]:
+    """Of each of a few kinds, at its strongest, the episode with the median delay."""
+    chosen = []
+    for kind in EXAMPLES:
+        own = [i for i, v in enumerate(verdicts) if v.kind == kind]
+        own = [i for i in own if verdicts[i].severity == verdicts[own[-1]].severity]
+        if own:
+            late = sorted((math.inf if (a := verdicts[i].detected_after(threshold)) is None else a, i) for i in own)
+            chosen.append(late[(len(late) - 1) // 2][1])
+    traces = []
+    for i in chosen:
+        label, episode = recordings[i].label, recordings[i].episode
+        surprise = monitor.score(episode)
+        traces.append(
+            Trace(
+                condition=" ".join([label.severity, label.kind.replace("_", " "), "in", label.task]),
+                acting=POLICY_ALONE,
+                seed=label.seed,
+                dt=episode.spec.dt,
+                threshold=threshold,
+                surprise=surprise.value,
+                alarm=surprise.value > threshold,
+                fault=episode.faults,
+                contact_force=recordings[i].contact_force,
+                attribution=surprise.attribution,
+                labels=episode.spec.labels,
+                success=episode.success,
+            )
+        )
+    return traces
 
 
 def _sights(by_role: Mapping[str, Sequence[Recording]], window_s: float) -> list[Sight]:

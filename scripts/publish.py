@@ -14,6 +14,7 @@ from rich.table import Table as RichTable
 from asm_gym.evaluation import comparison_plots as plots
 from asm_gym.evaluation.comparison import IDEAL, Cell, Score, Sight
 from asm_gym.evaluation.metrics import Share, window_steps
+from asm_gym.evaluation.plots import attribution_figure, surprise_figure
 from asm_gym.evaluation.report import Table, write_report
 from asm_gym.evaluation.scoring import Verdict
 from asm_gym.scripts.judge import Judgement
@@ -107,6 +108,13 @@ def publish(folder: Path, judgement: Judgement, details: Mapping[str, Any]) -> N
     }
     if len(severities) > 1:
         figures["Faults found at each severity."] = plots.severity_curves(cells, severities, judgement.rate)
+    if judgement.examples:
+        first = next(iter(judgement.verdicts))
+        figures[f"Typical episodes as {first} saw them: surprise over its threshold, the fault's span, the alarms."] = (
+            surprise_figure(judgement.examples)
+        )
+    for trace in judgement.examples:
+        figures[f"{trace.condition}: where the surprise came from."] = attribution_figure(trace)
     write_report(
         folder / "report.html",
         "Who notices what",

@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from asm_gym.evaluation.archive import Label, read
+from asm_gym.monitors import MONITORS
 from asm_gym.scripts.dispatch import Crew, dispatch
 from asm_gym.scripts.evaluate import Args, labels, main
 from asm_gym.scripts.record import Course, draw_onset, record
@@ -32,12 +33,12 @@ def run(tmp_path_factory):
 
 def test_it_writes_what_it_promises(run):
     rows = pq.read_table(run / "results.parquet").to_pylist()
-    assert len(rows) == 4 + 3 * 2 * 2 + 2
+    assert len(rows) == len(MONITORS) * (4 + 3 * 2 * 2 + 2)
     push = [r for r in rows if r["kind"] == "push" and r["severity"] == "strong"]
     assert all(r["ideal_separation"] > 100 and len(r["surprise"]) == r["steps"] for r in push)
     assert all(r["ideal_delay_s"] == pytest.approx(0.05) for r in push)
     report = (run / "report.html").read_text()
-    assert report.count("<img") == 4
+    assert report.count("<img") == 4 + 1 + 2  # typical episodes of a push and a frozen encoder, and their channels
     assert "ideal observer" in report
     assert "http" not in report.replace("http://www.w3.org", "")
     assert json.loads((run / "results.json").read_text())["settings"]["seed"] == 0
