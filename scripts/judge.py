@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +49,11 @@ class Judgement:
     window_s: float
     examples: Sequence[Trace] = ()
 
-    @property
+    @cached_property
     def visible(self) -> dict[tuple[str, str], bool]:
         return comparison.visible_kinds(self.sights)
 
+    @cached_property
     def cells(self) -> dict[str, dict[tuple[str, str], Cell]]:
         """Each monitor's score on each kind, the ideal observer's first."""
         kinds = self.visible
@@ -60,6 +62,7 @@ class Judgement:
             m: comparison.by_kind(v, self.thresholds[m], self.rate, self.window_s) for m, v in self.verdicts.items()
         }
 
+    @cached_property
     def scores(self) -> list[Score]:
         """A row for each monitor."""
         return [

@@ -25,7 +25,7 @@ _MORE = ("False alarms", "per hour", "Balanced accuracy", "Timestep-weighted", "
 
 def main_table(judgement: Judgement) -> Table:
     """Monitors side by side, the ideal observer on top."""
-    rows = [(IDEAL, *_cell(judgement.ideal()), "", "", "", "", ""), *map(_score, judgement.scores())]
+    rows = [(IDEAL, *_cell(judgement.ideal()), "", "", "", "", ""), *map(_score, judgement.scores)]
     hidden = [" ".join(k).strip() for k, seen in judgement.visible.items() if not seen]
     left_out = f" Kinds no observer could see, left out: {', '.join(hidden)}." if hidden else ""
     return Table(
@@ -39,7 +39,7 @@ def main_table(judgement: Judgement) -> Table:
 
 def kinds_table(judgement: Judgement) -> Table:
     """AUROC and faults found of every kind."""
-    cells = judgement.cells()
+    cells = judgement.cells
     monitors = list(cells)
     rows = []
     for kind, seen in judgement.visible.items():
@@ -68,8 +68,8 @@ def console_tables(judgement: Judgement) -> list[RichTable]:
     summary = RichTable(title=f"found within {judgement.window_s:g} s at a false-alarm rate of {100 * rate:g} %")
     for i, heading in enumerate(("monitor", "AUROC", "found", "median [ms]", "alarms/h", "right channel")):
         summary.add_column(heading, justify="left" if i == 0 else "right", no_wrap=True)
-    for name, cell in ((IDEAL, judgement.ideal()), *((s.monitor, s.cell) for s in judgement.scores())):
-        score = next((s for s in judgement.scores() if s.monitor == name), None)
+    for name, cell in ((IDEAL, judgement.ideal()), *((s.monitor, s.cell) for s in judgement.scores)):
+        score = next((s for s in judgement.scores if s.monitor == name), None)
         summary.add_row(
             name,
             f"{cell.auroc:.3f}",
@@ -94,7 +94,7 @@ def publish(folder: Path, judgement: Judgement, details: Mapping[str, Any]) -> N
     (folder / "results.md").write_text("\n\n".join(map(_markdown, tables)) + "\n", encoding="utf-8")
     summary = {"settings": details, "tables": [{"headings": t.headings, "rows": t.rows} for t in tables]}
     (folder / "results.json").write_text(json.dumps(summary, indent=1, default=str) + "\n", encoding="utf-8")
-    cells = judgement.cells()
+    cells = judgement.cells
     severities = list(dict.fromkeys(s for _, s in judgement.visible))
     thresholds = {m: own[judgement.rate] for m, own in judgement.thresholds.items()}
     figures = {
