@@ -1,25 +1,46 @@
 """From prediction errors to evidence, and from evidence to an alarm.
 
     whitened   e_t = M ε_t/σ_t,   M = ((1 - λ) C + λ tr(C)/X I)^(-½),   C = E[(ε/σ)(ε/σ)ᵀ] over nominal steps
-    bounded    ẽ_t = e_t / √(1 + ‖e_t‖²/(ν X))                          ‖ẽ_t‖² < ν X, however large e_t
+    bounded    ẽ_i = e_i / √(1 + e_i²/ν²)                               |ẽ_i| < ν, however large e_i
     evidence   w_t = (1 - a) w_{t-1} + a ẽ_t,   w_0 = 0
-    value      s_t = ‖w_t‖² (2 - a) / (a X (1 - (1 - a)^{2t}))          nominal mean 1 for white errors, for every t
-    alarm      s_t > q,   q the ⌈(n + 1)(1 - rate)⌉-th smallest of the maxima of n nominal episodes
+               v_i = w_i² (2 - a) / (a (1 - (1 - a)^{2t}))              nominal mean 1 for white errors, for every t
+    pooled     s_t = (Σ_i (v_i/q_i)^p)^(1/p)                            q_i: what v_i stays below in 99 % of episodes
+    value      s_t / ŝ(c_t)                                             ŝ: what s seldom exceeds in a context like this
+    alarm      value > the ⌈(n + 1)(1 - rate)⌉-th smallest of the maxima of n nominal episodes
 
-Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted as under a multivariate t);
-Lowry et al. 1992 (multivariate EWMA chart, its exact variance at start-up);
-Vovk et al. 2005 and Angelopoulos and Bates 2023 (split conformal prediction).
+Each number is measured against what it does in nominal episodes at its worst, so that a wrist that is often surprised
+by contact does not drown an encoder that never is; p lets the most surprising one count, and several add up.
+
+Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted as under a t distribution); Lowry et al.
+1992 (multivariate EWMA chart, its exact variance at start-up); Vovk et al. 2005 and Angelopoulos and Bates 2023 (split
+conformal prediction).
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.memory.habituation import habituate
+
 Array = NDArray[np.floating[Any]]
+
+POWER = 8
+"""p."""
+
+LATELY = 0.2
+"""Weight of the newest step in the running mean of the context."""
+
+WORST = 0.99
+"""Share of nominal episodes whose maximum of v stays below q."""
+
+FAINTEST = 1e-9
+"""Lower bound of s where its logarithm is taken."""
 
 
 def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
@@ -42,35 +63,130 @@ def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
 
 
 def bounded(errors: Array, bound: float) -> NDArray[np.float64]:
-    """Whitened errors (B, X) pulled in as a whole, directions kept: a step counts at most ν = ``bound`` usual ones."""
+    """Errors pulled in one by one: none counts more than ν = ``bound`` standard deviations."""
     exact = np.asarray(errors, np.float64)
-    excess = (exact**2).sum(axis=1, keepdims=True) / (bound * exact.shape[1])  # (B, 1)
-    pulled: NDArray[np.float64] = exact / np.sqrt(1.0 + excess)
+    pulled: NDArray[np.float64] = exact / np.sqrt(1.0 + (exact / bound) ** 2)
     return pulled
 
 
 class Evidence(NamedTuple):
     """What the last steps of each stream in a batch have added up to; never changed in place."""
 
-    vector: NDArray[np.float64]  # (B, X) w_t
+    vector: NDArray[np.float64]  # (B, G, X) w_t, for each of G gains
+    context: NDArray[np.float64]  # (B, C) running mean of the contexts
     steps: NDArray[np.int64]  # (B,) t, how many steps are in it
 
 
-def no_evidence(batch: int, size: int) -> Evidence:
-    """w_0 for ``batch`` streams of ``size`` channels."""
-    return Evidence(np.zeros((batch, size)), np.zeros(batch, np.int64))
+def no_evidence(batch: int, gains: int, size: int, context: int = 0) -> Evidence:
+    """w_0 for ``batch`` streams of ``size`` errors."""
+    return Evidence(np.zeros((batch, gains, size)), np.zeros((batch, context)), np.zeros(batch, np.int64))
 
 
-def accumulate(evidence: Evidence, whitened: Array, gain: float) -> Evidence:
-    """w_t from w_{t-1} and the whitened errors e_t (B, X); ``gain`` is a in (0, 1], and 1 forgets all but this step."""
-    return Evidence((1.0 - gain) * evidence.vector + gain * whitened, evidence.steps + 1)
+def accumulate(evidence: Evidence, whitened: Array, context: Array, gains: Array) -> Evidence:
+    """w_t from w_{t-1} and the whitened errors e_t (B, X); a gain a in (0, 1] of 1 forgets all but this step."""
+    vector = evidence.vector + gains[:, None] * (whitened[:, None, :] - evidence.vector)
+    return Evidence(vector, evidence.context + LATELY * (context - evidence.context), evidence.steps + 1)
 
 
-def shares(evidence: Evidence, gain: float) -> NDArray[np.float64]:
-    """Each channel's part of s_t (B, X): they add up to s_t, whose nominal mean is 1."""
-    variance = gain / (2.0 - gain) * (1.0 - (1.0 - gain) ** (2 * evidence.steps))  # (B,) of each w_t,i
-    parts: NDArray[np.float64] = evidence.vector**2 / (evidence.vector.shape[1] * variance[:, None])
-    return parts
+def strength(evidence: Evidence, gains: Array) -> NDArray[np.float64]:
+    """v (B, G, X): the squared evidence in each error, with a nominal mean of 1."""
+    variance = gains / (2.0 - gains) * (1.0 - (1.0 - gains) ** (2 * evidence.steps[:, None]))  # (B, G) of each w_t,i
+    squared: NDArray[np.float64] = evidence.vector**2 / variance[:, :, None]
+    return squared
+
+
+def pool(ratios: Array, power: float = POWER) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(Σ_i r_i^p)^(1/p) (B,), and each one's part of it (B, X), which add up to it; r >= 0."""
+    greatest = np.maximum(ratios.max(axis=1, keepdims=True), np.finfo(float).tiny)
+    powers = (ratios / greatest) ** power
+    total = powers.sum(axis=1, keepdims=True)
+    pooled = greatest * total ** (1.0 / power)
+    return pooled[:, 0], pooled * (powers / np.maximum(total, np.finfo(float).tiny))
+
+
+class Run(NamedTuple):
+    """What a model said of one nominal episode."""
+
+    errors: Array  # (T, X) normalised
+    contexts: Array  # (T, C) what the model took to be going on; C may be 0
+
+
+@dataclass(frozen=True, eq=False)
+class Detector:
+    """Turns a model's errors into one number that an alarm can be set on.
+
+    Args:
+        whitening: (X, X) M.
+        ceiling: (G, X) q.
+        habit: (2 C + 1,) weights of ŝ, on the context now and lately, and its bias.
+        gains: (G,) a, each in (0, 1].
+        bound: ν > 0.
+    """
+
+    whitening: NDArray[np.float64]
+    ceiling: NDArray[np.float64]
+    habit: NDArray[np.float64]
+    gains: NDArray[np.float64]
+    bound: float
+
+    @classmethod
+    def fit(
+        cls,
+        learned: Sequence[Run],
+        held_out: Sequence[Run],
+        gains: Sequence[float],
+        bound: float,
+        shrinkage: float,
+        rng: np.random.Generator,
+    ) -> Self:
+        """From nominal episodes that the model has learned, and others that it has not.
+
+        How surprise depends on context is taken from those held out, for a model is too sure of what it has seen.
+        """
+        matrix = whitening(bounded(np.concatenate([r.errors for r in learned]), bound), shrinkage)
+        a = np.asarray(gains, np.float64)
+        plain = cls(matrix, np.ones((len(a), len(matrix))), np.zeros(1), a, bound)
+        worst = [plain._strengths(r)[0].max(axis=0) for r in (*learned, *held_out)]
+        ceiling = np.maximum(np.quantile(worst, WORST, axis=0), FAINTEST)
+        contexts, levels = [], []
+        for r in held_out or learned:
+            strengths, lately = plain._strengths(r)
+            contexts.append(np.hstack([r.contexts, lately]).astype(np.float32))
+            levels.append(np.log(np.maximum(pool((strengths / ceiling).reshape(len(lately), -1))[0], FAINTEST)))
+        habit = habituate(np.concatenate(contexts), np.concatenate(levels), rng)
+        return cls(matrix, ceiling, habit.astype(np.float64), a, bound)
+
+    def start(self, batch: int) -> Evidence:
+        """No evidence yet."""
+        gains, size = self.ceiling.shape
+        return no_evidence(batch, gains, size, (len(self.habit) - 1) // 2)
+
+    def step(
+        self, evidence: Evidence, errors: Array, context: Array
+    ) -> tuple[Evidence, NDArray[np.float64], NDArray[np.float64]]:
+        """The new evidence, the value (B,), and each error's share of it (B, X).
+
+        Args:
+            errors: (B, X) normalised.
+            context: (B, C).
+        """
+        evidence = accumulate(evidence, bounded(errors, self.bound) @ self.whitening, context, self.gains)
+        ratios = strength(evidence, self.gains) / self.ceiling
+        pooled, parts = pool(ratios.reshape(len(ratios), -1))
+        C = context.shape[1]
+        usual = np.exp(context @ self.habit[:C] + evidence.context @ self.habit[C:-1] + self.habit[-1])
+        return evidence, pooled / usual, parts.reshape(ratios.shape).sum(axis=1) / usual[:, None]
+
+    def _strengths(self, run: Run) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """v (T, G, X) and the running mean of the contexts (T, C) of a whole episode."""
+        evidence = no_evidence(1, len(self.gains), len(self.whitening), run.contexts.shape[1])
+        whitened = bounded(run.errors, self.bound) @ self.whitening
+        strengths, lately = [], []
+        for e, c in zip(whitened, run.contexts, strict=True):
+            evidence = accumulate(evidence, e[None], c[None], self.gains)
+            strengths.append(strength(evidence, self.gains)[0])
+            lately.append(evidence.context[0])
+        return np.array(strengths), np.array(lately)
 
 
 def conformal_episodes(rate: float) -> int:

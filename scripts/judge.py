@@ -28,6 +28,10 @@ EXAMPLES = ("push", "collision", "weak_joint", "frozen_encoder", "snatch")
 """Kinds of which the report shows an episode."""
 
 
+NOMINAL = ("fit", "calibration", "nominal")
+"""Roles of the episodes that nothing is done to."""
+
+
 @dataclass(frozen=True)
 class Judgement:
     """What the monitors said of a run's episodes.
@@ -38,6 +42,7 @@ class Judgement:
         thresholds: by monitor and by the false-alarm rate they were set for.
         sights: what an ideal observer could see.
         rate, window_s: the run's own.
+        failed: nominal episodes that did not succeed; they are left out.
         examples: a typical faulty episode of some kinds, as the first monitor saw it.
     """
 
@@ -47,6 +52,7 @@ class Judgement:
     sights: Sequence[Sight]
     rate: float
     window_s: float
+    failed: int = 0
     examples: Sequence[Trace] = ()
 
     @cached_property
@@ -100,8 +106,16 @@ def judge(
     """
     recordings = {label: read(folder / label.path) for label in labels}
     by_role: dict[str, list[Recording]] = {}
+    failed = 0
     for label, recording in recordings.items():
-        by_role.setdefault(label.role, []).append(recording)
+        # A nominal episode that fails is no example of what should feel normal, nor an alarm in it a false one.
+        if label.role in NOMINAL and not recording.episode.success:
+            failed += 1
+        else:
+            by_role.setdefault(label.role, []).append(recording)
+    for role in NOMINAL:
+        if not by_role.get(role):
+            raise ValueError(f"none of the {role} episodes succeeded: there is nothing normal to learn or to test on")
     rates = sorted({r for r in (*RATES, rate) if len(by_role["calibration"]) >= conformal_episodes(r)})
     verdicts, harmless, thresholds = {}, {}, {}
     examples: list[Trace] = []
@@ -116,7 +130,9 @@ def judge(
             examples = _examples(monitor, verdicts[name], tested, thresholds[name][rate])
         harmless[name] = _verdicts(name, monitor, by_role.get("harmless", []), thresholds[name][rate])
     progress(len(monitors), len(monitors))
-    return Judgement(verdicts, harmless, thresholds, _sights(by_role, window_s), rate, window_s, examples)
+    twins = [r for label, r in recordings.items() if label.role == "nominal"]
+    sights = _sights(twins, by_role.get("faulty", []), window_s)
+    return Judgement(verdicts, harmless, thresholds, sights, rate, window_s, failed, examples)
 
 
 def _fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) -> Monitor:
@@ -195,15 +211,15 @@ def _examples(
     return traces
 
 
-def _sights(by_role: Mapping[str, Sequence[Recording]], window_s: float) -> list[Sight]:
-    twins = {(r.label.task, r.label.seed): r.episode.stream for r in by_role["nominal"]}
+def _sights(nominal: Sequence[Recording], faulty: Sequence[Recording], window_s: float) -> list[Sight]:
+    twins = {(r.label.task, r.label.seed): r.episode.stream for r in nominal}
     noises: dict[str, Any] = {}
     sights = []
-    for recording in by_role.get("faulty", []):
+    for recording in faulty:
         label, episode = recording.label, recording.episode
         if label.task not in noises:
-            nominal = [r.episode.stream for r in by_role["nominal"] if r.label.task == label.task]
-            noises[label.task] = noise_floor(episode.spec.noise, nominal)
+            own = [r.episode.stream for r in nominal if r.label.task == label.task]
+            noises[label.task] = noise_floor(episode.spec.noise, own)
         summed = separation(episode.stream, twins[label.task, label.seed], noises[label.task], label.onset or 0)
         window = summed[: window_steps(window_s, episode.spec.dt)]
         seen = float(window[-1]) if len(window) else 0.0

@@ -4,8 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from asm_gym.detection import accumulate, conformal_episodes, conformal_threshold, no_evidence, shares, whitening
+from asm_gym.detection import (
+    Detector,
+    Run,
+    accumulate,
+    bounded,
+    conformal_episodes,
+    conformal_threshold,
+    no_evidence,
+    pool,
+    strength,
+    whitening,
+)
+from asm_gym.memory.habituation import USUAL, habituate
 
 
 def correlated(rng: np.random.Generator, n: int = 4000, size: int = 5) -> np.ndarray:
@@ -48,36 +62,111 @@ def test_shrinkage_outside_the_unit_interval_is_refused(shrinkage):
         whitening(np.eye(3), shrinkage)
 
 
-@pytest.mark.parametrize("gain", [0.2, 0.05, 1.0])
-def test_evidence_of_white_noise_has_mean_one_from_the_first_step_on(gain):
-    rng, streams, size = np.random.default_rng(0), 4000, 3
-    evidence = no_evidence(streams, size)
+def test_evidence_of_white_noise_has_mean_one_from_the_first_step_on():
+    rng, streams, size, gains = np.random.default_rng(0), 4000, 3, np.array([0.2, 0.05, 1.0])
+    evidence = no_evidence(streams, 3, size)
     for _ in range(12):
-        evidence = accumulate(evidence, rng.normal(size=(streams, size)), gain)
-        value = shares(evidence, gain).sum(axis=1)
+        evidence = accumulate(evidence, rng.normal(size=(streams, size)), np.zeros((streams, 0)), gains)
         # variance of a chi-square over its 3 degrees of freedom is 2/3
-        assert value.mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / size / streams))
+        for value in strength(evidence, gains).mean(axis=2).T:
+            assert value.mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / size / streams))
 
 
 def test_evidence_is_the_hand_computed_moving_average():
-    first = no_evidence(1, 2)
-    one = accumulate(first, np.array([[1.0, 2.0]]), 0.5)
-    two = accumulate(one, np.array([[3.0, 0.0]]), 0.5)
-    np.testing.assert_allclose(two.vector, [[1.75, 0.5]])
+    half, first = np.array([0.5]), no_evidence(1, 1, 2, context=1)
+    one = accumulate(first, np.array([[1.0, 2.0]]), np.array([[5.0]]), half)
+    two = accumulate(one, np.array([[3.0, 0.0]]), np.array([[0.0]]), half)
+    np.testing.assert_allclose(two.vector, [[[1.75, 0.5]]])
+    np.testing.assert_allclose(two.context, [[0.8]])  # 5 × 0.2 × 0.8
     # variance of each: 0.5 / 1.5 * (1 - 0.5 ** 4) = 0.3125
-    np.testing.assert_allclose(shares(two, 0.5), [[1.75**2 / 0.625, 0.25 / 0.625]])
+    np.testing.assert_allclose(strength(two, half), [[[1.75**2 / 0.3125, 0.25 / 0.3125]]])
     assert first.steps[0] == 0
     assert not first.vector.any()
 
 
 def test_a_lasting_shift_adds_up_while_noise_averages_out():
-    evidence = no_evidence(1, 4)
+    gains, evidence = np.array([0.2]), no_evidence(1, 1, 4)
     values = []
     for _ in range(60):
-        evidence = accumulate(evidence, np.array([[1.0, 0, 0, 0]]), 0.2)
-        values.append(shares(evidence, 0.2).sum())
+        evidence = accumulate(evidence, np.array([[1.0, 0, 0, 0]]), np.zeros((1, 0)), gains)
+        values.append(strength(evidence, gains).sum())
     assert np.all(np.diff(values) > 0)
-    assert values[-1] == pytest.approx((2 - 0.2) / 0.2 / 4, rel=1e-3)
+    assert values[-1] == pytest.approx((2 - 0.2) / 0.2, rel=1e-3)
+
+
+@given(st.floats(-1e9, 1e9), st.floats(1.0, 100.0))
+def test_no_error_counts_more_than_the_bound_and_small_ones_count_in_full(size, bound):
+    pulled = bounded(np.array([[size, 1e-6 * size / (1 + abs(size))]]), bound)
+    assert abs(pulled[0, 0]) <= bound * (1 + 1e-12)
+    assert np.sign(pulled[0, 0]) == np.sign(size)
+    np.testing.assert_allclose(pulled[0, 1], 1e-6 * size / (1 + abs(size)), rtol=1e-9)
+
+
+def test_pooling_is_the_hand_computed_norm_and_its_parts_add_up():
+    pooled, parts = pool(np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0]]), power=2)
+    np.testing.assert_allclose(pooled, [5.0, 0.0], atol=1e-300)
+    np.testing.assert_allclose(parts, [[5 * 9 / 25, 5 * 16 / 25, 0.0], [0.0, 0.0, 0.0]], atol=1e-300)
+    huge, parts = pool(np.array([[1e200, 1e-200]]))
+    assert huge[0] == pytest.approx(1e200)
+    assert parts.sum() == pytest.approx(1e200)
+
+
+def test_habituation_finds_the_quantile_of_each_context():
+    rng = np.random.default_rng(0)
+    context = np.repeat(np.eye(2, dtype=np.float32), 20_000, axis=0)
+    level = rng.normal(size=40_000) + np.where(context[:, 0] > 0, 0.6, -0.6)
+    found = habituate(context, level, rng)
+    usual = context @ found[:2] + found[2]
+    for which in (0, 1):
+        below = (level < usual)[context[:, which] > 0].mean()
+        assert below == pytest.approx(USUAL, abs=0.015)
+
+
+def runs(rng: np.random.Generator, count: int, steps: int = 200) -> list[Run]:
+    """Errors four times as large in one of two contexts, between which an episode goes to and fro."""
+    made = []
+    for _ in range(count):
+        rough = (np.arange(steps) // 50 + rng.integers(2)) % 2
+        errors = rng.normal(size=(steps, 3)) * np.where(rough, 4.0, 1.0)[:, None]
+        made.append(Run(errors, np.stack([rough, 1 - rough], axis=1).astype(np.float32)))
+    return made
+
+
+def judged(detector: Detector, run: Run) -> np.ndarray:
+    evidence, values = detector.start(1), []
+    for e, c in zip(run.errors, run.contexts, strict=True):
+        evidence, value, parts = detector.step(evidence, e[None], c[None])
+        np.testing.assert_allclose(parts.sum(), value[0])
+        values.append(value[0])
+    return np.array(values)
+
+
+def test_what_is_usual_in_a_context_alarms_no_more_than_elsewhere():
+    rng = np.random.default_rng(0)
+    detector = Detector.fit(runs(rng, 40), runs(rng, 40), [0.8, 0.2], 10.0, 1e-3, rng)
+    rough, calm = [], []
+    for run in runs(rng, 20):
+        value = judged(detector, run)
+        settled = np.arange(len(value)) % 50 >= 25  # the evidence of the last context has gone
+        rough.append(value[settled & (run.contexts[:, 0] > 0)])
+        calm.append(value[settled & (run.contexts[:, 0] == 0)])
+    a, b = (np.quantile(np.concatenate(v), 0.95) for v in (rough, calm))
+    assert 0.6 < a / b < 1.7  # 16 without habituation, for the evidence is squared
+
+
+def test_a_fault_in_a_calm_error_is_not_drowned_by_a_wild_one():
+    rng = np.random.default_rng(1)
+
+    def episode() -> Run:
+        errors = rng.normal(size=(100, 2))
+        errors[rng.integers(100), 0] = 40.0  # one knock in every episode, in the first error only
+        return Run(errors, np.zeros((100, 0)))
+
+    detector = Detector.fit([episode() for _ in range(60)], [episode() for _ in range(60)], [0.8, 0.2], 10.0, 1e-3, rng)
+    threshold = np.quantile([judged(detector, episode()).max() for _ in range(100)], 0.95)
+    faulty = episode()
+    faulty.errors[50:, 1] += 3.0
+    assert judged(detector, faulty)[50:].max() > threshold
 
 
 @pytest.mark.parametrize(("rate", "episodes"), [(0.5, 1), (0.1, 9), (0.05, 19), (0.01, 99), (0.07, 14), (0.001, 999)])

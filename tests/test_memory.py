@@ -7,6 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from asm_gym.memory.association import (
+    Association,
+    association_change,
+    association_shapes,
+    complete,
+    hidden_units,
+    learn_association,
+    synapses,
+)
 from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.memory.energy import activate, backward, energy, energy_gradient, outward
 from asm_gym.memory.inference import STRIDE, expect, infer, sense
@@ -24,6 +33,7 @@ from asm_gym.memory.learning import (
 )
 from asm_gym.memory.network import Network, initial_weights, train
 from asm_gym.memory.precision import LARGEST, SMALLEST, learn_precision, log_variance
+from asm_gym.memory.senses import Reading
 
 
 def problem(seed: int, batch: int = 3, hidden: int = 8, sensory: int = 5, scale: float = 1.0, dtype=np.float32):
@@ -59,8 +69,26 @@ def trajectories(count: int, seed: int = 0, sensory: int = 5, motor: int = 2, st
         T = steps + n % 3
         time = np.arange(T)[:, None] * rng.uniform(0.1, 0.3, size=sensory)
         commands = np.concatenate([rng.normal(size=(T, motor)), np.ones((T, 1))], axis=1)
-        out.append(Trajectory(np.sin(time).astype(np.float32), commands.astype(np.float32)))
+        out.append(trajectory(np.sin(time).astype(np.float32), commands.astype(np.float32)))
     return out
+
+
+def trajectory(senses: np.ndarray, commands: np.ndarray) -> Trajectory:
+    """With inputs of association made from the senses: each before, each one's change, and the commands."""
+    before = np.vstack([senses[:1], senses[:-1]])
+    return Trajectory(senses, commands, np.hstack([before, senses - before, commands]))
+
+
+CHANGES = slice(5, 10)
+
+
+def trained_on(episodes: list[Trajectory], hidden: int, how: Schedule, rng: np.random.Generator):
+    return train(episodes, np.arange(5), CHANGES, hidden, 20, how, rng)
+
+
+def some_association(rng: np.random.Generator, inputs: int, units: int, changes: int) -> Association:
+    shapes = association_shapes(inputs, units, changes).values()
+    return Association(*(rng.normal(scale=0.3, size=s).astype(np.float32) for s in shapes))
 
 
 def test_activation_is_tanh():
@@ -274,10 +302,12 @@ def test_the_motor_prediction_learns_a_repeated_action():
     for t in episodes:
         t.commands[:, 0] = np.sin(0.4 * np.arange(len(t.commands)))
     rng = np.random.default_rng(0)
-    w = train(episodes, 32, schedule(epochs=30, iterations=20), rng).network.weights
-    network = Network(w, 20, 1.0, 1.0)
-    batch = side_by_side(episodes[:1])
-    expected = np.concatenate([s.expected for s in network.run(batch)])
+    network = trained_on(episodes, 32, schedule(epochs=30, iterations=20), rng).network
+    w, batch, z, states = network.weights, side_by_side(episodes[:1]), np.zeros((1, 32), np.float32), []
+    for x, u in zip(batch.senses, batch.commands, strict=True):
+        mu, z = network.follow(z, u, x, np.ones_like(x))
+        states.append(mu)
+    expected = np.concatenate(states)
     predicted = np.tanh(expected - batch.commands[:, 0, :2] @ w.W_U[:, :2].T) @ w.W_A.T
     error = np.mean((predicted - batch.commands[:, 0, :2]) ** 2, axis=0) / batch.commands[:, 0, :2].var(axis=0)
     assert error[0] < 0.5 < 0.8 < error[1]  # the second action is noise: nobody can predict it
@@ -289,18 +319,18 @@ def test_the_state_handed_on_is_the_inferred_one_or_the_prior(free):
     w = initial_weights(16, 5, 2, rng)
     learner, batch = Learner(w, schedule(), rng), side_by_side(trajectories(3))
     z, total = np.zeros((3, 16), np.float32), 0.0
-    network = Network(w, 10, 1.0, 1.0)
+    network = Network(w, some_association(rng, 13, 6, 5), 10, 1.0, 1.0)
     for x, u, n in zip(batch.senses, batch.commands, batch.active, strict=True):
-        step = network.step(z[:n], u[:n], x[:n], np.ones_like(x[:n]))
-        total += energy(step.hidden, step.expected, x[:n], w.W_F, w.b_F, 1.0, np.ones_like(x[:n])).sum()
-        z = step.expected if free else step.hidden
+        mu, after = network.follow(z[:n], u[:n], x[:n], np.ones_like(x[:n]))
+        total += energy(after, mu, x[:n], w.W_F, w.b_F, 1.0, np.ones_like(x[:n])).sum()
+        z = mu if free else after
     assert learner.run(batch, rate=0.0, free=free) == pytest.approx(total, rel=1e-3)
 
 
 def test_a_stream_without_actions_can_be_learned():
-    episodes = [Trajectory(t.senses, t.commands[:, 2:]) for t in trajectories(6)]
+    episodes = [trajectory(t.senses, t.commands[:, 2:]) for t in trajectories(6)]
     rng = np.random.default_rng(0)
-    trained = train(episodes, 16, schedule(), rng)
+    trained = trained_on(episodes, 16, schedule(), rng)
     assert trained.network.weights.W_A.shape == (0, 16)
     assert trained.energy[-1] < trained.energy[0]
 
@@ -311,7 +341,7 @@ def test_precision_recovers_noise_that_depends_on_context():
     truth = np.stack([2.0 * context[:, 0] - 3.0, -1.0 - context[:, 1] + context[:, 2]], axis=1)
     error = rng.normal(size=truth.shape) * np.exp(truth / 2)
     f, W_S, b_S = context.astype(np.float32), np.ones((2, 6), np.float32), np.zeros(2, np.float32)
-    learn_precision(f, error.astype(np.float32), W_S, b_S, 3e-3, rng)
+    learn_precision(f, error.astype(np.float32), W_S, b_S, rng, rate=3e-3)
     learned = log_variance(f, W_S, b_S)
     np.testing.assert_allclose(learned.mean(axis=0), truth.mean(axis=0), atol=0.1)
     assert np.sqrt(np.mean((learned - truth) ** 2)) < 0.15  # against 1.15 and 0.8 for the best constant
@@ -324,17 +354,68 @@ def test_log_variance_stays_in_bounds():
         assert np.all(log_variance(f, W_S, np.zeros(2, np.float32)) == bound)
 
 
-def test_network_reports_the_error_of_the_prediction_made_before():
+def test_network_reports_the_errors_of_association_in_the_spread_that_is_expected_of_them():
     rng = np.random.default_rng(0)
-    w = initial_weights(8, 5, 2, rng)
-    network = Network(w, 20, 1.0, 1.0)
-    z, u, x = (rng.normal(size=(2, n)).astype(np.float32) for n in (8, 3, 5))
+    w, association = initial_weights(8, 5, 2, rng), some_association(rng, 13, 6, 5)
+    network = Network(w, association, 20, 1.0, 1.0)
+    z, u, x, inputs = (rng.normal(size=(2, n)).astype(np.float32) for n in (8, 3, 5, 13))
     seen = np.ones_like(x)
     seen[1, 3] = 0
-    step = network.step(z, u, x, seen)
-    mu = np.tanh(z) @ w.W_H.T + u @ w.W_U.T
-    np.testing.assert_allclose(step.expected, mu, atol=1e-5)
-    np.testing.assert_allclose(step.error, (x - np.tanh(mu) @ w.W_F.T) * seen, atol=1e-5)
+    whole = seen.min(axis=1, keepdims=True)
+    step = network.step(z, Reading(x, seen, u, inputs, inputs[:, CHANGES], whole, np.ones((2, 7), bool)))
+    np.testing.assert_allclose(step.expected, np.tanh(z) @ w.W_H.T + u @ w.W_U.T, atol=1e-5)
+    V, U, D, W_S, b_S = association
+    f = np.tanh(inputs @ V.T)
+    error = inputs[:, CHANGES] - f @ U.T - inputs @ D.T
+    np.testing.assert_allclose(step.error, whole * error * np.exp(-0.5 * (f @ W_S.T + b_S)), atol=1e-4)
+
+
+def test_nothing_is_predicted_from_its_own_group():
+    groups = np.array([0, 0, 1, 2, 2])
+    exists = synapses(groups, CHANGES, 13, size=4)
+    reaches = (exists.U @ exists.V > 0) | (exists.D > 0)  # (X, I)
+    assert np.array_equal(reaches[:, CHANGES], groups[:, None] != groups)
+    assert reaches[:, :5].all()
+    assert reaches[:, 10:].all()
+
+
+def test_association_changes_are_the_gradient_of_half_the_squared_error():
+    rng = np.random.default_rng(3)
+    a, delta = rng.normal(size=(4, 13)).astype(np.float32), rng.normal(size=(4, 5)).astype(np.float32)
+    V, U, D, *_ = some_association(rng, 13, 6, 5)
+    spread = np.full(5, 1e3, np.float32)  # no error is so large that it is cut off
+    change, error = association_change(a, delta, spread, V, U, D)
+
+    def loss(V, U, D):
+        e = delta - np.tanh(a @ V.T) @ U.T - a @ D.T
+        return 0.5 * np.sum(e**2) / len(a)
+
+    np.testing.assert_allclose(error, delta - np.tanh(a @ V.T) @ U.T - a @ D.T, atol=1e-5)
+    exact = [W.astype(np.float64) for W in (V, U, D)]
+    for n, found in enumerate(change):
+        for place in [(0, 0), (2, 3), (4, 5)]:
+            up, down = ([W.copy() for W in exact] for _ in range(2))
+            up[n][place] += 1e-5
+            down[n][place] -= 1e-5
+            slope = (loss(*up) - loss(*down)) / 2e-5
+            assert found[place] * spread[0] == pytest.approx(-slope, rel=1e-2, abs=1e-4)
+
+
+def test_association_learns_what_ties_the_senses_together_and_how_sure_that_is():
+    rng = np.random.default_rng(0)
+    N = 6000
+    cause = rng.normal(size=(N, 2))
+    noise = 0.05 * rng.normal(size=(N, 2)) * np.where(cause[:, :1] > 0, 4.0, 1.0)
+    delta = np.stack([cause[:, 0], cause[:, 1], *(np.sin(2 * cause) + noise).T], axis=1).astype(np.float32)
+    inputs = np.hstack([delta, np.ones((N, 1), np.float32)])
+    w = learn_association(inputs, delta, np.array([0, 0, 1, 1]), slice(0, 4), 32, rng)
+    f = hidden_units(inputs, w.V)
+    error = (delta - complete(f, inputs, w.U, w.D))[:, 2:]
+    deviation = np.exp(0.5 * log_variance(f, w.W_S, w.b_S))[:, 2:]
+    assert error.std() < 0.25  # 0.15 is the noise alone, 0.66 the best that a line could do
+    rough = cause[:, 0] > 0.5
+    calm = cause[:, 0] < -0.5
+    assert deviation[rough].mean() > 2 * deviation[calm].mean()
 
 
 def test_checkpoint_keeps_every_bit(tmp_path):

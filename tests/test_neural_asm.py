@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import json
+import re
 import zipfile
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from asm_gym.monitors import Monitor, NeuralASM, make_monitor
 from asm_gym.stream import Channel, StreamSpec
 from tests.streams import frozen, sine_episodes, sine_spec
 
-SMALL = {"hidden_size": 48, "epochs": 25, "seed": 1}
+SMALL = {"hidden_size": 48, "association_size": 240, "epochs": 25, "seed": 1}
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +25,9 @@ def asm() -> NeuralASM:
 
 def learned_bytes(asm: NeuralASM) -> list[bytes]:
     senses = asm.senses_
-    arrays = [*asm.network_.weights, senses.mean, senses.spread, senses.change, asm.whitening_, asm.energy_]
-    return [a.tobytes() for a in arrays]
+    detector = asm.detector_.whitening, asm.detector_.ceiling, asm.detector_.habit
+    network = *asm.network_.weights, *asm.network_.association
+    return [a.tobytes() for a in (*network, senses.mean, senses.spread, senses.change, *detector, asm.energy_)]
 
 
 def test_a_frozen_sense_is_detected_and_attributed_to_its_channel(asm):
@@ -48,11 +49,9 @@ def test_nominal_episodes_rarely_raise_an_alarm(asm):
     assert np.mean(alarms) < 0.05 + 3 * np.sqrt(0.05 * 0.95 * (1 / 60 + 1 / 200))
 
 
-def test_nominal_surprise_of_a_single_step_is_about_one(asm):
-    single = copy.copy(asm)
-    single.gain = 1.0  # no accumulation, so that errors that resemble the last ones do not add up
-    value = np.concatenate([s.value for s in single.score_episodes(sine_episodes(60, seed=4))])
-    assert 0.8 < value.mean() < 1.4
+def test_surprise_of_one_is_seldom_exceeded(asm):
+    value = np.concatenate([s.value for s in asm.score_episodes(sine_episodes(60, seed=4))])
+    assert 0.8 < np.mean(value < 1.0) < 0.99  # 0.95 on the episodes that habituation learned from
 
 
 def test_attribution_adds_up_to_the_value_and_spares_the_action(asm):
@@ -75,9 +74,9 @@ def test_observing_changes_neither_weights_nor_state_nor_row(asm):
     rows = np.stack([e.stream[0] for e in sine_episodes(3, seed=7)])
     state = asm.initial_state(3)
     state, _ = asm.observe(state, rows)
-    kept = [a.tobytes() for a in (state.hidden, *state.evidence, state.before, rows)]
+    kept = [a.tobytes() for a in (*state.model, *state.evidence, rows)]
     asm.observe(state, rows)
-    assert [a.tobytes() for a in (state.hidden, *state.evidence, state.before, rows)] == kept
+    assert [a.tobytes() for a in (*state.model, *state.evidence, rows)] == kept
     assert learned_bytes(asm) == before
 
 
@@ -109,7 +108,7 @@ def test_a_number_that_is_not_finite_is_an_alarm_and_passes(asm, broken):
     assert np.all(surprise.attribution[20][np.isfinite(surprise.attribution[20])] == 0)
     clean = asm.score(episode).value
     np.testing.assert_array_equal(surprise.value[:20], clean[:20])
-    np.testing.assert_allclose(surprise.value[35:], clean[35:], rtol=0.2, atol=0.2)
+    np.testing.assert_allclose(surprise.value[35:], clean[35:], rtol=0.3, atol=0.3)
 
 
 def test_a_row_of_nothing_but_nan_leaves_a_finite_state(asm):
@@ -197,7 +196,7 @@ def test_save_and_load_keep_every_bit(asm, tmp_path):
 
 
 def test_a_memory_without_a_threshold_can_be_saved(tmp_path):
-    numbers = {"hidden_size": np.int64(8), "epochs": np.int64(1), "gain": np.float32(0.5)}
+    numbers = {"hidden_size": np.int64(8), "epochs": np.int64(1), "gains": (np.float32(0.5),)}
     NeuralASM(sine_spec(), **numbers).fit(sine_episodes(3)).save(tmp_path / "m.asm")
     with pytest.raises(RuntimeError, match="calibrate"):
         _ = NeuralASM.load(tmp_path / "m.asm").threshold
@@ -264,13 +263,16 @@ def test_nothing_works_before_it_is_learned(tmp_path):
         ("prior_precision", -1.0),
         ("sensory_precision", np.inf),
         ("carry_prior", 1.5),
-        ("gain", 0.0),
+        ("association_size", 0),
+        ("gains", ()),
+        ("gains", (0.2, 0.0)),
+        ("bound", 0.0),
         ("shrinkage", -0.1),
         ("seed", -1),
     ],
 )
 def test_a_bad_hyperparameter_is_named_with_what_was_given(name, value):
-    with pytest.raises(ValueError, match=f"{name} must be .* got {value}"):
+    with pytest.raises(ValueError, match=f"{name} must be .* got {re.escape(str(value))}"):
         NeuralASM(sine_spec(), **{name: value})
 
 

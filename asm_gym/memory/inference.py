@@ -28,14 +28,12 @@ class Weights(NamedTuple):
     W_F: Array  # (X, H) from the state to the senses
     b_F: Array  # noqa: N815 (X,)
     W_A: Array  # (A, H) from the expected state to the action
-    W_S: Array  # (X, H) from the expected state to the log variance of each sense
-    b_S: Array  # noqa: N815 (X,)
 
 
 def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
     """The shape of each array in ``Weights``, by name."""
     H, X, A = hidden, sensory, motor
-    return {"W_H": (H, H), "W_U": (H, A + 1), "W_F": (X, H), "b_F": (X,), "W_A": (A, H), "W_S": (X, H), "b_S": (X,)}
+    return {"W_H": (H, H), "W_U": (H, A + 1), "W_F": (X, H), "b_F": (X,), "W_A": (A, H)}
 
 
 @kernel

@@ -11,7 +11,7 @@ Source: Millidge et al. 2024 (PLOS Comput Biol); Kingma and Ba 2015 for the step
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +29,7 @@ class Trajectory(NamedTuple):
 
     senses: Array  # (T, X)
     commands: Array  # (T, A + 1), the last one a constant 1
+    inputs: Array  # (T, I) of association
 
 
 class Batch(NamedTuple):
@@ -59,6 +60,13 @@ def batches(trajectories: Sequence[Trajectory], size: int, rng: np.random.Genera
     by_length = shuffled[np.argsort([len(trajectories[i].senses) for i in shuffled], kind="stable")]
     groups = [by_length[i : i + size] for i in range(0, len(by_length), size)]
     return [side_by_side([trajectories[i] for i in groups[g]]) for g in rng.permutation(len(groups))]
+
+
+def shuffled(count: int, size: int, rng: np.random.Generator) -> Iterator[NDArray[np.intp]]:
+    """Batches of indices without end, every one of ``count`` once before any comes again."""
+    while True:
+        order = rng.permutation(count)
+        yield from (order[start : start + size] for start in range(0, count, size))
 
 
 @kernel

@@ -1,19 +1,23 @@
-"""The network as a whole: predict, compare, infer; and how its weights come to be.
+"""The network as a whole: two ways to expect, one memory.
 
-μ_t → x̂_t, log σ²_t (before x_t is seen) → ε_t = x_t - x̂_t → z_t
+time          μ_t → z_t            what is going on: a state that carries on from step to step, and infers its skill
+association   a_t → Δ̂_t, σ_t       what each sense should do: from what came before and what the others do now
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, activate
-from asm_gym.memory.inference import Weights, expect, infer, sense, weight_shapes
-from asm_gym.memory.learning import Batch, Schedule, Trajectory, batches, learn
-from asm_gym.memory.precision import PRECISION_EPOCHS, RATE, learn_precision, log_variance
+from asm_gym.memory.association import TICKS, Association, complete, hidden_units, learn_association
+from asm_gym.memory.energy import Array
+from asm_gym.memory.inference import Weights, expect, infer, weight_shapes
+from asm_gym.memory.learning import Schedule, Trajectory, learn
+from asm_gym.memory.precision import PRECISION_EPOCHS, log_variance
+from asm_gym.memory.senses import Reading
 
 
 class Step(NamedTuple):
@@ -21,12 +25,11 @@ class Step(NamedTuple):
 
     hidden: Array  # (B, H) z_t, the state to carry on with
     expected: Array  # (B, H) μ_t, the state expected before the row was seen
-    error: Array  # (B, X) ε_t of the prediction from μ_t; 0 where a number was not seen
-    log_variance: Array  # (B, X) log σ²_t
+    error: Array  # (B, X) (Δ_t - Δ̂_t)/σ_t; 0 where a row was not whole
 
 
 def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> Weights:
-    """Random weights of about unit gain; no biases, and a precision that knows no context yet."""
+    """Random weights of about unit gain; no biases."""
     weights = {n: np.zeros(shape, np.float32) for n, shape in weight_shapes(hidden, sensory, motor).items()}
     for name in ("W_H", "W_U", "W_F", "W_A"):
         W = weights[name]
@@ -38,14 +41,22 @@ class Network:
     """Weights that no longer change, and what is needed to run them.
 
     Args:
-        weights: the synapses.
+        weights: the synapses through time.
+        association: the synapses between senses.
         iterations: inference steps per control step.
         prior_precision: Π_z.
         sensory_precision: Π_x.
     """
 
-    def __init__(self, weights: Weights, iterations: int, prior_precision: float, sensory_precision: float) -> None:
-        self.weights = weights
+    def __init__(
+        self,
+        weights: Weights,
+        association: Association,
+        iterations: int,
+        prior_precision: float,
+        sensory_precision: float,
+    ) -> None:
+        self.weights, self.association = weights, association
         self.iterations = iterations
         self.prior_precision = float(prior_precision)
         self.sensory_precision = np.float32(sensory_precision)
@@ -56,48 +67,60 @@ class Network:
     def hidden_size(self) -> int:
         return self.weights.W_H.shape[0]
 
-    def step(self, z: Array, u: Array, x: Array, seen: Array) -> Step:
-        """One control step.
+    def step(self, z: Array, reading: Reading) -> Step:
+        """One control step from the state ``z`` (B, H)."""
+        mu, after = self.follow(z, reading.commands, reading.senses, reading.seen)
+        return Step(after, mu, self.judge(reading.inputs, reading.changes, reading.whole))
+
+    def follow(self, z: Array, u: Array, x: Array, seen: Array) -> tuple[Array, Array]:
+        """μ_t and z_t (B, H).
 
         Args:
             z: (B, H) the state carried so far.
             u: (B, A + 1) the action as commanded, standardised, and a constant 1.
-            x: (B, X) what was sensed, standardised.
-            seen: (B, X) 1 where ``x`` is a measurement, 0 where it is to be ignored.
+            x: (B, S) what was sensed, standardised.
+            seen: (B, S) 1 where ``x`` is a measurement, 0 where it is to be ignored.
         """
         w = self.weights
         mu = expect(z, u, w.W_H, w.W_U)
-        error = (x - sense(mu, w.W_F, w.b_F)) * seen
         precision = self.sensory_precision * seen
-        hidden = infer(mu, x, w.W_F, w.b_F, self.prior_precision, precision, self.curvature, self.iterations)
-        return Step(hidden, mu, error, log_variance(activate(mu), w.W_S, w.b_S))
+        return mu, infer(mu, x, w.W_F, w.b_F, self.prior_precision, precision, self.curvature, self.iterations)
 
-    def run(self, batch: Batch) -> Iterator[Step]:
-        """The steps of whole episodes, from the state zero on."""
-        z = np.zeros((batch.senses.shape[1], self.hidden_size), np.float32)
-        for x, u, n in zip(batch.senses, batch.commands, batch.active, strict=True):
-            step = self.step(z[:n], u[:n], x[:n], np.ones_like(x[:n]))
-            yield step
-            z = step.hidden
+    def judge(self, inputs: Array, changes: Array, whole: Array) -> Array:
+        """(B, X) errors of association over what is to be expected of them; arguments as in ``Reading``."""
+        w = self.association
+        f = hidden_units(inputs, w.V)
+        error = changes - complete(f, inputs, w.U, w.D)
+        normalised: Array = whole * error * np.exp(np.float32(-0.5) * log_variance(f, w.W_S, w.b_S))
+        return normalised
 
 
 class Trained(NamedTuple):
-    """A finished network and what it left unexplained."""
+    """A finished network, and how its energy fell."""
 
     network: Network
     energy: Array  # (epochs,) mean energy of a step in each epoch
-    normalised_errors: Array  # (N, X) ε/σ over all training steps
 
 
 def train(
     trajectories: Sequence[Trajectory],
+    groups: NDArray[np.intp],
+    changes: slice,
     hidden: int,
+    units: int,
     schedule: Schedule,
     rng: np.random.Generator,
     progress: Callable[[int, int], object] | None = None,
 ) -> Trained:
-    """Learns weights from whole episodes, then the precision from the errors the finished weights make."""
-    done, total = 0, schedule.epochs + PRECISION_EPOCHS
+    """Learns both kinds of synapses from whole episodes.
+
+    Args:
+        groups: (X,) the group of each change.
+        changes: where the changes stand among the inputs of association.
+        hidden: H.
+        units: hidden units of association for each group.
+    """
+    done, total = 0, schedule.epochs + TICKS + PRECISION_EPOCHS
 
     def tick() -> None:
         nonlocal done
@@ -108,10 +131,7 @@ def train(
     sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
     weights = initial_weights(hidden, sensory, commands - 1, rng)
     energy = learn(weights, trajectories, schedule, rng, tick)
-    network = Network(weights, schedule.iterations, schedule.prior_precision, schedule.sensory_precision)
-    steps = [s for batch in batches(trajectories, schedule.batch_size, rng) for s in network.run(batch)]
-    context = activate(np.concatenate([s.expected for s in steps]))  # (N, H)
-    error = np.concatenate([s.error for s in steps])  # (N, X)
-    learn_precision(context, error, weights.W_S, weights.b_S, RATE, rng, tick)
-    normalised = error * np.exp(-0.5 * log_variance(context, weights.W_S, weights.b_S))
-    return Trained(network, energy, normalised)
+    inputs = np.concatenate([t.inputs for t in trajectories])
+    association = learn_association(inputs, np.ascontiguousarray(inputs[:, changes]), groups, changes, units, rng, tick)
+    how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision
+    return Trained(Network(weights, association, *how), energy)

@@ -1,8 +1,8 @@
 """Precision that depends on context: how large an error is to be expected of each sense, here and now.
 
-    log σ²_t = W_S f(μ_t) + b_S          ΔW_S ∝ (ε²/σ² - 1) f(μ_t)ᵀ          ε_t = x_t - W_F f(μ_t) - b_F
+    log σ²_t = W_S f(h_t) + b_S          ΔW_S ∝ (ε²/σ² - 1) f(h_t)ᵀ
 
-ε is the error of the prediction made before x_t was seen. The rule follows the gradient of the Gaussian log
+f(h) are the units that a prediction came from, ε is its error. The rule follows the gradient of the Gaussian log
 likelihood, and each synapse needs only its own two ends. It is applied to the finished weights, for the errors of
 weights still learning are larger than those that will be watched.
 
@@ -32,7 +32,7 @@ RATE = 1e-3
 
 @kernel
 def log_variance(f: Array, W_S: Array, b_S: Array) -> Array:
-    """log σ² (B, X) in the context ``f`` = f(μ) (B, H)."""
+    """log σ² (B, X) in the context ``f`` (B, H)."""
     out = outward(f, W_S)
     for n in range(out.shape[0]):
         for i in range(out.shape[1]):
@@ -51,9 +51,9 @@ def learn_precision(
     error: Array,
     W_S: Array,
     b_S: Array,
-    rate: float,
     rng: np.random.Generator,
     tick: Callable[[], None] = lambda: None,
+    rate: float = RATE,
 ) -> None:
     """Fits ``W_S`` and ``b_S`` in place to the contexts ``f`` (N, H) and the errors (N, X) that came in them."""
     W_S[:] = 0.0

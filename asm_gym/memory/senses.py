@@ -1,11 +1,12 @@
-r"""What of a stream row the memory senses: every channel's value and, of the slow ones, their change as well.
+r"""What of a stream row the memory reads: values and their changes.
 
-A joint moves a few hundredths of its range in a step, so the best prediction of its position is the last one, plus a
-little. Of such a channel the memory predicts both the value, which says where in a skill it is, and the change, which
-says what is happening now (generalised coordinates of motion: Friston 2008, PLOS Comput Biol 4(11)). Surprise is
-judged by the change where there is one, by the value elsewhere: one error for every channel.
+Of a channel that moves little in a step the best prediction is its last value, plus a little. The temporal network
+senses both the value, which says where in a skill the robot is, and the change, which says what is happening now
+(generalised coordinates of motion: Friston 2008, PLOS Comput Biol 4(11)). Association judges the change of every
+channel, given all values before and all other changes.
 
-    s_t = [(x_t - m) / σ,  (x_t - x_{t-1})_slow / σ_Δ]        slow:  σ_Δ < 0.3 σ
+    s_t = [v_t, Δ_t,slow]      v_t = (x_t - m) / σ      Δ_t = (x_t - x_{t-1}) / σ_Δ      slow:  σ_Δ < 0.3 σ
+    a_t = [v_{t-1}, Δ_t, Δ_{t-1},slow, u_t, 1]
 """
 
 from __future__ import annotations
@@ -24,15 +25,21 @@ SLOW = 0.3
 """A channel is slow where a step's change is under this share of its spread."""
 
 FARTHEST = 1e3
-"""Where standardised numbers are cut off, so that no finite row can overflow."""
+"""Where standardised numbers are cut off, so that no finite row can overflow.
+
+A number that far out is judged, but nothing is expected from it: one broken sense should not make all look wrong.
+"""
 
 
 class Reading(NamedTuple):
-    """Rows of B streams, as the memory reads them; S numbers are sensed, X channels judged."""
+    """Rows of B streams, as the memory reads them; S numbers are sensed, X changes judged."""
 
     senses: NDArray[np.float32]  # (B, S) standardised; 0 where unseen
     seen: NDArray[np.float32]  # (B, S) 1 where there was something to read, else 0
     commands: NDArray[np.float32]  # (B, A + 1) standardised, then a constant 1
+    inputs: NDArray[np.float32]  # (B, I) of association; 0 where unseen or cut off
+    changes: NDArray[np.float32]  # (B, X) what is judged; 0 where unseen
+    whole: NDArray[np.float32]  # (B, 1) 1 where nothing was unseen in any of the three rows, else 0
     finite: NDArray[np.bool_]  # (B, D)
 
 
@@ -44,7 +51,7 @@ class Senses:
         spec: of the stream.
         mean: (D,) of the training rows [unit of each channel].
         spread: (D,) their standard deviation.
-        change: (D,) standard deviation of the step from row to row; 0 for channels that are not slow.
+        change: (D,) standard deviation of the step from row to row.
     """
 
     spec: StreamSpec
@@ -60,14 +67,14 @@ class Senses:
         mean = rows.mean(axis=0)
         spread = _spread(rows, mean, spec.noise)
         change = steps.std(axis=0)
-        slow = (change > 0) & (change < SLOW * spread)
-        slow[spec.motor] = False
-        return cls(spec, mean, spread, np.where(slow, change, 0.0))
+        return cls(spec, mean, spread, np.where(change > 0, change, spread))
 
     @cached_property
     def slow(self) -> NDArray[np.intp]:
         """(S - X,) columns of the stream whose change is sensed too."""
-        return np.flatnonzero(self.change > 0)
+        slow = self.change < SLOW * self.spread
+        slow[self.spec.motor] = False
+        return np.flatnonzero(slow)
 
     @cached_property
     def size(self) -> int:
@@ -75,27 +82,55 @@ class Senses:
         return len(self.spec.sensory) + len(self.slow)
 
     @cached_property
-    def judged(self) -> NDArray[np.intp]:
-        """(X,) which of the S numbers is judged for each sensory channel: its change, or else its value."""
-        X = len(self.spec.sensory)
-        place = np.arange(X)
-        place[np.searchsorted(self.spec.sensory, self.slow)] = X + np.arange(len(self.slow))
-        return place
+    def changes(self) -> slice:
+        """Where the X changes stand among the inputs."""
+        return slice(self.spec.size, self.spec.size + len(self.spec.sensory))
 
-    def read(self, rows: NDArray[np.floating[Any]], before: NDArray[np.floating[Any]]) -> Reading:
-        """Rows (B, D) and those that came just before (B, D); what is not finite in either is unseen."""
+    @cached_property
+    def groups(self) -> NDArray[np.intp]:
+        """(X,) the group of each change, by number; where all are of one group, every number is its own."""
+        names = [c.group for c in self.spec.channels for _ in range(c.size)]
+        found = np.unique([names[i] for i in self.spec.sensory], return_inverse=True)[1].astype(np.intp)
+        return found if found.any() else np.arange(len(found))
+
+    @cached_property
+    def inputs(self) -> int:
+        """I."""
+        return self.spec.size + len(self.spec.sensory) + len(self.slow) + len(self.spec.motor) + 1
+
+    def read_episode(self, stream: NDArray[np.floating[Any]]) -> Reading:
+        """All rows of an episode (T, D); nothing has moved before the first."""
+        before = np.concatenate([stream[:1], stream[:-1]])
+        return self.read(stream, before, np.concatenate([before[:1], before[:-1]]))
+
+    def read(
+        self,
+        rows: NDArray[np.floating[Any]],
+        before: NDArray[np.floating[Any]],
+        earlier: NDArray[np.floating[Any]],
+    ) -> Reading:
+        """Rows (B, D), those that came just before, and those before them; what is not finite is unseen."""
         sensory, motor, slow = self.spec.sensory, self.spec.motor, self.slow
-        rows, before = np.asarray(rows, np.float64), np.asarray(before, np.float64)
-        finite = np.isfinite(rows)
+        rows, before, earlier = (np.asarray(r, np.float64) for r in (rows, before, earlier))
+        finite, known = np.isfinite(rows), np.isfinite(before)
         with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are cut off below, inf - inf is unseen
-            values = (rows[:, sensory] - self.mean[sensory]) / self.spread[sensory]
-            changes = (rows[:, slow] - before[:, slow]) / self.change[slow]
-        seen = np.concatenate([finite[:, sensory], finite[:, slow] & np.isfinite(before[:, slow])], axis=1)  # (B, S)
-        senses = np.where(seen, np.concatenate([values, changes], axis=1), 0.0)
-        commands = np.ones((len(rows), len(motor) + 1), np.float32)
-        told = np.where(finite[:, motor], rows[:, motor] - self.mean[motor], 0.0)
-        commands[:, :-1] = _bounded(told / self.spread[motor])
-        return Reading(_bounded(senses), seen.astype(np.float32), commands, finite)
+            values = (rows - self.mean) / self.spread
+            last = (before - self.mean) / self.spread
+            steps = (rows - before) / self.change
+            earlier_steps = (before - earlier)[:, slow] / self.change[slow]
+        moved = finite & known
+        values = _bounded(np.where(finite, values, 0.0))
+        steps = _bounded(np.where(moved, steps, 0.0))
+        seen = np.concatenate([finite[:, sensory], moved[:, slow]], axis=1).astype(np.float32)  # (B, S)
+        commands = np.concatenate([values[:, motor], np.ones((len(rows), 1), np.float32)], axis=1)
+        known_steps = known[:, slow] & np.isfinite(earlier[:, slow])
+        past = _bounded(np.where(known, last, 0.0)), _bounded(np.where(known_steps, earlier_steps, 0.0))
+        changes = steps[:, sensory]
+        inputs = np.concatenate([past[0], changes, past[1], commands], axis=1)
+        inputs[np.abs(inputs) >= FARTHEST] = 0.0
+        senses = np.concatenate([values[:, sensory], steps[:, slow]], axis=1)
+        whole = (moved & np.isfinite(earlier)).all(axis=1, keepdims=True).astype(np.float32)
+        return Reading(senses, seen, commands, inputs, changes, whole, finite)
 
 
 def _bounded(numbers: NDArray[np.float64]) -> NDArray[np.float32]:

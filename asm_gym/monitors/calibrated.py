@@ -1,14 +1,15 @@
-"""What rivals share: checks, calibration, scoring of whole episodes, checkpoints."""
+"""What monitors share: checks, calibration, scoring of whole episodes, checkpoints."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.episodes import Episode
@@ -16,8 +17,11 @@ from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.monitors.base import State, Surprise
 from asm_gym.stream import StreamSpec
 
+Progress = Callable[[int, int], object]
+"""Called as ``progress(done, total)``."""
+
 SCORED_AT_ONCE = 64
-"""Episodes scored side by side."""
+"""Episodes scored side by side; with more the arrays no longer fit the cache."""
 
 
 class CalibratedMonitor(ABC):
@@ -26,29 +30,42 @@ class CalibratedMonitor(ABC):
     Args:
         spec: the stream it watches.
         seed: of whatever learning draws.
+
+    Attributes:
+        learned_: what ``fit`` has found, by name; empty before.
+        threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
     """
 
     kind: ClassVar[str]
     """Its name, in checkpoints and in ``make_monitor``."""
 
+    hyperparameters: ClassVar[tuple[str, ...]] = ("seed",)
+    """Arguments of ``__init__`` beside the spec, kept under their own names."""
+
+    shortest: ClassVar[int] = 1
+    """Steps that an episode must have to be learned from."""
+
     def __init__(self, spec: StreamSpec, seed: int = 0) -> None:
+        require("seed", seed, isinstance(seed, (int, np.integer)) and seed >= 0, "a whole number of at least 0")
         self.spec = spec
         self.seed = int(seed)
         self.threshold_: float | None = None
-        self.learned_: dict[str, NDArray[np.float64]] = {}
-        """What ``fit`` has found, by name."""
+        self.learned_: dict[str, NDArray[Any]] = {}
 
     @abstractmethod
-    def learn(self, streams: Sequence[NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+    def learn(self, streams: Sequence[NDArray[np.float32]], progress: Progress) -> dict[str, NDArray[Any]]:
         """What is to be known of nominal streams, (T, D) each."""
 
+    def build(self) -> None:  # noqa: B027 (many need none)
+        """Makes what ``shares`` needs out of ``learned_``. Raises ValueError where that does not fit together."""
+
     @abstractmethod
-    def initial_state(self, batch: int = 1) -> State:
-        """The state before the first row of ``batch`` streams."""
+    def start(self, batch: int) -> State:
+        """The state before the first row of ``batch`` streams: a NamedTuple of arrays whose first axis is B."""
 
     @abstractmethod
     def shares(self, state: State, rows: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
-        """The next rows (B, D), all finite: the new state, and each number's share of the surprise (B, D)."""
+        """The next rows (B, D), perhaps not all finite: the new state, and each number's share of the surprise."""
 
     @property
     def threshold(self) -> float:
@@ -58,35 +75,70 @@ class CalibratedMonitor(ABC):
             )
         return self.threshold_
 
-    def fit(self, episodes: Sequence[Episode]) -> Self:
-        """Learns from whole nominal episodes of this spec.
+    def get_params(self) -> dict[str, Any]:
+        """The hyperparameters by name."""
+        return {name: getattr(self, name) for name in self.hyperparameters}
+
+    def fit(self, episodes: Sequence[Episode], progress: Progress | None = None) -> Self:
+        """Learns from whole nominal episodes of any number of skills; no labels.
+
+        Args:
+            episodes: of this spec.
+            progress: called as ``progress(done, total)`` while learning.
 
         Raises:
-            ValueError: none, one of another spec, or one with a number that is not finite.
+            ValueError: no episode, one that is too short or of another spec, or a number that is not finite.
         """
         self._check(episodes)
-        self.learned_ = self.learn([np.asarray(e.stream, np.float64) for e in episodes])
-        self.threshold_ = None
+        # One thread: products this small are slowed down by several, and ruined by several that share a core.
+        with threadpool_limits(1):
+            learned = self.learn([e.stream for e in episodes], progress or (lambda done, total: None))
+        self.learned_, self.threshold_ = learned, None
+        self.build()
         return self
 
     def calibrate(self, episodes: Sequence[Episode], false_alarm_rate: float = 0.01) -> Self:
-        """Sets the threshold from nominal episodes that ``fit`` has not seen; P(any alarm in one) <= the rate."""
+        """Sets the threshold from nominal episodes that ``fit`` has not seen; P(any alarm in one) <= the rate.
+
+        Args:
+            episodes: at least ``conformal_episodes(false_alarm_rate)`` of them.
+            false_alarm_rate: P(any alarm in a nominal episode), at most.
+        """
         self._fitted()
-        conformal_episodes(false_alarm_rate)
+        conformal_episodes(false_alarm_rate)  # refuses a bad rate before the work begins
         self._check(episodes)
         maxima = np.array([s.value.max() for s in self.score_episodes(episodes)])
         self.threshold_ = conformal_threshold(maxima, false_alarm_rate)
         return self
 
+    def initial_state(self, batch: int = 1) -> State:
+        """The state before the first row of ``batch`` streams."""
+        if batch < 1:
+            raise ValueError(f"batch must be at least 1, got {batch}")
+        self._fitted()
+        return self.start(batch)
+
     def observe(self, state: State, stream: NDArray[np.floating[Any]]) -> tuple[State, Surprise]:
-        """The next row (B, D) of each stream; one with a number that is not finite is infinitely surprising there."""
+        """The next row of each stream: the new state, and how surprising the row was.
+
+        A number that is not finite makes the value and its own attribution infinite; it counts as unseen, so that
+        later rows can be judged again.
+
+        Args:
+            state: as handed back last; it is not changed.
+            stream: (B, D) one row a stream.
+        """
         self._fitted()
         rows = np.asarray(stream, np.float64)
         self.spec.check_row(rows)
+        batch = _batch(state)
+        if rows.shape != (batch, self.spec.size):
+            raise ValueError(f"stream must have the shape {(batch, self.spec.size)}, got {rows.shape}")
+        state, attribution = self.shares(state, rows)
         finite = np.isfinite(rows)
-        state, attribution = self.shares(state, np.where(finite, rows, 0.0))
         broken = ~finite.all(axis=1)
-        attribution[broken] = np.where(finite[broken], 0.0, np.inf)
+        if broken.any():
+            attribution[broken] = np.where(finite[broken], 0.0, np.inf)
         return state, Surprise(attribution.sum(axis=1), attribution)
 
     def score(self, episode: Episode) -> Surprise:
@@ -97,25 +149,20 @@ class CalibratedMonitor(ABC):
         """``score`` for many episodes, which are run side by side."""
         for episode in episodes:
             self.spec.require(episode.spec, "the episode")
-        scores: list[Surprise] = []
-        for start in range(0, len(episodes), SCORED_AT_ONCE):
-            group = [e.stream for e in episodes[start : start + SCORED_AT_ONCE]]
-            state, steps = self.initial_state(len(group)), []
-            for t in range(max(map(len, group))):
-                # Those that have ended repeat their last row, and are cut off below.
-                state, surprise = self.observe(state, np.stack([s[min(t, len(s) - 1)] for s in group]))
-                steps.append(surprise)
-            for n, stream in enumerate(group):
-                mine = steps[: len(stream)]
-                scores.append(
-                    Surprise(np.array([s.value[n] for s in mine]), np.array([s.attribution[n] for s in mine]))
-                )
+        self._fitted()
+        scores: list[Surprise] = [Surprise(np.zeros(0), np.zeros((0, self.spec.size)))] * len(episodes)
+        with threadpool_limits(1):
+            for group, steps in side_by_side([e.stream for e in episodes], self.start, self.observe):
+                for n, i in enumerate(group):
+                    mine = steps[: len(episodes[i])]
+                    value, attribution = (np.array([s[k][n] for s in mine]) for k in range(2))
+                    scores[i] = Surprise(value, attribution.reshape(-1, self.spec.size))
         return scores
 
     def save(self, path: str | Path) -> None:
         """Writes everything learned to one file: arrays and JSON."""
         self._fitted()
-        header = {"spec": self.spec.to_json(), "seed": self.seed, "threshold": self.threshold_}
+        header = {"spec": self.spec.to_json(), "hyperparameters": self.get_params(), "threshold": self.threshold_}
         header["shapes"] = {name: list(array.shape) for name, array in self.learned_.items()}
         write_checkpoint(path, self.kind, header, self.learned_)
 
@@ -129,12 +176,13 @@ class CalibratedMonitor(ABC):
         """
         saved = read_checkpoint(path, cls.kind)
         try:
-            monitor = cls(StreamSpec.from_json(saved.header["spec"]), seed=saved.header["seed"])
+            monitor = cls(StreamSpec.from_json(saved.header["spec"]), **saved.header["hyperparameters"])
             monitor.threshold_ = saved.header["threshold"]
             shapes = saved.header["shapes"]
+            monitor.learned_ = {name: saved.array(name, *shape) for name, shape in shapes.items()}
+            monitor.build()
         except (KeyError, TypeError) as error:
             raise ValueError(f"{path} is damaged: {error}") from error
-        monitor.learned_ = {name: saved.array(name, *shape) for name, shape in shapes.items()}
         return monitor
 
     def _fitted(self) -> None:
@@ -142,14 +190,46 @@ class CalibratedMonitor(ABC):
             raise RuntimeError(f"this {type(self).__name__} has learned nothing yet: call fit(episodes) first")
 
     def _check(self, episodes: Sequence[Episode]) -> None:
+        """Refuses episodes that cannot be learned from."""
+        if isinstance(episodes, Episode):
+            raise TypeError("episodes must be a list of them, got a single Episode")
         if len(episodes) == 0:
             raise ValueError("at least one episode is needed, got none")
         for n, episode in enumerate(episodes):
             self.spec.require(episode.spec, f"episode {n}")
+            if len(episode) < self.shortest:
+                raise ValueError(f"episode {n} must be at least {self.shortest} steps long, got {len(episode)}")
             bad = np.argwhere(~np.isfinite(episode.stream))
             if len(bad):
                 step, column = bad[0]
-                raise ValueError(f"episode {n}, step {step}, {self.spec.labels[column]} must be finite")
+                label, value = self.spec.labels[column], episode.stream[step, column]
+                raise ValueError(f"episode {n}, step {step}, {label} must be finite, got {value}")
+
+
+def side_by_side(
+    streams: Sequence[NDArray[np.float32]],
+    start: Callable[[int], State],
+    advance: Callable[[State, NDArray[np.float64]], tuple[State, Any]],
+) -> Iterator[tuple[list[int], list[Any]]]:
+    """Runs many streams together, the longest first; those that have ended are left out.
+
+    Yields, for each group of streams, their indices and what ``advance`` said of each step.
+    """
+    order = sorted(range(len(streams)), key=lambda i: -len(streams[i]))
+    for first in range(0, len(order), SCORED_AT_ONCE):
+        group = order[first : first + SCORED_AT_ONCE]
+        state, said = start(len(group)), []
+        for t in range(len(streams[group[0]])):
+            rows = np.stack([streams[i][t] for i in group if t < len(streams[i])]).astype(np.float64)
+            state, step = advance(_first(state, len(rows)), rows)
+            said.append(step)
+        yield group, said
+
+
+def require(name: str, value: object, fulfilled: bool, what: str) -> None:
+    """Raises ValueError unless a hyperparameter is what it must be."""
+    if not fulfilled:
+        raise ValueError(f"{name} must be {what}, got {value}")
 
 
 def columns(spec: StreamSpec, suffix: str) -> NDArray[np.intp]:
@@ -162,3 +242,13 @@ def columns(spec: StreamSpec, suffix: str) -> NDArray[np.intp]:
     if not found:
         raise ValueError(f"this stream has no {suffix}; it has: {', '.join(spec.slices)}")
     return np.array(found, dtype=np.intp)
+
+
+def _first(state: State, count: int) -> State:
+    """The state of the first ``count`` streams."""
+    return type(state)(*(_first(s, count) for s in state)) if isinstance(state, tuple) else state[:count]
+
+
+def _batch(state: State) -> int:
+    """B."""
+    return _batch(state[0]) if isinstance(state, tuple) else len(state)

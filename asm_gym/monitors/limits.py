@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.monitors.base import State
-from asm_gym.monitors.calibrated import CalibratedMonitor, columns
+from asm_gym.monitors.calibrated import CalibratedMonitor, Progress, columns
 from asm_gym.stream import StreamSpec
+
+
+class _Nothing(NamedTuple):
+    """A limit remembers nothing; the array only says how many streams there are."""
+
+    streams: NDArray[np.bool_]  # (B,)
 
 
 class ForceLimit(CalibratedMonitor):
@@ -26,16 +32,16 @@ class ForceLimit(CalibratedMonitor):
         super().__init__(spec, seed)
         self._force = columns(spec, "wrist_force_peak")
 
-    def learn(self, streams: Sequence[NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
-        return {"weight": np.concatenate(streams)[:, self._force].mean(axis=0)}
+    def learn(self, streams: Sequence[NDArray[np.float32]], progress: Progress) -> dict[str, NDArray[Any]]:
+        return {"weight": np.concatenate(streams)[:, self._force].mean(axis=0, dtype=np.float64)}
 
-    def initial_state(self, batch: int = 1) -> State:
-        return None
+    def start(self, batch: int) -> _Nothing:
+        return _Nothing(np.zeros(batch, np.bool_))
 
-    def shares(self, state: State, rows: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
+    def shares(self, state: _Nothing, rows: NDArray[np.float64]) -> tuple[_Nothing, NDArray[np.float64]]:
         attribution = np.zeros(rows.shape)
         attribution[:, self._force] = (rows[:, self._force] - self.learned_["weight"]) ** 2
-        return None, attribution
+        return state, attribution
 
 
 class ExternalTorqueLimit(CalibratedMonitor):
@@ -52,17 +58,17 @@ class ExternalTorqueLimit(CalibratedMonitor):
         super().__init__(spec, seed)
         self._torque = columns(spec, "external_torque_peak")
 
-    def learn(self, streams: Sequence[NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
-        torque = np.concatenate(streams)[:, self._torque]
+    def learn(self, streams: Sequence[NDArray[np.float32]], progress: Progress) -> dict[str, NDArray[Any]]:
+        torque = np.concatenate(streams)[:, self._torque].astype(np.float64)
         return {"mean": torque.mean(axis=0), "spread": np.maximum(torque.std(axis=0), 1e-6)}
 
-    def initial_state(self, batch: int = 1) -> State:
-        return None
+    def start(self, batch: int) -> _Nothing:
+        return _Nothing(np.zeros(batch, np.bool_))
 
-    def shares(self, state: State, rows: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
+    def shares(self, state: _Nothing, rows: NDArray[np.float64]) -> tuple[_Nothing, NDArray[np.float64]]:
         score = np.abs(rows[:, self._torque] - self.learned_["mean"]) / self.learned_["spread"]  # (B, joints)
         worst = score.argmax(axis=1)
         attribution = np.zeros(rows.shape)
         batch = np.arange(len(rows))
         attribution[batch, self._torque[worst]] = score[batch, worst]
-        return None, attribution
+        return state, attribution

@@ -1,0 +1,150 @@
+"""Association: what each group of senses should do, given what was sensed before and what the others sense now.
+
+    a_t = [v_{t-1}, Δ_t, Δ_{t-1}, u_t, 1]          values before, changes now and before, the action as commanded
+    h_t = V a_t                                    units of group g have no synapse from its own Δ_t
+    Δ̂_t = U f(h_t) + D a_t                         what predicts g has synapses from units of g alone
+    log σ²_t = W_S f(h_t) + b_S                    how large an error is to be expected: see ``precision``
+    ε_t = ψ((Δ_t - Δ̂_t)/σ),  ψ(ε) = min(max(ε, -1), 1)
+    ΔU ∝ ε_t f(h_t)ᵀ    ΔD ∝ ε_t a_tᵀ    ΔV ∝ ε_h a_tᵀ,  ε_h = f'(h_t) ⊙ Uᵀ ε_t
+
+A joint that moves and a hand that does not, a torque commanded and none measured: each group is completed from the
+rest, so that what a body cannot do is an error, in whatever skill. ε_h is what one step of inference moves the hidden
+units by; learning from it follows the gradient of the squared error, with nothing but local products.
+
+Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning by prediction errors; Salvatori et al. 2021
+(NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest; Huber 1964 for ψ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.memory.energy import Array, activate, kernel, outward
+from asm_gym.memory.learning import Synapse, coincidence, cosine_decay, shuffled
+from asm_gym.memory.precision import learn_precision
+
+UPDATES = 6000
+BATCH = 256
+RATE = 5e-3
+WARM_UP = 0.1
+"""Share of the updates in which the step size rises to ``RATE``; it falls along a cosine after."""
+
+TICKS = 20
+"""How often learning tells of its progress."""
+
+SMALLEST_SPREAD = np.float32(1e-6)
+
+TRACKING = np.float32(0.01)
+"""Weight of the newest batch in the running spread σ of each error."""
+
+
+class Association(NamedTuple):
+    """The synapses. I inputs, M hidden units, X changes; all float32, 0 where there is no synapse."""
+
+    V: Array  # (M, I)
+    U: Array  # (X, M)
+    D: Array  # (X, I)
+    W_S: Array  # (X, M)
+    b_S: Array  # noqa: N815 (X,)
+
+
+def association_shapes(inputs: int, units: int, changes: int) -> dict[str, tuple[int, ...]]:
+    """The shape of each array in ``Association``, by name."""
+    M, X = units, changes
+    return {"V": (M, inputs), "U": (X, M), "D": (X, inputs), "W_S": (X, M), "b_S": (X,)}
+
+
+class Change(NamedTuple):
+    """What a batch asks of each array that predicts; or, of 0 and 1, which of its synapses exist."""
+
+    V: Array  # (M, I)
+    U: Array  # (X, M)
+    D: Array  # (X, I)
+
+
+def synapses(groups: NDArray[np.intp], changes: slice, inputs: int, size: int) -> Change:
+    """1 where there is a synapse, 0 elsewhere.
+
+    Args:
+        groups: (X,) the group of each change, counted from 0.
+        changes: where the X changes stand among the inputs.
+        size: hidden units of a group.
+    """
+    unit_group = np.repeat(np.arange(groups.max() + 1), size)  # (M,)
+    V, D = np.ones((len(unit_group), inputs), np.float32), np.ones((len(groups), inputs), np.float32)
+    V[:, changes] = unit_group[:, None] != groups
+    D[:, changes] = groups[:, None] != groups
+    return Change(V, (groups[:, None] == unit_group).astype(np.float32), D)
+
+
+@kernel
+def hidden_units(a: Array, V: Array) -> Array:
+    """f(h) (B, M) for inputs ``a`` (B, I)."""
+    return activate(outward(a, V))
+
+
+@kernel
+def complete(f: Array, a: Array, U: Array, D: Array) -> Array:
+    """Δ̂ (B, X) from hidden units ``f`` (B, M) and inputs ``a`` (B, I)."""
+    out = outward(f, U)
+    out += outward(a, D)
+    return out
+
+
+def association_change(a: Array, delta: Array, spread: Array, V: Array, U: Array, D: Array) -> tuple[Change, Array]:
+    """The local rules for inputs (B, I) and changes (B, X), as if every synapse existed; and the errors (B, X)."""
+    f = hidden_units(a, V)
+    error = delta - complete(f, a, U, D)
+    pulled = np.clip(error / spread, np.float32(-1), np.float32(1))
+    upstream = (np.float32(1) - f * f) * (pulled @ U)  # (B, M) ε_h
+    return Change(coincidence(upstream, a), coincidence(pulled, f), coincidence(pulled, a)), error
+
+
+def learn_association(
+    a: Array,
+    delta: Array,
+    groups: NDArray[np.intp],
+    changes: slice,
+    size: int,
+    rng: np.random.Generator,
+    tick: Callable[[], None] = lambda: None,
+    updates: int = UPDATES,
+) -> Association:
+    """Synapses learned from N steps, in random order; those of the precision last.
+
+    Args:
+        a: (N, I) inputs.
+        delta: (N, X) changes, standardised.
+        groups, changes, size: as in ``synapses``.
+        tick: called ``TICKS`` times on the way, and once after each of ``PRECISION_EPOCHS``.
+        updates: how many batches are learned from.
+    """
+    exists = synapses(groups, changes, a.shape[1], size)
+    V = rng.standard_normal(exists.V.shape).astype(np.float32) / np.float32(np.sqrt(a.shape[1])) * exists.V
+    weights = Change(V, np.zeros_like(exists.U), np.zeros_like(exists.D))
+    synapse = [Synapse(W) for W in weights]
+    spread = np.maximum(delta.std(axis=0), SMALLEST_SPREAD)
+    for n, chosen in zip(range(updates), shuffled(len(a), BATCH, rng), strict=False):
+        change, error = association_change(a[chosen], delta[chosen], spread, *weights)
+        rate = _rate(n / updates)
+        for s, product, real in zip(synapse, change, exists, strict=True):
+            s.learn(product * real, rate)
+        now = np.sqrt(np.mean(np.minimum(error**2, 9 * spread**2), axis=0))
+        spread += TRACKING * (np.maximum(now, SMALLEST_SPREAD) - spread)
+        if (n + 1) * TICKS // updates > n * TICKS // updates:
+            tick()
+    f = hidden_units(a, weights.V)
+    error = delta - complete(f, a, weights.U, weights.D)
+    W_S, b_S = np.zeros_like(weights.U), np.zeros(len(weights.U), np.float32)
+    learn_precision(f, error, W_S, b_S, rng, tick)
+    return Association(*weights, W_S, b_S)
+
+
+def _rate(progress: float) -> float:
+    if progress < WARM_UP:
+        return RATE * progress / WARM_UP
+    return cosine_decay(RATE, (progress - WARM_UP) / (1.0 - WARM_UP))

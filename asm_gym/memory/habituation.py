@@ -1,0 +1,43 @@
+"""Habituation: how much surprise is usual in a context, learned so that what is usual need not alarm.
+
+    log ŝ_t = w c_t + b          Δw ∝ (τ - [log s_t < log ŝ_t]) c_tᵀ
+
+A hand that meets an object is often wrong about when; one that moves freely hardly ever is. ŝ is the surprise that a
+share τ of nominal steps in a context like this one stays below. The rule is local, and follows the gradient of the
+quantile loss.
+
+Sources: Yu and Dayan 2005 (Neuron 46(4)) for surprise relative to expected uncertainty; Koenker and Bassett 1978 for
+the quantile loss; Romano et al. 2019 (NeurIPS) for quantiles of a context under a conformal threshold.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.memory.energy import Array
+from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
+
+USUAL = 0.95
+"""τ."""
+
+UPDATES = 2000
+BATCH = 512
+RATE = 2e-3
+
+
+def habituate(context: Array, level: Array, rng: np.random.Generator) -> NDArray[np.float32]:
+    """(C + 1,) w, then b, from N nominal steps.
+
+    Args:
+        context: (N, C).
+        level: (N,) log s.
+    """
+    w, b = np.zeros(context.shape[1], np.float32), np.array([np.quantile(level, USUAL)], np.float32)
+    rows, bias = Synapse(w), Synapse(b)
+    for n, chosen in zip(range(UPDATES), shuffled(len(level), BATCH, rng), strict=False):
+        c, rate = context[chosen], cosine_decay(RATE, n / UPDATES)
+        pull = (USUAL - (level[chosen] < c @ w + b)).astype(np.float32)
+        rows.learn(pull @ c / np.float32(len(chosen)), rate)
+        bias.learn(pull.mean(keepdims=True), rate)
+    return np.concatenate([w, b])
