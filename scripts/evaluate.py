@@ -34,6 +34,8 @@ from asm_gym.scripts.record import EXECUTIONS, Course, draw_onset, episode_seeds
 from asm_gym.tasks import task as task_spec
 
 _HARMLESS = (*HARMLESS, *EXECUTIONS)
+_QUICK = ("neural_asm", "logpzo", "kalman+evidence", "autoregression", "external_torque_limit", "force_limit")
+"""Monitors that are fitted in seconds."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class Args:
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
     """Folder of the run."""
     quick: bool = False
-    """Three tasks and few episodes: to see that everything runs, not to judge the figures."""
+    """Three tasks, few monitors and few episodes: to see that everything runs, not to judge the figures."""
 
     def __post_init__(self) -> None:
         for name in self.tasks:
@@ -118,6 +120,7 @@ class Args:
         return replace(
             self,
             tasks=tuple(t for t in self.tasks if t in ("Lift", "Stack", "Door")) or self.tasks[:3],
+            monitors=tuple(m for m in self.monitors if m in _QUICK) or self.monitors[:1],
             severities=("strong",) if "strong" in self.severities else self.severities[-1:],
             fit_episodes=16,
             calibration_episodes=10,
@@ -199,7 +202,8 @@ def evaluate(args: Args, console: Console) -> Judgement:
     with stage("recording", console, seconds) as progress:
         record_all(args, wanted, progress)
     with stage("fitting and judging", console, seconds) as progress:
-        judgement = judge(args.out, wanted, args.monitors, args.false_alarm_rate, args.window, args.seed, progress)
+        how = args.false_alarm_rate, args.window, args.seed, args.crew
+        judgement = judge(args.out, wanted, args.monitors, *how, progress)
     with stage("drawing", console, seconds):
         details = json.loads(json.dumps(asdict(args), default=str))
         details |= {"python": platform.python_version(), "machine": platform.machine(), "seconds": seconds}

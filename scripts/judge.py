@@ -7,9 +7,9 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,8 @@ from asm_gym.evaluation.ideal import earliest, noise_floor, separation
 from asm_gym.evaluation.metrics import Share, window_steps
 from asm_gym.evaluation.scoring import Verdict, coverage
 from asm_gym.evaluation.trace import POLICY_ALONE, Trace
-from asm_gym.monitors import MONITORS, Monitor, make_monitor
-from asm_gym.scripts.dispatch import Progress
+from asm_gym.monitors import EVIDENCE, Monitor, make_monitor, monitor_class
+from asm_gym.scripts.dispatch import Crew, Progress, dispatch
 
 EXAMPLES = ("push", "collision", "weak_joint", "frozen_encoder", "snatch")
 """Kinds of which the report shows an episode."""
@@ -88,6 +88,15 @@ class Judgement:
         }
 
 
+class _Opinion(NamedTuple):
+    """What one monitor said."""
+
+    verdicts: list[Verdict]
+    harmless: list[Verdict]
+    thresholds: dict[float, float]
+    examples: list[Trace]
+
+
 def judge(
     folder: Path,
     labels: Sequence[Label],
@@ -95,6 +104,7 @@ def judge(
     rate: float,
     window_s: float,
     seed: int,
+    crew: Crew,
     progress: Progress,
 ) -> Judgement:
     """Reads the recordings, and lets every monitor judge them.
@@ -103,7 +113,50 @@ def judge(
         folder: of the run.
         labels: its episodes; those of roles fit and calibration are learned from, all others judged.
         seed: of the monitors.
+        crew: who judges; each monitor is one task.
     """
+    progress(0, len(monitors))
+    # One that is judged in two ways is fitted once.
+    models: dict[str, list[str]] = {}
+    for name in monitors:
+        models.setdefault(name.removesuffix(EVIDENCE), []).append(name)
+    opine = partial(_opinions, folder=folder.resolve(), labels=tuple(labels), rate=rate, seed=seed)
+    made = dispatch(opine, list(models.values()), crew, lambda k, n: progress(k * len(monitors) // n, len(monitors)))
+    found = {name: opinion for opinions in made for name, opinion in opinions.items()}
+    opinions = {name: found[name] for name in monitors}
+    by_role, failed, twins = _by_role(folder, labels)
+    return Judgement(
+        {n: o.verdicts for n, o in opinions.items()},
+        {n: o.harmless for n, o in opinions.items()},
+        {n: o.thresholds for n, o in opinions.items()},
+        _sights(twins, by_role.get("faulty", []), window_s),
+        rate,
+        window_s,
+        failed,
+        opinions[monitors[0]].examples,
+    )
+
+
+def _opinions(
+    names: Sequence[str], folder: Path, labels: Sequence[Label], rate: float, seed: int
+) -> dict[str, _Opinion]:
+    by_role, _, _ = _by_role(folder, labels)
+    return {name: _opinion(name, folder, by_role, rate, seed) for name in names}
+
+
+def _opinion(name: str, folder: Path, by_role: Mapping[str, Sequence[Recording]], rate: float, seed: int) -> _Opinion:
+    monitor = _fitted(folder, name, by_role["fit"], seed)
+    maxima = np.array([s.value.max() for s in _scores(monitor, by_role["calibration"])])
+    rates = sorted({r for r in (*RATES, rate) if len(maxima) >= conformal_episodes(r)})
+    thresholds = {r: conformal_threshold(maxima, r) for r in rates}
+    tested = [*by_role["nominal"], *by_role.get("faulty", [])]
+    verdicts = _verdicts(name, monitor, tested, thresholds[rate])
+    harmless = _verdicts(name, monitor, by_role.get("harmless", []), thresholds[rate])
+    return _Opinion(verdicts, harmless, thresholds, _examples(monitor, verdicts, tested, thresholds[rate]))
+
+
+def _by_role(folder: Path, labels: Sequence[Label]) -> tuple[dict[str, list[Recording]], int, list[Recording]]:
+    """Recordings by role, how many nominal ones failed and are not among them, and all twins of faulty ones."""
     recordings = {label: read(folder / label.path) for label in labels}
     by_role: dict[str, list[Recording]] = {}
     failed = 0
@@ -116,32 +169,18 @@ def judge(
     for role in NOMINAL:
         if not by_role.get(role):
             raise ValueError(f"none of the {role} episodes succeeded: there is nothing normal to learn or to test on")
-    rates = sorted({r for r in (*RATES, rate) if len(by_role["calibration"]) >= conformal_episodes(r)})
-    verdicts, harmless, thresholds = {}, {}, {}
-    examples: list[Trace] = []
-    for n, name in enumerate(monitors):
-        progress(n, len(monitors))
-        monitor = _fitted(folder, name, by_role["fit"], seed)
-        maxima = np.array([s.value.max() for s in _scores(monitor, by_role["calibration"])])
-        thresholds[name] = {r: conformal_threshold(maxima, r) for r in rates}
-        tested = [*by_role["nominal"], *by_role.get("faulty", [])]
-        verdicts[name] = _verdicts(name, monitor, tested, thresholds[name][rate])
-        if n == 0:
-            examples = _examples(monitor, verdicts[name], tested, thresholds[name][rate])
-        harmless[name] = _verdicts(name, monitor, by_role.get("harmless", []), thresholds[name][rate])
-    progress(len(monitors), len(monitors))
     twins = [r for label, r in recordings.items() if label.role == "nominal"]
-    sights = _sights(twins, by_role.get("faulty", []), window_s)
-    return Judgement(verdicts, harmless, thresholds, sights, rate, window_s, failed, examples)
+    return by_role, failed, twins
 
 
 def _fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) -> Monitor:
     """The monitor fitted on these episodes; kept in the folder for the next time, under the name of what it learned."""
     spec = recordings[0].episode.spec
-    digest = hashlib.sha256(json.dumps([name, seed, sorted(str(r.label.path) for r in recordings)]).encode())
-    path = folder / "monitors" / f"{name}-{digest.hexdigest()[:12]}.asm"
+    model = name.removesuffix(EVIDENCE)
+    digest = hashlib.sha256(json.dumps([model, seed, sorted(str(r.label.path) for r in recordings)]).encode())
+    path = folder / "monitors" / f"{model}-{digest.hexdigest()[:12]}.asm"
     if path.is_file():
-        loaded: Monitor = MONITORS[name].load(path)
+        loaded: Monitor = monitor_class(name).load(path)
         return loaded
     monitor = make_monitor(name, spec, seed=seed).fit([r.episode for r in recordings])
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -31,7 +31,8 @@ def main_table(judgement: Judgement) -> Table:
     return Table(
         f"Detection within {1e3 * judgement.window_s:.0f} ms of the onset, over kinds of fault and severities that an "
         f"ideal observer can see; thresholds from separate nominal episodes, delays and accuracies at a false-alarm "
-        f"rate of {100 * judgement.rate:g} % of episodes; 95 % Wilson intervals in brackets.{left_out}",
+        f"rate of {100 * judgement.rate:g} % of episodes; 95 % Wilson intervals in brackets. Nominal episodes that did "
+        f"not succeed, {judgement.failed} in all, are left out.{left_out}",
         (*_HEADINGS, *_MORE),
         rows,
     )

@@ -11,14 +11,15 @@ import pyarrow.parquet as pq
 import pytest
 
 from asm_gym.evaluation.archive import Label, read
-from asm_gym.monitors import MONITORS
 from asm_gym.scripts.dispatch import Crew, dispatch
 from asm_gym.scripts.evaluate import Args, labels, main
 from asm_gym.scripts.record import Course, draw_onset, record
 
+MONITORS = ("neural_asm", "kalman+evidence", "autoregression", "force_limit")
 SMALL = [
     *("--tasks", "Stack", "--faults", "push", "frozen_encoder", "gripper_opens", "--severities", "mild", "strong"),
-    *("--harmless", "touch", "slower", "--fit-episodes", "4", "--calibration-episodes", "20"),
+    *("--harmless", "touch", "slower", "--fit-episodes", "4", "--calibration-episodes", "24"),
+    *("--monitors", *MONITORS),
     *("--nominal-episodes", "4", "--faulty-episodes", "2", "--harmless-episodes", "1"),
     *("--false-alarm-rate", "0.05", "--workers", "1"),
 ]

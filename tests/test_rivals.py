@@ -130,7 +130,7 @@ def test_a_limit_needs_its_channel(name, lacks):
 
 
 def test_unknown_names_and_hyperparameters_list_the_known():
-    with pytest.raises(ValueError, match=r"'oracle'.*neural_asm, autoregression"):
+    with pytest.raises(ValueError, match=r"'oracle'.*neural_asm, skill_library"):
         make_monitor("oracle", SPEC)
     with pytest.raises(ValueError, match=r"'hiden_size'.*did you mean 'hidden_size'"):
         make_monitor("neural_asm", SPEC, hiden_size=3)

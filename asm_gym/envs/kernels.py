@@ -27,7 +27,8 @@ MOTOR = slice(JOINTS, 2 * JOINTS)
 WRENCH = slice(2 * JOINTS, 2 * JOINTS + 6)
 CONTACT = slice(2 * JOINTS + 6, 2 * JOINTS + 9)
 VELOCITY = slice(2 * JOINTS + 9, 2 * JOINTS + 15)
-SAMPLE = VELOCITY.stop
+EXTERNAL = slice(2 * JOINTS + 15, 2 * JOINTS + 18)
+SAMPLE = EXTERNAL.stop
 
 # MuJoCo's own functions, linked by name so that the compiled loop can be cached on disk.
 binding.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
@@ -86,13 +87,14 @@ def sample(views: Views, nominal: Nominal, arms: Arms, k: int, samples: Floats) 
         for i in range(6):
             row[2 * JOINTS + i] = views.sensordata[at + i]
         for i in range(3):
-            row[2 * JOINTS + 6 + i] = 0.0
+            row[2 * JOINTS + 6 + i] = row[2 * JOINTS + 15 + i] = 0.0
         for t in range(arms.bodies.shape[1]):
             body = arms.bodies[a, t]
             if body < 0:
                 break
             for i in range(3):
                 row[2 * JOINTS + 6 + i] += views.contact[body, 3 + i] - views.applied[body, i]
+                row[2 * JOINTS + 15 + i] += views.contact[body, 3 + i]
         hand_velocity(views, arms, a, views.subtree_com[arms.root[a]], row[2 * JOINTS + 9 :])
 
 
@@ -131,13 +133,14 @@ def run(
 
 
 @compiled
-def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Floats) -> float:
+def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Floats) -> tuple[float, float, float]:
     """Writes the mean, signed peak and last of the first ``count`` substeps into mean, peak and last (A, SAMPLE).
 
     Returns:
-        The largest contact force on an arm [N], the norm of its vector; not finite where a sample is not.
+        The largest contact force on an arm, the largest force on it from anything outside, and the mean of the latter
+        [N], norms of their vectors; not finite where a sample is not.
     """
-    largest = 0.0
+    largest = external = total = 0.0
     for a in range(len(samples)):
         mean[a] = 0.0
         peak[a] = 0.0
@@ -152,7 +155,11 @@ def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Flo
             force = np.sqrt(np.sum(row[2 * JOINTS + 6 : 2 * JOINTS + 9] ** 2))
             if not force <= largest and largest == largest:
                 largest = force
-    return largest
+            outside = np.sqrt(np.sum(row[2 * JOINTS + 15 : 2 * JOINTS + 18] ** 2))
+            total += outside / count
+            if not outside <= external and external == external:
+                external = outside
+    return largest, external, total
 
 
 @compiled

@@ -35,6 +35,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     - ``success``: whether the task is solved now;
     - ``reward_terms``: the parts of the reward by name, which add up to it (not on reset);
     - ``contact_force``: the largest net contact force on an arm within the step [N];
+    - ``external_force``: the same of all that acts on it from outside, faults that push or pull included [N];
+    - ``external_impulse``: that force's mean norm times the length of the step [N s];
     - ``unstable``: the simulation diverged, which ends the episode as truncated. Its last stream is then NaN, its last
       observation 0.
 
@@ -279,8 +281,11 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
     def _info(self, success: bool, unstable: bool = False) -> dict[str, Any]:
         info: dict[str, Any] = {"stream": self.to_stream(self._row)} if self._layout.stream_spec else {}
-        force = np.nan if unstable else self.simulation.contact_force
-        return info | {"success": success, "contact_force": force, "unstable": unstable}
+        sim = self.simulation
+        felt = sim.contact_force, sim.external_force, sim.mean_external_force / self.metadata["render_fps"]
+        names = "contact_force", "external_force", "external_impulse"
+        forces = dict(zip(names, (np.nan,) * 3 if unstable else felt, strict=True))
+        return info | {"success": success, **forces, "unstable": unstable}
 
     def _bad_count(self) -> int:
         """How often MuJoCo found the simulation unstable; it resets itself then, and says so nowhere else."""

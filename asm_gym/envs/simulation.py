@@ -49,7 +49,7 @@ class Simulation:
         self._believed: tuple[mujoco.MjModel, mujoco.MjData, Nominal] | None = None
         self._samples = np.zeros((len(self._parts), substeps, kernels.SAMPLE))
         self.proprioception = Proprioception(self._parts, self._views, self.data)
-        self.contact_force = 0.0
+        self.contact_force = self.external_force = self.mean_external_force = 0.0
         """The largest net contact force on an arm within the control step [N]: the norm of the summed contact forces on
         its bodies. A grasp's own squeeze cancels in the sum, and loads that a fault applies are left out."""
         self.keeps_history = False
@@ -138,7 +138,8 @@ class Simulation:
 
     def _summarise(self, count: int) -> None:
         p = self.proprioception
-        self.contact_force = kernels.summarise(self._samples, count, p.mean, p.peak, p.last)
+        forces = kernels.summarise(self._samples, count, p.mean, p.peak, p.last)
+        self.contact_force, self.external_force, self.mean_external_force = forces
 
     def _move_gripper(self, robot: Any, arm: str, action: NDArray[np.float64]) -> None:
         name = robot.get_gripper_name(arm)

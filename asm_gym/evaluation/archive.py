@@ -108,6 +108,7 @@ def read(path: Path) -> Recording:
                 success=header["success"],
                 seed=label.seed,
                 faults=arrays["faults"],
+                info={"skill": label.task},
             )
             return Recording(label, episode, arrays["contact_force"], frozenset(header["guilty"]))
     except (OSError, EOFError, KeyError, TypeError, ValueError, BadZipFile) as error:

@@ -27,7 +27,9 @@ from asm_gym.memory.energy import Array, activate, kernel, outward
 from asm_gym.memory.learning import Synapse, coincidence, cosine_decay, shuffled
 from asm_gym.memory.precision import learn_precision
 
-UPDATES = 6000
+UPDATES, PASSES = 6000, 40
+"""Batches learned from at most, and passes over the steps at most: with more, few steps would be learned by heart."""
+
 BATCH = 256
 RATE = 5e-3
 WARM_UP = 0.1
@@ -113,6 +115,7 @@ def learn_association(
     rng: np.random.Generator,
     tick: Callable[[], None] = lambda: None,
     updates: int = UPDATES,
+    passes: int = PASSES,
 ) -> Association:
     """Synapses learned from N steps, in random order; those of the precision last.
 
@@ -121,8 +124,9 @@ def learn_association(
         delta: (N, X) changes, standardised.
         groups, changes, size: as in ``synapses``.
         tick: called ``TICKS`` times on the way, and once after each of ``PRECISION_EPOCHS``.
-        updates: how many batches are learned from.
+        updates, passes: over batches and over the N steps, at most.
     """
+    updates = max(TICKS, min(updates, passes * len(a) // BATCH))
     exists = synapses(groups, changes, a.shape[1], size)
     V = rng.standard_normal(exists.V.shape).astype(np.float32) / np.float32(np.sqrt(a.shape[1])) * exists.V
     weights = Change(V, np.zeros_like(exists.U), np.zeros_like(exists.D))

@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 from asm_gym.memory.energy import Array, activate, energy, kernel
 from asm_gym.memory.inference import Weights, expect, infer, sense
 
+UPDATES = 50_000
+"""Steps of a batch that are learned from at most: with very many episodes fewer passes over them are enough."""
+
 REFERENCE_WIDTH = 256
 """Hidden units up to which ``learning_rate`` is taken as it is; beyond them learning would diverge."""
 
@@ -198,6 +201,12 @@ class Learner:
         return total
 
 
+def passes(trajectories: Sequence[Trajectory], schedule: Schedule) -> int:
+    """How often all episodes are learned from."""
+    updates = sum(len(t.senses) for t in trajectories) / schedule.batch_size
+    return max(1, min(schedule.epochs, round(UPDATES / updates)))
+
+
 def learn(
     weights: Weights,
     trajectories: Sequence[Trajectory],
@@ -205,13 +214,14 @@ def learn(
     rng: np.random.Generator,
     tick: Callable[[], None],
 ) -> NDArray[np.float64]:
-    """Learns all but the precision, in place; the mean energy of each epoch (epochs,). Calls ``tick`` each epoch."""
+    """Learns in place; the mean energy of each epoch. Calls ``tick`` after each, of which many data need fewer."""
     learner = Learner(weights, schedule, rng)
     widest = schedule.learning_rate * min(1.0, REFERENCE_WIDTH / weights.W_H.shape[0])
     steps = sum(len(t.senses) for t in trajectories)
-    curve = np.zeros(schedule.epochs)
-    for epoch in range(schedule.epochs):
-        progress = epoch / schedule.epochs
+    epochs = passes(trajectories, schedule)
+    curve = np.zeros(epochs)
+    for epoch in range(epochs):
+        progress = epoch / epochs
         rate = cosine_decay(widest, progress)
         for batch in batches(trajectories, schedule.batch_size, rng):
             curve[epoch] += learner.run(batch, rate, schedule.carry_prior * progress) / steps

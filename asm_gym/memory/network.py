@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from asm_gym.memory.association import TICKS, Association, complete, hidden_units, learn_association
 from asm_gym.memory.energy import Array
 from asm_gym.memory.inference import Weights, expect, infer, weight_shapes
-from asm_gym.memory.learning import Schedule, Trajectory, learn
+from asm_gym.memory.learning import Schedule, Trajectory, learn, passes
 from asm_gym.memory.precision import PRECISION_EPOCHS, log_variance
 from asm_gym.memory.senses import Reading
 
@@ -120,7 +120,7 @@ def train(
         hidden: H.
         units: hidden units of association for each group.
     """
-    done, total = 0, schedule.epochs + TICKS + PRECISION_EPOCHS
+    done = 0
 
     def tick() -> None:
         nonlocal done
@@ -130,6 +130,7 @@ def train(
 
     sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
     weights = initial_weights(hidden, sensory, commands - 1, rng)
+    total = passes(trajectories, schedule) + TICKS + PRECISION_EPOCHS
     energy = learn(weights, trajectories, schedule, rng, tick)
     inputs = np.concatenate([t.inputs for t in trajectories])
     association = learn_association(inputs, np.ascontiguousarray(inputs[:, changes]), groups, changes, units, rng, tick)

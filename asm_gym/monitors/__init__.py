@@ -2,25 +2,47 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 from typing import Any
 
 from asm_gym.choices import check_choice
-from asm_gym.monitors.autoregression import Autoregression
 from asm_gym.monitors.base import Monitor, Surprise
-from asm_gym.monitors.limits import ExternalTorqueLimit, ForceLimit
 from asm_gym.monitors.neural_asm import NeuralASM
+from asm_gym.monitors.rival import EVIDENCE, Rival, with_evidence
 from asm_gym.stream import StreamSpec
 
-__all__ = ["MONITORS", "Monitor", "NeuralASM", "Surprise", "make_monitor"]
+__all__ = ["EVIDENCE", "MONITORS", "Monitor", "NeuralASM", "Surprise", "make_monitor", "monitor_class"]
 
-MONITORS: dict[str, type[Any]] = {
-    "neural_asm": NeuralASM,
-    "autoregression": Autoregression,
-    "external_torque_limit": ExternalTorqueLimit,
-    "force_limit": ForceLimit,
+_RIVALS = {
+    "skill_library": "skill_library:SkillLibrary",
+    "logpzo": "fail_detect:LogpZO",
+    "rnd": "fail_detect:RND",
+    "lstm_vae": "lstm_vae:LSTMVAE",
+    "gru": "gru:GRU",
+    "kalman": "kalman:Kalman",
+    "autoregression": "autoregression:Autoregression",
+    "elapsed_time": "elapsed_time:ElapsedTime",
 }
-"""Every monitor by its name."""
+_LIMITS = {"external_torque_limit": "limits:ExternalTorqueLimit", "force_limit": "limits:ForceLimit"}
+
+MONITORS = ("neural_asm", *(n for r in _RIVALS for n in (r, r + EVIDENCE)), *_LIMITS)
+"""The name of every monitor. A rival's plain name scores as its authors did; with ``+evidence``, its errors are judged
+as those of the Neural ASM are."""
+
+
+def monitor_class(name: str) -> type[Any]:
+    """The class of the monitor of that name; torch is imported only for those that need it.
+
+    Raises:
+        ValueError: there is no monitor of that name; the message lists what exists.
+    """
+    check_choice("monitor", name, MONITORS)
+    if name == "neural_asm":
+        return NeuralASM
+    module, _, attribute = (_RIVALS | _LIMITS)[name.removesuffix(EVIDENCE)].partition(":")
+    found: type[Any] = getattr(importlib.import_module(f"asm_gym.monitors.{module}"), attribute)
+    return with_evidence(found) if name.endswith(EVIDENCE) and issubclass(found, Rival) else found
 
 
 def make_monitor(name: str, spec: StreamSpec, **kwargs: Any) -> Monitor:
@@ -34,9 +56,9 @@ def make_monitor(name: str, spec: StreamSpec, **kwargs: Any) -> Monitor:
     Raises:
         ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists.
     """
-    check_choice("monitor", name, MONITORS)
-    known = [p for p in inspect.signature(MONITORS[name]).parameters if p != "spec"]
+    kind = monitor_class(name)
+    known = [p for p in inspect.signature(kind).parameters if p not in ("spec", "kwargs")]
     for parameter in kwargs:
         check_choice(f"hyperparameter of {name}", parameter, known)
-    monitor: Monitor = MONITORS[name](spec, **kwargs)
+    monitor: Monitor = kind(spec, **kwargs)
     return monitor

@@ -2,8 +2,8 @@
 
     x̂_t = A₁ x_{t-1} + A₂ x_{t-2} + B u_t + c,    ridge regression over nominal steps
 
-Source: vector autoregression with exogenous input (Lütkepohl 2005, ch. 10), whose residuals go through the same
-detection as the Neural ASM's errors.
+Source: vector autoregression with exogenous input (Lütkepohl 2005, ch. 10), and the Mahalanobis distance of its
+residuals.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.monitors.calibrated import Progress
-from asm_gym.monitors.predictive import PredictiveMonitor
+from asm_gym.monitors.rival import Mahalanobis
 
 RIDGE = 1e-3
 """Of the standardised inputs; keeps channels that are constant or copies of others from mattering."""
@@ -26,7 +26,7 @@ class _State(NamedTuple):
     earlier: NDArray[np.float64]  # (B, X) the one before
 
 
-class Autoregression(PredictiveMonitor):
+class Autoregression(Mahalanobis):
     """A linear model of the stream; the arguments are those of ``PredictiveMonitor``."""
 
     kind = "autoregression"

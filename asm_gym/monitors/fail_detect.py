@@ -5,8 +5,8 @@
 
 Each is averaged over the last five steps, as there. Source: Xu et al. 2025 (RSS), “Can we detect failures without
 failure data? Uncertainty-aware runtime failure detection for imitation learning policies”; Burda et al. 2019 (ICLR) for
-distillation, Lipman et al. 2023 (ICLR) for the flow. What is scored there is an embedding of images and the action; here
-the sensorimotor row: values, changes and the action.
+distillation, Lipman et al. 2023 (ICLR) for the flow. What is scored there is an embedding of images and the action;
+here the sensorimotor row: values, changes and the action.
 """
 
 from __future__ import annotations
@@ -46,7 +46,12 @@ class _Scored(TorchModel):
     """A network on single rows, whose squared errors are averaged over a few steps."""
 
     def start_model(self, batch: int) -> _Memory:
-        return _Memory(no_rows(batch, self.spec.size), np.full((batch, WINDOW, len(self.judged)), np.nan))
+        return _Memory(no_rows(batch, self.spec.size), np.full((batch, WINDOW, self.scored), np.nan))
+
+    @property
+    def scored(self) -> int:
+        """X, errors of a row."""
+        return len(self.judged)
 
     @abstractmethod
     def errors(self, x: Tensor) -> Tensor:
@@ -68,37 +73,47 @@ class _Scored(TorchModel):
         return self.senses_.size + len(self.spec.motor)
 
 
+class _Distillation(nn.Module):
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.target = _mlp(size, EMBEDDING, 1).requires_grad_(False)
+        self.follower = _mlp(size, EMBEDDING, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        difference: Tensor = self.follower(x) - self.target(x)
+        return difference
+
+
 class RND(_Scored):
     """Random network distillation; the arguments are those of ``PredictiveMonitor``."""
 
     kind = "rnd"
 
     @property
-    def judged(self) -> NDArray[np.intp]:
-        # An embedding has no channels: its errors are shared out evenly, and blame nobody.
-        return np.resize(self.spec.sensory, EMBEDDING)
+    def scored(self) -> int:
+        return EMBEDDING
+
+    def attribute(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """An embedding has no channels: its errors are shared out evenly, and blame nobody."""
+        shares = np.zeros((len(parts), self.spec.size))
+        shares[:, self.spec.sensory] = parts.sum(axis=1, keepdims=True) / len(self.spec.sensory)
+        return shares
 
     def module(self) -> nn.Module:
-        return nn.ModuleDict({"target": _mlp(self.size, EMBEDDING, 1), "follower": _mlp(self.size, EMBEDDING, 2)})
+        return _Distillation(self.size)
 
     def train(self, module: nn.Module, readings: Sequence[Reading], rng: np.random.Generator, tell: Progress) -> None:
-        optimiser, schedule = adam(module["follower"], UPDATES)
+        assert isinstance(module, _Distillation)
+        optimiser, schedule = adam(module.follower, UPDATES)
         rows = np.concatenate([_features(r) for r in readings])
         for n, x in enumerate(steps_of(rows, BATCH, UPDATES, rng)):
             tell(n, UPDATES)
-            with torch.no_grad():
-                wanted = module["target"](x)
-            descend(((module["follower"](x) - wanted) ** 2).mean(), optimiser, schedule)
+            descend((module(x) ** 2).mean(), optimiser, schedule)
 
     def errors(self, x: Tensor) -> Tensor:
         assert self.module_ is not None
-        difference: Tensor = self.module_["follower"](x) - self.module_["target"](x)
+        difference: Tensor = self.module_(x)
         return difference
-
-    def shares(self, state: State, rows: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
-        # Several errors fall on one column: the shares have to be summed and spread, not written.
-        state, _ = super().shares(state, rows)
-        return state, _
 
 
 class LogpZO(_Scored):

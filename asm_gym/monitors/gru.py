@@ -22,8 +22,7 @@ from asm_gym.monitors.rival import Mahalanobis
 from asm_gym.monitors.torch_model import TorchModel, adam, descend, padded
 
 HIDDEN = 256
-EPOCHS = 60
-BATCH = 16
+UPDATES, EPOCHS, BATCH = 1500, 60, 16
 CLOSEST = 20.0
 """Largest error, in standard deviations, whose full weight training feels; contacts would drown all else."""
 
@@ -57,10 +56,11 @@ class GRU(Mahalanobis, TorchModel):
 
     def train(self, module: nn.Module, readings: Sequence[Reading], rng: np.random.Generator, tell: Progress) -> None:
         inputs = [np.hstack([np.vstack([r.senses[:1], r.senses[:-1]]), r.commands]) for r in readings]
-        updates = EPOCHS * -(-len(readings) // BATCH)
-        optimiser, schedule = adam(module, updates)
-        for epoch in range(EPOCHS):
-            tell(epoch, EPOCHS)
+        each = -(-len(readings) // BATCH)
+        epochs = max(1, min(EPOCHS, UPDATES // each))
+        optimiser, schedule = adam(module, epochs * each)
+        for epoch in range(epochs):
+            tell(epoch, epochs)
             order = rng.permutation(len(readings))
             for start in range(0, len(order), BATCH):
                 chosen = order[start : start + BATCH]

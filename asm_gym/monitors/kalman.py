@@ -1,4 +1,4 @@
-"""The engineer's rival: a Kalman filter of a linear model of the stream, and the Mahalanobis distance of its innovations.
+"""The engineer's rival: a Kalman filter of the stream, and the Mahalanobis distance of its innovations.
 
     x_t = A x_{t-1} + B u_t + c + w,  w ~ N(0, Q)        y_t = x_t + v,  v ~ N(0, R)
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sklearn.svm import SVR
 from torch import Tensor, nn
 
+from asm_gym.detection import Run
 from asm_gym.memory.senses import Reading
 from asm_gym.monitors.base import State
 from asm_gym.monitors.calibrated import Progress
@@ -23,16 +24,21 @@ from asm_gym.monitors.rival import Rows, no_rows, read
 from asm_gym.monitors.torch_model import TorchModel, adam, descend, padded
 
 HIDDEN, LATENT = 128, 16
-EPOCHS, BATCH = 60, 16
+UPDATES, EPOCHS, BATCH = 1500, 60, 16
 CORRUPTION = 0.1
 """Standard deviation of the noise that the encoder's inputs are corrupted with."""
 REGRESSED = 3000
 """Steps that the threshold is learned from; a support vector regression takes the square of their number in time."""
 
 
+class _Cell(NamedTuple):
+    hidden: NDArray[np.float32]  # (B, H)
+    cell: NDArray[np.float32]  # (B, H)
+
+
 class _Memory(NamedTuple):
-    encoder: tuple[NDArray[np.float32], NDArray[np.float32]]  # (B, H) each
-    decoder: tuple[NDArray[np.float32], NDArray[np.float32]]
+    encoder: _Cell
+    decoder: _Cell
     latent: NDArray[np.float32]  # (B, Z) mean of z_t
     seen: Rows
 
@@ -69,12 +75,15 @@ class LSTMVAE(TorchModel):
         return np.concatenate([self.spec.sensory, self.senses_.slow])
 
     def train(self, module: nn.Module, readings: Sequence[Reading], rng: np.random.Generator, tell: Progress) -> None:
-        optimiser, schedule = adam(module, EPOCHS * -(-len(readings) // BATCH))
+        assert isinstance(module, _Module)
+        each = -(-len(readings) // BATCH)
+        epochs = max(1, min(EPOCHS, UPDATES // each))
+        optimiser, schedule = adam(module, epochs * each)
         longest = max(len(r.senses) for r in readings)
         # The centre of the prior moves through the latent space as the episode goes on.
         centre = torch.linspace(-1.0, 1.0, longest)[None, :, None]
-        for epoch in range(EPOCHS):
-            tell(epoch, EPOCHS)
+        for epoch in range(epochs):
+            tell(epoch, epochs)
             order = rng.permutation(len(readings))
             for start in range(0, len(order), BATCH):
                 x, real = padded([readings[i].senses for i in order[start : start + BATCH]])
@@ -87,7 +96,7 @@ class LSTMVAE(TorchModel):
                 descend(((likelihood + divergence) * real).sum() / real.sum(), optimiser, schedule)
 
     def start_model(self, batch: int) -> _Memory:
-        nothing = np.zeros((batch, HIDDEN), np.float32), np.zeros((batch, HIDDEN), np.float32)
+        nothing = _Cell(np.zeros((batch, HIDDEN), np.float32), np.zeros((batch, HIDDEN), np.float32))
         return _Memory(nothing, nothing, np.zeros((batch, LATENT), np.float32), no_rows(batch, self.spec.size))
 
     def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, NDArray[Any], NDArray[Any]]:
@@ -99,9 +108,9 @@ class LSTMVAE(TorchModel):
         latent = z.numpy()[:, 0]
         return _Memory(_numpy(encoder), _numpy(decoder), latent, state.seen.then(rows)), error, latent
 
-    def learn_score(self, errors: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        contexts = np.concatenate([r.contexts for r in self._nominal])
-        scores = 0.5 * (np.concatenate(errors) ** 2).sum(axis=1)
+    def learn_score(self, runs: Sequence[Run]) -> dict[str, NDArray[Any]]:
+        contexts = np.concatenate([r.contexts for r in runs])
+        scores = 0.5 * (np.concatenate([r.errors for r in runs]) ** 2).sum(axis=1)
         chosen = np.random.default_rng(self.seed).permutation(len(scores))[:REGRESSED]
         centre, spread = contexts.mean(axis=0), np.maximum(contexts.std(axis=0), 1e-6)
         machine = SVR(C=10.0, gamma=1.0 / LATENT, epsilon=0.1)
@@ -124,10 +133,10 @@ class LSTMVAE(TorchModel):
         return parts
 
 
-def _torch(state: tuple[NDArray[np.float32], NDArray[np.float32]]) -> tuple[Tensor, Tensor]:
+def _torch(state: _Cell) -> tuple[Tensor, Tensor]:
     hidden, cell = (torch.from_numpy(np.ascontiguousarray(s))[None] for s in state)
     return hidden, cell
 
 
-def _numpy(state: tuple[Tensor, Tensor]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    return state[0].numpy()[0], state[1].numpy()[0]
+def _numpy(state: tuple[Tensor, Tensor]) -> _Cell:
+    return _Cell(state[0].numpy()[0], state[1].numpy()[0])

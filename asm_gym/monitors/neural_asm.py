@@ -42,7 +42,7 @@ class NeuralASM(PredictiveMonitor):
         iterations: inference steps per control step.
         learning_rate: largest change of a synapse in one step, decaying to 0 along a cosine; scaled by 256 / H where H
             is larger, so that a unit's input does not change more for having more synapses.
-        epochs: passes of the temporal network over the training episodes.
+        epochs: passes of the temporal network over the training episodes; fewer where they are very many.
         batch_size: episodes it learns from side by side.
         prior_precision: Π_z, trust in what was expected.
         sensory_precision: Π_x, trust in what is sensed.
@@ -59,7 +59,7 @@ class NeuralASM(PredictiveMonitor):
         network_: the memory with its weights; None before ``fit``.
         senses_: how it reads a row.
         detector_: what turns errors into surprise; None before ``fit``.
-        energy_: (epochs,) mean energy of a step while learning.
+        energy_: mean energy of a step in each pass.
         threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
     """
 

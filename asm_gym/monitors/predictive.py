@@ -115,9 +115,13 @@ class PredictiveMonitor(CalibratedMonitor):
         assert self.detector_ is not None
         model, errors, context = self.predict(state.model, rows)
         evidence, _, parts = self.detector_.step(state.evidence, errors, context)
-        attribution = np.zeros(rows.shape)
-        attribution[:, self.judged] = parts
-        return PredictiveState(model, evidence), attribution
+        return PredictiveState(model, evidence), self.attribute(parts)
+
+    def attribute(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(B, D) each number's share, from each error's (B, X)."""
+        shares = np.zeros((self.spec.size, len(parts)))
+        np.add.at(shares, self.judged, parts.T)
+        return shares.T
 
     def _runs(self, streams: Sequence[NDArray[np.float32]]) -> list[Run]:
         """What the model says of whole episodes."""

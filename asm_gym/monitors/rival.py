@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection import whitening
+from asm_gym.detection import Run, whitening
 from asm_gym.memory.senses import Reading, Senses
 from asm_gym.monitors.base import State
 from asm_gym.monitors.calibrated import Progress
@@ -28,21 +28,18 @@ class Rival(PredictiveMonitor):
 
     def learn(self, streams: Sequence[NDArray[np.float32]], progress: Progress) -> dict[str, NDArray[Any]]:
         learned = super().learn(streams, progress)
-        if self.own_score:
-            self.learned_ = learned
-            learned |= self.learn_score([r.errors for r in self._runs(streams)])
-        return learned
+        self.learned_ = learned
+        return learned | self.learn_score(self._runs(streams))
 
     def shares(self, state: PredictiveState, rows: NDArray[np.float64]) -> tuple[PredictiveState, NDArray[np.float64]]:
         if not self.own_score:
             return super().shares(state, rows)
         model, errors, _ = self.predict(state.model, rows)
-        attribution = np.zeros(rows.shape)
-        attribution[:, self.judged] = self.published(model, np.asarray(errors, np.float64))
-        return PredictiveState(model, state.evidence), attribution
+        parts = self.published(model, np.asarray(errors, np.float64))
+        return PredictiveState(model, state.evidence), self.attribute(parts)
 
-    def learn_score(self, errors: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """What ``published`` needs to know of the errors (T, X) of nominal episodes."""
+    def learn_score(self, runs: Sequence[Run]) -> dict[str, NDArray[Any]]:
+        """What ``published`` needs to know of the errors in nominal episodes."""
         return {}
 
     def published(self, model: State, errors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -53,8 +50,8 @@ class Rival(PredictiveMonitor):
 class Mahalanobis(Rival):
     """A rival that scores by the Mahalanobis distance of its prediction errors: ‖M ε‖², C of nominal steps."""
 
-    def learn_score(self, errors: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        return {"mahalanobis": whitening(np.concatenate(errors), self.shrinkage)}
+    def learn_score(self, runs: Sequence[Run]) -> dict[str, NDArray[Any]]:
+        return {"mahalanobis": whitening(np.concatenate([r.errors for r in runs]), self.shrinkage)}
 
     def published(self, model: State, errors: NDArray[np.float64]) -> NDArray[np.float64]:
         parts: NDArray[np.float64] = (errors @ self.learned_["mahalanobis"]) ** 2
@@ -84,5 +81,5 @@ def read(senses: Senses, seen: Rows, rows: NDArray[np.float64]) -> Reading:
 
 
 def with_evidence(rival: type[Rival]) -> type[Rival]:
-    """The same model, judged by the detection of the Neural ASM."""
-    return type(rival.__name__ + "Evidence", (rival,), {"kind": rival.kind + EVIDENCE, "own_score": False})
+    """The same model, judged by the detection of the Neural ASM; either reads what the other has saved."""
+    return type(rival.__name__ + "Evidence", (rival,), {"own_score": False})
