@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 from typing import Any
 
 from asm_gym.choices import check_choice
@@ -57,8 +56,7 @@ def make_monitor(name: str, spec: StreamSpec, **kwargs: Any) -> Monitor:
         ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists.
     """
     kind = monitor_class(name)
-    known = [p for p in inspect.signature(kind).parameters if p not in ("spec", "kwargs")]
     for parameter in kwargs:
-        check_choice(f"hyperparameter of {name}", parameter, known)
+        check_choice(f"hyperparameter of {name}", parameter, kind.hyperparameters)
     monitor: Monitor = kind(spec, **kwargs)
     return monitor
