@@ -145,7 +145,7 @@ def _opinions(
 
 
 def _opinion(name: str, folder: Path, by_role: Mapping[str, Sequence[Recording]], rate: float, seed: int) -> _Opinion:
-    monitor = _fitted(folder, name, by_role["fit"], seed)
+    monitor = fitted(folder, name, by_role["fit"], seed)
     maxima = np.array([s.value.max() for s in _scores(monitor, by_role["calibration"])])
     rates = sorted({r for r in (*RATES, rate) if len(maxima) >= conformal_episodes(r)})
     thresholds = {r: conformal_threshold(maxima, r) for r in rates}
@@ -173,7 +173,7 @@ def _by_role(folder: Path, labels: Sequence[Label]) -> tuple[dict[str, list[Reco
     return by_role, failed, twins
 
 
-def _fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) -> Monitor:
+def fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) -> Monitor:
     """The monitor fitted on these episodes; kept in the folder for the next time, under the name of what it learned."""
     spec = recordings[0].episode.spec
     model = name.removesuffix(EVIDENCE)

@@ -92,7 +92,7 @@ def publish(folder: Path, judgement: Judgement, details: Mapping[str, Any]) -> N
     """Writes ``results.parquet``, ``results.json``, ``results.md`` and ``report.html``."""
     _write_parquet(folder / "results.parquet", judgement)
     tables = [main_table(judgement), kinds_table(judgement), harmless_table(judgement)]
-    (folder / "results.md").write_text("\n\n".join(map(_markdown, tables)) + "\n", encoding="utf-8")
+    (folder / "results.md").write_text("\n\n".join(map(markdown, tables)) + "\n", encoding="utf-8")
     summary = {"settings": details, "tables": [{"headings": t.headings, "rows": t.rows} for t in tables]}
     (folder / "results.json").write_text(json.dumps(summary, indent=1, default=str) + "\n", encoding="utf-8")
     cells = judgement.cells
@@ -211,7 +211,7 @@ def _of(share: Share | None) -> str:
     return f"{share.k} of {share.n}" if share is not None and share.n else ""
 
 
-def _markdown(table: Table) -> str:
+def markdown(table: Table) -> str:
     def line(cells: Sequence[object]) -> str:
         return "| " + " | ".join(map(str, cells)) + " |"
 

@@ -114,7 +114,7 @@ def test_an_environment_without_a_stream_is_watched_through_its_spaces():
 
 
 def test_unknown_reactions_are_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"'freeze'.*monitor, hold, terminate"):
+    with pytest.raises(ValueError, match=r"'freeze'.*monitor, hold, retract.*terminate"):
         NeuralASMSafety(FakeEnv(), CueMonitor(), on_alarm="freeze")
     with pytest.raises(ValueError, match="predict"):
         NeuralASMSafety(FakeEnv(), CueMonitor(), on_alarm=3)

@@ -12,10 +12,15 @@ from numpy.typing import NDArray
 
 from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.base import Policy
-from asm_gym.policies.reflexes import Hold
+from asm_gym.policies.reflexes import Comply, Graded, Hold, Retract
 from asm_gym.wrappers.stream_recorder import StreamSource
 
-REFLEXES: dict[str, Callable[[gym.Env[Any, Any]], Policy]] = {"hold": Hold}
+REFLEXES: dict[str, Callable[[gym.Env[Any, Any]], Policy]] = {
+    "hold": Hold,
+    "retract": Retract,
+    "comply": Comply,
+    "graded": Graded,
+}
 """Reflexes by name: policies that act from the step after an alarm."""
 ON_ALARM = ("monitor", *REFLEXES, "terminate")
 """Names that ``on_alarm`` takes."""
@@ -25,19 +30,25 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """A safety layer around any environment with a Box action space, under any policy.
 
     After each step the monitor compares what was sensed with what it expected. From the step after an alarm on, a
-    reflex acts in the policy's place, until surprise has stayed under the threshold for ``release_after`` steps.
+    reflex acts in the policy's place, until surprise has stayed under ``release_below`` of the threshold for
+    ``release_after`` steps; what has alarmed is not counted again, so that a nudge costs a pause and not the task.
 
     ``info["asm"]`` holds ``surprise``, ``threshold``, ``alarm`` (surprise is over the threshold now), ``intervened``
-    (the reflex acted in this step), ``executed_action``, and ``attribution``: what each number of the stream adds to
-    the surprise. ``info["cost"]`` is 1.0 on every step spent in alarm and 0.0 otherwise, as safe-RL libraries expect.
+    (the reflex acted in this step), ``gave_up`` (it has acted for ``max_override`` steps, and the episode ends),
+    ``executed_action``, and ``attribution``: what each number of the stream adds to the surprise. ``info["cost"]`` is
+    1.0 on every step spent in alarm and 0.0 otherwise, as safe-RL libraries expect.
 
     Args:
         env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream.
         monitor: a fitted and calibrated monitor.
-        on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip; ``"terminate"`` ends the episode;
-            any other policy acts itself.
+        on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip; ``"retract"`` goes back along the
+            path; ``"comply"`` yields to what presses; ``"graded"`` stays, and yields to what keeps pressing;
+            ``"terminate"`` ends the episode; any other policy acts itself.
         release_after: control steps of quiet after which control is handed back.
-        truncate: ``"terminate"`` ends the episode as truncated rather than terminated.
+        release_below: share of the threshold, in (0, 1], that surprise must be under to count as quiet.
+        max_override: control steps for which a reflex may act at a stretch, after which the episode ends; None for as
+            many as it takes.
+        truncate: an episode that is ended by an alarm is truncated rather than terminated.
 
     Raises:
         ValueError: an unknown ``on_alarm``, or a monitor fitted for another stream (the message names the channels).
@@ -51,21 +62,34 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         on_alarm: str | Policy = "hold",
         *,
         release_after: int = 10,
+        release_below: float = 0.8,
+        max_override: int | None = None,
         truncate: bool = False,
     ) -> None:
         RecordConstructorArgs.__init__(
-            self, monitor=monitor, on_alarm=on_alarm, release_after=release_after, truncate=truncate
+            self,
+            monitor=monitor,
+            on_alarm=on_alarm,
+            release_after=release_after,
+            release_below=release_below,
+            max_override=max_override,
+            truncate=truncate,
         )
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
             raise TypeError(f"NeuralASMSafety needs a Box action space, got {env.action_space}")
         if release_after < 1:
             raise ValueError(f"release_after must be at least 1, got {release_after}")
+        if not 0.0 < release_below <= 1.0:
+            raise ValueError(f"release_below must be in (0, 1], got {release_below}")
+        if max_override is not None and max_override < 1:
+            raise ValueError(f"max_override must be at least 1, got {max_override}")
         self._source = StreamSource(env)
         monitor.spec.require(self._source.spec, "the monitor")
         self.monitor = monitor
         self.threshold = monitor.threshold
-        self.release_after = release_after
+        self.release_after, self.max_override = release_after, max_override
+        self.release_below = release_below
         self._ends = "truncated" if truncate else "terminated"
         self._on_alarm = on_alarm if isinstance(on_alarm, str) else "policy"
         self._reflex = _reflex(on_alarm, env)
@@ -75,7 +99,9 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         observation, info = self.env.reset(seed=seed, options=options)
         self._state = self.monitor.initial_state(batch=1)
         self._observation = observation
-        self._overriding, self._quiet, self._reflex_state = False, 0, None
+        self._overriding, self._quiet, self._reflex_state, self._acted = False, 0, None, 0
+        if isinstance(self._reflex, Hold):
+            self._reflex.reset()
         self._fresh = False
         self._ended = False
         none = np.zeros((1, self.monitor.spec.size))
@@ -91,8 +117,13 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         row = self._source.row(observation, executed, info)
         self._state, surprise = self.monitor.observe(self._state, row[None])
         alarm = self._report(info, surprise, executed, intervened)["asm"]["alarm"]
-        self._arbitrate(alarm, executed)
-        if alarm and self._on_alarm == "terminate":
+        if isinstance(self._reflex, Hold):
+            self._reflex.feel(row, executed, intervened)
+        self._acted = self._acted + 1 if intervened else 0
+        self._arbitrate(float(surprise.value[0]), executed)
+        gave_up = intervened and self._overriding and self._acted == self.max_override
+        info["asm"]["gave_up"] = gave_up
+        if gave_up or (alarm and self._on_alarm == "terminate"):
             terminated, truncated = terminated or self._ends == "terminated", truncated or self._ends == "truncated"
         self._ended = bool(terminated or truncated)
         return observation, reward, terminated, truncated, info
@@ -106,11 +137,15 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         )
         return np.asarray(action, dtype=np.float32)
 
-    def _arbitrate(self, alarm: bool, executed: NDArray[np.float32]) -> None:
+    def _arbitrate(self, surprise: float, executed: NDArray[np.float32]) -> None:
         """Who acts next."""
         if self._reflex is None:
             return
-        self._quiet = 0 if alarm else self._quiet + 1
+        alarm = surprise > self.threshold
+        quiet = surprise <= self.threshold * (self.release_below if self._overriding else 1.0)
+        self._quiet = self._quiet + 1 if quiet else 0
+        if alarm and hasattr(self.monitor, "resynchronise"):
+            self._state = self.monitor.resynchronise(self._state)
         if alarm and not self._overriding:
             self._overriding = self._fresh = True
             # Our own reflexes start from what was last done; a user's policy starts as in a new episode.
@@ -129,6 +164,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             "threshold": self.threshold,
             "alarm": alarm,
             "intervened": intervened,
+            "gave_up": False,
             "executed_action": executed,
             "attribution": dict(zip(self.monitor.spec.labels, surprise.attribution[0].tolist(), strict=True)),
         }

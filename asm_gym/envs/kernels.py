@@ -27,8 +27,8 @@ MOTOR = slice(JOINTS, 2 * JOINTS)
 WRENCH = slice(2 * JOINTS, 2 * JOINTS + 6)
 CONTACT = slice(2 * JOINTS + 6, 2 * JOINTS + 9)
 VELOCITY = slice(2 * JOINTS + 9, 2 * JOINTS + 15)
-EXTERNAL = slice(2 * JOINTS + 15, 2 * JOINTS + 18)
-SAMPLE = EXTERNAL.stop
+OUTSIDE = slice(2 * JOINTS + 15, 2 * JOINTS + 18)
+SAMPLE = OUTSIDE.stop
 
 # MuJoCo's own functions, linked by name so that the compiled loop can be cached on disk.
 binding.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))

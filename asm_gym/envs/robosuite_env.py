@@ -118,6 +118,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._ended = True
         self._steps = 0
 
+        self.controller = controller if isinstance(controller, str) else "custom"
+        """Of the arms, by name."""
         self.robosuite_env: Any = backend.make(self.task, self.robots, controller, control_freq, reward_shaping)
         """The simulator underneath."""
         for name in (camera, *cameras):
@@ -245,6 +247,25 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """
         self._action = self._checked(action)
         self.simulation.command(self._delivered(self._action))
+
+    def action_for(self, turns: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+        """The action that moves the arms' joints by ``turns`` from where they are, as nearly as one step can.
+
+        Args:
+            turns: [rad] for every joint of every arm, from the base on.
+
+        Returns:
+            (A,) in [-1, 1]; 0 for grippers.
+
+        Raises:
+            ValueError: the controller is neither OSC_POSE nor JOINT_POSITION.
+        """
+        if self.controller not in ("OSC_POSE", "JOINT_POSITION"):
+            raise ValueError(f"actions of OSC_POSE and JOINT_POSITION are changes, those of {self.controller} are not")
+        action = np.zeros(self.action_space.shape, np.float32)  # type: ignore[arg-type]
+        for part, motion in self.simulation.motions(np.asarray(turns, np.float64)):
+            action[part] = np.clip(motion, -1.0, 1.0)
+        return action
 
     def _checked(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         action = np.asarray(action, dtype=np.float32)

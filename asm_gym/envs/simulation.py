@@ -156,6 +156,26 @@ class Simulation:
 
     # ------------------------------------------------------------------ knowledge of the robot
 
+    def motions(self, turns: NDArray[np.float64]) -> list[tuple[slice, NDArray[np.float64]]]:
+        """For each arm, its part of the action, and that part's values for a change of its joints [rad]."""
+        found, joint, start = [], 0, 0
+        for a, (robot, arm) in enumerate(self._parts):
+            low, high = robot._action_split_indexes[arm]
+            n, controller = int(self._arms.joints[a]), self._controllers[a]
+            move = turns[joint : joint + n]
+            if controller.name != "JOINT_POSITION":
+                jacobian = np.zeros((6, self.model.nv))
+                mujoco.mj_jacSite(self.model, self.data, jacobian[:3], jacobian[3:], int(self._arms.site[a]))
+                hand = jacobian[:, self._arms.dofs[a, :n]] @ move
+                base = int(self._arms.base[a])
+                frame = np.eye(3) if base < 0 else self.data.site_xmat[base].reshape(3, 3)
+                move = np.concatenate([frame.T @ hand[:3], frame.T @ hand[3:]])
+            middle, half = (f(controller.output_max, controller.output_min) / 2 for f in (np.add, np.subtract))
+            found.append((slice(start + low, start + high), (move - middle) / half))
+            joint += n
+            start += robot.action_dim
+        return found
+
     def _nominal(self) -> Nominal:
         """The dynamics the robot believes in: the live ones, until somebody edits its masses."""
         if not any(kernels.edited(self._live[n], self._frozen[n], self._robots) for n in _INERTIA):

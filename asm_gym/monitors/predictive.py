@@ -117,6 +117,11 @@ class PredictiveMonitor(CalibratedMonitor):
         evidence, _, parts = self.detector_.step(state.evidence, errors, context)
         return PredictiveState(model, evidence), self.attribute(parts)
 
+    def resynchronise(self, state: PredictiveState) -> PredictiveState:
+        """The state with the evidence so far forgotten, after an alarm that was acted on; the model goes on."""
+        evidence = state.evidence
+        return PredictiveState(state.model, evidence._replace(vector=np.zeros_like(evidence.vector)))
+
     def attribute(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
         """(B, D) each number's share, from each error's (B, X)."""
         shares = np.zeros((self.spec.size, len(parts)))

@@ -1,0 +1,267 @@
+"""Lets reflexes act on the alarms of a memory that an evaluation has fitted: what is gained, what it costs.
+
+Every faulty episode is run with the policy alone and with each reflex, paired by seed, on the real simulator. Reads the
+folder of ``asm-gym evaluate`` for nominal episodes to learn from and to calibrate on.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from asm_gym.choices import check_choice
+from asm_gym.envs.robosuite_env import RobosuiteEnv
+from asm_gym.evaluation.archive import Recording, read
+from asm_gym.evaluation.reactions import Comparison, Estimate, Reaction, compare
+from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.trace import POLICY_ALONE
+from asm_gym.faults import Fault, Push
+from asm_gym.faults.suite import KINDS, draw, suite_fault
+from asm_gym.monitors import NeuralASM
+from asm_gym.policies import make_policy, rollout
+from asm_gym.scripts.dispatch import Crew, dispatch, environment
+from asm_gym.scripts.judge import fitted
+from asm_gym.scripts.progress import stage
+from asm_gym.scripts.publish import markdown
+from asm_gym.scripts.record import draw_onset, episode_seeds
+from asm_gym.wrappers import FaultInjection, NeuralASMSafety
+from asm_gym.wrappers.safety import ON_ALARM
+
+NOMINAL, PASSING = "nominal", "passing_push"
+FAULTS = (NOMINAL, PASSING, "collision", "held_by_person", "stuck_joint", "encoder_bias")
+
+
+@dataclass(frozen=True)
+class Args:
+    """Reflexes x faults: success, force, and time in alarm, against the policy alone."""
+
+    run: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
+    """Folder of an evaluation, whose nominal episodes the memory learns from."""
+    tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan", "Door")
+    """Names of tasks; the evaluation must have recorded them."""
+    robot: str = "Panda"
+    """The arm."""
+    policy: str = "scripted"
+    """What acts: scripted, or the path of an agent."""
+    reflexes: tuple[str, ...] = ("hold", "retract", "comply", "graded", "terminate")
+    """What ``on_alarm`` takes."""
+    faults: tuple[str, ...] = FAULTS
+    """nominal, passing_push (30 N for 0.3 s), or kinds of the suite, which are strong."""
+    episodes: int = 12
+    """Of each task, fault and reflex."""
+    max_override_s: float = 3.0
+    """How long a reflex may act at a stretch before the episode is ended [s]."""
+    false_alarm_rate: float = 0.01
+    """Share of nominal episodes that may raise an alarm."""
+    workers: int = 2
+    """Processes."""
+    seed: int = 0
+    """Of the evaluation, of the memory and of the episodes."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/react")
+    """Folder of the results."""
+
+    def __post_init__(self) -> None:
+        for name in self.reflexes:
+            check_choice("reflex", name, ON_ALARM)
+        for name in self.faults:
+            check_choice("fault", name, (NOMINAL, PASSING, *KINDS))
+        if self.episodes < 1:
+            raise ValueError(f"episodes must be at least 1, got {self.episodes}")
+        if not self.max_override_s > 0:
+            raise ValueError(f"max_override_s must be > 0, got {self.max_override_s}")
+
+
+@dataclass(frozen=True)
+class Bout:
+    """One episode to run."""
+
+    task: str
+    fault: str
+    acting: str
+    seed: int
+
+
+def learned_from(args: Args) -> NeuralASM:
+    """The memory, fitted and calibrated on what the evaluation recorded of these tasks.
+
+    Raises:
+        ValueError: it recorded too little.
+    """
+
+    def role(name: str) -> list[Recording]:
+        paths = [p for task in args.tasks for p in sorted((args.run / "episodes" / task / name).glob("*.npz"))]
+        return [r for r in map(read, paths) if r.episode.success]
+
+    fit = role("fit")
+    if not fit:
+        raise ValueError(f"{args.run} has no recordings of {', '.join(args.tasks)}: run asm-gym evaluate first")
+    memory = fitted(args.out, "neural_asm", fit, args.seed)
+    assert isinstance(memory, NeuralASM)
+    return memory.calibrate([r.episode for r in role("calibration")], args.false_alarm_rate)
+
+
+def bouts(args: Args) -> list[Bout]:
+    """Every episode, those that share a task and a fault side by side."""
+    return [
+        Bout(task, fault, acting, seed)
+        for task in args.tasks
+        for fault in args.faults
+        for seed in episode_seeds(args.seed, task, "react", args.episodes)
+        for acting in (POLICY_ALONE, *args.reflexes)
+    ]
+
+
+@lru_cache(maxsize=1)
+def _memory(path: Path, written_ns: int) -> NeuralASM:
+    """Loaded once a process, and again when the file has been written anew."""
+    return NeuralASM.load(path)
+
+
+def _fault(kind: str, env: RobosuiteEnv, onset: int, seed: int) -> tuple[Fault, ...]:
+    if kind == NOMINAL:
+        return ()
+    if kind == PASSING:
+        drawn = draw(env, onset, seed)
+        duration = max(1, round(0.3 / env.stream_spec.dt))
+        return (Push(body=drawn.link, newtons=30.0, direction=drawn.direction, duration=duration, onset=onset),)
+    return (suite_fault(kind, env, "strong", onset, seed),)
+
+
+def bout(one: Bout, args: Args, memory: Path) -> Reaction:
+    """Runs one episode in this process's environment."""
+    base = environment(f"asm_gym/{one.task}-v0", (("robot", args.robot),))
+    inner: Any = base.unwrapped
+    monitor = _memory(memory, memory.stat().st_mtime_ns)
+    dt = monitor.spec.dt
+    onset = draw_onset(one.seed, inner.horizon)
+    alone = one.acting == POLICY_ALONE
+    env = NeuralASMSafety(
+        FaultInjection(base, _fault(one.fault, inner, onset, one.seed)),
+        monitor,
+        on_alarm="monitor" if alone else one.acting,
+        max_override=None if alone else max(1, round(args.max_override_s / dt)),
+    )
+    infos: list[dict[str, Any]] = []
+    try:
+        success = rollout(env, make_policy(args.policy, env, seed=one.seed), one.seed, infos.append)
+    finally:
+        env.get_wrapper_attr("undo_faults")()
+    alarms = np.array([info["asm"]["alarm"] for info in infos])
+    since = infos[onset:]
+    raised = np.flatnonzero(alarms[onset:] & ~np.concatenate([[False], alarms])[onset:-1])
+    last = infos[-1]["asm"]
+    return Reaction(
+        task=one.task,
+        fault=one.fault,
+        acting=one.acting,
+        seed=one.seed,
+        success=success,
+        peak_force=float(np.nanmax([info["external_force"] for info in since], initial=0.0)),
+        impulse=float(np.nansum([info["external_impulse"] for info in since])),
+        alarm_s=float(alarms.sum() * dt),
+        acted_s=sum(info["asm"]["intervened"] for info in infos) * dt,
+        delay_ms=1e3 * (raised[0] + 1) * dt if len(raised) and one.fault != NOMINAL else math.inf,
+        ended=bool(last["gave_up"] or (one.acting == "terminate" and last["alarm"])),
+    )
+
+
+def comparisons(reactions: Sequence[Reaction], args: Args) -> list[Comparison]:
+    """Each reflex under each fault, over all tasks."""
+
+    def of(fault: str, acting: str) -> list[Reaction]:
+        return [r for r in reactions if (r.fault, r.acting) == (fault, acting)]
+
+    return [compare(of(f, POLICY_ALONE), of(f, r), args.seed) for f in args.faults for r in args.reflexes]
+
+
+def table(found: Sequence[Comparison], args: Args) -> Table:
+    """A row for each fault and reflex."""
+    headings = (
+        *("Fault", "Reflex", "Success", "alone", "gained", "Peak force less by", "Impulse less by"),
+        *("In alarm [s]", "Ended", "Median delay [ms]"),
+    )
+    rows = [
+        (
+            c.fault.replace("_", " "),
+            c.acting,
+            f"{100 * c.success.value:.0f} %",
+            f"{100 * c.alone.value:.0f} %",
+            _percent(c.gained),
+            _percent(c.peak) if c.fault != NOMINAL else "",
+            _percent(c.impulse) if c.fault != NOMINAL else "",
+            f"{c.alarm_s:.2f}",
+            f"{c.ended.k} of {c.ended.n}",
+            "" if c.fault == NOMINAL else f"{c.median_delay_ms:.0f}" if math.isfinite(c.median_delay_ms) else "missed",
+        )
+        for c in found
+    ]
+    return Table(
+        f"Reflexes against the policy alone, paired by seed, {args.episodes} episodes of each of "
+        f"{', '.join(args.tasks)}; force on the arm from outside since the onset; in brackets 95 % bootstrap "
+        "intervals.",
+        headings,
+        rows,
+    )
+
+
+def _percent(e: Estimate) -> str:
+    if math.isnan(e.value):
+        return ""
+    return f"{100 * e.value:.0f} % ({100 * e.low:.0f} to {100 * e.high:.0f})"
+
+
+def react(args: Args, console: Console) -> Table:
+    """Fits, runs, compares and writes."""
+    seconds: dict[str, float] = {}
+    args.out.mkdir(parents=True, exist_ok=True)
+    with stage("fitting and calibrating", console, seconds):
+        memory = args.out / "memory.asm"
+        learned_from(args).save(memory)
+    with stage("acting", console, seconds) as progress:
+        run: Callable[[Bout], Reaction] = partial(bout, args=args, memory=memory.resolve())
+        reactions = dispatch(run, bouts(args), Crew(args.workers), progress)
+    found = comparisons(reactions, args)
+    made = table(found, args)
+    (args.out / "reactions.md").write_text(markdown(made) + "\n", encoding="utf-8")
+    settings = {f.name: getattr(args, f.name) for f in fields(args)}
+    content = {
+        "settings": json.loads(json.dumps(settings, default=str)),
+        "seconds": seconds,
+        "episodes": [{k: None if v == math.inf else v for k, v in asdict(r).items()} for r in reactions],
+    }
+    (args.out / "reactions.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the comparison; 2 where the arguments make no sense."""
+    console = Console()
+    try:
+        args = tyro.cli(Args, args=argv, prog="asm-gym react", description=__doc__)
+        made = react(args, console)
+    except ValueError as error:
+        print(f"asm-gym react: {error}", file=sys.stderr)
+        return 2
+    shown = RichTable()
+    for heading in made.headings:
+        shown.add_column(heading)
+    for row in made.rows:
+        shown.add_row(*map(str, row))
+    console.print(shown)
+    console.print(f"Wrote {args.out / 'reactions.md'} and {args.out / 'reactions.json'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
