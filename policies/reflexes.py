@@ -131,7 +131,7 @@ class Comply(Hold):
         ValueError: the environment measures no external torque, or its controller cannot be told to move so.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], compliance: float = 0.2, tolerated: float = 1.0) -> None:
+    def __init__(self, env: gym.Env[Any, Any], compliance: float = 0.05, tolerated: float = 2.0) -> None:
         super().__init__(env)
         _require_deltas(env, "comply")
         spec: StreamSpec = env.get_wrapper_attr("stream_spec")
@@ -173,7 +173,7 @@ class Graded(Comply):
     The arguments are those of ``Comply``, with more torque tolerated.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], compliance: float = 0.2, tolerated: float = 3.0) -> None:
+    def __init__(self, env: gym.Env[Any, Any], compliance: float = 0.05, tolerated: float = 4.0) -> None:
         super().__init__(env, compliance, tolerated)
 
 

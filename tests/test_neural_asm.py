@@ -317,3 +317,31 @@ def test_a_monitor_is_made_by_name():
     assert monitor.hidden_size == 7
     with pytest.raises(ValueError, match=r"unknown monitor 'oracle'; known: .*neural_asm"):
         make_monitor("oracle", sine_spec())
+
+
+def test_the_running_skill_is_told_by_name_and_changes_nothing_else(asm, tmp_path):
+    def labelled(count, seed):
+        made = []
+        for n, e in enumerate(sine_episodes(count, seed=seed)):
+            stream = e.stream.copy()
+            stream[:, :4] += 2.0 * (n % 2)  # the second skill is elsewhere
+            made.append(replace(e, stream=stream, info={"skill": ("near", "far")[n % 2]}))
+        return made
+
+    memory = NeuralASM(sine_spec(), **SMALL).fit(labelled(30, 0))
+    before = memory.score(labelled(1, 1)[0]).value
+    memory.name_skills(labelled(30, 0))
+    np.testing.assert_array_equal(memory.score(labelled(1, 1)[0]).value, before)
+    memory.save(tmp_path / "m.asm")
+    memory = NeuralASM.load(tmp_path / "m.asm")
+    right = []
+    for e in labelled(20, 2):
+        state = memory.initial_state()
+        for row in e.stream[:20]:
+            state, surprise = memory.observe(state, row[None])
+        right.append(surprise.skill[0] == e.info["skill"])
+    assert np.mean(right) > 0.95
+    with pytest.raises(ValueError, match="does not say its skill"):
+        memory.name_skills(sine_episodes(2))
+    with pytest.raises(ValueError, match="two skills"):
+        memory.name_skills(labelled(2, 0)[:1])

@@ -22,10 +22,12 @@ class Surprise(NamedTuple):
     Attributes:
         value: (B,) what the threshold applies to; ``inf`` where the row was not finite.
         attribution: (B, D) each number's share; adds up to ``value`` along the last axis.
+        skill: (B,) the name of the skill that seems to be running, for people to read; None where none was named.
     """
 
     value: NDArray[np.float64]
     attribution: NDArray[np.float64]
+    skill: NDArray[np.str_] | None = None
 
 
 class Monitor(Protocol):

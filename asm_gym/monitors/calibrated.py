@@ -34,6 +34,7 @@ class CalibratedMonitor(ABC):
     Attributes:
         learned_: what ``fit`` has found, by name; empty before.
         threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
+        skills_: names of skills, where it was told any.
     """
 
     kind: ClassVar[str]
@@ -51,6 +52,7 @@ class CalibratedMonitor(ABC):
         self.seed = int(seed)
         self.threshold_: float | None = None
         self.learned_: dict[str, NDArray[Any]] = {}
+        self.skills_: tuple[str, ...] = ()
 
     @abstractmethod
     def learn(self, streams: Sequence[NDArray[np.float32]], progress: Progress) -> dict[str, NDArray[Any]]:
@@ -162,8 +164,13 @@ class CalibratedMonitor(ABC):
     def save(self, path: str | Path) -> None:
         """Writes everything learned to one file: arrays and JSON."""
         self._fitted()
-        header = {"spec": self.spec.to_json(), "hyperparameters": self.get_params(), "threshold": self.threshold_}
-        header["shapes"] = {name: list(array.shape) for name, array in self.learned_.items()}
+        header = {
+            "spec": self.spec.to_json(),
+            "hyperparameters": self.get_params(),
+            "threshold": self.threshold_,
+            "skills": list(self.skills_),
+            "shapes": {name: list(array.shape) for name, array in self.learned_.items()},
+        }
         write_checkpoint(path, self.kind, header, self.learned_)
 
     @classmethod
@@ -177,7 +184,7 @@ class CalibratedMonitor(ABC):
         saved = read_checkpoint(path, cls.kind)
         try:
             monitor = cls(StreamSpec.from_json(saved.header["spec"]), **saved.header["hyperparameters"])
-            monitor.threshold_ = saved.header["threshold"]
+            monitor.threshold_, monitor.skills_ = saved.header["threshold"], tuple(saved.header["skills"])
             shapes = saved.header["shapes"]
             monitor.learned_ = {name: saved.array(name, *shape) for name, shape in shapes.items()}
             monitor.build()

@@ -7,19 +7,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
+from threadpoolctl import threadpool_limits
 
+from asm_gym.detection import LATELY
+from asm_gym.episodes import Episode
 from asm_gym.memory.association import Association, association_shapes
 from asm_gym.memory.energy import activate
 from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, train
+from asm_gym.memory.readout import certainty, learn_readout
 from asm_gym.memory.senses import Senses
+from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated import Progress, require
-from asm_gym.monitors.predictive import BOUND, GAINS, PredictiveMonitor
+from asm_gym.monitors.predictive import BOUND, GAINS, PredictiveMonitor, PredictiveState
 from asm_gym.stream import StreamSpec
 
 
@@ -107,6 +113,7 @@ class NeuralASM(PredictiveMonitor):
         trajectories = [Trajectory(r.senses, r.commands, r.inputs) for r in readings]
         schedule = Schedule(*(getattr(self, name) for name in Schedule._fields))
         sizes = self.hidden_size, self._units_each(senses)
+        self.skills_ = ()
         trained = train(trajectories, senses.groups, senses.changes, *sizes, schedule, rng, progress)
         standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change, "energy": trained.energy}
         return {**standard, **trained.network.weights._asdict(), **trained.network.association._asdict()}
@@ -140,6 +147,41 @@ class NeuralASM(PredictiveMonitor):
         earlier = np.where(state.steps[:, None] > 1, state.earlier, before)
         step = self.network_.step(state.hidden, self.senses_.read(rows, before, earlier))
         return MemoryState(step.hidden, rows, before, state.steps + 1), step.error, activate(step.expected)
+
+    def name_skills(self, episodes: Sequence[Episode]) -> Self:
+        """Learns to tell which skill is running, from episodes whose ``info["skill"]`` says it.
+
+        Only ``surprise.skill`` depends on it: neither the weights nor the surprise do.
+
+        Raises:
+            ValueError: an episode says none, or all say the same.
+        """
+        self._fitted()
+        self._check(episodes)
+        names = [str(e.info.get("skill", "")) for e in episodes]
+        if "" in names:
+            raise ValueError(f"episode {names.index('')} does not say its skill: set info['skill']")
+        known = sorted(set(names))
+        if len(known) < 2:
+            raise ValueError(f"two skills at least are needed to tell them apart, got {', '.join(known)}")
+        contexts, skills = [], []
+        with threadpool_limits(1):
+            for name, run in zip(names, self._runs([e.stream for e in episodes]), strict=True):
+                lately = lfilter([LATELY], [1.0, LATELY - 1.0], run.contexts, axis=0)
+                contexts.append(lately.astype(np.float32))
+                skills.append(np.full(len(lately), known.index(name)))
+            rng = np.random.default_rng(self.seed)
+            W_K, b_K = learn_readout(np.concatenate(contexts), np.concatenate(skills), len(known), rng)
+        self.learned_ = self.learned_ | {"W_K": W_K, "b_K": b_K}
+        self.skills_ = tuple(known)
+        return self
+
+    def observe(self, state: PredictiveState, stream: NDArray[np.floating[Any]]) -> tuple[PredictiveState, Surprise]:
+        state, surprise = super().observe(state, stream)
+        if self.skills_:
+            p = certainty(state.evidence.context, self.learned_["W_K"], self.learned_["b_K"])
+            surprise = surprise._replace(skill=np.array(self.skills_)[p.argmax(axis=1)])
+        return state, surprise
 
     def _units_each(self, senses: Senses) -> int:
         """Hidden units of association for each group."""

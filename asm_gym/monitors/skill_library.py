@@ -44,7 +44,7 @@ class SkillLibrary(Rival):
     """A library of movement primitives; the arguments are those of ``PredictiveMonitor``.
 
     Attributes:
-        selected: number of the skill that a new state starts with, in the alphabetical order of their names.
+        selected: number of the skill in ``skills_`` that a new state starts with.
     """
 
     kind = "skill_library"
@@ -73,11 +73,11 @@ class SkillLibrary(Rival):
         for name in skills:
             own = [x for x, s in zip(xs, streams, strict=True) if self._skill[id(s)] == name] or xs
             learned.append(_learn(own, self._hand, 0.01 * overall))
-        arrays = {k: np.stack([one[k] for one in learned]) for k in learned[0]}
-        return arrays | {"names": np.array([[ord(c) for c in n.ljust(32)[:32]] for n in skills], np.float64)}
+        self.skills_ = tuple(skills)
+        return {k: np.stack([one[k] for one in learned]) for k in learned[0]}
 
     def build_model(self) -> None:
-        self.skills = ["".join(chr(int(c)) for c in row).strip() for row in self.learned_["names"]]
+        """Nothing to make: the arrays are used as they are."""
 
     def start_model(self, batch: int) -> _Running:
         nowhere = np.zeros((batch, len(self._hand)))
@@ -111,7 +111,7 @@ class SkillLibrary(Rival):
         scores: dict[int, Surprise] = {}
         for name in sorted({_name(e) for e in episodes}):
             own = [i for i, e in enumerate(episodes) if _name(e) == name]
-            self.selected = self.skills.index(name) if name in self.skills else 0
+            self.selected = self.skills_.index(name) if name in self.skills_ else 0
             scores.update(zip(own, super().score_episodes([episodes[i] for i in own]), strict=True))
         self.selected = 0
         return [scores[i] for i in range(len(episodes))]
