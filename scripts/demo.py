@@ -12,17 +12,15 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
-import gymnasium as gym
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table as RichTable
 
@@ -31,17 +29,14 @@ from asm_gym.evaluation import plots
 from asm_gym.evaluation.metrics import Row, Share, binomial_interval, summarise
 from asm_gym.evaluation.report import detection_table, headline, outcome_table, write_report
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
-from asm_gym.evaluation.video import write_video
 from asm_gym.faults import Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
-from asm_gym.policies import make_policy, rollout
-from asm_gym.scripts import doctor
 from asm_gym.scripts.collect import collect, episode_seeds
-from asm_gym.scripts.dispatch import Progress, dispatch
+from asm_gym.scripts.dispatch import dispatch
+from asm_gym.scripts.film import Scene, film, prepare_film
 from asm_gym.scripts.progress import stage
-from asm_gym.scripts.watch import Trial, guarded, watch_pair
+from asm_gym.scripts.watch import Trial, watch_pair
 from asm_gym.tasks import task
-from asm_gym.wrappers import SurpriseOverlay
 
 WINDOW_S = 1.0
 """How soon after its onset a fault must be noticed to count as detected [s]."""
@@ -162,23 +157,10 @@ def observe_latency_us(memory: NeuralASM, calls: int = 2000) -> dict[str, float]
     return {"median": round(float(median), 1), "p95": round(float(p95), 1)}
 
 
-def film(args: Args, memory: NeuralASM, shown: list[Trial], path: Path, progress: Progress) -> Path:
-    """A video of the trials, one after the other, surprise under the picture."""
-
-    def frames() -> Iterator[NDArray[np.uint8]]:
-        env = gym.make(args.task, render_mode="rgb_array", camera="agentview", render_size=(512, 640))
-        for k, trial in enumerate(shown):
-            caption = f"{trial.condition}, {trial.acting}"
-            watched = SurpriseOverlay(guarded(env, memory, trial), caption=caption)
-            pictures: list[NDArray[np.uint8]] = []
-            policy = make_policy("scripted", watched, seed=trial.seed)
-            rollout(watched, policy, trial.seed, lambda _, p=pictures, w=watched: p.append(w.render()))  # type: ignore[misc]
-            watched.get_wrapper_attr("undo_faults")()
-            yield from pictures
-            progress(k + 1, len(shown))
-        env.close()
-
-    return write_video(path, frames(), fps=1.0 / memory.spec.dt)
+def scene(args: Args, trial: Trial) -> Scene:
+    """What to film of a trial."""
+    on_alarm = "monitor" if trial.acting == POLICY_ALONE else trial.acting
+    return Scene(args.task, f"{trial.condition}, {trial.acting}", trial.seed, lambda _: trial.faults, on_alarm)
 
 
 def typical(traces: list[Trace]) -> list[Trace]:
@@ -274,17 +256,6 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def prepare_film(console: Console) -> bool:
-    """Whether this machine can render and encode; says what it lacks, and the command that installs it."""
-    needed = (doctor.rendering(), doctor.encoder())
-    for check in needed:
-        if not check.ok:
-            console.print(f"[yellow]{check.detail}. To have one: {check.remedy}[/yellow]")
-    if doctor.rendering_backend() == "osmesa":
-        os.environ["MUJOCO_GL"] = "osmesa"  # before this process loads robosuite, which would choose EGL
-    return all(check.ok for check in needed)
-
-
 def run(args: Args, console: Console) -> list[Row]:
     """The whole demo."""
     args = args.scaled()
@@ -319,7 +290,8 @@ def run(args: Args, console: Console) -> list[Row]:
         examples = {(t.condition, t.seed) for t in typical(traces)}
         shown = [t for t in todo if (t.condition, t.seed) in examples]
         with timed("filming") as progress:
-            video = film(args, memory, shown, folder / "demo.mp4", progress)
+            scenes = [scene(args, trial) for trial in shown]
+            video = film(scenes, memory, folder / "demo.mp4", progress)
     write_json(folder / "demo.json", args, rows, expert, latency, seconds)
     write_report(
         folder / "report.html",

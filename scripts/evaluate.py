@@ -24,16 +24,20 @@ import asm_gym
 from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation.archive import Label
-from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, possible
+from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, possible, suite_fault
 from asm_gym.monitors import MONITORS
 from asm_gym.scripts.dispatch import Crew, Progress, dispatch
-from asm_gym.scripts.judge import Judgement, judge
+from asm_gym.scripts.film import Scene, film, prepare_film
+from asm_gym.scripts.judge import Judgement, calibrated, judge
 from asm_gym.scripts.progress import stage
 from asm_gym.scripts.publish import console_tables, publish
 from asm_gym.scripts.record import EXECUTIONS, Course, draw_onset, episode_seeds, record
 from asm_gym.tasks import task as task_spec
 
 _HARMLESS = (*HARMLESS, *EXECUTIONS)
+FILMED = 2
+"""Typical episodes in the film."""
+
 _QUICK = ("neural_asm", "logpzo", "kalman+evidence", "autoregression", "external_torque_limit", "force_limit")
 """Monitors that are fitted in seconds."""
 
@@ -80,6 +84,8 @@ class Args:
     """Of everything."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
     """Folder of the run."""
+    video: bool = True
+    """Film two typical episodes, where this machine can render."""
     quick: bool = False
     """Three tasks, few monitors and few episodes: to see that everything runs, not to judge the figures."""
 
@@ -193,6 +199,26 @@ def claim(args: Args) -> None:
     path.write_text(json.dumps(ours, indent=2) + "\n", encoding="utf-8")
 
 
+def film_examples(args: Args, judgement: Judgement, wanted: Sequence[Label], progress: Progress) -> Path:
+    """The first of the typical episodes, as the first monitor saw them."""
+    name = args.monitors[0]
+    monitor = calibrated(args.out, name, wanted, args.seed, judgement.thresholds[name][args.false_alarm_rate])
+    after = round(Course().after_s / monitor.spec.dt)
+    scenes = [
+        Scene(
+            f"asm_gym/{label.task}-v0",
+            f"{label.severity} {label.kind.replace('_', ' ')}",
+            label.seed,
+            lambda env, x=label: [suite_fault(x.kind, env, x.severity, x.onset or 0, x.seed)],  # type: ignore[misc]
+            steps=(label.onset or 0) + after,
+            policy=args.policy,
+            robot=args.robot,
+        )
+        for label in judgement.shown[:FILMED]
+    ]
+    return film(scenes, monitor, args.out / "examples.mp4", progress)
+
+
 def evaluate(args: Args, console: Console) -> Judgement:
     """Records, fits, judges and publishes."""
     seconds: dict[str, float] = {}
@@ -204,10 +230,14 @@ def evaluate(args: Args, console: Console) -> Judgement:
     with stage("fitting and judging", console, seconds) as progress:
         how = args.false_alarm_rate, args.window, args.seed, args.crew
         judgement = judge(args.out, wanted, args.monitors, *how, progress)
+    video = None
+    if args.video and judgement.shown and prepare_film(console):
+        with stage("filming", console, seconds) as progress:
+            video = film_examples(args, judgement, wanted, progress)
     with stage("drawing", console, seconds):
         details = json.loads(json.dumps(asdict(args), default=str))
         details |= {"python": platform.python_version(), "machine": platform.machine(), "seconds": seconds}
-        publish(args.out, judgement, details)
+        publish(args.out, judgement, details, video)
     return judgement
 
 

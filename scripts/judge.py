@@ -44,6 +44,7 @@ class Judgement:
         rate, window_s: the run's own.
         failed: nominal episodes that did not succeed; they are left out.
         examples: a typical faulty episode of some kinds, as the first monitor saw it.
+        shown: which those are.
     """
 
     verdicts: Mapping[str, Sequence[Verdict]]
@@ -54,6 +55,7 @@ class Judgement:
     window_s: float
     failed: int = 0
     examples: Sequence[Trace] = ()
+    shown: Sequence[Label] = ()
 
     @cached_property
     def visible(self) -> dict[tuple[str, str], bool]:
@@ -94,7 +96,7 @@ class _Opinion(NamedTuple):
     verdicts: list[Verdict]
     harmless: list[Verdict]
     thresholds: dict[float, float]
-    examples: list[Trace]
+    examples: dict[Label, Trace]
 
 
 def judge(
@@ -133,7 +135,8 @@ def judge(
         rate,
         window_s,
         failed,
-        opinions[monitors[0]].examples,
+        list(opinions[monitors[0]].examples.values()),
+        list(opinions[monitors[0]].examples),
     )
 
 
@@ -188,6 +191,14 @@ def fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) 
     return monitor
 
 
+def calibrated(folder: Path, name: str, labels: Sequence[Label], seed: int, threshold: float) -> Any:
+    """The monitor as it judged the run, with the threshold it judged by."""
+    by_role, _, _ = _by_role(folder, [label for label in labels if label.role in NOMINAL])
+    monitor: Any = fitted(folder, name, by_role["fit"], seed)
+    monitor.threshold_ = threshold
+    return monitor
+
+
 def _scores(monitor: Any, recordings: Sequence[Recording]) -> list[Any]:
     return list(monitor.score_episodes([r.episode for r in recordings])) if recordings else []
 
@@ -218,7 +229,7 @@ def _verdicts(name: str, monitor: Monitor, recordings: Sequence[Recording], thre
 
 def _examples(
     monitor: Any, verdicts: Sequence[Verdict], recordings: Sequence[Recording], threshold: float
-) -> list[Trace]:
+) -> dict[Label, Trace]:
     """Of each of a few kinds, at its strongest, the episode with the median delay."""
     chosen = []
     for kind in EXAMPLES:
@@ -227,25 +238,23 @@ def _examples(
         if own:
             late = sorted((math.inf if (a := verdicts[i].detected_after(threshold)) is None else a, i) for i in own)
             chosen.append(late[(len(late) - 1) // 2][1])
-    traces = []
+    traces = {}
     for i in chosen:
         label, episode = recordings[i].label, recordings[i].episode
         surprise = monitor.score(episode)
-        traces.append(
-            Trace(
-                condition=" ".join([label.severity, label.kind.replace("_", " "), "in", label.task]),
-                acting=POLICY_ALONE,
-                seed=label.seed,
-                dt=episode.spec.dt,
-                threshold=threshold,
-                surprise=surprise.value,
-                alarm=surprise.value > threshold,
-                fault=episode.faults,
-                contact_force=recordings[i].contact_force,
-                attribution=surprise.attribution,
-                labels=episode.spec.labels,
-                success=episode.success,
-            )
+        traces[label] = Trace(
+            condition=" ".join([label.severity, label.kind.replace("_", " "), "in", label.task]),
+            acting=POLICY_ALONE,
+            seed=label.seed,
+            dt=episode.spec.dt,
+            threshold=threshold,
+            surprise=surprise.value,
+            alarm=surprise.value > threshold,
+            fault=episode.faults,
+            contact_force=recordings[i].contact_force,
+            attribution=surprise.attribution,
+            labels=episode.spec.labels,
+            success=episode.success,
         )
     return traces
 

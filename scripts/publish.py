@@ -68,7 +68,7 @@ def console_tables(judgement: Judgement) -> list[RichTable]:
     rate = judgement.rate
     summary = RichTable(title=f"found within {judgement.window_s:g} s at a false-alarm rate of {100 * rate:g} %")
     for i, heading in enumerate(("monitor", "AUROC", "found", "median [ms]", "alarms/h", "right channel")):
-        summary.add_column(heading, justify="left" if i == 0 else "right", no_wrap=True)
+        summary.add_column(heading, justify="left" if i == 0 else "right", no_wrap=i == 0)
     for name, cell in ((IDEAL, judgement.ideal()), *((s.monitor, s.cell) for s in judgement.scores)):
         score = next((s for s in judgement.scores if s.monitor == name), None)
         summary.add_row(
@@ -79,16 +79,14 @@ def console_tables(judgement: Judgement) -> list[RichTable]:
             f"{score.false_alarms_per_hour:.1f}" if score else "",
             _percent(score.attribution) if score else "",
         )
-    table = harmless_table(judgement)
-    harmless = RichTable(title="episodes with an alarm under harmless variations")
-    for i, heading in enumerate(table.headings):
-        harmless.add_column(heading, justify="left" if i == 0 else "right", no_wrap=True)
-    for row in table.rows:
-        harmless.add_row(*map(str, row))
+    first = next(iter(judgement.verdicts))
+    harmless = RichTable(title=f"episodes with an alarm of {first} under harmless variations")
+    for row in harmless_table(judgement).rows:
+        harmless.add_row(*map(str, row[:2]))
     return [summary, harmless]
 
 
-def publish(folder: Path, judgement: Judgement, details: Mapping[str, Any]) -> None:
+def publish(folder: Path, judgement: Judgement, details: Mapping[str, Any], video: Path | None = None) -> None:
     """Writes ``results.parquet``, ``results.json``, ``results.md`` and ``report.html``."""
     _write_parquet(folder / "results.parquet", judgement)
     tables = [main_table(judgement), kinds_table(judgement), harmless_table(judgement)]
@@ -123,7 +121,8 @@ def publish(folder: Path, judgement: Judgement, details: Mapping[str, Any]) -> N
         "healthy twin of every faulty episode and the sensors' noise: no monitor can do better than its row.",
         tables,
         figures,
-        details=details,
+        video,
+        details,
     )
 
 
