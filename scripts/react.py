@@ -11,34 +11,29 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table as RichTable
 
 from asm_gym.choices import check_choice
-from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.evaluation.archive import Recording, read
 from asm_gym.evaluation.reactions import Comparison, Estimate, Reaction, compare
 from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.trace import POLICY_ALONE
-from asm_gym.faults import Fault, Push
-from asm_gym.faults.suite import KINDS, draw, suite_fault
+from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import NeuralASM
-from asm_gym.policies import make_policy, rollout
-from asm_gym.scripts.dispatch import Crew, dispatch, environment
+from asm_gym.scripts.bout import NOMINAL, PASSING, Bout, run_bout
+from asm_gym.scripts.dispatch import Crew, dispatch
 from asm_gym.scripts.judge import fitted
 from asm_gym.scripts.progress import stage
 from asm_gym.scripts.publish import markdown
-from asm_gym.scripts.record import draw_onset, episode_seeds
-from asm_gym.wrappers import FaultInjection, NeuralASMSafety
+from asm_gym.scripts.record import episode_seeds
 from asm_gym.wrappers.safety import ON_ALARM
 
-NOMINAL, PASSING = "nominal", "passing_push"
 FAULTS = (NOMINAL, PASSING, "collision", "held_by_person", "stuck_joint", "encoder_bias")
 
 
@@ -82,16 +77,6 @@ class Args:
             raise ValueError(f"max_override_s must be > 0, got {self.max_override_s}")
 
 
-@dataclass(frozen=True)
-class Bout:
-    """One episode to run."""
-
-    task: str
-    fault: str
-    acting: str
-    seed: int
-
-
 def learned_from(args: Args) -> NeuralASM:
     """The memory, fitted and calibrated on what the evaluation recorded of these tasks.
 
@@ -120,60 +105,6 @@ def bouts(args: Args) -> list[Bout]:
         for seed in episode_seeds(args.seed, task, "react", args.episodes)
         for acting in (POLICY_ALONE, *args.reflexes)
     ]
-
-
-@lru_cache(maxsize=1)
-def _memory(path: Path, written_ns: int) -> NeuralASM:
-    """Loaded once a process, and again when the file has been written anew."""
-    return NeuralASM.load(path)
-
-
-def _fault(kind: str, env: RobosuiteEnv, onset: int, seed: int) -> tuple[Fault, ...]:
-    if kind == NOMINAL:
-        return ()
-    if kind == PASSING:
-        drawn = draw(env, onset, seed)
-        duration = max(1, round(0.3 / env.stream_spec.dt))
-        return (Push(body=drawn.link, newtons=30.0, direction=drawn.direction, duration=duration, onset=onset),)
-    return (suite_fault(kind, env, "strong", onset, seed),)
-
-
-def bout(one: Bout, args: Args, memory: Path) -> Reaction:
-    """Runs one episode in this process's environment."""
-    base = environment(f"asm_gym/{one.task}-v0", (("robot", args.robot),))
-    inner: Any = base.unwrapped
-    monitor = _memory(memory, memory.stat().st_mtime_ns)
-    dt = monitor.spec.dt
-    onset = draw_onset(one.seed, inner.horizon)
-    alone = one.acting == POLICY_ALONE
-    env = NeuralASMSafety(
-        FaultInjection(base, _fault(one.fault, inner, onset, one.seed)),
-        monitor,
-        on_alarm="monitor" if alone else one.acting,
-        max_override=None if alone else max(1, round(args.max_override_s / dt)),
-    )
-    infos: list[dict[str, Any]] = []
-    try:
-        success = rollout(env, make_policy(args.policy, env, seed=one.seed), one.seed, infos.append)
-    finally:
-        env.get_wrapper_attr("undo_faults")()
-    alarms = np.array([info["asm"]["alarm"] for info in infos])
-    since = infos[onset:]
-    raised = np.flatnonzero(alarms[onset:] & ~np.concatenate([[False], alarms])[onset:-1])
-    last = infos[-1]["asm"]
-    return Reaction(
-        task=one.task,
-        fault=one.fault,
-        acting=one.acting,
-        seed=one.seed,
-        success=success,
-        peak_force=float(np.nanmax([info["external_force"] for info in since], initial=0.0)),
-        impulse=float(np.nansum([info["external_impulse"] for info in since])),
-        alarm_s=float(alarms.sum() * dt),
-        acted_s=sum(info["asm"]["intervened"] for info in infos) * dt,
-        delay_ms=1e3 * (raised[0] + 1) * dt if len(raised) and one.fault != NOMINAL else math.inf,
-        ended=bool(last["gave_up"] or (one.acting == "terminate" and last["alarm"])),
-    )
 
 
 def comparisons(reactions: Sequence[Reaction], args: Args) -> list[Comparison]:
@@ -229,7 +160,8 @@ def react(args: Args, console: Console) -> Table:
         memory = args.out / "memory.asm"
         learned_from(args).save(memory)
     with stage("acting", console, seconds) as progress:
-        run: Callable[[Bout], Reaction] = partial(bout, args=args, memory=memory.resolve())
+        how = {"robot": args.robot, "policy": args.policy, "max_override_s": args.max_override_s}
+        run: Callable[[Bout], Reaction] = partial(run_bout, **how, memory=memory.resolve())  # type: ignore[arg-type]
         reactions = dispatch(run, bouts(args), Crew(args.workers), progress)
     found = comparisons(reactions, args)
     made = table(found, args)
