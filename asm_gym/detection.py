@@ -26,6 +26,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.compilation import compiled
 from asm_gym.memory.habituation import habituate
 
 Array = NDArray[np.floating[Any]]
@@ -38,6 +39,8 @@ LATELY = 0.2
 
 WORST = 0.99
 """Share of nominal episodes whose maximum of v stays below q."""
+
+TINY = float(np.finfo(np.float64).tiny)
 
 FAINTEST = 1e-9
 """Lower bound of s where its logarithm is taken."""
@@ -102,6 +105,51 @@ def pool(ratios: Array, power: float = POWER) -> tuple[NDArray[np.float64], NDAr
     total = powers.sum(axis=1, keepdims=True)
     pooled = greatest * total ** (1.0 / power)
     return pooled[:, 0], pooled * (powers / np.maximum(total, np.finfo(float).tiny))
+
+
+@compiled
+def _step(
+    vector: Any,
+    lately: Any,
+    steps: Any,
+    errors: Any,
+    context: Any,
+    whitening: Any,
+    ceiling: Any,
+    habit: Any,
+    gains: Any,
+    bound: float,
+) -> Any:
+    """All of the above in one go: the fields of the new evidence, the value (B,) and the shares (B, X)."""
+    B, X = errors.shape
+    G, C = len(gains), context.shape[1]
+    new, recent, value = np.empty((B, G, X)), np.empty((B, C)), np.empty(B)
+    ratios, shares = np.empty((G, X)), np.zeros((B, X))
+    whitened = np.dot(errors / np.sqrt(1.0 + (errors / bound) ** 2), whitening)
+    for n in range(B):
+        greatest = TINY
+        for g in range(G):
+            a = gains[g]
+            variance = a / (2.0 - a) * (1.0 - (1.0 - a) ** (2 * (steps[n] + 1)))
+            for i in range(X):
+                w = vector[n, g, i] + a * (whitened[n, i] - vector[n, g, i])
+                new[n, g, i] = w
+                ratios[g, i] = w * w / variance / ceiling[g, i]
+                greatest = max(greatest, ratios[g, i])
+        total = 0.0
+        for g in range(G):
+            for i in range(X):
+                part = (ratios[g, i] / greatest) ** POWER
+                shares[n, i] += part
+                total += part
+        drive = habit[2 * C]
+        for c in range(C):
+            recent[n, c] = lately[n, c] + LATELY * (context[n, c] - lately[n, c])
+            drive += context[n, c] * habit[c] + recent[n, c] * habit[C + c]
+        value[n] = greatest * total ** (1.0 / POWER) / np.exp(drive)
+        for i in range(X):
+            shares[n, i] *= value[n] / max(total, TINY)
+    return (new, recent, steps + 1), value, shares
 
 
 class Run(NamedTuple):
@@ -170,12 +218,17 @@ class Detector:
             errors: (B, X) normalised.
             context: (B, C).
         """
-        evidence = accumulate(evidence, bounded(errors, self.bound) @ self.whitening, context, self.gains)
-        ratios = strength(evidence, self.gains) / self.ceiling
-        pooled, parts = pool(ratios.reshape(len(ratios), -1))
-        C = context.shape[1]
-        usual = np.exp(context @ self.habit[:C] + evidence.context @ self.habit[C:-1] + self.habit[-1])
-        return evidence, pooled / usual, parts.reshape(ratios.shape).sum(axis=1) / usual[:, None]
+        new, value, shares = _step(
+            *evidence,
+            np.asarray(errors, np.float64),
+            np.asarray(context, np.float64),
+            self.whitening,
+            self.ceiling,
+            self.habit,
+            self.gains,
+            self.bound,
+        )
+        return Evidence(*new), value, shares
 
     def _strengths(self, run: Run) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """v (T, G, X) and the running mean of the contexts (T, C) of a whole episode."""

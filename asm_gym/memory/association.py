@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from asm_gym.memory.energy import Array, activate, kernel, outward
 from asm_gym.memory.learning import Synapse, coincidence, cosine_decay, shuffled
-from asm_gym.memory.precision import learn_precision
+from asm_gym.memory.precision import learn_precision, log_variance
 
 UPDATES, PASSES = 6000, 40
 """Batches learned from at most, and passes over the steps at most: with more, few steps would be learned by heart."""
@@ -94,6 +94,20 @@ def complete(f: Array, a: Array, U: Array, D: Array) -> Array:
     """Δ̂ (B, X) from hidden units ``f`` (B, M) and inputs ``a`` (B, I)."""
     out = outward(f, U)
     out += outward(a, D)
+    return out
+
+
+@kernel
+def normalised_errors(
+    inputs: Array, changes: Array, whole: Array, V: Array, U: Array, D: Array, W_S: Array, b_S: Array
+) -> Array:
+    """(Δ - Δ̂)/σ (B, X) for inputs (B, I) and changes (B, X); 0 where ``whole`` (B, 1) is."""
+    f = hidden_units(inputs, V)
+    out = complete(f, inputs, U, D)
+    spread = log_variance(f, W_S, b_S)
+    for n in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            out[n, i] = whole[n, 0] * (changes[n, i] - out[n, i]) * np.exp(np.float32(-0.5) * spread[n, i])
     return out
 
 

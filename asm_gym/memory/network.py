@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import TICKS, Association, complete, hidden_units, learn_association
+from asm_gym.memory.association import TICKS, Association, learn_association, normalised_errors
 from asm_gym.memory.energy import Array
 from asm_gym.memory.inference import Weights, expect, infer, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory, learn, passes
-from asm_gym.memory.precision import PRECISION_EPOCHS, log_variance
+from asm_gym.memory.precision import PRECISION_EPOCHS
 from asm_gym.memory.senses import Reading
 
 
@@ -88,11 +88,8 @@ class Network:
 
     def judge(self, inputs: Array, changes: Array, whole: Array) -> Array:
         """(B, X) errors of association over what is to be expected of them; arguments as in ``Reading``."""
-        w = self.association
-        f = hidden_units(inputs, w.V)
-        error = changes - complete(f, inputs, w.U, w.D)
-        normalised: Array = whole * error * np.exp(np.float32(-0.5) * log_variance(f, w.W_S, w.b_S))
-        return normalised
+        errors: Array = normalised_errors(inputs, changes, whole, *self.association)
+        return errors
 
 
 class Trained(NamedTuple):

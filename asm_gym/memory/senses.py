@@ -19,7 +19,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.compilation import compiled
 from asm_gym.stream import StreamSpec
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
 
 SLOW = 0.3
 """A channel is slow where a step's change is under this share of its spread."""
@@ -110,33 +114,69 @@ class Senses:
         earlier: NDArray[np.floating[Any]],
     ) -> Reading:
         """Rows (B, D), those that came just before, and those before them; what is not finite is unseen."""
-        sensory, motor, slow = self.spec.sensory, self.spec.motor, self.slow
-        rows, before, earlier = (np.asarray(r, np.float64) for r in (rows, before, earlier))
-        finite, known = np.isfinite(rows), np.isfinite(before)
-        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are cut off below, inf - inf is unseen
-            values = (rows - self.mean) / self.spread
-            last = (before - self.mean) / self.spread
-            steps = (rows - before) / self.change
-            earlier_steps = (before - earlier)[:, slow] / self.change[slow]
-        moved = finite & known
-        values = _bounded(np.where(finite, values, 0.0))
-        steps = _bounded(np.where(moved, steps, 0.0))
-        seen = np.concatenate([finite[:, sensory], moved[:, slow]], axis=1).astype(np.float32)  # (B, S)
-        commands = np.concatenate([values[:, motor], np.ones((len(rows), 1), np.float32)], axis=1)
-        known_steps = known[:, slow] & np.isfinite(earlier[:, slow])
-        past = _bounded(np.where(known, last, 0.0)), _bounded(np.where(known_steps, earlier_steps, 0.0))
-        changes = steps[:, sensory]
-        inputs = np.concatenate([past[0], changes, past[1], commands], axis=1)
-        inputs[np.abs(inputs) >= FARTHEST] = 0.0
-        senses = np.concatenate([values[:, sensory], steps[:, slow]], axis=1)
-        whole = (moved & np.isfinite(earlier)).all(axis=1, keepdims=True).astype(np.float32)
-        return Reading(senses, seen, commands, inputs, changes, whole, finite)
+        x, y, z = (np.ascontiguousarray(r, np.float64) for r in (rows, before, earlier))
+        sensory, motor = self.spec.sensory, self.spec.motor
+        return Reading(*_read(x, y, z, self.mean, self.spread, self.change, sensory, motor, self.slow))
 
 
-def _bounded(numbers: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Cut off at ``FARTHEST``; 0 where not a number."""
-    inside = np.minimum(np.maximum(np.where(np.isnan(numbers), 0.0, numbers), -FARTHEST), FARTHEST)
-    return np.ascontiguousarray(inside, np.float32)
+@compiled
+def _bounded(number: float) -> float:
+    """Cut off at ``FARTHEST``; what overflowed on both sides of a difference is there already."""
+    return 0.0 if number != number else min(max(number, -FARTHEST), FARTHEST)
+
+
+@compiled
+def _believed(number: float) -> float:
+    """0 where the number would be cut off."""
+    return number if abs(number) < FARTHEST else 0.0
+
+
+@compiled
+def _read(
+    rows: Floats,
+    before: Floats,
+    earlier: Floats,
+    mean: Floats,
+    spread: Floats,
+    change: Floats,
+    sensory: Ints,
+    motor: Ints,
+    slow: Ints,
+) -> tuple[Any, ...]:
+    """The fields of a ``Reading``, in order."""
+    B, D = rows.shape
+    X, A, L = len(sensory), len(motor), len(slow)
+    senses, seen = np.zeros((B, X + L), np.float32), np.zeros((B, X + L), np.float32)
+    commands = np.ones((B, A + 1), np.float32)
+    inputs, changes = np.zeros((B, D + X + L + A + 1), np.float32), np.zeros((B, X), np.float32)
+    whole, finite = np.ones((B, 1), np.float32), np.zeros((B, D), np.bool_)
+    for n in range(B):
+        for i in range(D):
+            finite[n, i] = np.isfinite(rows[n, i])
+            known = np.isfinite(before[n, i])
+            if not (finite[n, i] and known and np.isfinite(earlier[n, i])):
+                whole[n, 0] = 0.0
+            if known:
+                inputs[n, i] = _believed((before[n, i] - mean[i]) / spread[i])
+        for j in range(X):
+            i = sensory[j]
+            if finite[n, i]:
+                senses[n, j], seen[n, j] = _bounded((rows[n, i] - mean[i]) / spread[i]), 1.0
+                if np.isfinite(before[n, i]):
+                    changes[n, j] = _bounded((rows[n, i] - before[n, i]) / change[i])
+                    inputs[n, D + j] = _believed((rows[n, i] - before[n, i]) / change[i])
+        for j in range(L):
+            i = slow[j]
+            if finite[n, i] and np.isfinite(before[n, i]):
+                senses[n, X + j], seen[n, X + j] = _bounded((rows[n, i] - before[n, i]) / change[i]), 1.0
+            if np.isfinite(before[n, i]) and np.isfinite(earlier[n, i]):
+                inputs[n, D + X + j] = _believed((before[n, i] - earlier[n, i]) / change[i])
+        for j in range(A):
+            i = motor[j]
+            commands[n, j] = _bounded((rows[n, i] - mean[i]) / spread[i]) if finite[n, i] else 0.0
+            inputs[n, D + X + L + j] = commands[n, j] if abs(commands[n, j]) < FARTHEST else 0.0
+        inputs[n, D + X + L + A] = 1.0
+    return senses, seen, commands, inputs, changes, whole, finite
 
 
 def _spread(rows: NDArray[np.float64], mean: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
