@@ -141,3 +141,53 @@ def test_discrete_actions_are_refused():
 def test_stepping_before_reset_is_refused():
     with pytest.raises(gym.error.ResetNeeded):
         NeuralASMSafety(FakeEnv(), CueMonitor()).step(ACT)
+
+
+def test_a_reflex_that_acts_too_long_gives_up_and_ends_the_episode():
+    env = NeuralASMSafety(FakeEnv(), CueMonitor(range(2, 20)), on_alarm="hold", max_override=4)
+    env.reset(seed=0)
+    outs = [env.step(ACT) for _ in range(7)]
+    assert [o[4]["asm"]["gave_up"] for o in outs] == [False] * 6 + [True]
+    assert [o[2] for o in outs] == [False] * 6 + [True]
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(ACT)
+    outs = [env.reset(seed=0), *(env.step(ACT) for _ in range(4))]  # a new episode has its own patience
+    assert not outs[-1][2]
+
+
+def test_control_is_not_handed_back_before_surprise_is_well_below_the_threshold():
+    class Lingering(CueMonitor):
+        def observe(self, state, stream):
+            state, surprise = super().observe(state, stream)
+            value = {3: 0.9, 4: 0.9, 5: 0.5, 6: 0.5}.get(state - 1, surprise.value[0])
+            return state, surprise._replace(value=np.array([value]))
+
+    infos = run(NeuralASMSafety(FakeEnv(), Lingering([2]), on_alarm="hold", release_after=2, release_below=0.8), 9)
+    assert [i["asm"]["intervened"] for i in infos[1:]] == [False] * 3 + [True] * 4 + [False] * 2
+
+
+def test_evidence_that_was_acted_on_is_not_counted_again():
+    class Remembering(CueMonitor):
+        def resynchronise(self, state):
+            forgotten.append(state)
+            return state
+
+    forgotten: list[int] = []
+    run(NeuralASMSafety(FakeEnv(), Remembering([2, 4]), on_alarm="hold"), 8)
+    assert forgotten == [3, 5]
+    forgotten.clear()
+    run(NeuralASMSafety(FakeEnv(), Remembering([2, 4]), on_alarm="monitor"), 8)
+    assert not forgotten  # who only reports, reports all there is
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"release_below": 0.0}, "release_below"),
+        ({"release_below": 1.1}, "release_below"),
+        ({"max_override": 0}, "max_over"),
+    ],
+)
+def test_bad_patience_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        NeuralASMSafety(FakeEnv(), CueMonitor(), **arguments)

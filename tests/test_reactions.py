@@ -1,0 +1,104 @@
+"""What acting on alarms is worth: pairs, bootstrap intervals, and the program that runs them."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+
+from asm_gym.evaluation.reactions import Reaction, bootstrap, compare, gain, reduction
+from asm_gym.evaluation.trace import POLICY_ALONE
+from asm_gym.scripts.bout import NOMINAL, PASSING, Bout
+from asm_gym.scripts.evaluate import main as evaluate
+from asm_gym.scripts.react import Args, bouts, main
+
+
+def reaction(seed: int, acting: str, **changes) -> Reaction:
+    what = {"success": True, "peak_force": 40.0, "impulse": 8.0, "alarm_s": 0.5, "acted_s": 0.5, "delay_ms": 100.0}
+    return Reaction(
+        **{"task": "Lift", "fault": "push", "acting": acting, "seed": seed, "ended": False, **what, **changes}
+    )
+
+
+def test_gain_and_reduction_are_the_hand_computed_ones():
+    pairs = np.array([[1.0, 0.0], [3.0, 2.0], [0.0, 1.0], [4.0, 1.0]])
+    assert gain(pairs) == -1.0
+    assert reduction(pairs) == 0.5
+    assert np.isnan(reduction(np.zeros((3, 2))))
+
+
+def test_the_bootstrap_interval_of_a_mean_is_about_the_normal_one():
+    rng = np.random.default_rng(0)
+    pairs = np.stack([np.zeros(400), rng.normal(1.0, 2.0, 400)], axis=1)
+    estimate = bootstrap(gain, pairs, rng)
+    half = 1.96 * pairs[:, 1].std() / 20
+    assert estimate.value == pytest.approx(pairs[:, 1].mean())
+    assert estimate.low == pytest.approx(estimate.value - half, abs=0.03)
+    assert estimate.high == pytest.approx(estimate.value + half, abs=0.03)
+
+
+def test_pairs_are_matched_by_seed_whatever_their_order():
+    alone = [reaction(n, POLICY_ALONE, peak_force=10.0 * (n + 1), success=n < 3) for n in range(4)]
+    held = [reaction(n, "hold", peak_force=5.0 * (n + 1), delay_ms=50.0 * (n + 1), ended=n == 0) for n in (2, 0, 3, 1)]
+    c = compare(alone, held)
+    assert c.peak == (0.5, 0.5, 0.5)
+    assert c.impulse.value == 0.0
+    assert (c.success.k, c.alone.k, c.gained.value) == (4, 3, 0.25)
+    assert c.median_delay_ms == 100.0
+    assert (c.ended.k, c.ended.n) == (1, 4)
+
+
+def test_what_is_no_pair_is_refused():
+    with pytest.raises(ValueError, match="twin"):
+        compare([reaction(0, POLICY_ALONE)], [reaction(1, "hold")])
+    with pytest.raises(ValueError, match="twin"):
+        compare([], [])
+
+
+def test_every_reflex_has_the_twin_of_the_policy_alone():
+    args = Args(tasks=("Lift", "Door"), reflexes=("hold", "retract"), faults=(NOMINAL, PASSING), episodes=3)
+    made = bouts(args)
+    assert len(set(made)) == len(made) == 2 * 2 * 3 * 3
+    seeds = {(b.task, b.acting): set() for b in made}
+    for b in made:
+        seeds[b.task, b.acting].add(b.seed)
+    assert all(seeds["Lift", r] == seeds["Lift", POLICY_ALONE] for r in ("hold", "retract"))
+    assert isinstance(made[0], Bout)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--reflexes", "dance"], "dance.*hold"),
+        (["--faults", "meteor"], "meteor.*passing_push"),
+        (["--episodes", "0"], "episodes"),
+        (["--max-override-s", "0"], "max_override_s"),
+        (["--tasks", "Lift"], "run asm-gym evaluate first"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message, tmp_path, capsys):
+    try:
+        code = main([*arguments, "--run", str(tmp_path / "none"), "--out", str(tmp_path / "out")])
+    except SystemExit as end:  # what tyro refuses itself
+        code = end.code
+    assert code == 2
+    assert re.search(message, capsys.readouterr().err.replace("\n", " "))
+
+
+@pytest.mark.slow
+def test_it_runs_on_what_an_evaluation_has_recorded(tmp_path):
+    small = ["--tasks", "Lift", "--faults", "push", "--severities", "strong", "--harmless", "touch"]
+    counts = ["--fit-episodes", "10", "--calibration-episodes", "19", "--nominal-episodes", "2"]
+    few = ["--faulty-episodes", "1", "--harmless-episodes", "1", "--false-alarm-rate", "0.05", "--no-video"]
+    assert evaluate([*small, *counts, *few, "--monitors", "neural_asm", "--out", str(tmp_path / "run")]) == 0
+    how = ["--tasks", "Lift", "--reflexes", "hold", "retract", "terminate", "--faults", "nominal", "collision"]
+    where = ["--run", str(tmp_path / "run"), "--out", str(tmp_path / "out")]
+    assert main([*how, *where, "--episodes", "2", "--false-alarm-rate", "0.05"]) == 0
+    made = json.loads((tmp_path / "out" / "reactions.json").read_text())["episodes"]
+    assert len(made) == 2 * 2 * 4
+    for one in made:
+        assert one["acting"] != POLICY_ALONE or one["acted_s"] == 0
+        assert one["fault"] == "nominal" or one["peak_force"] > 0
+        assert math.isfinite(one["impulse"])
+    assert (tmp_path / "out" / "reactions.md").read_text().count("\n| ") == 2 + 2 * 3
