@@ -165,7 +165,7 @@ def test_what_is_always_carried_is_not_yielded_to(lift):
 
 def test_reflexes_that_need_changes_refuse_other_actions():
     for reflex in (Retract, Comply):
-        with pytest.raises(ValueError, match="OSC_POSE or JOINT_POSITION.*safe_action"):
+        with pytest.raises(ValueError, match=r"OSC_POSE or JOINT_POSITION.*safe_action"):
             reflex(FakeEnv())
     env = gym.make("asm_gym/Lift-v0", stream=("joint", "hand"))
     with pytest.raises(ValueError, match="external_torque"):
