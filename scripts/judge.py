@@ -238,6 +238,7 @@ def _examples(
         if own:
             late = sorted((math.inf if (a := verdicts[i].detected_after(threshold)) is None else a, i) for i in own)
             chosen.append(late[(len(late) - 1) // 2][1])
+    twins = {(r.label.task, r.label.seed): r.episode.stream for r in recordings if r.label.role == "nominal"}
     traces = {}
     for i in chosen:
         label, episode = recordings[i].label, recordings[i].episode
@@ -255,6 +256,8 @@ def _examples(
             attribution=surprise.attribution,
             labels=episode.spec.labels,
             success=episode.success,
+            stream=episode.stream,
+            twin=twins.get((label.task, label.seed)),
         )
     return traces
 

@@ -14,7 +14,7 @@ from rich.table import Table as RichTable
 from asm_gym.evaluation import comparison_plots as plots
 from asm_gym.evaluation.comparison import IDEAL, Cell, Score, Sight
 from asm_gym.evaluation.metrics import Share, window_steps
-from asm_gym.evaluation.plots import attribution_figure, surprise_figure
+from asm_gym.evaluation.plots import attribution_figure, stream_figure, surprise_figure
 from asm_gym.evaluation.report import Table, write_report
 from asm_gym.evaluation.scoring import Verdict
 from asm_gym.scripts.judge import Judgement
@@ -113,6 +113,7 @@ def publish(folder: Path, judgement: Judgement, details: Mapping[str, Any], vide
             surprise_figure(judgement.examples)
         )
     for trace in judgement.examples:
+        figures[f"{trace.condition}: the channels that surprised most."] = stream_figure(trace)
         figures[f"{trace.condition}: where the surprise came from."] = attribution_figure(trace)
     write_report(
         folder / "report.html",

@@ -39,7 +39,9 @@ def test_it_writes_what_it_promises(run):
     assert all(r["ideal_separation"] > 100 and len(r["surprise"]) == r["steps"] for r in push)
     assert all(r["ideal_delay_s"] == pytest.approx(0.05) for r in push)
     report = (run / "report.html").read_text()
-    assert report.count("<img") == 4 + 1 + 2  # typical episodes of a push and a frozen encoder, and their channels
+    assert (
+        report.count("<img") == 4 + 1 + 4
+    )  # typical episodes of a push and a frozen encoder, what they sensed and what surprised
     assert "ideal observer" in report
     assert "http" not in report.replace("http://www.w3.org", "")
     assert json.loads((run / "results.json").read_text())["settings"]["seed"] == 0

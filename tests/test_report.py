@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -114,6 +115,21 @@ def test_attribution_shows_the_channels_with_the_greatest_share_first(traces: li
     labels = [text.get_text() for text in plots.attribution_figure(trace, top=3).axes[0].get_yticklabels()]
     peaks = trace.attribution[20:].max(axis=0)
     assert labels == [trace.labels[i] for i in np.argsort(-peaks)[:3]]
+
+
+def test_the_stream_is_shown_beside_its_twin_and_the_most_surprising_channel_first(traces: list[Trace]):
+    trace = next(t for t in traces if t.delay is not None)
+    rng = np.random.default_rng(0)
+    stream, twin = rng.normal(size=(2, len(trace), len(trace.labels)))
+    axes = plots.stream_figure(dataclasses.replace(trace, stream=stream, twin=twin), top=2).axes
+    peaks = trace.attribution[trace.onset :].max(axis=0)
+    order = np.argsort(-peaks)[:2]
+    assert [ax.get_title(loc="left") for ax in axes] == [trace.labels[i] for i in order]
+    healthy, sensed = (line.get_ydata() for line in axes[0].lines[:2])
+    np.testing.assert_array_equal(healthy, twin[:, order[0]])
+    np.testing.assert_array_equal(sensed, stream[:, order[0]])
+    with pytest.raises(ValueError, match="without its stream"):
+        plots.stream_figure(trace)
 
 
 def test_nothing_to_draw_is_an_error(traces: list[Trace]):

@@ -194,6 +194,37 @@ def attribution_figure(trace: Trace, top: int = 12) -> Figure:
     return fig
 
 
+def stream_figure(trace: Trace, top: int = 4) -> Figure:
+    """What was sensed by the ``top`` channels that surprised most since the onset, beside the healthy twin.
+
+    Raises:
+        ValueError: the trace has no stream.
+    """
+    if trace.stream is None:
+        raise ValueError("this trace was kept without its stream")
+    share = np.nan_to_num(trace.attribution[trace.onset or 0 :], posinf=1e30)
+    rows = np.argsort(-share.max(axis=0), kind="stable")[:top]
+    time = (np.arange(len(trace)) + 1) * trace.dt
+    with figure(height=1.0 + 1.15 * len(rows)) as fig:
+        axes = fig.subplots(len(rows), sharex=True, squeeze=False)[:, 0]
+        for i, (ax, row) in enumerate(zip(axes, rows, strict=True)):
+            for start, stop in spans(trace.fault):
+                label = "fault" if i == 0 else None
+                ax.axvspan(start * trace.dt, stop * trace.dt, color="#f3d9a4", linewidth=0, label=label)
+            if trace.twin is not None:
+                healthy = trace.twin[: len(trace), row]
+                label = "without the fault" if i == 0 else None
+                ax.plot(time[: len(healthy)], healthy, color="#666666", linestyle=(0, (4, 2)), label=label)
+            ax.plot(time, trace.stream[:, row], color=BLUE, label="sensed" if i == 0 else None)
+            if trace.delay is not None and trace.onset is not None:
+                at = trace.onset * trace.dt + trace.delay
+                ax.axvline(at, color=BLACK, linewidth=1, label="alarm" if i == 0 else None)
+            ax.set_title(trace.labels[row], loc="left", fontsize=10)
+        axes[-1].set_xlabel("time [s]")
+        fig.legend(loc="outside upper right", ncols=4, frameon=False)
+    return fig
+
+
 def maxima_figure(traces: Sequence[Trace], window_s: float) -> Figure:
     """The greatest surprise of every episode against the threshold: within the window after a fault, or of it all."""
     watched = [t for t in traces if t.watched_only]

@@ -43,6 +43,8 @@ class Trace:
         labels: D names.
         success: the task was solved at some step.
         ended_by_alarm: the alarm ended the episode.
+        stream: (T, D) what was sensed, where it was kept.
+        twin: (at least T, D) the stream of the same seed without the fault, where it is known.
     """
 
     condition: str
@@ -58,6 +60,8 @@ class Trace:
     labels: tuple[str, ...]
     success: bool
     ended_by_alarm: bool = False
+    stream: NDArray[np.floating[Any]] | None = None
+    twin: NDArray[np.floating[Any]] | None = None
 
     def __post_init__(self) -> None:
         steps = len(self.surprise)
