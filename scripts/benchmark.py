@@ -24,7 +24,7 @@ import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
 from asm_gym.evaluation.metrics import Share
 from asm_gym.policies.registry import EXPERTS
-from asm_gym.scripts.benchmark_memory import Memory
+from asm_gym.scripts.benchmark_memory import Memory, Safety
 from asm_gym.scripts.collect import collect
 from asm_gym.scripts.progress import stage
 from asm_gym.tasks import task as task_spec
@@ -247,7 +247,8 @@ class Args:
         Annotated[Env, tyro.conf.subcommand("env")]
         | Annotated[Leaks, tyro.conf.subcommand("leaks")]
         | Annotated[Experts, tyro.conf.subcommand("experts")]
-        | Annotated[Memory, tyro.conf.subcommand("memory")],
+        | Annotated[Memory, tyro.conf.subcommand("memory")]
+        | Annotated[Safety, tyro.conf.subcommand("safety")],
         tyro.conf.arg(name=""),
     ] = field(default_factory=Env)
 
@@ -256,7 +257,7 @@ def main(argv: list[str] | None = None) -> int:
     """Runs one benchmark, and returns its exit code."""
     args = tyro.cli(Args, args=argv, prog="asm-gym benchmark", description=__doc__)
     console = Console()
-    return args.what.run(console, _take_turns) if isinstance(args.what, Memory) else args.what.run(console)
+    return args.what.run(console, _take_turns) if isinstance(args.what, (Memory, Safety)) else args.what.run(console)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What watching costs, against the same equations written plainly in torch: ``asm-gym benchmark memory``."""
+"""What watching costs: ``asm-gym benchmark memory``, against plain torch, and ``asm-gym benchmark safety``."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,7 +17,9 @@ from torch import Tensor
 from asm_gym.detection import LATELY, POWER
 from asm_gym.episodes import Episode
 from asm_gym.monitors import NeuralASM
+from asm_gym.scripts.collect import collect
 from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.wrappers import NeuralASMSafety
 
 ACTIONS = 7
 STEPS = 60
@@ -182,6 +185,37 @@ class Memory:
     def _fitted(hidden: int, channels: int) -> tuple[NeuralASM, Episode]:
         episodes = synthetic(channels, 10)
         return NeuralASM(episodes[0].spec, hidden_size=hidden, epochs=1).fit(episodes[:8]), episodes[-1]
+
+
+@dataclass
+class Safety:
+    """What the safety wrapper adds to a control step."""
+
+    task: str = "Lift"
+    """a task's name"""
+    hidden: int = 256
+    """hidden units of the memory"""
+    steps: int = 400
+    """control steps of each rival"""
+
+    def run(self, console: Console, take_turns: Callable[..., dict[str, float]]) -> int:
+        """Prints the table."""
+        env_id = f"asm_gym/{self.task}-v0"
+        episodes = collect(env_id, episodes=6, workers=1, horizon=40)
+        asm = NeuralASM(episodes[0].spec, hidden_size=self.hidden, epochs=1).fit(episodes[:4])
+        asm.calibrate(episodes[4:], 0.5)
+        plain, wrapped = (gym.make(env_id, horizon=10**9, disable_env_checker=True) for _ in range(2))
+        wrapped = NeuralASMSafety(wrapped, asm, on_alarm="monitor")
+        action = np.zeros(plain.action_space.shape or (), np.float32)
+        for env in (plain, wrapped):
+            env.reset(seed=0)
+        rivals = {"step": lambda: plain.step(action), "step under the wrapper": lambda: wrapped.step(action)}
+        seconds = take_turns(rivals, self.steps, console)
+        table = _table(f"{self.task}, 20 Hz, {self.hidden} hidden units: a control step", "", "ms", "against step")
+        for name, s in seconds.items():
+            table.add_row(name, f"{1e3 * s:.2f}", f"{s / seconds['step']:.2f}×")
+        console.print(table)
+        return 0
 
 
 def _table(title: str, *columns: str) -> Table:

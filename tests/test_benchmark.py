@@ -1,0 +1,28 @@
+"""The benchmarks of watching: what they time is what they say."""
+
+import numpy as np
+import pytest
+import torch
+
+from asm_gym.monitors import NeuralASM
+from asm_gym.scripts.benchmark import main
+from asm_gym.scripts.benchmark_memory import PlainTorch, synthetic
+
+
+@pytest.mark.parametrize("channels", [5, 23])
+def test_the_torch_rival_computes_the_same_surprise(channels):
+    episodes = synthetic(channels, 12)
+    asm = NeuralASM(episodes[0].spec, hidden_size=32, association_size=50, epochs=2).fit(episodes[:10])
+    plain = PlainTorch(asm)
+    with torch.no_grad():
+        values = [plain.observe(row.astype(np.float64)) for row in episodes[-1].stream]
+    np.testing.assert_allclose(values, asm.score(episodes[-1]).value, rtol=2e-3)
+
+
+def test_both_print_their_ratios(capsys):
+    assert main(["memory", "--hidden", "16", "--channels", "10", "--steps", "5", "--no-sweep"]) == 0
+    assert main(["safety", "--hidden", "16", "--steps", "3"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("×") >= 5
+    assert "plain torch" in shown
+    assert "under the wrapper" in shown
