@@ -21,9 +21,12 @@ from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 USUAL = 0.95
 """τ."""
 
-UPDATES = 2000
+UPDATES, PASSES = 1000, 12
+"""Batches learned from, and passes over the steps, at most: a context has more numbers than few episodes tell of."""
+
+FEWEST = 40
 BATCH = 512
-RATE = 2e-3
+RATE = 1e-2
 
 
 def habituate(context: Array, level: Array, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -35,8 +38,9 @@ def habituate(context: Array, level: Array, rng: np.random.Generator) -> NDArray
     """
     w, b = np.zeros(context.shape[1], np.float32), np.array([np.quantile(level, USUAL)], np.float32)
     rows, bias = Synapse(w), Synapse(b)
-    for n, chosen in zip(range(UPDATES), shuffled(len(level), BATCH, rng), strict=False):
-        c, rate = context[chosen], cosine_decay(RATE, n / UPDATES)
+    updates = max(FEWEST, min(UPDATES, PASSES * len(level) // BATCH))
+    for n, chosen in zip(range(updates), shuffled(len(level), BATCH, rng), strict=False):
+        c, rate = context[chosen], cosine_decay(RATE, n / updates)
         pull = (USUAL - (level[chosen] < c @ w + b)).astype(np.float32)
         rows.learn(pull @ c / np.float32(len(chosen)), rate)
         bias.learn(pull.mean(keepdims=True), rate)
