@@ -117,10 +117,6 @@ class StreamSpec:
             dtype=np.intp,
         )
 
-    def by_channel(self, values: NDArray[np.floating[Any]]) -> dict[str, NDArray[np.floating[Any]]]:
-        """Sums ``values`` (…, D) within each channel: {name: (…)}."""
-        return {name: values[..., s].sum(axis=-1) for name, s in self.slices.items()}
-
     def check_row(self, stream: NDArray[np.floating[Any]]) -> None:
         """Raises ValueError unless the last axis of ``stream`` is D long."""
         if stream.ndim < 1 or stream.shape[-1] != self.size:

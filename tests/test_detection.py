@@ -198,3 +198,19 @@ def test_a_fresh_episode_exceeds_the_threshold_as_rarely_as_promised(n, rate):
     exact = (n + 1 - np.ceil((n + 1) * (1 - rate) - 1e-9)) / (n + 1)  # the rank of the fresh one is uniform
     assert exact <= rate
     assert rank.mean() == pytest.approx(exact, abs=4 * np.sqrt(exact * (1 - exact) / trials))
+
+
+def test_the_compiled_step_is_the_same_equations_put_together():
+    rng = np.random.default_rng(2)
+    detector = Detector.fit(runs(rng, 8), runs(rng, 8), [0.8, 0.2], 5.0, 1e-3, rng)
+    gains, evidence, plain = detector.gains, detector.start(2), no_evidence(2, 2, 3, 2)
+    for _ in range(30):
+        errors, context = 4.0 * rng.normal(size=(2, 3)), rng.random((2, 2))
+        evidence, value, parts = detector.step(evidence, errors, context)
+        plain = accumulate(plain, bounded(errors, 5.0) @ detector.whitening, context, gains)
+        pooled, _ = pool((strength(plain, gains) / detector.ceiling).reshape(2, -1))
+        usual = np.exp(np.hstack([context, plain.context]) @ detector.habit[:-1] + detector.habit[-1])
+        np.testing.assert_allclose(value, pooled / usual, rtol=1e-9)
+        np.testing.assert_allclose(parts.sum(axis=1), value, rtol=1e-9)
+        for a, b in zip(evidence, plain, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)

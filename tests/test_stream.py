@@ -29,15 +29,6 @@ def test_every_number_has_a_name_and_a_place():
     assert SPEC.noise.tolist() == [0.1, 0.1, 0.5, 0, 0]
 
 
-def test_values_are_summed_by_channel():
-    sums = SPEC.by_channel(np.array([[1.0, 2, 4, 8, 16]]))
-    assert {name: value.tolist() for name, value in sums.items()} == {
-        "joint_position": [3],
-        "force": [4],
-        "action": [24],
-    }
-
-
 channels = st.builds(
     Channel,
     name=st.text(min_size=1, max_size=8),
