@@ -17,7 +17,7 @@ from asm_gym.memory.association import (
     synapses,
 )
 from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
-from asm_gym.memory.energy import activate, backward, energy, energy_gradient, outward
+from asm_gym.memory.energy import activate, energy, energy_gradient, feedback, outward
 from asm_gym.memory.inference import STRIDE, expect, infer, sense
 from asm_gym.memory.learning import (
     Learner,
@@ -97,11 +97,13 @@ def test_activation_is_tanh():
 
 
 @pytest.mark.parametrize("batch", [1, 2, 7])
-def test_products_along_and_against_synapses_are_matrix_products(batch):
+@pytest.mark.parametrize("senses", [1, 4, 11])
+def test_products_along_synapses_and_back_are_matrix_products(batch, senses):
     rng = np.random.default_rng(0)
-    a, W = rng.normal(size=(batch, 6)), rng.normal(size=(4, 6))
+    a, W = rng.normal(size=(batch, 6)), rng.normal(size=(senses, 6))
     np.testing.assert_allclose(outward(a, W), a @ W.T, rtol=1e-12)
-    np.testing.assert_allclose(backward(a @ W.T, W), a @ W.T @ W, rtol=1e-12)
+    x, b, pi = rng.normal(size=(batch, senses)), rng.normal(size=senses), rng.uniform(size=(batch, senses))
+    np.testing.assert_allclose(feedback(a, x, W, b, pi), (pi * (x - a @ W.T - b)) @ W, rtol=1e-12, atol=1e-12)
 
 
 def test_energy_is_the_sum_of_both_weighted_squares():

@@ -11,17 +11,15 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 from threadpoolctl import threadpool_limits
 
-from asm_gym.detection import LATELY
 from asm_gym.episodes import Episode
 from asm_gym.memory.association import Association, association_shapes
 from asm_gym.memory.energy import activate
 from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, train
-from asm_gym.memory.readout import certainty, learn_readout
+from asm_gym.memory.readout import add_up, learn_readout
 from asm_gym.memory.senses import Senses
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated import Progress, require
@@ -36,6 +34,7 @@ class MemoryState(NamedTuple):
     before: NDArray[np.float64]  # (B, D) the row seen last
     earlier: NDArray[np.float64]  # (B, D) the one before
     steps: NDArray[np.int64]  # (B,) how many rows were seen
+    skill: NDArray[np.float32]  # (B, K) L, what speaks for each skill; K is 0 where none has a name
 
 
 class NeuralASM(PredictiveMonitor):
@@ -125,6 +124,8 @@ class NeuralASM(PredictiveMonitor):
         X, A = len(self.spec.sensory), len(self.spec.motor)
         units = self._units_each(senses) * (int(senses.groups.max()) + 1)
         shapes = weight_shapes(self.hidden_size, senses.size, A) | association_shapes(senses.inputs, units, X)
+        if self.skills_:
+            shapes |= {"W_K": (len(self.skills_), units), "b_K": (len(self.skills_),)}
         for name, shape in shapes.items():
             if found[name].shape != shape:
                 raise ValueError(f"{name} should be of shape {shape}, found {found[name].shape}")
@@ -136,17 +137,23 @@ class NeuralASM(PredictiveMonitor):
 
     def start_model(self, batch: int) -> MemoryState:
         hidden, rows = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.spec.size))
-        return MemoryState(hidden, rows, rows, np.zeros(batch, np.int64))
+        skill = np.zeros((batch, len(self.skills_)), np.float32)
+        return MemoryState(hidden, rows, rows, np.zeros(batch, np.int64), skill)
 
     def predict(
         self, state: MemoryState, rows: NDArray[np.float64]
     ) -> tuple[MemoryState, NDArray[np.float32], NDArray[np.float32]]:
         assert self.network_ is not None
-        # Before the first row nothing has moved.
-        before = np.where(state.steps[:, None] > 0, state.before, rows)
-        earlier = np.where(state.steps[:, None] > 1, state.earlier, before)
+        before, earlier = state.before, state.earlier
+        if state.steps.min() < 2:  # before the first row nothing has moved
+            before = np.where(state.steps[:, None] > 0, before, rows)
+            earlier = np.where(state.steps[:, None] > 1, earlier, before)
         step = self.network_.step(state.hidden, self.senses_.read(rows, before, earlier))
-        return MemoryState(step.hidden, rows, before, state.steps + 1), step.error, activate(step.expected)
+        skill = state.skill
+        if self.skills_:
+            skill = add_up(skill, step.units, self.learned_["W_K"], self.learned_["b_K"])
+        state = MemoryState(step.hidden, rows, before, state.steps + 1, skill)
+        return state, step.error, activate(step.expected)
 
     def name_skills(self, episodes: Sequence[Episode]) -> Self:
         """Learns to tell which skill is running, from episodes whose ``info["skill"]`` says it.
@@ -164,14 +171,12 @@ class NeuralASM(PredictiveMonitor):
         known = sorted(set(names))
         if len(known) < 2:
             raise ValueError(f"two skills at least are needed to tell them apart, got {', '.join(known)}")
-        contexts, skills = [], []
+        assert self.network_ is not None
+        inputs = np.concatenate([self.senses_.read_episode(e.stream).inputs for e in episodes])
+        skills = np.repeat([known.index(name) for name in names], [len(e) for e in episodes])
         with threadpool_limits(1):
-            for name, run in zip(names, self._runs([e.stream for e in episodes]), strict=True):
-                lately = lfilter([LATELY], [1.0, LATELY - 1.0], run.contexts, axis=0)
-                contexts.append(lately.astype(np.float32))
-                skills.append(np.full(len(lately), known.index(name)))
             rng = np.random.default_rng(self.seed)
-            W_K, b_K = learn_readout(np.concatenate(contexts), np.concatenate(skills), len(known), rng)
+            W_K, b_K = learn_readout(inputs, self.network_.association.V, skills, len(known), rng)
         self.learned_ = self.learned_ | {"W_K": W_K, "b_K": b_K}
         self.skills_ = tuple(known)
         return self
@@ -179,8 +184,7 @@ class NeuralASM(PredictiveMonitor):
     def observe(self, state: PredictiveState, stream: NDArray[np.floating[Any]]) -> tuple[PredictiveState, Surprise]:
         state, surprise = super().observe(state, stream)
         if self.skills_:
-            p = certainty(state.evidence.context, self.learned_["W_K"], self.learned_["b_K"])
-            surprise = surprise._replace(skill=np.array(self.skills_)[p.argmax(axis=1)])
+            surprise = surprise._replace(skill=np.array(self.skills_)[state.model.skill.argmax(axis=1)])
         return state, surprise
 
     def _units_each(self, senses: Senses) -> int:
