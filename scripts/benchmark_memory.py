@@ -38,7 +38,7 @@ class PlainTorch:
         self.w = {n: torch.tensor(W) for n, W in asm.network_.weights._asdict().items()}
         self.a = {n: torch.tensor(W) for n, W in asm.network_.association._asdict().items()}
         self.pi_z, self.pi_x = asm.prior_precision, asm.sensory_precision
-        self.curvature, self.iterations = asm.network_.curvature, asm.iterations
+        self.curvature, self.iterations = float(asm.network_.curvature), asm.iterations
         d, s = asm.detector_, asm.senses_
         self.M, self.q, self.gains = (torch.tensor(x, dtype=torch.float32) for x in (d.whitening, d.ceiling, d.gains))
         self.habit, self.bound = torch.tensor(d.habit, dtype=torch.float32), d.bound

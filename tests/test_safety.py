@@ -191,3 +191,19 @@ def test_evidence_that_was_acted_on_is_not_counted_again():
 def test_bad_patience_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         NeuralASMSafety(FakeEnv(), CueMonitor(), **arguments)
+
+
+def test_a_monitor_learns_on_the_job_only_when_asked_and_never_from_an_override():
+    class Learner(CueMonitor):
+        def adapt(self, before, stream, surprise, rate):
+            learned.append((before, rate))
+
+    learned: list[tuple[int, float]] = []
+    run(NeuralASMSafety(FakeEnv(), Learner([2]), on_alarm="hold", release_after=2), 7)
+    assert not learned
+    run(NeuralASMSafety(FakeEnv(), Learner([2]), on_alarm="hold", release_after=2, learning_rate=0.25), 7)
+    assert learned == [(t, 0.25) for t in (0, 1, 2, 5, 6)]  # steps 3 and 4 were held
+    with pytest.raises(ValueError, match="CueMonitor cannot learn"):
+        NeuralASMSafety(FakeEnv(), CueMonitor(), learning_rate=0.1)
+    with pytest.raises(ValueError, match=r"learning_rate must be in \[0, 1\], got 3"):
+        NeuralASMSafety(FakeEnv(), Learner(), learning_rate=3)

@@ -49,6 +49,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         max_override: control steps for which a reflex may act at a stretch, after which the episode ends; None for as
             many as it takes.
         truncate: an episode that is ended by an alarm is truncated rather than terminated.
+        learning_rate: above 0 the monitor goes on learning from steps that do not surprise it, by its ``adapt``, which
+            changes it for all who watch with it: for a robot that slowly wears.
 
     Raises:
         ValueError: an unknown ``on_alarm``, or a monitor fitted for another stream (the message names the channels).
@@ -65,6 +67,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         release_below: float = 0.8,
         max_override: int | None = None,
         truncate: bool = False,
+        learning_rate: float = 0.0,
     ) -> None:
         RecordConstructorArgs.__init__(
             self,
@@ -74,6 +77,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             release_below=release_below,
             max_override=max_override,
             truncate=truncate,
+            learning_rate=learning_rate,
         )
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
@@ -84,12 +88,16 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             raise ValueError(f"release_below must be in (0, 1], got {release_below}")
         if max_override is not None and max_override < 1:
             raise ValueError(f"max_override must be at least 1, got {max_override}")
+        if not 0.0 <= learning_rate <= 1.0:
+            raise ValueError(f"learning_rate must be in [0, 1], got {learning_rate}")
+        if learning_rate > 0 and not hasattr(monitor, "adapt"):
+            raise ValueError(f"{type(monitor).__name__} cannot learn on the job: learning_rate must be 0")
         self._source = StreamSource(env)
         monitor.spec.require(self._source.spec, "the monitor")
         self.monitor = monitor
         self.threshold = monitor.threshold
         self.release_after, self.max_override = release_after, max_override
-        self.release_below = release_below
+        self.release_below, self.learning_rate = release_below, learning_rate
         self._ends = "truncated" if truncate else "terminated"
         self._on_alarm = on_alarm if isinstance(on_alarm, str) else "policy"
         self._reflex = _reflex(on_alarm, env)
@@ -115,7 +123,10 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         observation, reward, terminated, truncated, info = self.env.step(executed)
         self._observation = observation
         row = self._source.row(observation, executed, info)
-        self._state, surprise = self.monitor.observe(self._state, row[None])
+        before = self._state
+        self._state, surprise = self.monitor.observe(before, row[None])
+        if self.learning_rate > 0 and not intervened:
+            self.monitor.adapt(before, row[None], surprise, self.learning_rate)  # type: ignore[attr-defined]
         alarm = self._report(info, surprise, executed, intervened)["asm"]["alarm"]
         if isinstance(self._reflex, Hold):
             self._reflex.feel(row, executed, intervened)

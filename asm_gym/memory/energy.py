@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import compiled
 
 Array = NDArray[np.floating[Any]]
+Scalar = float | np.floating[Any]
 
 STEEPEST = np.float32(0.77)
 """An upper bound of |f''|; tanh has 4 / (3√3) = 0.7698."""
@@ -71,7 +72,7 @@ def outward(a: Array, W: Array) -> Array:
     return out
 
 
-def energy(z: Array, mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: float, pi_x: Array) -> Array:
+def energy(z: Array, mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: Scalar, pi_x: Array) -> Array:
     """F for each of the batch: (B,).
 
     Args:
@@ -131,7 +132,7 @@ def feedback(f: Array, x: Array, W_F: Array, b_F: Array, pi_x: Array) -> Array:
 
 @kernel
 def energy_gradient(
-    z: Array, mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: float, pi_x: Array
+    z: Array, mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: Scalar, pi_x: Array
 ) -> tuple[Array, Array]:
     """∂F/∂z (B, H), and what the bend of f can add to the curvature of F at most (B,); arguments as in ``energy``."""
     f = activate(z)  # (B, H)

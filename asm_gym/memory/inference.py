@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asm_gym.memory.energy import Array, activate, energy_gradient, kernel, outward
+from asm_gym.memory.energy import Array, Scalar, activate, energy_gradient, kernel, outward
 
 STRIDE = np.float32(1.5)
 """Length of an inference step over the inverse of the curvature; from 2 on it would diverge."""
@@ -54,7 +54,7 @@ def sense(z: Array, W_F: Array, b_F: Array) -> Array:
 
 @kernel
 def infer(
-    mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: float, pi_x: Array, curvature: float, iterations: int
+    mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: Scalar, pi_x: Array, curvature: Scalar, iterations: int
 ) -> Array:
     """z_t (B, H): ``iterations`` steps down the energy, from ``mu`` on; arguments as in ``energy``.
 

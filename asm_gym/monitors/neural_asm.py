@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.episodes import Episode
-from asm_gym.memory.association import Association, association_shapes
+from asm_gym.memory.association import Association, association_shapes, synapses
 from asm_gym.memory.energy import activate
 from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, train
+from asm_gym.memory.online import followed
 from asm_gym.memory.readout import add_up, learn_readout
 from asm_gym.memory.senses import Senses
 from asm_gym.monitors.base import Surprise
@@ -180,6 +181,47 @@ class NeuralASM(PredictiveMonitor):
         self.learned_ = self.learned_ | {"W_K": W_K, "b_K": b_K}
         self.skills_ = tuple(known)
         return self
+
+    def adapt(
+        self,
+        before: PredictiveState,
+        stream: NDArray[np.floating[Any]],
+        surprise: Surprise,
+        rate: float = 5e-3,
+        below: float = 0.5,
+    ) -> NDArray[np.bool_]:
+        """Learns from rows that were just observed, where they were not surprising: for a body that slowly wears.
+
+        Nothing calls this unless asked to. It changes this memory for whoever watches with it; the promise of
+        ``calibrate`` holds for the weights it was made with, so calibrate anew now and then.
+
+        Args:
+            before: the state that ``observe`` was given.
+            stream: (B, D) the rows that ``observe`` was given.
+            surprise: what it made of them.
+            rate: share of an error that one step takes away, in (0, 1].
+            below: only rows whose surprise is under this share of the threshold are learned from.
+
+        Returns:
+            (B,) which rows were learned from.
+
+        Raises:
+            RuntimeError: there is no threshold yet.
+        """
+        require("rate", rate, 0.0 < rate <= 1.0, "in (0, 1]")
+        require("below", below, 0.0 < below <= 1.0, "in (0, 1]")
+        assert self.network_ is not None
+        model, rows = before.model, np.asarray(stream, np.float64)
+        quiet = (surprise.value < below * self.threshold) & (model.steps > 1)
+        reading = self.senses_.read(rows, model.before, model.earlier)
+        learned: NDArray[np.bool_] = quiet & (reading.whole[:, 0] > 0)
+        if learned.any():
+            senses, size = self.senses_, self._units_each(self.senses_)
+            exists = synapses(senses.groups, senses.changes, senses.inputs, size)
+            now = followed(self.network_.association, exists, reading.inputs[learned], reading.changes[learned], rate)
+            self.network_.association = now
+            self.learned_ = self.learned_ | {"U": now.U, "D": now.D}
+        return learned
 
     def observe(self, state: PredictiveState, stream: NDArray[np.floating[Any]]) -> tuple[PredictiveState, Surprise]:
         state, surprise = super().observe(state, stream)
