@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.episodes import Episode
-from asm_gym.memory.association import Association, association_shapes, synapses
+from asm_gym.memory.association import Association, association_shapes, hidden_units, synapses
 from asm_gym.memory.energy import activate
 from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
@@ -181,6 +181,22 @@ class NeuralASM(PredictiveMonitor):
         self.learned_ = self.learned_ | {"W_K": W_K, "b_K": b_K}
         self.skills_ = tuple(known)
         return self
+
+    def skills(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.str_]:
+        """(T,) the skill that seems to run in each step of a stream (T, D), by what came before.
+
+        Raises:
+            RuntimeError: no skill has a name: ``name_skills`` comes first.
+        """
+        if not self.skills_:
+            raise RuntimeError("no skill has a name yet: call name_skills(episodes) first")
+        assert self.network_ is not None
+        units = hidden_units(self.senses_.read_episode(np.asarray(stream)).inputs, self.network_.association.V)
+        L, named = np.zeros((1, len(self.skills_)), np.float32), []
+        for f in units:
+            L = add_up(L, f[None], self.learned_["W_K"], self.learned_["b_K"])
+            named.append(int(L.argmax()))
+        return np.array(self.skills_)[named]
 
     def adapt(
         self,
