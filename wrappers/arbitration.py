@@ -51,6 +51,10 @@ class Verdict(NamedTuple):
     acted_on: bool
 
 
+NOTHING = Verdict(False, False, False, False)
+"""Of a step in which there was nothing to judge."""
+
+
 class Arbiter:
     """Decides who acts in one environment.
 
