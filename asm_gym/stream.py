@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -169,3 +170,12 @@ class StreamSpec:
                 raise TypeError(f"the {name} space must be a Box to be read as a stream, got {space}")
         sizes = [int(np.prod(s.shape)) for s in (observation, action) if s.shape is not None]
         return cls((Channel("observation", sizes[0]), Channel("action", sizes[1], group=MOTOR)), dt, "spaces")
+
+
+def control_period(env: gym.Env[Any, Any]) -> float:
+    """Of any environment [s]; 1 where it does not say."""
+    dt = getattr(env.unwrapped, "dt", None)
+    if isinstance(dt, int | float) and dt > 0:
+        return float(dt)
+    fps = env.metadata.get("render_fps")
+    return 1.0 / fps if fps else 1.0

@@ -12,7 +12,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,12 +19,12 @@ import gymnasium as gym
 import tyro
 from rich.console import Console
 
-import asm_gym
 from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation.archive import Label
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, possible, suite_fault
 from asm_gym.monitors import MONITORS
+from asm_gym.scripts.claims import claim_folder
 from asm_gym.scripts.dispatch import Crew, Progress, dispatch
 from asm_gym.scripts.film import Scene, film, prepare_film
 from asm_gym.scripts.judge import Judgement, calibrated, judge
@@ -187,16 +186,7 @@ def claim(args: Args) -> None:
         for name, value in json.loads(json.dumps(asdict(args), default=str)).items()
         if name in ("robot", "policy", "seed")
     }
-    versions = {p: metadata.version(p) for p in ("robosuite", "mujoco", "gymnasium", "numpy")}
-    ours |= {"asm_gym": asm_gym.__version__, **versions}
-    path = args.out / "recordings.json"
-    if path.is_file():
-        theirs = json.loads(path.read_text(encoding="utf-8"))
-        other = [f"{n}: {theirs.get(n)!r} there, {ours[n]!r} here" for n in ours if theirs.get(n) != ours[n]]
-        if other:
-            raise ValueError(f"{args.out} holds recordings of other settings ({'; '.join(other)}): name another --out")
-    args.out.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(ours, indent=2) + "\n", encoding="utf-8")
+    claim_folder(args.out, "recordings.json", ours)
 
 
 def film_examples(args: Args, judgement: Judgement, wanted: Sequence[Label], progress: Progress) -> Path:

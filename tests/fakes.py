@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import gymnasium as gym
 import numpy as np
@@ -19,15 +19,16 @@ SPEC = StreamSpec((Channel("position", 2, "m"), Channel("action", 3, group=MOTOR
 
 
 class FakeEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """Runs for ``length`` steps; what it senses in step t is t, and it keeps every action it was given."""
+    """Runs for ``length`` steps; in step t it senses ``first`` + t, and it keeps every action it was given."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
 
-    def __init__(self, length: int = 20, own_stream: bool = True) -> None:
+    def __init__(self, length: int = 20, own_stream: bool = True, first: int = 0) -> None:
         self.observation_space = spaces.Box(-100.0, 100.0, (2,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
         self.gripper_actions = (2,)
         self.length, self.actions = length, []  # type: tuple[int, list[NDArray[np.float32]]]
+        self.first = first
         self.render_mode = "rgb_array"
         if own_stream:
             self.stream_spec = SPEC
@@ -45,7 +46,7 @@ class FakeEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return observation, 1.0, False, self.t >= self.length, info
 
     def _out(self, action: Any) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        sensed = np.full(2, self.t, np.float32)
+        sensed = np.full(2, self.first + self.t, np.float32)
         info: dict[str, Any] = {"success": False}
         if hasattr(self, "stream_spec"):
             info["stream"] = np.concatenate([sensed, action]).astype(np.float32)
@@ -86,3 +87,30 @@ class CueMonitor:
 
     def save(self, path: str | Path) -> None:
         raise NotImplementedError
+
+
+class Remembered(NamedTuple):
+    """A state with rows, as those of the real monitors are."""
+
+    evidence: NDArray[np.float64]  # (B,)
+    steps: NDArray[np.int64]  # (B,)
+
+
+class FadingMonitor(CueMonitor):
+    """Watches many streams: what it senses of ``cue`` surprises it by 2 (threshold 1), which fades by a third a step.
+
+    It grows bored as well, so that a state which outlives its episode shows.
+    """
+
+    def initial_state(self, batch: int = 1) -> Remembered:
+        return Remembered(np.zeros(batch), np.zeros(batch, np.int64))
+
+    def observe(self, state: Remembered, stream: NDArray[Any]) -> tuple[Remembered, Surprise]:
+        self.spec.check_row(stream)
+        evidence = state.evidence * 2 / 3 + 2.0 * np.isin(stream[:, 0], list(self.cue)) + 0.001 * state.steps
+        attribution = np.zeros((len(stream), self.spec.size))
+        attribution[:, 0] = evidence
+        return Remembered(evidence, state.steps + 1), Surprise(evidence, attribution)
+
+    def resynchronise(self, state: Remembered) -> Remembered:
+        return state._replace(evidence=0.5 * state.evidence)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Comply, Graded, Hold, Retract
+from asm_gym.wrappers.arbitration import Arbiter, Patience
 from asm_gym.wrappers.stream_recorder import StreamSource
 
 REFLEXES: dict[str, Callable[[gym.Env[Any, Any]], Policy]] = {
@@ -82,12 +83,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
             raise TypeError(f"NeuralASMSafety needs a Box action space, got {env.action_space}")
-        if release_after < 1:
-            raise ValueError(f"release_after must be at least 1, got {release_after}")
-        if not 0.0 < release_below <= 1.0:
-            raise ValueError(f"release_below must be in (0, 1], got {release_below}")
-        if max_override is not None and max_override < 1:
-            raise ValueError(f"max_override must be at least 1, got {max_override}")
+        patience = Patience(release_after, release_below, max_override)
         if not 0.0 <= learning_rate <= 1.0:
             raise ValueError(f"learning_rate must be in [0, 1], got {learning_rate}")
         if learning_rate > 0 and not hasattr(monitor, "adapt"):
@@ -95,22 +91,17 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._source = StreamSource(env)
         monitor.spec.require(self._source.spec, "the monitor")
         self.monitor = monitor
-        self.threshold = monitor.threshold
-        self.release_after, self.max_override = release_after, max_override
-        self.release_below, self.learning_rate = release_below, learning_rate
+        self.threshold, self.learning_rate = monitor.threshold, learning_rate
         self._ends = "truncated" if truncate else "terminated"
         self._on_alarm = on_alarm if isinstance(on_alarm, str) else "policy"
-        self._reflex = _reflex(on_alarm, env)
+        self._arbiter = Arbiter(make_reflex(on_alarm, env), self.threshold, patience)
         self._ended = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
         self._state = self.monitor.initial_state(batch=1)
         self._observation = observation
-        self._overriding, self._quiet, self._reflex_state, self._acted = False, 0, None, 0
-        if isinstance(self._reflex, Hold):
-            self._reflex.reset()
-        self._fresh = False
+        self._arbiter.reset()
         self._ended = False
         none = np.zeros((1, self.monitor.spec.size))
         return observation, self._report(info, Surprise(np.zeros(1), none), None, False)
@@ -118,52 +109,22 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         if self._ended:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
-        intervened = self._overriding
-        executed = self._override() if intervened else np.asarray(action, dtype=np.float32)
+        executed = self._arbiter.executed(action, self._observation)
         observation, reward, terminated, truncated, info = self.env.step(executed)
         self._observation = observation
         row = self._source.row(observation, executed, info)
         before = self._state
         self._state, surprise = self.monitor.observe(before, row[None])
-        if self.learning_rate > 0 and not intervened:
+        verdict = self._arbiter.judge(float(surprise.value[0]), row, executed)
+        if self.learning_rate > 0 and not verdict.intervened:
             self.monitor.adapt(before, row[None], surprise, self.learning_rate)  # type: ignore[attr-defined]
-        alarm = self._report(info, surprise, executed, intervened)["asm"]["alarm"]
-        if isinstance(self._reflex, Hold):
-            self._reflex.feel(row, executed, intervened)
-        self._acted = self._acted + 1 if intervened else 0
-        self._arbitrate(float(surprise.value[0]), executed)
-        gave_up = intervened and self._overriding and self._acted == self.max_override
-        info["asm"]["gave_up"] = gave_up
-        if gave_up or (alarm and self._on_alarm == "terminate"):
+        if verdict.acted_on and hasattr(self.monitor, "resynchronise"):
+            self._state = self.monitor.resynchronise(self._state)
+        self._report(info, surprise, executed, verdict.intervened)["asm"]["gave_up"] = verdict.gave_up
+        if verdict.gave_up or (verdict.alarm and self._on_alarm == "terminate"):
             terminated, truncated = terminated or self._ends == "terminated", truncated or self._ends == "truncated"
         self._ended = bool(terminated or truncated)
         return observation, reward, terminated, truncated, info
-
-    def _override(self) -> NDArray[np.float32]:
-        assert self._reflex is not None
-        start = np.array([self._fresh])
-        self._fresh = False
-        action, self._reflex_state = self._reflex.predict(
-            self._observation, state=self._reflex_state, episode_start=start, deterministic=True
-        )
-        return np.asarray(action, dtype=np.float32)
-
-    def _arbitrate(self, surprise: float, executed: NDArray[np.float32]) -> None:
-        """Who acts next."""
-        if self._reflex is None:
-            return
-        alarm = surprise > self.threshold
-        quiet = surprise <= self.threshold * (self.release_below if self._overriding else 1.0)
-        self._quiet = self._quiet + 1 if quiet else 0
-        if alarm and hasattr(self.monitor, "resynchronise"):
-            self._state = self.monitor.resynchronise(self._state)
-        if alarm and not self._overriding:
-            self._overriding = self._fresh = True
-            # Our own reflexes start from what was last done; a user's policy starts as in a new episode.
-            begin = getattr(self._reflex, "begin", None)
-            self._reflex_state = begin(executed) if begin else None
-        elif self._overriding and self._quiet >= self.release_after:
-            self._overriding = False
 
     def _report(
         self, info: dict[str, Any], surprise: Surprise, executed: NDArray[np.float32] | None, intervened: bool
@@ -183,7 +144,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return info
 
 
-def _reflex(on_alarm: str | Policy, env: gym.Env[Any, Any]) -> Policy | None:
+def make_reflex(on_alarm: str | Policy, env: gym.Env[Any, Any]) -> Policy | None:
     """The policy that acts during an alarm; None where none does."""
     if not isinstance(on_alarm, str):
         if not callable(getattr(on_alarm, "predict", None)):

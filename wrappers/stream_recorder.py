@@ -10,7 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from asm_gym.episodes import Episode
-from asm_gym.stream import StreamSpec
+from asm_gym.stream import StreamSpec, control_period
 
 
 class StreamSource:
@@ -25,7 +25,7 @@ class StreamSource:
         self.spec: StreamSpec = (
             env.get_wrapper_attr("stream_spec")
             if self._own
-            else StreamSpec.from_spaces(env.observation_space, env.action_space, _control_period(env))
+            else StreamSpec.from_spaces(env.observation_space, env.action_space, control_period(env))
         )
 
     def row(self, observation: Any, action: Any, info: dict[str, Any]) -> NDArray[np.float32]:
@@ -35,15 +35,6 @@ class StreamSource:
             return row
         both: NDArray[np.float32] = np.concatenate([np.ravel(observation), np.ravel(action)]).astype(np.float32)
         return both
-
-
-def _control_period(env: gym.Env[Any, Any]) -> float:
-    """[s]; 1 where the environment does not say."""
-    dt = getattr(env.unwrapped, "dt", None)
-    if isinstance(dt, int | float) and dt > 0:
-        return float(dt)
-    fps = env.metadata.get("render_fps")
-    return 1.0 / fps if fps else 1.0
 
 
 class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -71,7 +62,7 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._rewards: list[float] = []
         self._rows: list[NDArray[np.float32]] = []
         self._faults: list[bool] = []
-        self._success = False
+        self._success = self._terminated = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._finish()
@@ -90,6 +81,7 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._rows.append(info["stream"])
         self._faults.append(bool(info.get("fault")))
         self._success = self._success or bool(info.get("success", False))
+        self._terminated = bool(terminated)
         if terminated or truncated:
             self._finish()
         return observation, reward, terminated, truncated, info
@@ -122,6 +114,7 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                     observations=np.stack(self._observations) if flat else np.zeros((0, 0), np.float32),
                     rewards=np.asarray(self._rewards, np.float32),
                     faults=np.asarray(self._faults),
+                    info={"terminated": self._terminated},
                 )
             )
         self._clear(None)

@@ -1,0 +1,214 @@
+"""Minari datasets: episodes written so that others can read them, and read whoever wrote them.
+
+A dataset holds T + 1 observations and T actions, rewards, terminations and truncations of each episode; ours hold the
+sensorimotor stream, (T, D), in ``infos`` as well, and name its channels in the metadata. See Younis et al. 2024,
+https://minari.farama.org.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from asm_gym.episodes import Episode
+from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
+from asm_gym.stream import StreamSpec, control_period
+from asm_gym.tasks import TASKS
+
+METADATA = "metadata.json"
+ARRAYS = ("stream", "actions", "observations", "rewards", "faults")
+
+
+def save_episode(path: Path, episode: Episode) -> Path:
+    """Writes one episode to a file of its own, which appears only when it is complete."""
+    header = {
+        "spec": episode.spec.to_json(),
+        "success": bool(episode.success),
+        "seed": episode.seed,
+        "info": episode.info,
+    }
+    write_checkpoint(path, "episode", header, {name: getattr(episode, name) for name in ARRAYS})
+    return path
+
+
+def load_episode(path: Path) -> Episode:
+    """What ``save_episode`` wrote. Raises ValueError where the file is damaged or something else."""
+    saved = read_checkpoint(path, "episode")
+    try:
+        spec = StreamSpec.from_json(saved.header["spec"])
+        kept: dict[str, Any] = {name: saved.header[name] for name in ("success", "seed", "info")}
+        kept |= {name: saved.arrays[name] for name in ARRAYS}
+        return Episode(spec=spec, **kept)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def write_dataset(
+    root: Path, dataset_id: str, episodes: Sequence[Episode], env: gym.Env[Any, Any], details: dict[str, Any]
+) -> Path:
+    """Writes episodes as a Minari dataset to ``root/<dataset_id>``, in place of the one that is there.
+
+    ``root`` is what Minari calls its root: ``MINARI_DATASETS_PATH=root`` lets ``minari.load_dataset`` find it.
+
+    Args:
+        dataset_id: such as ``asm_gym/lift-v0``.
+        episodes: of one spec.
+        env: that they were recorded in.
+        details: JSON-serialisable; kept in the metadata, for example versions.
+
+    Raises:
+        ValueError: no episode, or episodes of several specs.
+    """
+    storage_class = _minari("minari.dataset.minari_storage.MinariStorage")
+    buffer = _minari("minari.data_collector.EpisodeBuffer")
+    if not episodes:
+        raise ValueError("a dataset needs at least one episode, got none")
+    spec = episodes[0].spec
+    for n, episode in enumerate(episodes):
+        spec.require(episode.spec, f"episode {n}")
+    folder = root / dataset_id
+    unfinished = folder.with_name(f".{folder.name}.unfinished")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    (unfinished / "data").mkdir(parents=True)
+    spaces = {"observation_space": env.observation_space, "action_space": env.action_space}
+    storage = storage_class.new(unfinished / "data", **spaces, env_spec=env.spec)
+    storage.update_episodes(buffer(**_columns(e)) for e in episodes)
+    storage.update_episode_metadata([{"success": bool(e.success), "info": json.dumps(e.info)} for e in episodes])
+    about = {"dataset_id": dataset_id, "minari_version": _minari("minari.__version__"), "stream_spec": spec.to_json()}
+    storage.update_metadata({**details, **about})
+    shutil.rmtree(folder, ignore_errors=True)
+    unfinished.rename(folder)
+    return folder
+
+
+def _columns(episode: Episode) -> dict[str, Any]:
+    """An episode's arrays by Minari's names."""
+    T = len(episode)
+    last = np.arange(T) == T - 1
+    terminated = bool(episode.info.get("terminated", False))
+    return {
+        "seed": episode.seed,
+        "observations": episode.observations,
+        "actions": episode.actions,
+        "rewards": episode.rewards,
+        "terminations": last & terminated,
+        "truncations": last & (not terminated),
+        "infos": {"stream": episode.stream, "fault": episode.faults},
+    }
+
+
+def read_dataset(path: str | Path, env_id: str | None = None, dt: float | None = None) -> list[Episode]:
+    """The episodes of a Minari dataset, whoever recorded them.
+
+    Where it holds no stream, observation and action are the stream, as in ``StreamSpec.from_spaces``.
+
+    Args:
+        path: the folder that holds ``metadata.json``, or one with a single dataset anywhere below it.
+        env_id: what the dataset must have been recorded in.
+        dt: control period of a dataset that does not say its own [s]; by default that of the environment where it
+            can be made here, or else 1.
+
+    Raises:
+        FileNotFoundError: there is no dataset.
+        TypeError: its spaces are no Boxes, and it holds no stream.
+        ValueError: the dataset is damaged, of another environment, or of one of ours without streams.
+    """
+    folder = find_dataset(Path(path))
+    dataset_class = _minari("minari.MinariDataset")
+    try:
+        metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
+        dataset = dataset_class(folder)
+        recorded = list(dataset.iterate_episodes())
+        notes = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
+        known = {"dataset": dataset, "metadata": metadata}
+    except (OSError, KeyError, ValueError, AssertionError, RuntimeError, AttributeError) as error:
+        raise ValueError(f"{folder} is damaged or not a Minari dataset: {error}") from error
+    found = dataset.env_spec.id if dataset.env_spec is not None else None
+    if env_id is not None and found != env_id:
+        raise ValueError(f"{folder} was recorded in {found}, not in {env_id}")
+    spec = _spec(folder, known, found, dt)
+    if not recorded:
+        raise ValueError(f"{folder} holds no episode")
+    return [_episode(folder, data, note, spec) for data, note in zip(recorded, notes, strict=True)]
+
+
+def find_dataset(path: Path) -> Path:
+    """The folder with the metadata of the only dataset at or below ``path``. Raises FileNotFoundError or ValueError."""
+    if (path / METADATA).is_file():
+        return path
+    below = [f.parent for f in sorted(path.rglob(METADATA)) if f.parent.name == "data"]
+    if not below:
+        raise FileNotFoundError(f"no Minari dataset at or below {path}")
+    if len(below) > 1:
+        raise ValueError(f"{path} holds several datasets, name one: {', '.join(map(str, below))}")
+    return below[0]
+
+
+def _spec(folder: Path, known: dict[str, Any], env_id: str | None, dt: float | None) -> StreamSpec:
+    if "stream_spec" in known["metadata"]:
+        try:
+            return StreamSpec.from_json(known["metadata"]["stream_spec"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{folder} names its channels in a way that cannot be read: {error}") from error
+    if env_id in {task.id for task in TASKS.values()}:
+        raise ValueError(
+            f"{folder} was recorded in {env_id} and holds no streams: record it with `asm-gym collect`, or have its "
+            "states replayed by `asm-gym import`"
+        )
+    dataset = known["dataset"]
+    return StreamSpec.from_spaces(dataset.observation_space, dataset.action_space, dt or _period(env_id))
+
+
+def _period(env_id: str | None) -> float:
+    """[s] of an environment that is registered here; what the file itself says of how to make it is not followed."""
+    if env_id not in gym.registry:
+        return 1.0
+    try:
+        env = gym.make(env_id)
+    except (gym.error.Error, ImportError):
+        return 1.0
+    try:
+        return control_period(env)
+    finally:
+        env.close()
+
+
+def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec) -> Episode:
+    T = len(data.rewards)
+    infos = data.infos or {}
+    seed = note.get("seed")
+    try:
+        actions = np.asarray(data.actions, np.float32).reshape(T, -1)
+        observations = np.asarray(data.observations, np.float32).reshape(T + 1, -1)
+        if spec.source == "spaces":
+            stream = np.concatenate([observations[1:], actions], axis=1)
+        else:
+            stream = np.asarray(infos["stream"], np.float32)[-T:]  # others may keep the row of reset as well
+        return Episode(
+            stream=stream,
+            spec=spec,
+            success=bool(note["success"] if "success" in note else np.any(infos.get("success", False))),
+            seed=None if seed is None else int(seed),
+            actions=actions,
+            observations=observations,
+            rewards=np.asarray(data.rewards, np.float32),
+            faults=np.asarray(infos.get("fault", np.zeros(T)), np.bool_)[-T:],
+            info=json.loads(note.get("info", "{}")) | {"terminated": bool(np.any(data.terminations))},
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{folder}, episode {data.id}: {error}") from error
+
+
+def _minari(name: str) -> Any:
+    """Something of Minari's, which is an extra. Raises ImportError that says how to get it."""
+    if importlib.util.find_spec("minari") is None or importlib.util.find_spec("h5py") is None:
+        raise ImportError("datasets need the packages minari and h5py: pip install 'asm-gym[data]'")
+    module, attribute = name.rsplit(".", 1)
+    return getattr(importlib.import_module(module), attribute)

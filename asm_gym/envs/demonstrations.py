@@ -1,0 +1,165 @@
+"""Demonstrations in robosuite's and robomimic's HDF5 files: each state is put back into the simulator and sensed there.
+
+Such a file holds, for each ``data/demo_<i>``, ``states`` (T, 1 + nq + nv) from before each of the ``actions`` (T, A),
+and in the attributes of ``data`` the task and its arguments (Mandlekar et al. 2021, robomimic). Nothing is stepped, so
+that a recording is read as it was made, whatever controller it was made with. What an environment senses of its hand
+while it runs is one physics substep (2 ms) older than its joints; here both are of one moment.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.envs.layout import Layout
+from asm_gym.envs.robosuite_env import RobosuiteEnv
+from asm_gym.episodes import Episode
+from asm_gym.stream import MOTOR
+from asm_gym.tasks import task as task_spec
+
+GROUPS = ("joint", "hand", MOTOR)
+"""Channel groups that a state determines. What motors and contacts do within a step is in no such file."""
+
+
+class Recorded(NamedTuple):
+    """What a file was recorded in.
+
+    Attributes:
+        task: a name in ``asm_gym.tasks.TASKS``.
+        robots: one for each arm.
+        control_freq: [Hz].
+        demos: names of the demonstrations, in the order of their numbers.
+    """
+
+    task: str
+    robots: tuple[str, ...]
+    control_freq: int
+    demos: tuple[str, ...]
+
+    def make(self, sensor_noise: float = 1.0) -> gym.Env[Any, Any]:
+        """The environment whose episodes the demonstrations become."""
+        how: dict[str, Any] = {"control_freq": self.control_freq, "stream": GROUPS, "sensor_noise": sensor_noise}
+        return gym.make(task_spec(self.task).id, robot=self.robots, **how)
+
+
+def recorded_in(path: Path) -> Recorded:
+    """Reads what a file says of itself.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is damaged, holds no demonstration, or its task is none of ours.
+    """
+    with _open(path) as file:
+        attributes = file["data"].attrs
+        if "env_args" in attributes:  # robomimic
+            about = json.loads(attributes["env_args"])
+            name, kwargs = about["env_name"], about["env_kwargs"]
+        else:
+            name, kwargs = str(attributes["env"]), json.loads(attributes["env_info"])
+        demos = sorted((n for n in file["data"] if n.startswith("demo")), key=lambda n: int(n.rsplit("_", 1)[-1]))
+    if not demos:
+        raise ValueError(f"{path} holds no demonstration")
+    robots = kwargs.get("robots", "Panda")
+    robots = (robots,) if isinstance(robots, str) else tuple(robots)
+    return Recorded(task_spec(name).name, robots, int(kwargs.get("control_freq", 20)), tuple(demos))
+
+
+def replay(path: Path, recorded: Recorded, env: gym.Env[Any, Any], seed: int = 0) -> Iterator[Episode]:
+    """The demonstrations as episodes, one step shorter than in the file, which has no state after the last action.
+
+    Args:
+        recorded: what the file was recorded in.
+        env: made by it.
+        seed: of the sensor noise.
+
+    Raises:
+        ValueError: states or actions of another size than the environment's.
+    """
+    inner: Any = env.unwrapped
+    inner.reset(seed=seed)
+    with _open(path) as file:
+        for name in recorded.demos:
+            demo = file["data"][name]
+            states, actions = np.array(demo["states"]), np.array(demo["actions"], np.float32)
+            rewards = np.array(demo["rewards"], np.float32) if "rewards" in demo else None
+            _check(path, name, inner, states, actions)
+            yield _episode(inner, name, states, actions, rewards, path)
+
+
+def _episode(
+    env: RobosuiteEnv,
+    name: str,
+    states: NDArray[np.float64],
+    actions: NDArray[np.float32],
+    rewards: NDArray[np.float32] | None,
+    path: Path,
+) -> Episode:
+    layout = Layout(env.measured_spec, GROUPS, flat=True)
+    before = np.concatenate([np.zeros_like(actions[:1]), actions[:-1]])
+    rows, solved = zip(*(_sense(env, s, a) for s, a in zip(states, before, strict=True)), strict=True)
+    T = len(actions) - 1
+    return Episode(
+        stream=np.stack([layout.stream(row) for row in rows[1:]]),
+        spec=env.stream_spec,
+        success=any(solved),
+        actions=actions[:T],
+        observations=np.stack([layout.observation(row, {}) for row in rows]),
+        rewards=np.array(solved[1:], np.float32) if rewards is None else rewards[:T],
+        faults=np.zeros(T, np.bool_),
+        info={"terminated": False, "file": path.name, "demonstration": name},
+    )
+
+
+def _sense(
+    env: RobosuiteEnv, state: NDArray[np.float64], action: NDArray[np.float32]
+) -> tuple[NDArray[np.float64], bool]:
+    """What the sensors read in ``state``, after ``action``, and whether the task is solved there."""
+    simulator = env.robosuite_env.sim
+    simulator.set_state_from_flattened(state)
+    simulator.forward()
+    env.simulation.begin_episode()  # samples the velocities, which are not in MuJoCo's state
+    row = env.measure()
+    row[env.measured_spec.motor] = action
+    return row, bool(env.robosuite_env._check_success())
+
+
+def _check(path: Path, name: str, env: RobosuiteEnv, states: NDArray[np.float64], actions: NDArray[np.float32]) -> None:
+    model = env.simulation.model
+    size = 1 + model.nq + model.nv
+    what = f"{path}, {name}"
+    if states.ndim != 2 or states.shape[1] != size:
+        raise ValueError(
+            f"{what}: a state of {env.task.name} with {'+'.join(env.robots)} has {size} numbers, got {states.shape}; "
+            "was it recorded with another robot, gripper or version?"
+        )
+    if actions.shape != (len(states), *(env.action_space.shape or ())):
+        raise ValueError(
+            f"{what}: {len(states)} states need actions of shape {env.action_space.shape}, got {actions.shape}"
+        )
+    if len(states) < 2:
+        raise ValueError(f"{what}: two states at least are needed, got {len(states)}")
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Any]:
+    """An HDF5 file. Raises ValueError where what is looked for in it is not there."""
+    try:
+        import h5py
+    except ImportError as error:
+        raise ImportError("HDF5 files need the package h5py: pip install 'asm-gym[data]'") from error
+    if not path.is_file():
+        raise FileNotFoundError(f"no file {path}")
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, KeyError, json.JSONDecodeError) as error:
+        raise ValueError(
+            f"{path} is damaged, or no file of robosuite's or robomimic's demonstrations: {error}"
+        ) from error

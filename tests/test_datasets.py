@@ -1,0 +1,336 @@
+"""Recording into Minari datasets, going on after a kill, and reading what others recorded."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import gymnasium as gym
+import h5py
+import minari
+import numpy as np
+import pytest
+from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_storage import MinariStorage
+
+from asm_gym.datasets import load_episode, read_dataset, save_episode, write_dataset
+from asm_gym.envs.demonstrations import recorded_in, replay
+from asm_gym.monitors import NeuralASM
+from asm_gym.policies import make_policy, rollout
+from asm_gym.scripts.cli import main
+from asm_gym.scripts.collect import collect
+from asm_gym.wrappers import StreamRecorder
+from tests.streams import sine_episodes
+
+ONE = ("--workers", "1", "--episodes")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """What two collected episodes of Lift left behind."""
+    out = tmp_path_factory.mktemp("collect")
+    assert main(["collect", "Lift", *ONE, "2", "--seed", "5", "--out", str(out)]) == 0
+    return out
+
+
+def exit_code(arguments):
+    try:
+        return main(arguments)
+    except SystemExit as end:
+        return end.code
+
+
+def assert_same(a, b):
+    for name in ("stream", "actions", "observations", "rewards", "faults"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), name)
+    assert (a.success, a.seed, a.spec, a.info) == (b.success, b.seed, b.spec, b.info)
+
+
+def test_a_dataset_gives_back_what_was_collected(folder):
+    read = read_dataset(folder, env_id="asm_gym/Lift-v0")
+    recorded = collect("asm_gym/Lift-v0", episodes=2, seed=5, workers=1)
+    for a, b in zip(read, recorded, strict=True):
+        assert_same(a, b)
+    assert read[0].observations.shape[0] == len(read[0]) + 1 == 101
+    assert read[0].success
+
+
+def test_minari_finds_and_reads_the_dataset_by_its_name(folder, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
+    dataset = minari.load_dataset("asm_gym/lift-scripted-v0")
+    assert dataset.total_episodes == 2
+    assert dataset.env_spec.id == "asm_gym/Lift-v0"
+    episode = dataset[0]
+    assert episode.observations.shape == (101, 37)
+    assert episode.truncations.tolist() == [False] * 99 + [True]
+    assert not episode.terminations.any()
+    assert dataset.storage.metadata["versions"]["robosuite"] == "1.5.2"
+
+
+def test_collecting_touches_nothing_outside_its_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("MINARI_DATASETS_PATH", raising=False)
+    before = dict(os.environ)
+    episodes = sine_episodes(2)
+    write_dataset(tmp_path / "out", "asm_gym/sines-v0", _observed(episodes), _Sines(), {})
+    assert dict(os.environ) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_second_call_goes_on_and_more_episodes_are_added(folder, tmp_path):
+    (first,) = [p for p in (folder / "episodes").iterdir() if p.name.startswith(str(read_dataset(folder)[0].seed))]
+    (tmp_path / "episodes").mkdir()
+    os.link(first, tmp_path / "episodes" / first.name)
+    written = first.stat().st_mtime_ns
+    assert main(["collect", "Lift", *ONE, "2", "--seed", "5", "--out", str(tmp_path)]) == 0
+    assert first.stat().st_mtime_ns == written
+    for a, b in zip(read_dataset(tmp_path), read_dataset(folder), strict=True):
+        assert_same(a, b)
+
+
+def test_other_settings_are_refused_by_name(folder, capsys):
+    assert main(["collect", "Lift", *ONE, "2", "--seed", "6", "--out", str(folder)]) == 2
+    assert "seed: 5 there, 6 here" in capsys.readouterr().err
+
+
+def test_a_killed_run_loses_only_what_was_running(tmp_path):
+    command = [sys.executable, "-m", "asm_gym.scripts.collect", "Lift", *ONE, "400", "--out", str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while len(list((tmp_path / "episodes").glob("[0-9]*.npz"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    kept = sorted((tmp_path / "episodes").glob("[0-9]*.npz"))
+    assert len(kept) >= 2
+    stamps = {p.name: p.stat().st_mtime_ns for p in kept}
+    more = len(kept) + 1
+    assert main(["collect", "Lift", *ONE, str(more), "--out", str(tmp_path)]) == 0
+    assert len(read_dataset(tmp_path)) == more
+    assert all((tmp_path / "episodes" / name).stat().st_mtime_ns == stamp for name, stamp in stamps.items())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["Juggle"], "Juggle"),
+        (["Lift", "--policy", "teleop"], "teleop"),
+        (["Lift", "--episodes", "0"], "episodes"),
+        (["Lift", "--robot", "R2D2"], "R2D2"),
+        (["Wipe", "--policy", "nowhere/agent_sac.zip"], "agent_sac"),
+    ],
+)
+def test_bad_arguments_are_refused_before_anything_runs(arguments, message, tmp_path, capsys):
+    assert exit_code(["collect", *arguments, "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_episode_files_give_back_what_was_saved_and_refuse_others(tmp_path):
+    (episode,) = sine_episodes(1)
+    assert_same(load_episode(save_episode(tmp_path / "one.npz", episode)), episode)
+    whole = (tmp_path / "one.npz").read_bytes()
+    (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=r"half\.npz is damaged"):
+        load_episode(tmp_path / "half.npz")
+
+
+class _Sines(gym.Env):
+    """As far as a dataset asks."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (12,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+
+def _observed(episodes):
+    """Episodes that have observations and actions too."""
+    return [
+        replace(
+            e,
+            observations=np.concatenate([e.stream[:1, :12], e.stream[:, :12]]),
+            actions=e.stream[:, 12:],
+            rewards=np.ones(len(e), np.float32),
+            faults=np.zeros(len(e), bool),
+        )
+        for e in episodes
+    ]
+
+
+def foreign(path, env_id="Pusher-v5", episodes=3, infos=None, actions=7):
+    """A dataset that somebody else recorded, with Minari alone."""
+    observations = gym.spaces.Box(-np.inf, np.inf, (23,), np.float64)
+    path.mkdir(parents=True)
+    spaces = {"observation_space": observations, "action_space": gym.spaces.Box(-2, 2, (actions,), np.float32)}
+    storage = MinariStorage.new(path, **spaces, env_spec=gym.spec(env_id))
+    rng = np.random.default_rng(0)
+    buffers = [
+        EpisodeBuffer(
+            seed=n,
+            observations=rng.normal(size=(11 + n, 23)),
+            actions=rng.normal(size=(10 + n, actions)).astype(np.float32),
+            rewards=rng.normal(size=10 + n),
+            terminations=np.zeros(10 + n, bool),
+            truncations=np.arange(10 + n) == 9 + n,
+            infos=infos,
+        )
+        for n in range(episodes)
+    ]
+    storage.update_episodes(buffers)
+    storage.update_metadata({"dataset_id": "somebody/thing-v0", "minari_version": minari.__version__})
+    return buffers
+
+
+def test_a_dataset_of_somebody_elses_environment_is_read_as_observation_and_action(tmp_path):
+    buffers = foreign(tmp_path / "theirs")
+    episodes = read_dataset(tmp_path / "theirs")
+    env = StreamRecorder(gym.make("Pusher-v5"))
+    for n, (episode, buffer) in enumerate(zip(episodes, buffers, strict=True)):
+        expected = np.concatenate([buffer.observations[1:], buffer.actions], axis=1).astype(np.float32)
+        np.testing.assert_array_equal(episode.stream, expected)
+        assert episode.seed == n
+        assert not episode.success
+    # A memory that is fitted on it watches the environment itself.
+    NeuralASM(episodes[0].spec, hidden_size=8, association_size=8, epochs=1).fit(episodes)
+    episodes[0].spec.require(env.stream_spec, "the dataset")
+
+
+def test_streams_of_others_are_taken_without_the_row_of_reset(tmp_path, folder):
+    (data,) = (folder / "asm_gym" / "lift-scripted-v0").glob("data")
+    copy = tmp_path / "data"
+    copy.mkdir()
+    (copy / "metadata.json").write_bytes((data / "metadata.json").read_bytes())
+    (copy / "main_data.hdf5").write_bytes((data / "main_data.hdf5").read_bytes())
+    with h5py.File(copy / "main_data.hdf5", "a") as file:
+        for episode in file.values():
+            stream = episode["infos/stream"][()]
+            del episode["infos/stream"]
+            episode["infos"]["stream"] = np.concatenate([stream[:1] * np.nan, stream])
+    for a, b in zip(read_dataset(copy), read_dataset(folder), strict=True):
+        np.testing.assert_array_equal(a.stream, b.stream)
+
+
+def test_what_cannot_be_read_is_refused_by_name(tmp_path, folder):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        read_dataset(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match=r"asm_gym/Lift-v0, not in asm_gym/Door-v0"):
+        read_dataset(folder, env_id="asm_gym/Door-v0")
+    foreign(tmp_path / "ours" / "data", env_id="asm_gym/Door-v0")
+    with pytest.raises(ValueError, match="holds no streams"):
+        read_dataset(tmp_path / "ours")
+    foreign(tmp_path / "ours2" / "more" / "data")
+    with pytest.raises(ValueError, match="several datasets"):
+        read_dataset(tmp_path)
+    broken = tmp_path / "ours2" / "more" / "data"
+    whole = (broken / "main_data.hdf5").read_bytes()
+    (broken / "main_data.hdf5").write_bytes(whole[: len(whole) // 3])
+    with pytest.raises(ValueError, match="damaged"):
+        read_dataset(broken)
+    (broken / "metadata.json").write_text("{")
+    with pytest.raises(ValueError, match="damaged"):
+        read_dataset(broken)
+
+
+# ---------------------------------------------------------------------- robosuite's and robomimic's files
+
+
+@pytest.fixture(scope="module")
+def demonstrated(tmp_path_factory):
+    """Two short episodes of Lift, as an HDF5 file of each format, and what was sensed while they were recorded."""
+    env = gym.make("asm_gym/Lift-v0", sensor_noise=0.0, horizon=12)
+    inner = env.unwrapped
+    folder, demos, episodes = tmp_path_factory.mktemp("demos"), [], []
+    for seed in (3, 4):
+        states = []
+
+        class Keeping(gym.Wrapper):
+            def step(self, action, kept=states):
+                kept.append(inner.robosuite_env.sim.get_state().flatten())
+                return self.env.step(action)
+
+        recorder = StreamRecorder(Keeping(env))
+        rollout(recorder, make_policy("scripted", env, seed=seed), seed)
+        episodes.append(recorder.finish())
+        demos.append((np.array(states), episodes[-1].actions))
+    kwargs = {"robots": ["Panda"], "control_freq": 20}
+    for name in ("robosuite", "robomimic"):
+        with h5py.File(folder / f"{name}.hdf5", "w") as file:
+            data = file.create_group("data")
+            if name == "robosuite":
+                data.attrs["env"], data.attrs["env_info"] = "Lift", json.dumps(kwargs)
+            else:
+                data.attrs["env_args"] = json.dumps({"env_name": "Lift", "type": 1, "env_kwargs": kwargs})
+            for n, (states, actions) in enumerate(demos, 9):  # demo_9 comes before demo_10
+                group = data.create_group(f"demo_{n}")
+                group["states"], group["actions"] = states, actions
+    env.close()
+    return folder, episodes
+
+
+@pytest.mark.parametrize("name", ["robosuite", "robomimic"])
+def test_replayed_states_read_as_they_did_when_they_were_recorded(demonstrated, name):
+    folder, episodes = demonstrated
+    file = folder / f"{name}.hdf5"
+    recorded = recorded_in(file)
+    env = recorded.make(sensor_noise=0.0)
+    replayed = list(replay(file, recorded, env))
+    env.close()
+    for mine, original in zip(replayed, episodes, strict=True):
+        T = len(original) - 1
+        assert len(mine) == T
+        was = {n: original.stream[:T, w] for n, w in original.spec.slices.items()}
+        now = {n: mine.stream[:, w] for n, w in mine.spec.slices.items()}
+        assert list(now) == [n for n in was if n.startswith(("joint", "hand", "action"))]
+        for channel in ("joint_position", "joint_velocity", "action"):
+            np.testing.assert_allclose(now[channel], was[channel], atol=1e-6, err_msg=channel)
+        # While an environment runs, the hand is where it was 2 ms before its joints came to where they are.
+        np.testing.assert_allclose(now["hand_position"], was["hand_position"] + 2e-3 * was["hand_velocity"], atol=1e-5)
+        np.testing.assert_allclose(now["hand_orientation"], was["hand_orientation"], atol=2e-3)
+        np.testing.assert_allclose(now["hand_velocity"], was["hand_velocity"], atol=1e-2)
+        np.testing.assert_array_equal(mine.actions, original.actions[:T])
+        np.testing.assert_allclose(mine.observations, original.observations[:-1], atol=5e-2)
+        assert np.abs(mine.observations - original.observations[:-1]).mean() < 1e-3
+
+
+def test_imported_demonstrations_are_a_dataset(demonstrated, tmp_path):
+    folder, _ = demonstrated
+    assert main(["import", str(folder / "robomimic.hdf5"), "--out", str(tmp_path)]) == 0
+    episodes = read_dataset(tmp_path, env_id="asm_gym/Lift-v0")
+    assert [len(e) for e in episodes] == [11, 11]
+    assert [e.info["demonstration"] for e in episodes] == ["demo_9", "demo_10"]
+    env = gym.make("asm_gym/Lift-v0", stream=("joint", "hand", "action"))
+    episodes[0].spec.require(env.unwrapped.stream_spec, "the dataset")
+    env.close()
+
+
+def test_files_that_do_not_fit_are_refused_by_name(demonstrated, tmp_path, capsys):
+    folder, _ = demonstrated
+    whole = (folder / "robosuite.hdf5").read_bytes()
+
+    def edited(edit):
+        path = tmp_path / "edited.hdf5"
+        path.write_bytes(whole)
+        with h5py.File(path, "a") as file:
+            edit(file["data"])
+        return path
+
+    def drop_a_column(data):
+        states = data["demo_9/states"][:, 1:]
+        del data["demo_9/states"]
+        data["demo_9/states"] = states
+
+    for edit, message in (
+        (lambda data: data.attrs.__setitem__("env", "Juggle"), "Juggle"),
+        (lambda data: data.attrs.__delitem__("env"), "no file of robosuite"),
+        (drop_a_column, "has 32 numbers"),
+    ):
+        assert main(["import", str(edited(edit)), "--out", str(tmp_path / "out")]) == 2
+        assert message in capsys.readouterr().err
+    (tmp_path / "half.hdf5").write_bytes(whole[:500])
+    assert main(["import", str(tmp_path / "half.hdf5"), "--out", str(tmp_path / "out")]) == 2
+    assert "damaged" in capsys.readouterr().err
+    assert main(["import", str(tmp_path / "none.hdf5"), "--out", str(tmp_path / "out")]) == 2
+    assert "none.hdf5" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
