@@ -47,6 +47,8 @@ class Args:
     """Names of monitors to repeat over seeds; the first is also fitted for each task alone."""
     seeds: int = 3
     """How many seeds of the monitors."""
+    alone_seeds: int = 1
+    """How many of them are used for one monitor a task too, which costs as much as all tasks together for each task."""
     switches: int = 40
     """Episodes in which one skill follows another; 0 for none."""
     false_alarm_rate: float = 0.01
@@ -67,6 +69,8 @@ class Args:
             raise ValueError("there must be at least one monitor")
         if self.seeds < 1:
             raise ValueError(f"seeds must be at least 1, got {self.seeds}")
+        if not 0 <= self.alone_seeds <= self.seeds:
+            raise ValueError(f"alone_seeds must be in [0, {self.seeds}], got {self.alone_seeds}")
         if self.switches < 0:
             raise ValueError(f"switches must be at least 0, got {self.switches}")
 
@@ -101,10 +105,10 @@ class Naming(NamedTuple):
 
 
 def jobs(args: Args) -> list[Job]:
-    """All tasks together for each monitor and seed, and each task alone for the first monitor."""
+    """All tasks together for each monitor and seed, and each task alone for the first monitor and seeds."""
     seeds, tasks = range(args.seed, args.seed + args.seeds), args.tasks
     together = [Job(m, s, tuple(tasks)) for m in args.monitors for s in seeds]
-    return together + [Job(args.monitors[0], s, (t,)) for s in seeds for t in tasks]
+    return together + [Job(args.monitors[0], s, (t,)) for s in seeds[: args.alone_seeds] for t in tasks]
 
 
 @lru_cache(maxsize=1)
@@ -165,8 +169,9 @@ def seeds_table(found: Sequence[tuple[Job, dict[str, Score]]], args: Args) -> Ta
 def alone_table(found: Sequence[tuple[Job, dict[str, Score]]], args: Args) -> Table:
     """The first monitor's AUROC and share found for each task, learned together and alone."""
     first, rate = args.monitors[0], args.false_alarm_rate
-    together = {j.seed: s for j, s in found if j.monitor == first and len(j.tasks) > 1}
     alone = {(j.seed, j.tasks[0]): s for j, s in found if len(j.tasks) == 1}
+    used = {seed for seed, _ in alone}
+    together = {j.seed: s for j, s in found if j.monitor == first and len(j.tasks) > 1 and j.seed in used}
     rows = []
     for task in args.tasks:
         pairs = [(s[task].cell, alone[seed, task][task].cell) for seed, s in together.items()]
@@ -175,7 +180,8 @@ def alone_table(found: Sequence[tuple[Job, dict[str, Score]]], args: Args) -> Ta
         power = [Spread.of([p[i].found[rate].value for p in pairs]).text(100, 0) for i in (0, 1)]
         rows.append((task, *auroc, gained, *power))
     return Table(
-        f"{first}: learned from all skills together, one threshold, and from each alone with its own.",
+        f"{first}: learned from all skills together, one threshold, and from each alone with its own; "
+        f"{args.alone_seeds} of the seeds.",
         ("Task", "AUROC, together", "alone", "gained", f"Found at {100 * rate:g} % [%], together", "alone"),
         rows,
     )
@@ -213,7 +219,9 @@ def repertoire(args: Args, console: Console) -> list[Table]:
         ask = partial(score, run=args.run.resolve(), rate=args.false_alarm_rate, window_s=args.window)
         wanted_jobs = jobs(args)
         found = list(zip(wanted_jobs, dispatch(ask, wanted_jobs, args.workers, progress), strict=True))
-    tables = [seeds_table(found, args), alone_table(found, args)]
+    tables = [seeds_table(found, args)]
+    if args.alone_seeds:
+        tables.append(alone_table(found, args))
     if "neural_asm" in args.monitors:
         with stage("naming skills", console, seconds) as progress:
             name = partial(name_skills, args=args, switches=switches)

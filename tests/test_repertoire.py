@@ -29,6 +29,7 @@ def test_a_spread_is_mean_and_sample_deviation():
     ("arguments", "message"),
     [
         ({"seeds": 0}, "seeds must be at least 1, got 0"),
+        ({"alone_seeds": 4}, r"alone_seeds must be in \[0, 3\], got 4"),
         ({"switches": -1}, "switches must be at least 0, got -1"),
         ({"monitors": ("oracle",)}, "unknown monitor 'oracle'"),
         ({"monitors": ()}, "at least one monitor"),
