@@ -1,6 +1,7 @@
 """Prediction before the senses are read, and inference after.
 
     μ_t = W_H f(z_{t-1}) + W_U u_t                 expected state; u_t is the commanded action and a constant 1
+    h_t = W_H f(z_{t-1}) + b_U,  â_t = W_A f(h_t)  the action that belongs to the state; b_U stands for the constant 1
     z ← z - η ∂F/∂z,  η = 1.5 / (Π_z + Π_x‖W_F‖² + max|f''| ‖W_Fᵀ Π_x ε_x‖_∞)
 
 The bracket bounds the largest curvature of F, so a step below 2 over it cannot raise F, however W_F grows.
@@ -50,6 +51,12 @@ def sense(z: Array, W_F: Array, b_F: Array) -> Array:
     x = outward(activate(z), W_F)
     x += b_F
     return x
+
+
+def motor_prediction(z: Array, weights: Weights) -> tuple[Array, Array]:
+    """h_t (B, H) and â_t (B, A), from the state ``z`` (B, H) before: what comes next, were no action commanded."""
+    h: Array = outward(activate(z), weights.W_H) + weights.W_U[:, -1]
+    return h, outward(activate(h), weights.W_A)
 
 
 @kernel

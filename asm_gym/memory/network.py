@@ -17,6 +17,7 @@ from asm_gym.memory.energy import Array
 from asm_gym.memory.inference import Weights, expect, infer, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory, learn, passes
 from asm_gym.memory.precision import PRECISION_EPOCHS
+from asm_gym.memory.rehearsal import rehearse
 from asm_gym.memory.senses import Reading
 
 
@@ -125,7 +126,8 @@ def train(
     sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
     weights = initial_weights(hidden, sensory, commands - 1, rng)
     total = passes(trajectories, schedule) + TICKS + PRECISION_EPOCHS
-    energy = learn(weights, trajectories, schedule, rng, tick)
+    how_to = rehearse if schedule.carry_prior > 0 else learn
+    energy = how_to(weights, trajectories, schedule, rng, tick)
     inputs = np.concatenate([t.inputs for t in trajectories])
     association = learn_association(inputs, np.ascontiguousarray(inputs[:, changes]), groups, changes, units, rng, tick)
     how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision
