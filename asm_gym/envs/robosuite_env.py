@@ -98,14 +98,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             raise ValueError(
                 f"control_freq must divide the physics rate of {backend.PHYSICS_FREQ} Hz, got {control_freq}"
             )
-        self.stream_freq = control_freq if stream_freq is None else stream_freq
-        """Rows of the stream a second [Hz]."""
-        possible = [f for f in range(1, backend.PHYSICS_FREQ + 1) if not (backend.PHYSICS_FREQ % f or f % control_freq)]
-        if self.stream_freq not in possible:
-            raise ValueError(
-                f"stream_freq must divide the physics rate of {backend.PHYSICS_FREQ} Hz and be a multiple of the "
-                f"control rate of {control_freq} Hz, one of {', '.join(map(str, possible))}, got {stream_freq}"
-            )
+        self._row_substeps = _row_substeps(control_freq if stream_freq is None else stream_freq, control_freq)
         if sensor_noise < 0:
             raise ValueError(f"sensor_noise must be >= 0, got {sensor_noise}")
         self.horizon = self.task.horizon if horizon is None else horizon
@@ -128,7 +121,6 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """Called with every row of the stream that is sensed within a control step, all but the last; ``command()``
         gives the controllers another action from the next physics substep on."""
         self.substeps = backend.PHYSICS_FREQ // control_freq
-        self._row_substeps = backend.PHYSICS_FREQ // self.stream_freq
         self._groups = tuple(stream)
         self._flat = observation == "flat"
         self._seeded = False
@@ -172,6 +164,20 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.observation_layout = self._layout.sizes
         """The observation's parts in order, and how many numbers each has."""
         self.observation_space = self._layout.space(self._pictures.spaces)
+
+    @property
+    def stream_freq(self) -> int:
+        """Rows of the stream a second [Hz]; may be set between episodes.
+
+        Raises:
+            ValueError: a rate that does not fit physics or control; the message lists those that do.
+        """
+        return backend.PHYSICS_FREQ // self._row_substeps
+
+    @stream_freq.setter
+    def stream_freq(self, rate: int) -> None:
+        self._row_substeps = _row_substeps(rate, backend.PHYSICS_FREQ // self.substeps)
+        self._build_spaces()
 
     # ------------------------------------------------------------------ episodes
 
@@ -385,6 +391,18 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             self.robosuite_env.close()
             self.robosuite_env = None
         self._ended = True
+
+
+def _row_substeps(rate: int, control_freq: int) -> int:
+    """Physics substeps between two rows of the stream."""
+    physics = backend.PHYSICS_FREQ
+    possible = [f for f in range(control_freq, physics + 1) if not (physics % f or f % control_freq)]
+    if rate not in possible:
+        raise ValueError(
+            f"stream_freq must divide the physics rate of {physics} Hz and be a multiple of the control rate of "
+            f"{control_freq} Hz, one of {', '.join(map(str, possible))}, got {rate}"
+        )
+    return physics // rate
 
 
 def _gripper_actions(robots: list[Any]) -> tuple[int, ...]:

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from asm_gym.episodes import Episode
 from asm_gym.memory.association import Association, association_shapes, hidden_units, synapses
 from asm_gym.memory.energy import activate
-from asm_gym.memory.inference import Weights, weight_shapes
+from asm_gym.memory.inference import Weights, motor_prediction, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, train
 from asm_gym.memory.online import followed
@@ -240,6 +240,17 @@ class NeuralASM(PredictiveMonitor):
             self.network_.association = now
             self.learned_ = self.learned_ | {"U": now.U, "D": now.D}
         return learned
+
+    def expected_action(self, state: PredictiveState) -> NDArray[np.float32]:
+        """(B, A) the motor prediction: what is likely to be commanded next, in the units of the action.
+
+        Args:
+            state: as ``observe`` handed it back.
+        """
+        assert self.network_ is not None
+        motor, senses = self.spec.motor, self.senses_
+        _, action = motor_prediction(state.model.hidden, self.network_.weights)
+        return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
 
     def recall(self, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
         """What comes after a cue, from memory alone: (steps, D) rows in the units of the stream.
