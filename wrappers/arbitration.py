@@ -154,14 +154,15 @@ class Arbiter:
             self._on_trial += 1
             if self._on_trial > self._patience.release_after:
                 self._on_trial = None
-        tried = False
+        gave_up = tried = False
         if alarm and not intervened:
             self._take_over(executed)
         elif intervened and self._quiet >= self._patience.release_after:
             self.overriding, self._on_trial = False, None
+        elif intervened and self._acted >= (self._patience.max_override or math.inf):
+            gave_up = True
         elif intervened and self._held >= self._wait:
             self.overriding, self._on_trial, tried = False, 0, True
-        gave_up = intervened and self.overriding and self._acted >= (self._patience.max_override or math.inf)
         return Verdict(alarm, intervened, gave_up, alarm or tried)
 
     def _take_over(self, executed: NDArray[np.float32]) -> None:
