@@ -233,8 +233,9 @@ def test_where_a_backup_policy_fails_the_robot_holds_and_says_so(how):
     assert not infos[2]["asm"]["failure"]
 
 
-def test_control_is_handed_back_on_trial_and_withheld_longer_after_each_that_fails():
+def test_control_is_handed_back_on_trial_and_withheld_longer_after_each_that_fails(caplog):
     """Surprise stays over the threshold whatever is done: holds of 2, 4 and 8 steps, and then it gives up."""
+    caplog.set_level("INFO", logger="asm_gym.safety")
     env = NeuralASMSafety(FakeEnv(length=60), CueMonitor(range(3, 60)), try_after=2, max_override=14)
     env.reset(seed=0)
     infos = []
@@ -242,6 +243,9 @@ def test_control_is_handed_back_on_trial_and_withheld_longer_after_each_that_fai
         infos.append(env.step(ACT)[4])
     acting = "".join("h" if i["asm"]["intervened"] else "p" for i in infos)
     assert acting == "pppp" + "hh" + "p" + "hhhh" + "p" + "hhhhhhhh"
+    said = [i["asm"]["transition"] for i in infos if i["asm"]["transition"]]
+    assert said == ["override", "trial", "override", "trial", "override", "give_up"]
+    assert [r.message.split(":")[0] for r in caplog.records if r.name == "asm_gym.safety"] == said
 
 
 def test_a_trial_that_goes_well_is_forgotten():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, Recall
+
+_log = logging.getLogger("asm_gym.safety")
 
 
 @dataclass(frozen=True)
@@ -58,12 +61,15 @@ class Verdict(NamedTuple):
         intervened: the reflex was acting.
         gave_up: it has acted for as long as it may, and surprise is not quiet yet.
         acted_on: the surprise has had its consequence, so that its evidence is not to be counted again.
+        transition: ``"override"`` where the reflex takes over next, ``"release"`` where the policy does, ``"trial"``
+            where it does though surprise is not quiet, ``"give_up"``; empty where nothing changes.
     """
 
     alarm: bool
     intervened: bool
     gave_up: bool
     acted_on: bool
+    transition: str = ""
 
 
 NOTHING = Verdict(False, False, False, False)
@@ -154,16 +160,26 @@ class Arbiter:
             self._on_trial += 1
             if self._on_trial > self._patience.release_after:
                 self._on_trial = None
-        gave_up = tried = False
-        if alarm and not intervened:
-            self._take_over(executed)
-        elif intervened and self._quiet >= self._patience.release_after:
+        transition = self._next(alarm, executed)
+        if transition:
+            _log.info("%s: surprise %.3g, threshold %.3g", transition, surprise, self._threshold)
+        return Verdict(alarm, intervened, transition == "give_up", alarm or transition == "trial", transition)
+
+    def _next(self, alarm: bool, executed: NDArray[np.float32]) -> str:
+        """Who acts next, as a transition."""
+        if not self.overriding:
+            if alarm:
+                self._take_over(executed)
+            return "override" if alarm else ""
+        if self._quiet >= self._patience.release_after:
             self.overriding, self._on_trial = False, None
-        elif intervened and self._acted >= (self._patience.max_override or math.inf):
-            gave_up = True
-        elif intervened and self._held >= self._wait:
-            self.overriding, self._on_trial, tried = False, 0, True
-        return Verdict(alarm, intervened, gave_up, alarm or tried)
+            return "release"
+        if self._acted >= (self._patience.max_override or math.inf):
+            return "give_up"
+        if self._held >= self._wait:
+            self.overriding, self._on_trial = False, 0
+            return "trial"
+        return ""
 
     def _take_over(self, executed: NDArray[np.float32]) -> None:
         if self._on_trial is None:

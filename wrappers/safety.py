@@ -51,7 +51,9 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     ``info["asm"]`` holds ``surprise`` (the largest of this step), ``threshold``, ``alarm`` (surprise is over the
     threshold), ``intervened`` (the reflex acted in this step, or in a part of it), ``gave_up`` (it has acted for
-    ``max_override`` steps, and the episode ends), ``failure`` (why the reflex could not act and the robot held instead,
+    ``max_override`` steps, and the episode ends), ``transition`` (who acts from now on: ``"override"``,
+    ``"release"``, ``"trial"``, ``"give_up"``, or empty where nothing changes; they go to the log ``asm_gym.safety`` as
+    well), ``failure`` (why the reflex could not act and the robot held instead,
     or empty), ``executed_action`` (the last one), ``attribution`` (what each number of the stream adds to surprise),
     ``surprises`` (n,) of all rows in this step, and ``latency_us`` (the longest time that the monitor took for one).
     ``info["cost"]`` is 1.0 on every step with an alarm and 0.0 otherwise, as safe-RL libraries expect.
@@ -213,6 +215,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             "alarm": alarm,
             "intervened": any(look.verdict.intervened for look in looks),
             "gave_up": any(look.verdict.gave_up for look in looks),
+            "transition": next((t for look in reversed(looks) if (t := look.verdict.transition)), ""),
             "failure": self._arbiter.failure,
             "executed_action": executed,
             "attribution": dict(zip(self.monitor.spec.labels, worst.attribution[0].tolist(), strict=True)),

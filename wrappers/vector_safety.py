@@ -219,6 +219,7 @@ class VectorNeuralASMSafety(VectorWrapper):
             "alarm": alarm,
             "intervened": np.array([v.intervened for v in verdicts]),
             "gave_up": np.array([v.gave_up for v in verdicts]),
+            "transition": np.array([v.transition for v in verdicts]),
             "executed_action": executed,
             "attribution": dict(zip(self.monitor.spec.labels, surprise.attribution.T, strict=True)),
         }
