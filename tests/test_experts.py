@@ -11,7 +11,16 @@ from asm_gym.policies.scripted.base import Style, gripping
 from asm_gym.policies.scripted.door import _about
 from asm_gym.scripts.collect import collect
 
-QUICK = ["Stack", "Door", "NutAssemblySquare", "NutAssemblyRound", "PickPlaceCan", "PickPlaceMilk", "PickPlaceCereal"]
+QUICK = [
+    "Stack",
+    "Door",
+    "Wipe",
+    "NutAssemblySquare",
+    "NutAssemblyRound",
+    "PickPlaceCan",
+    "PickPlaceMilk",
+    "PickPlaceCereal",
+]
 
 
 @pytest.mark.parametrize("task", QUICK)
