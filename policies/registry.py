@@ -15,6 +15,7 @@ from asm_gym.policies.scripted.lift import LiftExpert
 from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
 from asm_gym.policies.scripted.stack import StackExpert
+from asm_gym.policies.scripted.two_arm_lift import TwoArmLiftExpert
 from asm_gym.policies.scripted.wipe import WipeExpert
 
 EXPERTS: dict[str, Callable[..., Policy]] = {
@@ -22,6 +23,7 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
     "Stack": StackExpert,
     "Door": DoorExpert,
     "Wipe": WipeExpert,
+    "TwoArmLift": TwoArmLiftExpert,
     **{f"NutAssembly{which}": NutAssemblyExpert for which in ("", "Single", "Square", "Round")},
     **{f"PickPlace{which}": PickPlaceExpert for which in ("", "Single", "Can", "Milk", "Bread", "Cereal")},
 }
