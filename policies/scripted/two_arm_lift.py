@@ -94,7 +94,7 @@ class TwoArmLiftExpert:
             return state._replace(phase=phase, since=0, anchors=at)
 
         off = at - handles
-        far = np.linalg.norm(off + [0.0, 0.0, _DEPTH], axis=1)  # (2,)
+        far = np.linalg.norm(off + np.array([0.0, 0.0, _DEPTH]), axis=1)  # (2,)
         if state.phase == REACH:
             aligned = all(abs(hand.turned[:, 1] @ across) > np.cos(0.15) for hand in hands)
             over = np.linalg.norm(off - _above(state), axis=1)
@@ -123,9 +123,9 @@ class TwoArmLiftExpert:
         if state.phase == LIFT:
             # Whoever is ahead waits: a pot that tilts turns in their fingers.
             risen = float(np.min(at[:, 2] - state.anchors[:, 2]))
-            return state.anchors + [0.0, 0.0, min(state.height, risen + 0.03)], CLOSE
+            return state.anchors + np.array([0.0, 0.0, min(state.height, risen + 0.03)]), CLOSE
         # What one hand still holds comes down slowly, before both let go and try again.
-        return state.anchors - [0.0, 0.0, 0.01 * min(state.since, 15)], CLOSE
+        return state.anchors - np.array([0.0, 0.0, 0.01 * min(state.since, 15)]), CLOSE
 
 
 def _above(state: TwoArmLiftState) -> Vector:
