@@ -14,6 +14,7 @@ from asm_gym.policies.scripted.base import (
     ObservationReader,
     Style,
     Vector,
+    has_settled,
     matrix,
     move,
     pointing_down,
@@ -66,7 +67,7 @@ class LiftExpert:
         cube_at = self._read(observation, "cube_pos")
         cube = matrix(self._read(observation, "cube_quat"))
 
-        state = self._advance(state, hand_at, cube_at)
+        state = self._advance(state, hand_at, cube_at, self._read(observation, "gripper_velocity"))
         target, grip = self._target(state, cube_at)
         aligned = pointing_down(hand, cube if state.phase <= DESCEND else None)
         command = np.append(move(hand_at, target, hand, aligned, state.speed), grip)
@@ -87,14 +88,14 @@ class LiftExpert:
             drift=np.zeros(7),
         )
 
-    def _advance(self, state: _State, hand_at: Vector, cube_at: Vector) -> _State:
+    def _advance(self, state: _State, hand_at: Vector, cube_at: Vector, fingers: Vector) -> _State:
         state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
         offset = hand_at - cube_at
         if state.phase == REACH and np.linalg.norm(offset - state.hover) < 0.02:
             return state._replace(phase=DESCEND, since=0)
         if state.phase == DESCEND and abs(offset[2] + state.depth) < 0.008 and np.linalg.norm(offset[:2]) < 0.015:
             return state._replace(phase=GRASP, since=0, grasped_at=hand_at)
-        if state.phase == GRASP and state.since >= 6:
+        if state.phase == GRASP and has_settled(fingers, state.since, 6):
             return state._replace(phase=LIFT, since=0)
         if state.phase == LIFT and np.linalg.norm(offset) > 0.05:  # lost it
             return state._replace(phase=REACH, since=0)
