@@ -1,5 +1,7 @@
 """Every scripted expert solves its task, keeps it solved, and varies."""
 
+from functools import partial
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,7 +11,9 @@ from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS
 from asm_gym.policies.scripted.base import Style, gripping
 from asm_gym.policies.scripted.door import _about
-from asm_gym.scripts.collect import collect
+from asm_gym.scripts.benchmark_experts import attempt
+from asm_gym.scripts.collect import collect, episode_seeds
+from asm_gym.scripts.dispatch import dispatch
 
 QUICK = [
     "Stack",
@@ -37,6 +41,23 @@ def test_an_expert_solves_its_task_and_leaves_it_solved(task):
         assert solved
         assert info["success"]
     env.close()
+
+
+@pytest.mark.parametrize("robot", ["IIWA", "Sawyer"])
+@pytest.mark.parametrize("task", ["Lift", "Stack", "PickPlaceCan"])
+def test_other_arms_solve_it_too(task, robot):
+    for seed in (2, 3):
+        made = attempt(seed, task, robot)
+        assert made.solved
+        assert made.held
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["IIWA", "Sawyer"])
+@pytest.mark.parametrize("task", ["Lift", "Stack", "PickPlaceCan"])
+def test_other_arms_succeed_on_90_of_100_seeds(task, robot):
+    made = dispatch(partial(attempt, task=task, robot=robot), episode_seeds(99, 100), 2)
+    assert sum(m.solved for m in made) >= 90
 
 
 @pytest.mark.slow
