@@ -46,6 +46,11 @@ class Hands:
         robots = self._env.unwrapped.robosuite_env.robots  # type: ignore[attr-defined]
         return np.stack([np.array(robot.base_ori, np.float64) for robot in robots])
 
+    def places(self) -> Vector:
+        """(2, 3) where the arms' bases are [m]."""
+        robots = self._env.unwrapped.robosuite_env.robots  # type: ignore[attr-defined]
+        return np.stack([np.array(robot.base_pos, np.float64) for robot in robots])
+
 
 def move_arm(base: Vector, hand: Hand, target: Vector, turned: Vector, speed: float, gain: float = 1.0) -> Vector:
     """(6,) the command, in the frame of its ``base`` (3, 3), that moves a hand towards a pose in the world."""
