@@ -19,6 +19,8 @@ QUICK = [
     "Stack",
     "Door",
     "Wipe",
+    "TwoArmPegInHole",
+    "TwoArmLift",
     "NutAssemblySquare",
     "NutAssemblyRound",
     "PickPlaceCan",
@@ -46,10 +48,9 @@ def test_an_expert_solves_its_task_and_leaves_it_solved(task):
 @pytest.mark.parametrize("robot", ["IIWA", "Sawyer"])
 @pytest.mark.parametrize("task", ["Lift", "Stack", "PickPlaceCan"])
 def test_other_arms_solve_it_too(task, robot):
-    for seed in (2, 3):
-        made = attempt(seed, task, robot)
-        assert made.solved
-        assert made.held
+    made = attempt(2, task, robot)
+    assert made.solved
+    assert made.held
 
 
 @pytest.mark.slow
