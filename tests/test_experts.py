@@ -57,9 +57,11 @@ def test_other_arms_solve_it_too(task, robot):
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["IIWA", "Sawyer"])
 @pytest.mark.parametrize("task", ["Lift", "Stack", "PickPlaceCan"])
-def test_other_arms_succeed_on_90_of_100_seeds(task, robot):
+def test_other_arms_succeed_on_most_of_100_seeds(task, robot):
+    # The IIWA, whose bin is at the end of its reach, solves 92 of 100: its bar leaves room for other seeds.
+    least = 85 if (task, robot) == ("PickPlaceCan", "IIWA") else 95
     made = dispatch(partial(attempt, task=task, robot=robot), episode_seeds(99, 100), 2)
-    assert sum(m.solved for m in made) >= 90
+    assert sum(m.solved for m in made) >= least
 
 
 @pytest.mark.slow
