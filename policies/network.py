@@ -162,7 +162,7 @@ class NetworkPolicy:
 def describe(env: gym.Env[Any, Any]) -> dict[str, Any]:
     """What an agent's actions depend on beside the observation, as far as ``env`` says it."""
     inner = env.unwrapped
-    found: dict[str, Any] = {"env": env.spec.id} if env.spec is not None else {}
+    found: dict[str, Any] = {"env": inner.spec.id} if inner.spec is not None else {}
     if hasattr(inner, "robots"):
         found["robots"] = list(inner.robots)
     if hasattr(inner, "controller"):

@@ -32,7 +32,7 @@ class Cloner:
     Args:
         learner: SAC, TD3 or PPO.
         observations: (N, O), as the learner sees them.
-        actions: (N, A) in [-1, 1].
+        actions: (N, A), as the environment takes them.
         learning_rate: of the updates while learning; cloning itself begins at 1e-3.
         seed: of the batches.
     """
@@ -48,7 +48,7 @@ class Cloner:
         if len(observations) != len(actions) or not len(actions):
             raise ValueError(f"every action needs its observation, got {len(observations)} and {len(actions)}")
         self._learner: Any = learner
-        self._observations, self._actions = torch.as_tensor(observations), torch.as_tensor(actions)
+        self._observations, self._actions = torch.as_tensor(observations), torch.as_tensor(as_kept(learner, actions))
         self._draw = torch.Generator().manual_seed(seed)
         self._optimiser = torch.optim.Adam(list(self._parameters()), lr=learning_rate)
 
@@ -122,8 +122,15 @@ class Anchor(BaseCallback):
 
 def steps_of(episodes: Sequence[Episode]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(N, O) observations and (N, A) actions of whole episodes, one after the other."""
-    observations = np.concatenate([e.observations[:-1] for e in episodes])
-    return observations, np.clip(np.concatenate([e.actions for e in episodes]), -1.0, 1.0)
+    return np.concatenate([e.observations[:-1] for e in episodes]), np.concatenate([e.actions for e in episodes])
+
+
+def as_kept(learner: BaseAlgorithm, actions: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, A) actions within their bounds; off-policy learners keep them scaled to [-1, 1]."""
+    space: Any = learner.action_space
+    within = np.clip(actions, space.low, space.high)
+    kept = learner.policy.scale_action(within) if isinstance(learner, OffPolicyAlgorithm) else within
+    return np.asarray(kept, np.float32)
 
 
 def fill_buffer(learner: OffPolicyAlgorithm, episodes: Sequence[Episode], mean: Any, scale: Any) -> None:
@@ -131,7 +138,7 @@ def fill_buffer(learner: OffPolicyAlgorithm, episodes: Sequence[Episode], mean: 
     assert learner.replay_buffer is not None
     for episode in episodes:
         seen = ((episode.observations - mean) / scale).astype(np.float32)
-        actions = np.clip(episode.actions, -1.0, 1.0)
+        actions = as_kept(learner, episode.actions)
         for t, reward in enumerate(episode.rewards):
             last = t == len(episode) - 1
             # What was merely cut short is worth what would have followed.
