@@ -22,7 +22,7 @@ from asm_gym.episodes import Episode
 from asm_gym.scripts.dispatch import Progress
 
 BATCH = 256
-LOG_STD = -2.5
+LOG_STD = -3.5
 """Of a cloned SAC actor before tanh: it explores near to what the expert does."""
 
 

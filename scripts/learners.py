@@ -53,7 +53,7 @@ _OFF_POLICY: dict[str, Any] = {
     "learning_starts": 1000,
 }
 RECIPES = {
-    "sac": Recipe({**_OFF_POLICY, "ent_coef": "auto_0.005", "target_entropy": -14.0}, 0.05, 1, 2000),
+    "sac": Recipe({**_OFF_POLICY, "ent_coef": "auto_0.005", "target_entropy": -21.0}, 0.05, 1, 2000),
     "td3": Recipe({**_OFF_POLICY, "policy_delay": 2}, 0.05, 1, 2000),
     "ppo": Recipe(
         {"learning_rate": 1e-4, "n_steps": 2000, "batch_size": 200, "gamma": 0.98, "n_epochs": 5}, 1.0, 50, 0

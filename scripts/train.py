@@ -36,7 +36,7 @@ from asm_gym.tasks import task as task_spec
 class Args:
     """An agent for a task."""
 
-    task: Annotated[str, tyro.conf.Positional] = "Lift"
+    task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")] = "Lift"
     """Name of a task, or any Gymnasium id with Box spaces."""
     algorithm: str = "sac"
     """sac, td3 or ppo."""
