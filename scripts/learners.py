@@ -53,7 +53,7 @@ _OFF_POLICY: dict[str, Any] = {
     "learning_starts": 1000,
 }
 RECIPES = {
-    "sac": Recipe({**_OFF_POLICY, "ent_coef": "auto_0.005", "target_entropy": -21.0}, 0.05, 1, 2000),
+    "sac": Recipe(_OFF_POLICY, 0.05, 1, 2000),
     "td3": Recipe({**_OFF_POLICY, "policy_delay": 2}, 0.05, 1, 2000),
     "ppo": Recipe(
         {"learning_rate": 1e-4, "n_steps": 2000, "batch_size": 200, "gamma": 0.98, "n_epochs": 5}, 1.0, 50, 0
@@ -125,6 +125,10 @@ def make_learner(algorithm: str, env: gym.Env[Any, Any], seed: int, cloned: bool
         return PPO("MlpPolicy", env, policy_kwargs=kwargs, **settings)
     if cloned:
         settings["learning_starts"] = 0
+        if algorithm == "sac":
+            # A third of the usual spread for each number of the action, or grasps that were learned are shaken off.
+            entropy = -3.0 * float(np.prod(env.action_space.shape or ()))
+            settings |= {"ent_coef": "auto_0.005", "target_entropy": entropy}
     kwargs = {"net_arch": list(HIDDEN)}
     learner: _SAC | _TD3
     if algorithm == "sac":

@@ -95,11 +95,16 @@ class Run:
         plan: how.
         out: its folder.
         demonstrations: successful episodes of an expert; perhaps none.
+
+    Raises:
+        TypeError: spaces other than Boxes with one axis.
+        ValueError: demonstrations of other sizes.
     """
 
     def __init__(self, plan: Plan, out: Path, demonstrations: Sequence[Episode]) -> None:
         self.plan, self.out, self.demonstrations = plan, out, demonstrations
         self.env = plan.make()
+        _check(self.env, demonstrations)
         seen = steps_of(demonstrations)[0] if demonstrations else _wandered(self.env, plan.seed)
         self.standard = Standard.of(seen)
         around = Monitor(self.standard.around(self.env))
@@ -169,6 +174,17 @@ class Run:
 def success_rate(agent: NetworkPolicy, env: gym.Env[Any, Any], seeds: Sequence[int]) -> float:
     """Over one episode from each seed."""
     return float(np.mean([rollout(env, agent, seed) for seed in seeds]))
+
+
+def _check(env: gym.Env[Any, Any], demonstrations: Sequence[Episode]) -> None:
+    """Raises TypeError or ValueError where there is nothing that these learners can learn."""
+    for name, space in (("observations", env.observation_space), ("actions", env.action_space)):
+        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+            raise TypeError(f"an agent is trained where {name} are a Box with one axis, got {space}")
+        for n, episode in enumerate(demonstrations):
+            size = getattr(episode, name).shape[1]
+            if size != space.shape[0]:
+                raise ValueError(f"demonstration {n} has {name} of {size} numbers, the environment {space.shape[0]}")
 
 
 def _wandered(env: gym.Env[Any, Any], seed: int, steps: int = 1000) -> NDArray[np.float32]:

@@ -17,7 +17,7 @@ from asm_gym.policies.network import NetworkPolicy
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.cloning import Anchor, Cloner, fill_buffer, steps_of
 from asm_gym.scripts.learners import ALGORITHMS, RECIPES, export, make_learner, warm_critic
-from asm_gym.scripts.training import Standard
+from asm_gym.scripts.training import Plan, Run, Standard
 from asm_gym.scripts.training_state import Progressed, newest, resume, save
 from asm_gym.stream import StreamSpec
 
@@ -127,6 +127,12 @@ def test_an_anchored_actor_stays_with_its_expert(env):
     assert np.abs(kept - actions).mean() < 0.3 * np.abs(moved - actions).mean()
 
 
+def test_demonstrations_of_another_size_are_refused(tmp_path):
+    plan = Plan("MountainCarContinuous-v0", {}, "sac", 0, 1, 1, 1, 1, 0)
+    with pytest.raises(ValueError, match="demonstration 0 has observations of 3 numbers, the environment 2"):
+        Run(plan, tmp_path, linear_expert())
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_checkpoint_gives_back_the_learner(algorithm, env, tmp_path):
     learner = small(algorithm, env, cloned=False)
@@ -191,6 +197,7 @@ def test_an_expert_is_cloned_and_improved_end_to_end(tmp_path):
         (["ToolHang", "--steps", "10"], "no scripted expert"),
         (["Lift", "--dataset", "nowhere"], "nowhere"),
         (["Lift", "--evaluate-every", "0"], "evaluate_every"),
+        (["CartPole-v1", "--demonstrations", "0"], "actions are a Box"),
     ],
 )
 def test_what_makes_no_sense_is_refused(arguments, message, tmp_path, capsys):
