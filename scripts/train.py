@@ -1,7 +1,7 @@
 """Trains a stable-baselines3 agent: cloned from an expert's episodes, then improved by its own.
 
 A run lives in one folder and can be killed at any time: the same command goes on from the last checkpoint. The best
-agent of its evaluations, the clone included, is written as arrays and JSON, and judged once more on seeds of its own.
+agent of its evaluations is written as arrays and JSON, beside the clone, and judged once more on seeds of its own.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from asm_gym.scripts.collect import episode_seeds
 from asm_gym.scripts.dispatch import Progress
 from asm_gym.scripts.learners import ALGORITHMS
 from asm_gym.scripts.progress import stage
-from asm_gym.scripts.training import Plan, Run, success_rate
+from asm_gym.scripts.training import BEST, CLONE, Plan, Run, success_rate
 from asm_gym.tasks import task as task_spec
 
 
@@ -150,7 +150,7 @@ def train(args: Args, console: Console) -> dict[str, Any]:
         with stage("learning", console, seconds) as tick:
             run.learn(tick)
         with stage("judging", console, seconds):
-            agent = NetworkPolicy.load(args.out / "best.npz").fit_to(run.env, "the agent")
+            agent = NetworkPolicy.load(args.out / (BEST if args.steps else CLONE)).fit_to(run.env, "the agent")
             seeds = episode_seeds(args.seed, args.final_episodes, stage=3)
             success = success_rate(agent, run.env, seeds)
     finally:

@@ -27,6 +27,10 @@ from asm_gym.scripts.learners import RECIPES, export, make_learner, warm_critic
 from asm_gym.scripts.training_state import Progressed, newest, resume, save
 
 
+BEST, CLONE = "best.npz", "clone.npz"
+"""The best agent of the evaluations, and what it was before it learned from its own steps."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """What is trained where, and how long; the names are those of ``asm-gym train``'s options."""
@@ -155,14 +159,19 @@ class Run:
         save(self.out, self.learner, self.progressed)
 
     def evaluate(self) -> float:
-        """The share of successes of the agent as it is now, which is kept where it is the best."""
+        """The share of successes of the agent as it is now, which is kept where it is the best.
+
+        What has not learned from its own steps yet is a clone, and is kept as such.
+        """
         agent = export(self.learner, self.plan.algorithm, self.standard.mean, self.standard.scale, self._judged)
         seeds = episode_seeds(self.plan.seed, self.plan.evaluation_episodes, stage=2)
         success = success_rate(agent, self._judged, seeds)
-        steps = self.learner.num_timesteps
-        if success >= self.progressed.best:
-            agent.save(self.out / "best.npz", steps=steps, success=success, seeds=len(seeds))
-        best = max(success, self.progressed.best)
+        steps, best = self.learner.num_timesteps, self.progressed.best
+        if steps == 0:
+            agent.save(self.out / CLONE, steps=steps, success=success, episodes=len(seeds))
+        elif success >= best:
+            agent.save(self.out / BEST, steps=steps, success=success, episodes=len(seeds))
+            best = success
         self.progressed = Progressed(steps, best, (*self.progressed.curve, (steps, success)))
         return success
 

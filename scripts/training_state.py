@@ -22,7 +22,7 @@ class Progressed:
 
     Args:
         steps: control steps that were learned from.
-        best: share of successes of the best agent so far; -1 before the first evaluation.
+        best: share of successes of the best agent so far that has learned from its own steps; -1 before there is one.
         curve: (steps, share of successes) of each evaluation.
     """
 
