@@ -26,7 +26,6 @@ from asm_gym.scripts.dispatch import Progress
 from asm_gym.scripts.learners import RECIPES, export, make_learner, warm_critic
 from asm_gym.scripts.training_state import Progressed, newest, resume, save
 
-
 BEST, CLONE = "best.npz", "clone.npz"
 """The best agent of the evaluations, and what it was before it learned from its own steps."""
 
