@@ -122,6 +122,7 @@ def make_learner(algorithm: str, env: gym.Env[Any, Any], seed: int, cloned: bool
         # Little noise at first: a cloned gripper that flutters drops things.
         kwargs = {"net_arch": list(HIDDEN), "activation_fn": nn.ReLU, "log_std_init": -2.0 if cloned else -0.5}
         settings["n_steps"] = max(2, min(settings["n_steps"], steps))
+        settings["batch_size"] = min(settings["batch_size"], settings["n_steps"])
         return PPO("MlpPolicy", env, policy_kwargs=kwargs, **settings)
     if cloned:
         settings["learning_starts"] = 0
