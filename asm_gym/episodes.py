@@ -20,14 +20,15 @@ class Episode:
     """One episode of T control steps.
 
     Args:
-        stream: (T, D) float32, the sensorimotor stream; row t was sensed after action t.
+        stream: (T, D) float32, the sensorimotor stream; row t was sensed after action t. (k T, D) where the stream runs
+            k times faster than control.
         spec: names the D numbers.
         success: the task was solved at some step.
         seed: what ``reset`` was given.
         actions: (T, A) float32, as the policy commanded them.
         observations: (T + 1, O) float32, the first one from ``reset``.
         rewards: (T,) float32.
-        faults: (T,) bool, a fault was active in that step (the ground truth).
+        faults: (T,) bool, a fault was active in that row of the stream (the ground truth).
         info: whatever else is worth keeping; JSON-serialisable.
     """
 

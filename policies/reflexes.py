@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.stream import StreamSpec
+from asm_gym.stream import StreamSpec, control_period
 
 USUAL_GAIN = 0.1
 """Weight of the newest step in the external torque that is taken to be usual."""
@@ -87,6 +87,30 @@ class Hold:
         return self._rest.copy()
 
 
+class Recall(Hold):
+    """Goes on along what the memory expects to be commanded: the skill's own continuation.
+
+    The wrapper says what that is after every step, by the monitor's ``expected_action``.
+    """
+
+    def reset(self) -> None:
+        self.expects(self._rest)
+
+    def expects(self, action: NDArray[np.float32]) -> None:
+        """What the memory expects to be commanded next (A,)."""
+        self._expected = np.nan_to_num(np.asarray(action, np.float32))
+
+    def predict(
+        self,
+        observation: Any,
+        state: Begun | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], Begun | None]:
+        """The next action (A,), the gripper's part of it included."""
+        return self._expected.copy(), None if state is None else Begun(state.executed, state.steps + 1)
+
+
 class Retract(Hold):
     """Back along the path just travelled, then stay.
 
@@ -142,7 +166,7 @@ class Comply(Hold):
             raise ValueError("comply needs the channel external_torque: make the environment with stream group torque")
         self._env: Any = env.unwrapped
         self.tolerated = tolerated
-        self._each_step = compliance * spec.dt
+        self._each_step = compliance * control_period(env)
         self.reset()
 
     def reset(self) -> None:
@@ -168,10 +192,15 @@ class Comply(Hold):
 
 
 class Graded(Comply):
-    """Stays; yields while something keeps pressing; the wrapper hands back when surprise is quiet, or ends the episode.
+    """Stays; yields while something keeps pressing.
+
+    The wrapper hands back when surprise is quiet, and on trial after ``TRY_AFTER_S`` where it is not, for a robot that
+    holds still where it never did may surprise itself; after ``GIVE_UP_AFTER_S`` in all it ends the episode.
 
     The arguments are those of ``Comply``, with more torque tolerated.
     """
+
+    TRY_AFTER_S, GIVE_UP_AFTER_S = 0.5, 3.0
 
     def __init__(self, env: gym.Env[Any, Any], compliance: float = 0.05, tolerated: float = 4.0) -> None:
         super().__init__(env, compliance, tolerated)

@@ -24,6 +24,7 @@ import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
 from asm_gym.evaluation.metrics import Share
 from asm_gym.policies.registry import EXPERTS
+from asm_gym.scripts.benchmark_fit import Fit
 from asm_gym.scripts.benchmark_memory import Memory, Safety
 from asm_gym.scripts.collect import collect
 from asm_gym.scripts.progress import stage
@@ -248,6 +249,7 @@ class Args:
         | Annotated[Leaks, tyro.conf.subcommand("leaks")]
         | Annotated[Experts, tyro.conf.subcommand("experts")]
         | Annotated[Memory, tyro.conf.subcommand("memory")]
+        | Annotated[Fit, tyro.conf.subcommand("fit")]
         | Annotated[Safety, tyro.conf.subcommand("safety")],
         tyro.conf.arg(name=""),
     ] = field(default_factory=Env)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -38,7 +39,7 @@ class PlainTorch:
         self.w = {n: torch.tensor(W) for n, W in asm.network_.weights._asdict().items()}
         self.a = {n: torch.tensor(W) for n, W in asm.network_.association._asdict().items()}
         self.pi_z, self.pi_x = asm.prior_precision, asm.sensory_precision
-        self.curvature, self.iterations = asm.network_.curvature, asm.iterations
+        self.curvature, self.iterations = float(asm.network_.curvature), asm.iterations
         d, s = asm.detector_, asm.senses_
         self.M, self.q, self.gains = (torch.tensor(x, dtype=torch.float32) for x in (d.whitening, d.ceiling, d.gains))
         self.habit, self.bound = torch.tensor(d.habit, dtype=torch.float32), d.bound
@@ -189,7 +190,7 @@ class Memory:
 
 @dataclass
 class Safety:
-    """What the safety wrapper adds to a control step."""
+    """What the safety wrapper adds to a control step, at the control rate and within control steps."""
 
     task: str = "Lift"
     """a task's name"""
@@ -197,25 +198,38 @@ class Safety:
     """hidden units of the memory"""
     steps: int = 400
     """control steps of each rival"""
+    monitor_freq: int = 100
+    """rows watched a second, where it watches within control steps [Hz]"""
 
     def run(self, console: Console, take_turns: Callable[..., dict[str, float]]) -> int:
         """Prints the table."""
-        env_id = f"asm_gym/{self.task}-v0"
-        episodes = collect(env_id, episodes=6, workers=1, horizon=40)
-        asm = NeuralASM(episodes[0].spec, hidden_size=self.hidden, epochs=1).fit(episodes[:4])
-        asm.calibrate(episodes[4:], 0.5)
-        plain, wrapped = (gym.make(env_id, horizon=10**9, disable_env_checker=True) for _ in range(2))
-        wrapped = NeuralASMSafety(wrapped, asm, on_alarm="monitor")
+        plain = self._make(None)
+        envs = {"step": plain, "step under the wrapper": NeuralASMSafety(self._make(None), self._memory(None))}
+        rate = self.monitor_freq
+        watched = NeuralASMSafety(self._make(rate), self._memory(rate), monitor_freq=rate)
+        envs |= {f"step, stream at {rate} Hz": self._make(rate), f"step under the wrapper at {rate} Hz": watched}
         action = np.zeros(plain.action_space.shape or (), np.float32)
-        for env in (plain, wrapped):
+        for env in envs.values():
             env.reset(seed=0)
-        rivals = {"step": lambda: plain.step(action), "step under the wrapper": lambda: wrapped.step(action)}
+        rivals = {name: partial(env.step, action) for name, env in envs.items()}
         seconds = take_turns(rivals, self.steps, console)
         table = _table(f"{self.task}, 20 Hz, {self.hidden} hidden units: a control step", "", "ms", "against step")
         for name, s in seconds.items():
             table.add_row(name, f"{1e3 * s:.2f}", f"{s / seconds['step']:.2f}×")
         console.print(table)
         return 0
+
+    def _make(self, rate: int | None) -> gym.Env[Any, Any]:
+        env_id = f"asm_gym/{self.task}-v0"
+        return gym.make(env_id, horizon=10**9, stream_freq=rate, disable_env_checker=True)
+
+    def _memory(self, rate: int | None) -> NeuralASM:
+        """One that has learned little, and whose threshold is out of reach: the cost is the same."""
+        env_id = f"asm_gym/{self.task}-v0"
+        episodes = collect(env_id, episodes=4, workers=1, horizon=40, stream_freq=rate)
+        asm = NeuralASM(episodes[0].spec, hidden_size=self.hidden, epochs=1).fit(episodes)
+        asm.threshold_ = np.inf
+        return asm
 
 
 def _table(title: str, *columns: str) -> Table:

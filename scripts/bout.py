@@ -18,7 +18,8 @@ from asm_gym.faults.suite import draw, suite_fault
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy, rollout
 from asm_gym.scripts.dispatch import environment
-from asm_gym.scripts.record import draw_onset
+from asm_gym.scripts.record import Course, draw_onset
+from asm_gym.stream import control_period
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety
 
 NOMINAL, PASSING = "nominal", "passing_push"
@@ -46,21 +47,22 @@ def _fault(kind: str, env: RobosuiteEnv, onset: int, seed: int) -> tuple[Fault, 
         return ()
     if kind == PASSING:
         drawn = draw(env, onset, seed)
-        duration = max(1, round(0.3 / env.stream_spec.dt))
-        return (Push(body=drawn.link, newtons=30.0, direction=drawn.direction, duration=duration, onset=onset),)
+        duration = max(1, round(0.3 / control_period(env)))
+        return (Push(body=drawn.link, newtons=20.0, direction=drawn.direction, duration=duration, onset=onset),)
     return (suite_fault(kind, env, "strong", onset, seed),)
 
 
-def run_bout(one: Bout, robot: str, policy: str, max_override_s: float, memory: Path) -> Reaction:
+def run_bout(one: Bout, course: Course, max_override_s: float, memory: Path) -> Reaction:
     """Runs one episode in this process's environment.
 
     Args:
+        course: how episodes are made; its ``stream_freq`` is the rate that the memory watches at.
         memory: where the calibrated memory was saved.
     """
-    base = environment(f"asm_gym/{one.task}-v0", (("robot", robot),))
+    base = environment(f"asm_gym/{one.task}-v0", course.settings())
     inner: Any = base.unwrapped
     monitor = _memory(memory, memory.stat().st_mtime_ns)
-    dt = monitor.spec.dt
+    dt = control_period(base)
     onset = draw_onset(one.seed, inner.horizon)
     alone = one.acting == POLICY_ALONE
     env = NeuralASMSafety(
@@ -71,12 +73,13 @@ def run_bout(one: Bout, robot: str, policy: str, max_override_s: float, memory: 
     )
     infos: list[dict[str, Any]] = []
     try:
-        success = rollout(env, make_policy(policy, env, seed=one.seed), one.seed, infos.append)
+        success = rollout(env, make_policy(course.policy, env, seed=one.seed), one.seed, infos.append)
     finally:
         env.get_wrapper_attr("undo_faults")()
-    alarms = np.array([info["asm"]["alarm"] for info in infos])
     since = infos[onset:]
-    raised = np.flatnonzero(alarms[onset:] & ~np.concatenate([[False], alarms])[onset:-1])
+    rows = np.concatenate([info["asm"]["surprises"] for info in infos]) > monitor.threshold
+    began = onset * len(infos[0]["asm"]["surprises"])
+    raised = np.flatnonzero(rows[began:] & ~np.concatenate([[False], rows])[began:-1])
     last = infos[-1]["asm"]
     return Reaction(
         task=one.task,
@@ -86,8 +89,8 @@ def run_bout(one: Bout, robot: str, policy: str, max_override_s: float, memory: 
         success=success,
         peak_force=float(np.nanmax([info["external_force"] for info in since], initial=0.0)),
         impulse=float(np.nansum([info["external_impulse"] for info in since])),
-        alarm_s=float(alarms.sum() * dt),
+        alarm_s=float(rows.sum() * monitor.spec.dt),
         acted_s=sum(info["asm"]["intervened"] for info in infos) * dt,
-        delay_ms=1e3 * (raised[0] + 1) * dt if len(raised) and one.fault != NOMINAL else math.inf,
+        delay_ms=1e3 * (raised[0] + 1) * monitor.spec.dt if len(raised) and one.fault != NOMINAL else math.inf,
         ended=bool(last["gave_up"] or (one.acting == "terminate" and last["alarm"])),
     )

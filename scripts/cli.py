@@ -22,6 +22,7 @@ COMMANDS: dict[str, Command] = {
     "import": Command("asm_gym.scripts.demonstrations", "robosuite's or robomimic's HDF5 demonstrations, likewise"),
     "train": Command("asm_gym.scripts.train", "an agent: cloned from an expert, improved by SAC, TD3 or PPO"),
     "evaluate": Command("asm_gym.scripts.evaluate", "tasks x monitors x faults: who notices what, with a report"),
+    "repertoire": Command("asm_gym.scripts.repertoire", "one memory of all skills against one for each, over seeds"),
     "react": Command("asm_gym.scripts.react", "reflexes x faults: what acting on alarms is worth, paired by seed"),
     "benchmark": Command("asm_gym.scripts.benchmark", "speeds, as ratios against rivals in the same run"),
     "doctor": Command("asm_gym.scripts.doctor", "what this machine lacks, and the command that installs it"),

@@ -90,7 +90,7 @@ class Judgement:
         }
 
 
-class _Opinion(NamedTuple):
+class Opinion(NamedTuple):
     """What one monitor said."""
 
     verdicts: list[Verdict]
@@ -126,12 +126,12 @@ def judge(
     made = dispatch(opine, list(models.values()), crew, lambda k, n: progress(k * len(monitors) // n, len(monitors)))
     found = {name: opinion for opinions in made for name, opinion in opinions.items()}
     opinions = {name: found[name] for name in monitors}
-    by_role, failed, twins = _by_role(folder, labels)
+    by_role, failed, twins = sorted_by_role(folder, labels)
     return Judgement(
         {n: o.verdicts for n, o in opinions.items()},
         {n: o.harmless for n, o in opinions.items()},
         {n: o.thresholds for n, o in opinions.items()},
-        _sights(twins, by_role.get("faulty", []), window_s),
+        sights_of(twins, by_role.get("faulty", []), window_s),
         rate,
         window_s,
         failed,
@@ -142,12 +142,12 @@ def judge(
 
 def _opinions(
     names: Sequence[str], folder: Path, labels: Sequence[Label], rate: float, seed: int
-) -> dict[str, _Opinion]:
-    by_role, _, _ = _by_role(folder, labels)
-    return {name: _opinion(name, folder, by_role, rate, seed) for name in names}
+) -> dict[str, Opinion]:
+    by_role, _, _ = sorted_by_role(folder, labels)
+    return {name: opinion_of(name, folder, by_role, rate, seed) for name in names}
 
 
-def _opinion(name: str, folder: Path, by_role: Mapping[str, Sequence[Recording]], rate: float, seed: int) -> _Opinion:
+def opinion_of(name: str, folder: Path, by_role: Mapping[str, Sequence[Recording]], rate: float, seed: int) -> Opinion:
     monitor = fitted(folder, name, by_role["fit"], seed)
     maxima = np.array([s.value.max() for s in _scores(monitor, by_role["calibration"])])
     rates = sorted({r for r in (*RATES, rate) if len(maxima) >= conformal_episodes(r)})
@@ -155,10 +155,10 @@ def _opinion(name: str, folder: Path, by_role: Mapping[str, Sequence[Recording]]
     tested = [*by_role["nominal"], *by_role.get("faulty", [])]
     verdicts = _verdicts(name, monitor, tested, thresholds[rate])
     harmless = _verdicts(name, monitor, by_role.get("harmless", []), thresholds[rate])
-    return _Opinion(verdicts, harmless, thresholds, _examples(monitor, verdicts, tested, thresholds[rate]))
+    return Opinion(verdicts, harmless, thresholds, _examples(monitor, verdicts, tested, thresholds[rate]))
 
 
-def _by_role(folder: Path, labels: Sequence[Label]) -> tuple[dict[str, list[Recording]], int, list[Recording]]:
+def sorted_by_role(folder: Path, labels: Sequence[Label]) -> tuple[dict[str, list[Recording]], int, list[Recording]]:
     """Recordings by role, how many nominal ones failed and are not among them, and all twins of faulty ones."""
     recordings = {label: read(folder / label.path) for label in labels}
     by_role: dict[str, list[Recording]] = {}
@@ -193,7 +193,7 @@ def fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) 
 
 def calibrated(folder: Path, name: str, labels: Sequence[Label], seed: int, threshold: float) -> Any:
     """The monitor as it judged the run, with the threshold it judged by."""
-    by_role, _, _ = _by_role(folder, [label for label in labels if label.role in NOMINAL])
+    by_role, _, _ = sorted_by_role(folder, [label for label in labels if label.role in NOMINAL])
     monitor: Any = fitted(folder, name, by_role["fit"], seed)
     monitor.threshold_ = threshold
     return monitor
@@ -262,7 +262,7 @@ def _examples(
     return traces
 
 
-def _sights(nominal: Sequence[Recording], faulty: Sequence[Recording], window_s: float) -> list[Sight]:
+def sights_of(nominal: Sequence[Recording], faulty: Sequence[Recording], window_s: float) -> list[Sight]:
     twins = {(r.label.task, r.label.seed): r.episode.stream for r in nominal}
     noises: dict[str, Any] = {}
     sights = []

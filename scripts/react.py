@@ -20,18 +20,19 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 from asm_gym.choices import check_choice
-from asm_gym.evaluation.archive import Recording, read
+from asm_gym.evaluation.archive import Label, Recording, read
 from asm_gym.evaluation.reactions import Comparison, Estimate, Reaction, compare
 from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.trace import POLICY_ALONE
 from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.bout import NOMINAL, PASSING, Bout, run_bout
-from asm_gym.scripts.dispatch import Crew, dispatch
+from asm_gym.scripts.claims import claim_folder
+from asm_gym.scripts.dispatch import Crew, Progress, dispatch
 from asm_gym.scripts.judge import fitted
 from asm_gym.scripts.progress import stage
 from asm_gym.scripts.publish import markdown
-from asm_gym.scripts.record import episode_seeds
+from asm_gym.scripts.record import Course, episode_seeds, record
 from asm_gym.wrappers.safety import ON_ALARM
 
 FAULTS = (NOMINAL, PASSING, "collision", "held_by_person", "stuck_joint", "encoder_bias")
@@ -42,19 +43,25 @@ class Args:
     """Reflexes x faults: success, force, and time in alarm, against the policy alone."""
 
     run: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
-    """Folder of an evaluation, whose nominal episodes the memory learns from."""
+    """Folder of an evaluation, whose nominal episodes the memory learns from at the control rate."""
     tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan", "Door")
-    """Names of tasks; the evaluation must have recorded them."""
+    """Names of tasks; at the control rate the evaluation must have recorded them."""
     robot: str = "Panda"
     """The arm."""
     policy: str = "scripted"
     """What acts: scripted, or the path of an agent."""
-    reflexes: tuple[str, ...] = ("hold", "retract", "comply", "graded", "terminate")
+    reflexes: tuple[str, ...] = ("hold", "retract", "comply", "recall", "graded", "terminate")
     """What ``on_alarm`` takes."""
     faults: tuple[str, ...] = FAULTS
-    """nominal, passing_push (30 N for 0.3 s), or kinds of the suite, which are strong."""
+    """nominal, passing_push (20 N for 0.3 s), or kinds of the suite, which are strong."""
     episodes: int = 12
     """Of each task, fault and reflex."""
+    monitor_freq: int | None = None
+    """Rows watched a second [Hz], for reflexes within control steps; nominal episodes are then recorded here."""
+    fit_episodes: int = 60
+    """Nominal episodes of each task to learn from, with a monitor_freq."""
+    calibration_episodes: int = 60
+    """Others of each task, to calibrate on."""
     max_override_s: float = 3.0
     """How long a reflex may act at a stretch before the episode is ended [s]."""
     false_alarm_rate: float = 0.01
@@ -71,10 +78,15 @@ class Args:
             check_choice("reflex", name, ON_ALARM)
         for name in self.faults:
             check_choice("fault", name, (NOMINAL, PASSING, *KINDS))
-        if self.episodes < 1:
-            raise ValueError(f"episodes must be at least 1, got {self.episodes}")
+        for name in ("episodes", "fit_episodes", "calibration_episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if not self.max_override_s > 0:
             raise ValueError(f"max_override_s must be > 0, got {self.max_override_s}")
+
+    @property
+    def course(self) -> Course:
+        return Course(self.robot, self.policy, stream_freq=self.monitor_freq)
 
 
 def learned_from(args: Args) -> NeuralASM:
@@ -84,8 +96,10 @@ def learned_from(args: Args) -> NeuralASM:
         ValueError: it recorded too little.
     """
 
+    folder = args.run if args.monitor_freq is None else args.out
+
     def role(name: str) -> list[Recording]:
-        paths = [p for task in args.tasks for p in sorted((args.run / "episodes" / task / name).glob("*.npz"))]
+        paths = [p for task in args.tasks for p in sorted((folder / "episodes" / task / name).glob("*.npz"))]
         return [r for r in map(read, paths) if r.episode.success]
 
     fit = role("fit")
@@ -94,6 +108,20 @@ def learned_from(args: Args) -> NeuralASM:
     memory = fitted(args.out, "neural_asm", fit, args.seed)
     assert isinstance(memory, NeuralASM)
     return memory.calibrate([r.episode for r in role("calibration")], args.false_alarm_rate)
+
+
+def record_nominal(args: Args, progress: Progress) -> None:
+    """Records nominal episodes at ``monitor_freq``, those that are not there yet."""
+    roles = {"fit": args.fit_episodes, "calibration": args.calibration_episodes}
+    wanted = [
+        Label(task, role, seed=s)
+        for task in args.tasks
+        for role, n in roles.items()
+        for s in episode_seeds(args.seed, task, role, n)
+    ]
+    missing = [label for label in wanted if not (args.out / label.path).is_file()]
+    make = partial(record, course=args.course, folder=args.out.resolve())
+    dispatch(make, missing, Crew(args.workers), lambda k, n: progress(len(wanted) - n + k, len(wanted)))
 
 
 def bouts(args: Args) -> list[Bout]:
@@ -156,12 +184,18 @@ def react(args: Args, console: Console) -> Table:
     """Fits, runs, compares and writes."""
     seconds: dict[str, float] = {}
     args.out.mkdir(parents=True, exist_ok=True)
+    if args.monitor_freq is not None:
+        settings = {"robot": args.robot, "policy": args.policy, "seed": args.seed, "monitor_freq": args.monitor_freq}
+        claim_folder(args.out, "recordings.json", settings)
+        with stage("recording", console, seconds) as progress:
+            record_nominal(args, progress)
     with stage("fitting and calibrating", console, seconds):
         memory = args.out / "memory.asm"
         learned_from(args).save(memory)
     with stage("acting", console, seconds) as progress:
-        how = {"robot": args.robot, "policy": args.policy, "max_override_s": args.max_override_s}
-        run: Callable[[Bout], Reaction] = partial(run_bout, **how, memory=memory.resolve())  # type: ignore[arg-type]
+        run: Callable[[Bout], Reaction] = partial(
+            run_bout, course=args.course, max_override_s=args.max_override_s, memory=memory.resolve()
+        )
         reactions = dispatch(run, bouts(args), Crew(args.workers), progress)
     found = comparisons(reactions, args)
     made = table(found, args)

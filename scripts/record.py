@@ -14,6 +14,7 @@ from asm_gym.faults.suite import harmless_variation, suite_fault
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.scripted.base import Style
 from asm_gym.scripts.dispatch import environment
+from asm_gym.stream import control_period
 from asm_gym.wrappers import FaultInjection, StreamRecorder
 
 EXECUTIONS = {"slower": 0.85, "faster": 1.15}
@@ -28,11 +29,17 @@ class Course:
         robot: the arm.
         policy: what acts.
         after_s: how long a faulty episode goes on after its onset [s].
+        stream_freq: rows of the stream a second [Hz]; None for one each control step.
     """
 
     robot: str = "Panda"
     policy: str = "scripted"
     after_s: float = 2.0
+    stream_freq: int | None = None
+
+    def settings(self) -> tuple[tuple[str, Any], ...]:
+        """What the environment is made with."""
+        return ("robot", self.robot), ("stream_freq", self.stream_freq)
 
 
 def episode_seeds(seed: int, task: str, role: str, episodes: int) -> list[int]:
@@ -48,12 +55,12 @@ def draw_onset(seed: int, horizon: int) -> int:
 
 def record(label: Label, course: Course, folder: Path) -> Path:
     """Records the episode of ``label``, and writes it to its place under ``folder``."""
-    base = environment(f"asm_gym/{label.task}-v0", (("robot", course.robot),))
+    base = environment(f"asm_gym/{label.task}-v0", course.settings())
     inner: Any = base.unwrapped
     onset, style, faults, steps = label.onset or 0, Style(), [], None
     if label.role == "faulty":
         faults = [suite_fault(label.kind, inner, label.severity, onset, label.seed)]
-        steps = onset + round(course.after_s / inner.stream_spec.dt)
+        steps = onset + round(course.after_s / control_period(inner))
     elif label.kind in EXECUTIONS:
         style = Style(speed=EXECUTIONS[label.kind])
     elif label.role == "harmless":

@@ -5,7 +5,9 @@ import pytest
 import torch
 
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.gru import GRU
 from asm_gym.scripts.benchmark import main
+from asm_gym.scripts.benchmark_fit import errors
 from asm_gym.scripts.benchmark_memory import PlainTorch, synthetic
 
 
@@ -26,3 +28,16 @@ def test_both_print_their_ratios(capsys):
     assert shown.count("×") >= 5
     assert "plain torch" in shown
     assert "under the wrapper" in shown
+
+
+@pytest.mark.slow
+def test_errors_of_both_learners_are_those_their_surprise_is_made_of():
+    episodes = synthetic(10, 12)
+    for monitor in (NeuralASM(episodes[0].spec, hidden_size=16, association_size=50, epochs=1), GRU(episodes[0].spec)):
+        monitor.fit(episodes[:10])
+        (off,) = errors(monitor, episodes[-1:])
+        (run,) = monitor._runs([episodes[-1].stream])
+        ratio = run.errors[2:] / off  # 1/σ, whichever way the error went
+        assert np.all(ratio > 0)
+        assert off.shape == (len(episodes[-1]) - 2, 10)
+    assert main(["fit", "--tasks", "Lift", "--episodes", "5"]) == 0

@@ -17,7 +17,7 @@ from asm_gym.memory.association import (
     synapses,
 )
 from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
-from asm_gym.memory.energy import activate, backward, energy, energy_gradient, outward
+from asm_gym.memory.energy import activate, energy, energy_gradient, feedback, outward
 from asm_gym.memory.inference import STRIDE, expect, infer, sense
 from asm_gym.memory.learning import (
     Learner,
@@ -97,11 +97,13 @@ def test_activation_is_tanh():
 
 
 @pytest.mark.parametrize("batch", [1, 2, 7])
-def test_products_along_and_against_synapses_are_matrix_products(batch):
+@pytest.mark.parametrize("senses", [1, 4, 11])
+def test_products_along_synapses_and_back_are_matrix_products(batch, senses):
     rng = np.random.default_rng(0)
-    a, W = rng.normal(size=(batch, 6)), rng.normal(size=(4, 6))
+    a, W = rng.normal(size=(batch, 6)), rng.normal(size=(senses, 6))
     np.testing.assert_allclose(outward(a, W), a @ W.T, rtol=1e-12)
-    np.testing.assert_allclose(backward(a @ W.T, W), a @ W.T @ W, rtol=1e-12)
+    x, b, pi = rng.normal(size=(batch, senses)), rng.normal(size=senses), rng.uniform(size=(batch, senses))
+    np.testing.assert_allclose(feedback(a, x, W, b, pi), (pi * (x - a @ W.T - b)) @ W, rtol=1e-12, atol=1e-12)
 
 
 def test_energy_is_the_sum_of_both_weighted_squares():
@@ -313,18 +315,16 @@ def test_the_motor_prediction_learns_a_repeated_action():
     assert error[0] < 0.5 < 0.8 < error[1]  # the second action is noise: nobody can predict it
 
 
-@pytest.mark.parametrize("free", [0.0, 1.0])
-def test_the_state_handed_on_is_the_inferred_one_or_the_prior(free):
+def test_the_state_handed_on_is_the_inferred_one():
     rng = np.random.default_rng(0)
     w = initial_weights(16, 5, 2, rng)
     learner, batch = Learner(w, schedule(), rng), side_by_side(trajectories(3))
     z, total = np.zeros((3, 16), np.float32), 0.0
     network = Network(w, some_association(rng, 13, 6, 5), 10, 1.0, 1.0)
     for x, u, n in zip(batch.senses, batch.commands, batch.active, strict=True):
-        mu, after = network.follow(z[:n], u[:n], x[:n], np.ones_like(x[:n]))
-        total += energy(after, mu, x[:n], w.W_F, w.b_F, 1.0, np.ones_like(x[:n])).sum()
-        z = mu if free else after
-    assert learner.run(batch, rate=0.0, free=free) == pytest.approx(total, rel=1e-3)
+        mu, z = network.follow(z[:n], u[:n], x[:n], np.ones_like(x[:n]))
+        total += energy(z, mu, x[:n], w.W_F, w.b_F, 1.0, np.ones_like(x[:n])).sum()
+    assert learner.run(batch, rate=0.0) == pytest.approx(total, rel=1e-3)
 
 
 def test_a_stream_without_actions_can_be_learned():

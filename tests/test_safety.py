@@ -7,8 +7,10 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from asm_gym.policies.reflexes import Graded
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
+from asm_gym.wrappers.safety import make_patience
 from tests.fakes import SPEC, CueMonitor, FakeEnv
 
 ACT = np.array([0.3, -0.2, 1.0], np.float32)
@@ -191,3 +193,159 @@ def test_evidence_that_was_acted_on_is_not_counted_again():
 def test_bad_patience_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         NeuralASMSafety(FakeEnv(), CueMonitor(), **arguments)
+
+
+def test_a_monitor_learns_on_the_job_only_when_asked_and_never_from_an_override():
+    class Learner(CueMonitor):
+        def adapt(self, before, stream, surprise, rate):
+            learned.append((before, rate))
+
+    learned: list[tuple[int, float]] = []
+    run(NeuralASMSafety(FakeEnv(), Learner([2]), on_alarm="hold", release_after=2), 7)
+    assert not learned
+    run(NeuralASMSafety(FakeEnv(), Learner([2]), on_alarm="hold", release_after=2, learning_rate=0.25), 7)
+    assert learned == [(t, 0.25) for t in (0, 1, 2, 5, 6)]  # steps 3 and 4 were held
+    with pytest.raises(ValueError, match="CueMonitor cannot learn"):
+        NeuralASMSafety(FakeEnv(), CueMonitor(), learning_rate=0.1)
+    with pytest.raises(ValueError, match=r"learning_rate must be in \[0, 1\], got 3"):
+        NeuralASMSafety(FakeEnv(), Learner(), learning_rate=3)
+
+
+class Broken:
+    """A backup policy that fails in the way of ``how``."""
+
+    def __init__(self, how):
+        self.how = how
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        if self.how == "raises":
+            raise RuntimeError("no plan")
+        return {"nan": np.full(3, np.nan), "shape": np.ones(2)}[self.how], state
+
+
+@pytest.mark.parametrize("how", ["raises", "nan", "shape"])
+def test_where_a_backup_policy_fails_the_robot_holds_and_says_so(how):
+    env = NeuralASMSafety(FakeEnv(), CueMonitor([2]), on_alarm=Broken(how), release_after=2)
+    with pytest.warns(UserWarning, match="the reflex failed, and the robot holds instead"):
+        infos = run(env, 6)
+    np.testing.assert_array_equal(env.unwrapped.actions[3], [0, 0, 1])  # the grip is kept
+    assert [bool(i["asm"]["failure"]) for i in infos[4:6]] == [True, True]
+    assert not infos[2]["asm"]["failure"]
+
+
+def test_control_is_handed_back_on_trial_and_withheld_longer_after_each_that_fails(caplog):
+    """Surprise stays over the threshold whatever is done: holds of 2, 4 and 8 steps, and then it gives up."""
+    caplog.set_level("INFO", logger="asm_gym.safety")
+    env = NeuralASMSafety(FakeEnv(length=60), CueMonitor(range(3, 60)), try_after=2, max_override=14)
+    env.reset(seed=0)
+    infos = []
+    while not infos or not infos[-1]["asm"]["gave_up"]:
+        infos.append(env.step(ACT)[4])
+    acting = "".join("h" if i["asm"]["intervened"] else "p" for i in infos)
+    assert acting == "pppp" + "hh" + "p" + "hhhh" + "p" + "hhhhhhhh"
+    said = [i["asm"]["transition"] for i in infos if i["asm"]["transition"]]
+    assert said == ["override", "trial", "override", "trial", "override", "give_up"]
+    assert [r.message.split(":")[0] for r in caplog.records if r.name == "asm_gym.safety"] == said
+
+
+def test_a_trial_that_goes_well_is_forgotten():
+    cue = [3, 4, 5, 20, 21, 22]
+    env = NeuralASMSafety(FakeEnv(length=40), CueMonitor(cue), try_after=2, max_override=3, release_after=4)
+    infos = run(env, 30)
+    acting = "".join("h" if i["asm"]["intervened"] else "p" for i in infos[1:])
+    assert acting == "pppp" + "hh" + "p" * 15 + "hh" + "p" * 7
+    assert not any(i["asm"]["gave_up"] for i in infos)
+
+
+def test_an_overrun_warns_once_or_counts_as_an_alarm(monkeypatch):
+    class Slow(CueMonitor):
+        def observe(self, state, stream):
+            clock[0] += 0.2 if state == 3 else 0.01
+            return super().observe(state, stream)
+
+    clock = [0.0]
+    monkeypatch.setattr("asm_gym.wrappers.safety.time.perf_counter", lambda: clock[0])
+    with pytest.warns(UserWarning, match=r"took 200\.0 ms for a row that lasts 50\.0 ms"):
+        infos = run(NeuralASMSafety(FakeEnv(), Slow()), 6)
+    assert not any(i["asm"]["alarm"] for i in infos)
+    assert infos[4]["asm"]["latency_us"] == pytest.approx(2e5)
+    infos = run(NeuralASMSafety(FakeEnv(), Slow(), on_overrun="alarm"), 6)
+    assert [i["asm"]["alarm"] for i in infos[1:]] == [False, False, False, True, False, False]
+    assert infos[4]["asm"]["surprise"] == np.inf
+    with pytest.raises(ValueError, match=r"on_overrun.*warn.*alarm"):
+        NeuralASMSafety(FakeEnv(), CueMonitor(), on_overrun="panic")
+
+
+def test_recall_does_what_the_memory_expects_and_needs_one_that_expects():
+    class Expecting(CueMonitor):
+        def expected_action(self, state):
+            return np.full((1, 3), 0.1 * state, np.float32)
+
+    env = NeuralASMSafety(FakeEnv(), Expecting([2]), on_alarm="recall", release_after=2)
+    run(env, 6)
+    np.testing.assert_allclose(env.unwrapped.actions[3], 0.3, rtol=1e-6)  # as expected after the row that alarmed
+    np.testing.assert_allclose(env.unwrapped.actions[4], 0.4, rtol=1e-6)
+    np.testing.assert_array_equal(env.unwrapped.actions[5], ACT)
+    with pytest.raises(ValueError, match="CueMonitor does not"):
+        NeuralASMSafety(FakeEnv(), CueMonitor(), on_alarm="recall")
+
+
+def test_what_is_no_number_is_an_alarm():
+    class Lost(CueMonitor):
+        def observe(self, state, stream):
+            state, surprise = super().observe(state, stream)
+            return state, surprise._replace(value=np.array([np.nan]))
+
+    infos = run(NeuralASMSafety(FakeEnv(), Lost()), 3)
+    assert [i["asm"]["alarm"] for i in infos[1:]] == [True] * 3
+    assert infos[-1]["asm"]["intervened"]
+
+
+def test_graded_gives_up_after_seconds_and_not_steps():
+    reflex, patience = Graded.__new__(Graded), {}
+    for fps in (20, 100):
+        env = FakeEnv()
+        env.metadata = {"render_fps": fps}
+        patience[fps] = make_patience(reflex, env, 10, 0.8, None, None)
+    assert (patience[20].try_after, patience[20].max_override) == (10, 60)
+    assert (patience[100].try_after, patience[100].max_override) == (50, 300)
+
+
+def test_a_reflex_takes_over_within_a_control_step():
+    env = gym.make("asm_gym/Lift-v0", horizon=20)
+    env.unwrapped.stream_freq = 100
+    spec = env.unwrapped.stream_spec
+    env.unwrapped.stream_freq = 20
+    action = np.array([0.5, 0, 0, 0, 0, 0, 1], np.float32)
+    # Rows 0 to 4 are those of the first step; the third of the second step alarms.
+    env = NeuralASMSafety(env, CueMonitor([7], spec=spec), monitor_freq=100, release_after=2)
+    env.reset(seed=0)
+    first, second = env.step(action)[4], env.step(action)[4]
+    assert first["asm"]["surprises"].shape == (5,)
+    assert not first["asm"]["intervened"]
+    commanded = second["streams"][:, spec.slices["action"]]
+    np.testing.assert_allclose(commanded[:, 0], [0.5, 0.5, 0.5, 0, 0])
+    np.testing.assert_allclose(commanded[:, 6], 1)
+    assert second["asm"]["intervened"]
+    assert second["asm"]["alarm"]
+    np.testing.assert_array_equal(second["asm"]["executed_action"], [0, 0, 0, 0, 0, 0, 1])
+    assert np.argmax(second["asm"]["surprises"]) == 2
+    rows = [env.step(action)[4] for _ in range(3)]
+    assert [r["asm"]["intervened"] for r in rows] == [True, True, False]  # two control steps of quiet
+    assert not env.unwrapped.row_hooks
+    env.close()
+
+
+def test_rates_that_do_not_fit_are_refused():
+    env = gym.make("asm_gym/Lift-v0")
+    with pytest.raises(ValueError, match="one of 20, 100, 500, got 30"):
+        NeuralASMSafety(env, CueMonitor(), monitor_freq=30)
+    slow = CueMonitor(spec=env.unwrapped.stream_spec)
+    with pytest.raises(ValueError, match=r"dt: 0\.05 s against 0\.01 s"):
+        NeuralASMSafety(env, slow, monitor_freq=100)
+    rescaled = gym.wrappers.RescaleAction(env, -2.0, 2.0)
+    with pytest.raises(ValueError, match="RescaleAction changes actions"):
+        NeuralASMSafety(rescaled, slow, monitor_freq=100)
+    env.close()
+    with pytest.raises(ValueError, match="needs an environment of asm_gym"):
+        NeuralASMSafety(FakeEnv(), CueMonitor(), monitor_freq=100)

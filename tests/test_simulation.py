@@ -213,3 +213,61 @@ def test_the_gripper_speaks_in_its_own_units():
         units = {c.name: c.unit for c in env.stream_spec.channels}
         assert units["gripper_opening"] == unit
         env.close()
+
+
+def noiseless(stream_freq):
+    env = gym.make("asm_gym/Lift-v0", sensor_noise=0.0, stream_freq=stream_freq).unwrapped
+    observations, infos = [env.reset(seed=0)[0]], []
+    for t in range(40):  # down onto the table, for there to be a force
+        action = np.array([0.2 * np.sin(t), 0.1, -1, 0, 0, 0.3, 1], np.float32)
+        observation, *_, info = env.step(action)
+        observations.append(observation)
+        infos.append(info)
+    spec = env.stream_spec
+    env.close()
+    return np.array(observations), infos, spec
+
+
+def test_a_faster_stream_is_the_same_world_looked_at_more_often():
+    slow_seen, slow, slow_spec = noiseless(None)
+    fast_seen, fast, spec = noiseless(100)
+    assert (slow_spec.dt, spec.dt) == (0.05, 0.01)
+    np.testing.assert_allclose(slow_seen, fast_seen, atol=1e-6)
+    assert max(i["contact_force"] for i in slow) > 5
+    for a, b in zip(slow, fast, strict=True):
+        assert "streams" not in a
+        rows = b["streams"]
+        assert rows.shape == (5, spec.size)
+        np.testing.assert_array_equal(rows[-1], b["stream"])
+        for name in ("external_torque", "wrist_force"):  # a step's mean is that of its rows
+            of = spec.slices[name]
+            np.testing.assert_allclose(rows[:, of].mean(axis=0), a["stream"][of], rtol=1e-4, atol=1e-3)
+        of = spec.slices["wrist_force_peak"]
+        np.testing.assert_allclose(np.abs(rows[:, of]).max(axis=0), np.abs(a["stream"][of]), rtol=1e-4, atol=1e-3)
+        for name in ("contact_force", "external_force", "external_impulse"):
+            assert a[name] == pytest.approx(b[name], rel=1e-6, abs=1e-9)
+
+
+def test_a_row_hook_can_take_over_within_the_step():
+    env = gym.make("asm_gym/Lift-v0", stream_freq=100).unwrapped
+    env.reset(seed=0)
+    rest = np.zeros(7, np.float32)
+    felt = []
+
+    def stop(row):
+        felt.append(row)
+        if len(felt) == 2:
+            env.command(rest)
+
+    env.row_hooks.append(stop)
+    rows = env.step(np.array([1, 0, 0, 0, 0, 0, 1], np.float32))[4]["streams"]
+    env.close()
+    np.testing.assert_array_equal(rows[:4], felt)  # the last row of a step is the step's own
+    commanded = rows[:, env.stream_spec.slices["action"]]
+    np.testing.assert_array_equal(commanded[:, 0], [1, 1, 0, 0, 0])
+
+
+@pytest.mark.parametrize("rate", [0, 30, 50, 250, 1000])
+def test_a_stream_rate_that_does_not_fit_is_refused_with_those_that_do(rate):
+    with pytest.raises(ValueError, match=rf"one of 20, 100, 500, got {rate}"):
+        gym.make("asm_gym/Lift-v0", stream_freq=rate)

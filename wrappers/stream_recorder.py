@@ -21,12 +21,20 @@ class StreamSource:
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self._own = env.has_wrapper_attr("stream_spec")
-        self.spec: StreamSpec = (
-            env.get_wrapper_attr("stream_spec")
-            if self._own
-            else StreamSpec.from_spaces(env.observation_space, env.action_space, control_period(env))
-        )
+        self._env, self._own = env, env.has_wrapper_attr("stream_spec")
+        if not self._own:
+            self._spaces = StreamSpec.from_spaces(env.observation_space, env.action_space, control_period(env))
+
+    @property
+    def spec(self) -> StreamSpec:
+        """Names the numbers of a row; whoever makes the stream run faster changes it."""
+        spec: StreamSpec = self._env.get_wrapper_attr("stream_spec") if self._own else self._spaces
+        return spec
+
+    @property
+    def rows_per_step(self) -> int:
+        """How many rows a control step has."""
+        return max(1, round(control_period(self._env) / self.spec.dt)) if self._own else 1
 
     def row(self, observation: Any, action: Any, info: dict[str, Any]) -> NDArray[np.float32]:
         """(D,) what was sensed after ``action``, and the action."""
@@ -36,11 +44,17 @@ class StreamSource:
         both: NDArray[np.float32] = np.concatenate([np.ravel(observation), np.ravel(action)]).astype(np.float32)
         return both
 
+    def rows(self, observation: Any, action: Any, info: dict[str, Any]) -> NDArray[np.float32]:
+        """(n, D) all that was sensed since the last step; n is 1 unless the stream runs faster than control."""
+        found: NDArray[np.float32] = info["streams"] if "streams" in info else self.row(observation, action, info)[None]
+        return found
+
 
 class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Keeps every finished episode in ``episodes``, and gives environments without a stream one.
 
-    ``info["stream"]`` and ``stream_spec`` exist on the wrapped environment whatever it is.
+    ``info["stream"]`` and ``stream_spec`` exist on the wrapped environment whatever it is. Where the stream runs faster
+    than control, an episode has several rows of it for each action.
 
     Args:
         env: an environment with a stream, or with Box spaces.
@@ -50,10 +64,14 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
         self._source = StreamSource(env)
-        self.stream_spec = self._source.spec
         self.episodes: list[Episode] = []
         """What was recorded; an episode that was cut short by ``reset`` is kept too."""
         self._clear(None)
+
+    @property
+    def stream_spec(self) -> StreamSpec:
+        """Names the numbers of a row."""
+        return self._source.spec
 
     def _clear(self, seed: int | None) -> None:
         self._seed = seed
@@ -78,8 +96,9 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._observations.append(observation)
         self._actions.append(np.asarray(action, np.float32))
         self._rewards.append(float(reward))
-        self._rows.append(info["stream"])
-        self._faults.append(bool(info.get("fault")))
+        rows = self._source.rows(observation, action, info)
+        self._rows += list(rows)
+        self._faults += [bool(info.get("fault"))] * len(rows)
         self._success = self._success or bool(info.get("success", False))
         self._terminated = bool(terminated)
         if terminated or truncated:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold
-from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Patience, Verdict
+from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Verdict
 from asm_gym.wrappers.batches import choose, final, members, replace
-from asm_gym.wrappers.safety import make_reflex
+from asm_gym.wrappers.safety import check_expectation, make_fallback, make_patience, make_reflex
 from asm_gym.wrappers.stream_recorder import StreamSource
 
 Mask = NDArray[np.bool_]
@@ -35,7 +35,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         env: of ``gym.make_vec``; where ``info`` has no ``"stream"``, observation and action are the stream.
         monitor: a fitted and calibrated monitor.
         on_alarm: as in ``NeuralASMSafety``; a policy of yours is shared, and must keep what it knows in its state.
-        release_after, release_below, max_override, truncate: as in ``NeuralASMSafety``.
+        release_after, release_below, max_override, try_after, truncate: as in ``NeuralASMSafety``.
 
     Raises:
         TypeError: ``env`` is no vector environment, cannot be asked for what its members are, or takes no Box actions.
@@ -52,6 +52,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         release_after: int = 10,
         release_below: float = 0.8,
         max_override: int | None = None,
+        try_after: int | None = None,
         truncate: bool = False,
     ) -> None:
         super().__init__(env)
@@ -60,17 +61,25 @@ class VectorNeuralASMSafety(VectorWrapper):
         if isinstance(on_alarm, Hold) and type(on_alarm) is not Hold:
             raise ValueError(f"one {type(on_alarm).__name__} cannot act in several environments: give its name instead")
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
-        patience = Patience(release_after, release_below, max_override)
         each = members(env)
         self._own_stream = each[0].has_wrapper_attr("stream_spec")
         for member in each:
-            monitor.spec.require(StreamSource(member).spec, "the monitor")
+            source = StreamSource(member)
+            if source.rows_per_step > 1:
+                raise ValueError("many environments are watched at their control rate: make them without stream_freq")
+            monitor.spec.require(source.spec, "the monitor")
         self.monitor, self.threshold = monitor, monitor.threshold
         self._ends_truncated = truncate
         self._terminates = on_alarm == "terminate"
-        self._arbiters = [Arbiter(make_reflex(on_alarm, m), self.threshold, patience) for m in each]
+        limits = release_after, release_below, max_override, try_after
+        self._arbiters = [self._arbiter(on_alarm, member, limits) for member in each]
         self._ended: Mask | None = None
         self._forced = np.zeros(env.num_envs, bool)  # ended by this wrapper, which the environment does not know yet
+
+    def _arbiter(self, on_alarm: str | Policy, env: Any, limits: tuple[Any, ...]) -> Arbiter:
+        reflex = make_reflex(on_alarm, env)
+        self._recalls = check_expectation(reflex, self.monitor)
+        return Arbiter(reflex, self.threshold, make_patience(reflex, env, *limits), make_fallback(env))
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         n = self.num_envs
@@ -147,8 +156,11 @@ class VectorNeuralASMSafety(VectorWrapper):
         self._state, surprise = self.monitor.observe(self._state, rows)
         value = np.where(begun, 0.0, surprise.value)
         surprise = Surprise(value, np.where(begun[:, None], 0.0, surprise.attribution))
+        expected: Any = [None] * len(rows)
+        if self._recalls:
+            expected = self.monitor.expected_action(self._state)  # type: ignore[attr-defined]
         verdicts = [
-            NOTHING if begun[i] else arbiter.judge(float(value[i]), rows[i], executed[i])
+            NOTHING if begun[i] else arbiter.judge(float(value[i]), rows[i], executed[i], expected=expected[i])
             for i, arbiter in enumerate(self._arbiters)
         ]
         acted_on = np.array([v.acted_on for v in verdicts])
@@ -207,6 +219,7 @@ class VectorNeuralASMSafety(VectorWrapper):
             "alarm": alarm,
             "intervened": np.array([v.intervened for v in verdicts]),
             "gave_up": np.array([v.gave_up for v in verdicts]),
+            "transition": np.array([v.transition for v in verdicts]),
             "executed_action": executed,
             "attribution": dict(zip(self.monitor.spec.labels, surprise.attribution.T, strict=True)),
         }

@@ -37,6 +37,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     - ``contact_force``: the largest net contact force on an arm within the step [N];
     - ``external_force``: the same of all that acts on it from outside, faults that push or pull included [N];
     - ``external_impulse``: that force's mean norm times the length of the step [N s];
+    - ``streams`` (n, D) float32: where the stream runs faster than control, its rows since the last step; ``stream`` is
+      the last of them (not on reset);
     - ``unstable``: the simulation diverged, which ends the episode as truncated. Its last stream is then NaN, its last
       observation 0.
 
@@ -55,12 +57,14 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         terminate_on_success: end the episode (``terminated``) when the task is solved.
         stream: channel groups that make up the stream, of ``joint torque hand wrench gripper action contact object``;
             empty for none.
+        stream_freq: rows of the stream a second [Hz]; a multiple of ``control_freq`` that divides 500. Means and peaks
+            are then taken since the last row. None for one row a control step.
         sensor_noise: scales the noise of every channel; 0 for exact readings.
         camera, render_size: what ``render`` shows, and its (height, width) [pixels].
 
     Raises:
         ValueError: an unknown task, robot, controller, render mode, channel group or camera, the wrong number of
-            robots, or a rate that does not divide 500.
+            robots, or a rate that does not fit.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 20}  # noqa: RUF012
@@ -79,6 +83,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         reward_shaping: bool = True,
         terminate_on_success: bool = False,
         stream: Sequence[str] = GROUPS,
+        stream_freq: int | None = None,
         sensor_noise: float = 1.0,
         camera: str = "frontview",
         render_size: tuple[int, int] = (480, 480),
@@ -93,6 +98,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             raise ValueError(
                 f"control_freq must divide the physics rate of {backend.PHYSICS_FREQ} Hz, got {control_freq}"
             )
+        self._row_substeps = _row_substeps(control_freq if stream_freq is None else stream_freq, control_freq)
         if sensor_noise < 0:
             raise ValueError(f"sensor_noise must be >= 0, got {sensor_noise}")
         self.horizon = self.task.horizon if horizon is None else horizon
@@ -111,6 +117,9 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.substep_hooks: list[Callable[[int], None]] = []
         """Called after every physics substep with its number in the control step; ``measure()`` says what the sensors
         read then, and ``command()`` gives the controllers another action for the rest of the step."""
+        self.row_hooks: list[Callable[[NDArray[np.float32]], None]] = []
+        """Called with every row of the stream that is sensed within a control step, all but the last; ``command()``
+        gives the controllers another action from the next physics substep on."""
         self.substeps = backend.PHYSICS_FREQ // control_freq
         self._groups = tuple(stream)
         self._flat = observation == "flat"
@@ -147,7 +156,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.action_space = spaces.Box(-1.0, 1.0, self._action_low.shape, np.float32)
         action = Channel("action", self._action_low.size, "1", 0.0, MOTOR)
         everything = (*self.simulation.proprioception.channels, *self._objects.channels, action)
-        dt, source = self.substeps / backend.PHYSICS_FREQ, "+".join(self.robots)
+        dt, source = self._row_substeps / backend.PHYSICS_FREQ, "+".join(self.robots)
         self.measured_spec = StreamSpec(everything, dt, source)
         """Everything that is measured, whether or not the stream carries it."""
         self._noise = self.measured_spec.noise * self.sensor_noise
@@ -155,6 +164,20 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.observation_layout = self._layout.sizes
         """The observation's parts in order, and how many numbers each has."""
         self.observation_space = self._layout.space(self._pictures.spaces)
+
+    @property
+    def stream_freq(self) -> int:
+        """Rows of the stream a second [Hz]; may be set between episodes.
+
+        Raises:
+            ValueError: a rate that does not fit physics or control; the message lists those that do.
+        """
+        return backend.PHYSICS_FREQ // self._row_substeps
+
+    @stream_freq.setter
+    def stream_freq(self, rate: int) -> None:
+        self._row_substeps = _row_substeps(rate, backend.PHYSICS_FREQ // self.substeps)
+        self._build_spaces()
 
     # ------------------------------------------------------------------ episodes
 
@@ -215,13 +238,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         env.timestep += 1
         self._action = action
         self.simulation.begin(self._delivered(action))
-        if not self.substep_hooks:
-            self.simulation.advance(self.substeps)
-        else:
-            for k in range(self.substeps):
-                self.simulation.advance(1)
-                for hook in self.substep_hooks:
-                    hook(k)
+        self._rows: list[NDArray[np.float32]] = []
+        self._advance()
         env.cur_time += env.control_timestep
         self._steps += 1
         reward = self._rewards(self._action)
@@ -231,6 +249,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             self._row[:] = np.nan
             reward = RewardTerms(dict.fromkeys(reward.terms, 0.0), False)
         info = self._info(reward.success, unstable)
+        if self._row_substeps < self.substeps and "stream" in info:
+            info["streams"] = np.stack([*self._rows, info["stream"]])
         info["reward_terms"] = reward.terms
         terminated = self.terminate_on_success and reward.success
         truncated = self._steps >= self.horizon or unstable
@@ -239,8 +259,22 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             self.render()
         return self._observation(), float(sum(reward.terms.values())), terminated, truncated, info
 
+    def _advance(self) -> None:
+        """The substeps of a control step, and the rows of the stream that come before its end."""
+        stride = 1 if self.substep_hooks else self._row_substeps
+        for done in range(stride, self.substeps + 1, stride):
+            self.simulation.advance(stride)
+            for hook in self.substep_hooks:
+                hook(done - 1)
+            if done % self._row_substeps == 0 and done < self.substeps:
+                row = self.to_stream(self.measure()) if self._layout.stream_spec else np.zeros(0, np.float32)
+                self.simulation.begin_row()
+                self._rows.append(row)
+                for feel in self.row_hooks:
+                    feel(row)
+
     def command(self, action: NDArray[np.float32]) -> None:
-        """From within a substep hook: another action for the rest of the control step, efference copy included.
+        """From within a hook: another action for the rest of the control step, efference copy included.
 
         Raises:
             ValueError: a wrong shape, or an action that is not finite.
@@ -286,7 +320,11 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     # ------------------------------------------------------------------ senses
 
     def measure(self) -> NDArray[np.float64]:
-        """Reads every sensor once: the row that ``measured_spec`` names, with noise, then faults."""
+        """Reads every sensor once, over the time since the last row of the stream: noise, then faults.
+
+        Returns:
+            (M,) as ``measured_spec`` names it.
+        """
         row = np.concatenate([self.simulation.sense(), *self._objects.read(), self._action])
         row += self._noise * self.np_random.standard_normal(row.size)
         for corrupt in self.corruptions:
@@ -353,6 +391,18 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             self.robosuite_env.close()
             self.robosuite_env = None
         self._ended = True
+
+
+def _row_substeps(rate: int, control_freq: int) -> int:
+    """Physics substeps between two rows of the stream."""
+    physics = backend.PHYSICS_FREQ
+    possible = [f for f in range(control_freq, physics + 1) if not (physics % f or f % control_freq)]
+    if rate not in possible:
+        raise ValueError(
+            f"stream_freq must divide the physics rate of {physics} Hz and be a multiple of the control rate of "
+            f"{control_freq} Hz, one of {', '.join(map(str, possible))}, got {rate}"
+        )
+    return physics // rate
 
 
 def _gripper_actions(robots: list[Any]) -> tuple[int, ...]:

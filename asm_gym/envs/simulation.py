@@ -59,7 +59,8 @@ class Simulation:
     def begin_episode(self) -> None:
         """Takes up the controllers, which robosuite makes anew in every reset."""
         robots = self.env.robots
-        self._done = 0
+        self._done = self._row_began = 0
+        self._felt = (0.0, 0.0, 0.0)
         self._fresh = False
         self._action = np.zeros(sum(robot.action_dim for robot in robots))
         self._controllers = [robot.composite_controller.part_controllers[arm] for robot, arm in self._parts]
@@ -81,7 +82,8 @@ class Simulation:
 
     def begin(self, action: NDArray[np.float64]) -> None:
         """Begins a control step."""
-        self._done = 0
+        self._done = self._row_began = 0
+        self._felt = (0.0, 0.0, 0.0)
         self.command(action)
 
     def command(self, action: NDArray[np.float64]) -> None:
@@ -111,19 +113,24 @@ class Simulation:
                 self.env.sim.step1()
                 self.env._pre_action(self._action, self._fresh)
                 self.env.sim.step2()
-                kernels.sample(self._views, self._nominal(), self._arms, k, self._samples)
+                kernels.sample(self._views, self._nominal(), self._arms, k - self._row_began, self._samples)
                 self._fresh = False
         self._fresh = False
         self._done += count
 
+    def begin_row(self) -> None:
+        """What comes now is summarised by itself; the forces go on to be those of the whole control step."""
+        self._felt = (self.contact_force, self.external_force, self._done * self.mean_external_force)
+        self._row_began = self._done
+
     def _run(self, count: int) -> None:
-        steps = (self._fresh, self._done, count, self._samples)
+        steps = (self._fresh, self._done - self._row_began, count, self._samples)
         kernels.run(self._views, self._nominal(), self._arms, self._goals, self._deltas, self._turns, *steps)
 
     def sense(self) -> NDArray[np.float64]:
-        """What the arms' sensors read now, summarised over the substeps since the control step began; noiseless."""
-        if self._done:
-            self._summarise(self._done)
+        """What the arms' sensors read now, summarised over the substeps since the row began; noiseless."""
+        if self._done > self._row_began:
+            self._summarise(self._done - self._row_began)
         return self.proprioception.read()
 
     def _remember(self, wrenches: list[NDArray[np.float64]]) -> None:
@@ -138,8 +145,11 @@ class Simulation:
 
     def _summarise(self, count: int) -> None:
         p = self.proprioception
-        forces = kernels.summarise(self._samples, count, p.mean, p.peak, p.last)
-        self.contact_force, self.external_force, self.mean_external_force = forces
+        contact, external, mean = kernels.summarise(self._samples, count, p.mean, p.peak, p.last)
+        contact_before, external_before, sum_before = self._felt
+        self.contact_force = _larger(contact, contact_before)
+        self.external_force = _larger(external, external_before)
+        self.mean_external_force = (sum_before + count * mean) / (self._row_began + count)
 
     def _move_gripper(self, robot: Any, arm: str, action: NDArray[np.float64]) -> None:
         name = robot.get_gripper_name(arm)
@@ -196,6 +206,11 @@ class Simulation:
     def motors(self) -> NDArray[np.intp]:
         """The actuators of the arms' joints, from the base on."""
         return np.concatenate([robot._ref_actuators_indexes_dict[arm] for robot, arm in self._parts])
+
+
+def _larger(now: float, before: float) -> float:
+    """Of two forces; what is not finite stays so."""
+    return float(np.maximum(now, before))
 
 
 def _views(model: mujoco.MjModel, data: mujoco.MjData) -> Views:

@@ -100,15 +100,15 @@ def complete(f: Array, a: Array, U: Array, D: Array) -> Array:
 @kernel
 def normalised_errors(
     inputs: Array, changes: Array, whole: Array, V: Array, U: Array, D: Array, W_S: Array, b_S: Array
-) -> Array:
-    """(Δ - Δ̂)/σ (B, X) for inputs (B, I) and changes (B, X); 0 where ``whole`` (B, 1) is."""
+) -> tuple[Array, Array]:
+    """(Δ - Δ̂)/σ (B, X) for inputs (B, I) and changes (B, X); 0 where ``whole`` (B, 1) is. And f(h) (B, M)."""
     f = hidden_units(inputs, V)
     out = complete(f, inputs, U, D)
     spread = log_variance(f, W_S, b_S)
     for n in range(out.shape[0]):
         for i in range(out.shape[1]):
             out[n, i] = whole[n, 0] * (changes[n, i] - out[n, i]) * np.exp(np.float32(-0.5) * spread[n, i])
-    return out
+    return out, f
 
 
 def association_change(a: Array, delta: Array, spread: Array, V: Array, U: Array, D: Array) -> tuple[Change, Array]:

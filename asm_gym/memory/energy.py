@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import compiled
 
 Array = NDArray[np.floating[Any]]
+Scalar = float | np.floating[Any]
 
 STEEPEST = np.float32(0.77)
 """An upper bound of |f''|; tanh has 4 / (3√3) = 0.7698."""
@@ -71,21 +72,7 @@ def outward(a: Array, W: Array) -> Array:
     return out
 
 
-@kernel
-def backward(a: Array, W: Array) -> Array:
-    """a @ W: (B, Q) from (B, P), against the synapses ``W`` (P, Q)."""
-    out = np.zeros((a.shape[0], W.shape[1]), a.dtype)
-    if a.shape[0] > 1:
-        np.dot(a, W, out)
-        return out
-    for i in range(W.shape[0]):
-        strength = a[0, i]
-        for j in range(W.shape[1]):
-            out[0, j] += strength * W[i, j]
-    return out
-
-
-def energy(z: Array, mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: float, pi_x: Array) -> Array:
+def energy(z: Array, mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: Scalar, pi_x: Array) -> Array:
     """F for each of the batch: (B,).
 
     Args:
@@ -103,19 +90,56 @@ def energy(z: Array, mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: float, p
 
 
 @kernel
+def feedback(f: Array, x: Array, W_F: Array, b_F: Array, pi_x: Array) -> Array:
+    """W_Fᵀ Π_x ε_x (B, H) for firing rates ``f`` (B, H): what the senses ask of the hidden units.
+
+    Of a single row four synapses at a time are read once, forth and back: the weights come from the second level of
+    cache, and reading them is what inference takes its time with.
+    """
+    X, H = W_F.shape
+    out = np.zeros(f.shape, f.dtype)
+    if f.shape[0] > 1:
+        error = np.empty(x.shape, f.dtype)
+        np.dot(f, W_F.T, error)
+        for n in range(x.shape[0]):
+            for i in range(X):
+                error[n, i] = pi_x[n, i] * (x[n, i] - b_F[i] - error[n, i])
+        np.dot(error, W_F, out)
+        return out
+    whole = X - X % 4
+    for i in range(0, whole, 4):
+        a = b = c = d = np.float32(0)
+        for j in range(H):
+            a += f[0, j] * W_F[i, j]
+            b += f[0, j] * W_F[i + 1, j]
+            c += f[0, j] * W_F[i + 2, j]
+            d += f[0, j] * W_F[i + 3, j]
+        a = pi_x[0, i] * (x[0, i] - b_F[i] - a)
+        b = pi_x[0, i + 1] * (x[0, i + 1] - b_F[i + 1] - b)
+        c = pi_x[0, i + 2] * (x[0, i + 2] - b_F[i + 2] - c)
+        d = pi_x[0, i + 3] * (x[0, i + 3] - b_F[i + 3] - d)
+        for j in range(H):
+            out[0, j] += a * W_F[i, j] + b * W_F[i + 1, j] + c * W_F[i + 2, j] + d * W_F[i + 3, j]
+    for i in range(whole, X):
+        a = np.float32(0)
+        for j in range(H):
+            a += f[0, j] * W_F[i, j]
+        a = pi_x[0, i] * (x[0, i] - b_F[i] - a)
+        for j in range(H):
+            out[0, j] += a * W_F[i, j]
+    return out
+
+
+@kernel
 def energy_gradient(
-    z: Array, mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: float, pi_x: Array
+    z: Array, mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: Scalar, pi_x: Array
 ) -> tuple[Array, Array]:
     """∂F/∂z (B, H), and what the bend of f can add to the curvature of F at most (B,); arguments as in ``energy``."""
     f = activate(z)  # (B, H)
-    error = outward(f, W_F)  # (B, X), x̂ without its bias for now
-    for n in range(error.shape[0]):
-        for i in range(error.shape[1]):
-            error[n, i] = pi_x[n, i] * (x[n, i] - b_F[i] - error[n, i])
-    gradient = backward(error, W_F)  # (B, H), the feedback W_Fᵀ Π_x ε_x for now
+    gradient = feedback(f, x, W_F, b_F, pi_x)
     bend = np.empty(z.shape[0], z.dtype)
     for n in range(z.shape[0]):
-        steepest = abs(gradient[n, 0])
+        steepest = np.float32(0)
         for j in range(z.shape[1]):
             steepest = max(steepest, abs(gradient[n, j]))
         bend[n] = STEEPEST * steepest

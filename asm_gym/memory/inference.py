@@ -1,6 +1,7 @@
 """Prediction before the senses are read, and inference after.
 
     μ_t = W_H f(z_{t-1}) + W_U u_t                 expected state; u_t is the commanded action and a constant 1
+    h_t = W_H f(z_{t-1}) + b_U,  â_t = W_A f(h_t)  the action that belongs to the state; b_U stands for the constant 1
     z ← z - η ∂F/∂z,  η = 1.5 / (Π_z + Π_x‖W_F‖² + max|f''| ‖W_Fᵀ Π_x ε_x‖_∞)
 
 The bracket bounds the largest curvature of F, so a step below 2 over it cannot raise F, however W_F grows.
@@ -14,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asm_gym.memory.energy import Array, activate, energy_gradient, kernel, outward
+from asm_gym.memory.energy import Array, Scalar, activate, energy_gradient, kernel, outward
 
 STRIDE = np.float32(1.5)
 """Length of an inference step over the inverse of the curvature; from 2 on it would diverge."""
@@ -52,9 +53,15 @@ def sense(z: Array, W_F: Array, b_F: Array) -> Array:
     return x
 
 
+def motor_prediction(z: Array, weights: Weights) -> tuple[Array, Array]:
+    """h_t (B, H) and â_t (B, A), from the state ``z`` (B, H) before: what comes next, were no action commanded."""
+    h: Array = outward(activate(z), weights.W_H) + weights.W_U[:, -1]
+    return h, outward(activate(h), weights.W_A)
+
+
 @kernel
 def infer(
-    mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: float, pi_x: Array, curvature: float, iterations: int
+    mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: Scalar, pi_x: Array, curvature: Scalar, iterations: int
 ) -> Array:
     """z_t (B, H): ``iterations`` steps down the energy, from ``mu`` on; arguments as in ``energy``.
 

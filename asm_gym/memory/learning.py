@@ -131,18 +131,30 @@ class Change(NamedTuple):
 
 
 def hebbian_change(
-    weights: Weights, before: Array, mu: Array, after: Array, u: Array, x: Array, pi_z: float, pi_x: float
+    weights: Weights,
+    before: Array,
+    mu: Array,
+    after: Array,
+    u: Array,
+    x: Array,
+    pi_z: float,
+    pi_x: float,
+    drive: Array | None = None,
 ) -> Change:
-    """The local learning rules, for states ``before`` and ``after`` (B, H) and the expected ``mu`` (B, H)."""
+    """The local learning rules, for states ``before`` and ``after`` (B, H) and the expected ``mu`` (B, H).
+
+    ``drive`` (B, A + 1) is what ``mu`` was expected by, where that was not the commanded ``u``.
+    """
     A = u.shape[1] - 1
+    drive = u if drive is None else drive
     error_z = pi_z * (after - mu)  # (B, H)
     error_x = pi_x * (x - sense(after, weights.W_F, weights.b_F))  # (B, X)
     # The motor prediction must not see the action it predicts, only the constant that came with it.
-    expected = activate(mu - u[:, :A] @ weights.W_U[:, :A].T)  # (B, H)
+    expected = activate(mu - drive[:, :A] @ weights.W_U[:, :A].T)  # (B, H)
     error_a = u[:, :A] - expected @ weights.W_A.T  # (B, A)
     return Change(
         W_H=coincidence(error_z, activate(before)),
-        W_U=coincidence(error_z, u),
+        W_U=coincidence(error_z, drive),
         W_F=coincidence(error_x, activate(after)),
         b_F=error_x.mean(axis=0),
         W_A=coincidence(np.ascontiguousarray(error_a), expected),
@@ -161,6 +173,14 @@ class Schedule(NamedTuple):
     carry_prior: float
 
 
+class Step(NamedTuple):
+    """What a control step of learning came to."""
+
+    expected: Array  # (B, H) μ_t
+    inferred: Array  # (B, H) z_t
+    energy: float  # the sum over the batch
+
+
 class Learner:
     """Weights in the making: the synapses, their running moments, and the curvature that inference needs."""
 
@@ -171,33 +191,38 @@ class Learner:
         for _ in range(20):
             self._norm, self._direction = power_iteration(weights.W_F, self._direction)
 
-    def step(self, before: Array, u: Array, x: Array, rate: float) -> tuple[Array, Array, float]:
-        """One control step of a batch: μ_t (B, H), z_t (B, H) and the sum of the energies it ended with."""
+    def step(self, before: Array, u: Array, x: Array, rate: float, drive: Array | None = None) -> Step:
+        """One control step of a batch.
+
+        Args:
+            before: (B, H) z_{t-1}.
+            u: (B, A + 1) the action as commanded, and a constant 1.
+            x: (B, S) what is sensed.
+            rate: of the synapses.
+            drive: (B, A + 1) what is taken for the action; ``u`` where None.
+        """
         w, pi_z, pi_x = self.weights, self.schedule.prior_precision, self.schedule.sensory_precision
         precision = np.full_like(x, pi_x)
-        mu = expect(before, u, w.W_H, w.W_U)
+        drive = u if drive is None else drive
+        mu = expect(before, drive, w.W_H, w.W_U)
         curvature = pi_z + pi_x * self._norm
         after = infer(mu, x, w.W_F, w.b_F, pi_z, precision, curvature, self.schedule.iterations)
-        change = hebbian_change(w, before, mu, after, u, x, pi_z, pi_x)
+        change = hebbian_change(w, before, mu, after, u, x, pi_z, pi_x, drive)
         total = float(energy(after, mu, x, w.W_F, w.b_F, pi_z, precision).sum())
         for name, synapse in self.synapses.items():
             synapse.learn(getattr(change, name), rate)
         # W_F moves little in a step, so one iteration keeps the norm up to date.
         self._norm, self._direction = power_iteration(w.W_F, self._direction)
-        return mu, after, total
+        return Step(mu, after, total)
 
-    def run(self, batch: Batch, rate: float, free: float) -> float:
-        """Learns through a batch of episodes, handing the state on from step to step; the sum of all energies.
-
-        Args:
-            free: probability that the state handed on is the expected one and not the inferred one.
-        """
+    def run(self, batch: Batch, rate: float) -> float:
+        """Learns through a batch of episodes, handing the inferred state on; the sum of all energies."""
         z = np.zeros((batch.senses.shape[1], self.weights.W_H.shape[0]), np.float32)
         total = 0.0
         for x, u, n in zip(batch.senses, batch.commands, batch.active, strict=True):
-            mu, after, step_energy = self.step(z[:n], u[:n], x[:n], rate)
-            total += step_energy
-            z = np.where(self.rng.random((n, 1)) < free, mu, after) if free > 0 else after
+            step = self.step(z[:n], u[:n], x[:n], rate)
+            total += step.energy
+            z = step.inferred
         return total
 
 
@@ -205,6 +230,11 @@ def passes(trajectories: Sequence[Trajectory], schedule: Schedule) -> int:
     """How often all episodes are learned from."""
     updates = sum(len(t.senses) for t in trajectories) / schedule.batch_size
     return max(1, min(schedule.epochs, round(UPDATES / updates)))
+
+
+def largest_rate(weights: Weights, schedule: Schedule) -> float:
+    """The learning rate to begin with."""
+    return schedule.learning_rate * min(1.0, REFERENCE_WIDTH / weights.W_H.shape[0])
 
 
 def learn(
@@ -216,7 +246,7 @@ def learn(
 ) -> NDArray[np.float64]:
     """Learns in place; the mean energy of each epoch. Calls ``tick`` after each, of which many data need fewer."""
     learner = Learner(weights, schedule, rng)
-    widest = schedule.learning_rate * min(1.0, REFERENCE_WIDTH / weights.W_H.shape[0])
+    widest = largest_rate(weights, schedule)
     steps = sum(len(t.senses) for t in trajectories)
     epochs = passes(trajectories, schedule)
     curve = np.zeros(epochs)
@@ -224,6 +254,6 @@ def learn(
         progress = epoch / epochs
         rate = cosine_decay(widest, progress)
         for batch in batches(trajectories, schedule.batch_size, rng):
-            curve[epoch] += learner.run(batch, rate, schedule.carry_prior * progress) / steps
+            curve[epoch] += learner.run(batch, rate) / steps
         tick()
     return curve

@@ -17,6 +17,7 @@ from asm_gym.memory.energy import Array
 from asm_gym.memory.inference import Weights, expect, infer, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory, learn, passes
 from asm_gym.memory.precision import PRECISION_EPOCHS
+from asm_gym.memory.rehearsal import rehearse
 from asm_gym.memory.senses import Reading
 
 
@@ -26,6 +27,7 @@ class Step(NamedTuple):
     hidden: Array  # (B, H) z_t, the state to carry on with
     expected: Array  # (B, H) μ_t, the state expected before the row was seen
     error: Array  # (B, X) (Δ_t - Δ̂_t)/σ_t; 0 where a row was not whole
+    units: Array  # (B, M) f(h_t) of association
 
 
 def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> Weights:
@@ -58,10 +60,10 @@ class Network:
     ) -> None:
         self.weights, self.association = weights, association
         self.iterations = iterations
-        self.prior_precision = float(prior_precision)
-        self.sensory_precision = np.float32(sensory_precision)
+        # Of single precision all of them, or the compiled loops would compute in double.
+        self.prior_precision, self.sensory_precision = np.float32(prior_precision), np.float32(sensory_precision)
         norm = float(np.linalg.norm(weights.W_F.astype(np.float64), 2))
-        self.curvature = self.prior_precision + float(sensory_precision) * norm**2
+        self.curvature = np.float32(prior_precision + sensory_precision * norm**2)
 
     @property
     def hidden_size(self) -> int:
@@ -70,7 +72,8 @@ class Network:
     def step(self, z: Array, reading: Reading) -> Step:
         """One control step from the state ``z`` (B, H)."""
         mu, after = self.follow(z, reading.commands, reading.senses, reading.seen)
-        return Step(after, mu, self.judge(reading.inputs, reading.changes, reading.whole))
+        error, units = normalised_errors(reading.inputs, reading.changes, reading.whole, *self.association)
+        return Step(after, mu, error, units)
 
     def follow(self, z: Array, u: Array, x: Array, seen: Array) -> tuple[Array, Array]:
         """μ_t and z_t (B, H).
@@ -85,11 +88,6 @@ class Network:
         mu = expect(z, u, w.W_H, w.W_U)
         precision = self.sensory_precision * seen
         return mu, infer(mu, x, w.W_F, w.b_F, self.prior_precision, precision, self.curvature, self.iterations)
-
-    def judge(self, inputs: Array, changes: Array, whole: Array) -> Array:
-        """(B, X) errors of association over what is to be expected of them; arguments as in ``Reading``."""
-        errors: Array = normalised_errors(inputs, changes, whole, *self.association)
-        return errors
 
 
 class Trained(NamedTuple):
@@ -128,7 +126,8 @@ def train(
     sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
     weights = initial_weights(hidden, sensory, commands - 1, rng)
     total = passes(trajectories, schedule) + TICKS + PRECISION_EPOCHS
-    energy = learn(weights, trajectories, schedule, rng, tick)
+    how_to = rehearse if schedule.carry_prior > 0 else learn
+    energy = how_to(weights, trajectories, schedule, rng, tick)
     inputs = np.concatenate([t.inputs for t in trajectories])
     association = learn_association(inputs, np.ascontiguousarray(inputs[:, changes]), groups, changes, units, rng, tick)
     how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision

@@ -1,8 +1,12 @@
-"""Readout: what skill the latent state says is running, for people to read; nothing depends on it.
+"""Readout: what skill the memory's units say is running, for people to read; nothing depends on it.
 
-    p_t = softmax(W_K c_t + b_K)          ΔW_K ∝ (1_k - p_t) c_tᵀ
+    p_t = softmax(W_K f(h_t) + b_K)          ΔW_K ∝ n_k (1_k - p_t) f(h_t)ᵀ
+    L_t = (1 - λ) L_{t-1} + log p_t          the skill named is that with the largest L
 
-c is the running mean of the states that were expected. The delta rule is local. Names come from whoever knows them.
+h are the units of ``association``; n_k makes rare skills count as much as frequent ones. The delta rule is local. What
+single moments say adds up, and is forgotten, so that a change of skill is followed. Names come from whoever knows them.
+
+Source: Wald and Wolfowitz 1948 for adding up log likelihoods.
 """
 
 from __future__ import annotations
@@ -10,38 +14,57 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.memory.association import hidden_units
 from asm_gym.memory.energy import Array
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 
-UPDATES = 2000
+UPDATES, PASSES = 6000, 40
+"""Batches learned from, and passes over the steps, at most."""
+
 BATCH = 512
 RATE = 1e-2
 
+FORGOTTEN = 0.1
+"""λ."""
 
-def certainty(context: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
-    """p (B, K) for contexts (B, C)."""
-    drive = context @ W_K.T + b_K
+SMALLEST = np.float32(1e-6)
+"""Lower bound of p where its logarithm is taken."""
+
+
+def certainty(units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
+    """p (B, K) for firing rates of the units (B, M)."""
+    drive = units @ W_K.T + b_K
     strength = np.exp(drive - drive.max(axis=1, keepdims=True))
     shares: NDArray[np.float32] = (strength / strength.sum(axis=1, keepdims=True)).astype(np.float32)
     return shares
 
 
+def add_up(L: Array, units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
+    """L_t (B, K) from L_{t-1}, which is 0 before the first row."""
+    added: NDArray[np.float32] = np.float32(1 - FORGOTTEN) * L + np.log(certainty(units, W_K, b_K) + SMALLEST)
+    return added
+
+
 def learn_readout(
-    context: Array, skill: NDArray[np.intp], count: int, rng: np.random.Generator
+    inputs: Array, V: Array, skill: NDArray[np.intp], count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """W_K (K, C) and b_K (K,) from N steps whose skill is known.
+    """W_K (K, M) and b_K (K,) from N steps whose skill is known.
 
     Args:
-        context: (N, C).
+        inputs: (N, I) of association.
+        V: (M, I) its synapses onto the units.
         skill: (N,) each below ``count``.
         count: K.
     """
-    W_K, b_K = np.zeros((count, context.shape[1]), np.float32), np.zeros(count, np.float32)
+    W_K, b_K = np.zeros((count, len(V)), np.float32), np.zeros(count, np.float32)
     weights, bias = Synapse(W_K), Synapse(b_K)
-    for n, chosen in zip(range(UPDATES), shuffled(len(skill), BATCH, rng), strict=False):
-        c = np.ascontiguousarray(context[chosen], np.float32)
-        error = np.eye(count, dtype=np.float32)[skill[chosen]] - certainty(c, W_K, b_K)
-        rate = cosine_decay(RATE, n / UPDATES)
-        weights.learn(error.T @ c / np.float32(len(chosen)), rate)
+    rarity = (len(skill) / (count * np.bincount(skill, minlength=count))).astype(np.float32)  # (K,) n
+    updates = max(1, min(UPDATES, PASSES * len(skill) // BATCH))
+    for n, chosen in zip(range(updates), shuffled(len(skill), BATCH, rng), strict=False):
+        f = hidden_units(inputs[chosen], V)
+        error = np.eye(count, dtype=np.float32)[skill[chosen]] - certainty(f, W_K, b_K)
+        error *= rarity[skill[chosen], None]
+        rate = cosine_decay(RATE, n / updates)
+        weights.learn(error.T @ f / np.float32(len(chosen)), rate)
         bias.learn(error.mean(axis=0), rate)
     return W_K, b_K

@@ -11,17 +11,17 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 from threadpoolctl import threadpool_limits
 
-from asm_gym.detection import LATELY
 from asm_gym.episodes import Episode
-from asm_gym.memory.association import Association, association_shapes
+from asm_gym.memory.association import Association, association_shapes, hidden_units, synapses
 from asm_gym.memory.energy import activate
-from asm_gym.memory.inference import Weights, weight_shapes
+from asm_gym.memory.inference import Weights, motor_prediction, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, train
-from asm_gym.memory.readout import certainty, learn_readout
+from asm_gym.memory.online import followed
+from asm_gym.memory.readout import add_up, learn_readout
+from asm_gym.memory.recall import at_rest, check_cue, follow, run_on, to_rows
 from asm_gym.memory.senses import Senses
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated import Progress, require
@@ -36,6 +36,7 @@ class MemoryState(NamedTuple):
     before: NDArray[np.float64]  # (B, D) the row seen last
     earlier: NDArray[np.float64]  # (B, D) the one before
     steps: NDArray[np.int64]  # (B,) how many rows were seen
+    skill: NDArray[np.float32]  # (B, K) L, what speaks for each skill; K is 0 where none has a name
 
 
 class NeuralASM(PredictiveMonitor):
@@ -52,8 +53,9 @@ class NeuralASM(PredictiveMonitor):
         batch_size: episodes it learns from side by side.
         prior_precision: Π_z, trust in what was expected.
         sensory_precision: Π_x, trust in what is sensed.
-        carry_prior: probability, reached linearly by the end of training, that the state carried on while learning is
-            the expected one rather than the inferred one. Above 0 the memory learns to run on without senses (recall).
+        carry_prior: probability, reached linearly by the end of training, that after a random cue the state carried on
+            while learning is the expected one rather than the inferred one, and the action that comes with it. Above 0
+            the memory learns to run on without senses (``recall``, best at 0.95 with a learning rate of 1e-3).
         gains: a in (0, 1], weights of the newest step in the accumulated evidence; several, for faults that come as
             a knock and faults that creep.
         bound: ν > 0, how many standard deviations an error counts at most, so that a knock that is soon over counts
@@ -125,6 +127,8 @@ class NeuralASM(PredictiveMonitor):
         X, A = len(self.spec.sensory), len(self.spec.motor)
         units = self._units_each(senses) * (int(senses.groups.max()) + 1)
         shapes = weight_shapes(self.hidden_size, senses.size, A) | association_shapes(senses.inputs, units, X)
+        if self.skills_:
+            shapes |= {"W_K": (len(self.skills_), units), "b_K": (len(self.skills_),)}
         for name, shape in shapes.items():
             if found[name].shape != shape:
                 raise ValueError(f"{name} should be of shape {shape}, found {found[name].shape}")
@@ -136,17 +140,23 @@ class NeuralASM(PredictiveMonitor):
 
     def start_model(self, batch: int) -> MemoryState:
         hidden, rows = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.spec.size))
-        return MemoryState(hidden, rows, rows, np.zeros(batch, np.int64))
+        skill = np.zeros((batch, len(self.skills_)), np.float32)
+        return MemoryState(hidden, rows, rows, np.zeros(batch, np.int64), skill)
 
     def predict(
         self, state: MemoryState, rows: NDArray[np.float64]
     ) -> tuple[MemoryState, NDArray[np.float32], NDArray[np.float32]]:
         assert self.network_ is not None
-        # Before the first row nothing has moved.
-        before = np.where(state.steps[:, None] > 0, state.before, rows)
-        earlier = np.where(state.steps[:, None] > 1, state.earlier, before)
+        before, earlier = state.before, state.earlier
+        if state.steps.min() < 2:  # before the first row nothing has moved
+            before = np.where(state.steps[:, None] > 0, before, rows)
+            earlier = np.where(state.steps[:, None] > 1, earlier, before)
         step = self.network_.step(state.hidden, self.senses_.read(rows, before, earlier))
-        return MemoryState(step.hidden, rows, before, state.steps + 1), step.error, activate(step.expected)
+        skill = state.skill
+        if self.skills_:
+            skill = add_up(skill, step.units, self.learned_["W_K"], self.learned_["b_K"])
+        state = MemoryState(step.hidden, rows, before, state.steps + 1, skill)
+        return state, step.error, activate(step.expected)
 
     def name_skills(self, episodes: Sequence[Episode]) -> Self:
         """Learns to tell which skill is running, from episodes whose ``info["skill"]`` says it.
@@ -164,23 +174,108 @@ class NeuralASM(PredictiveMonitor):
         known = sorted(set(names))
         if len(known) < 2:
             raise ValueError(f"two skills at least are needed to tell them apart, got {', '.join(known)}")
-        contexts, skills = [], []
+        assert self.network_ is not None
+        inputs = np.concatenate([self.senses_.read_episode(e.stream).inputs for e in episodes])
+        skills = np.repeat([known.index(name) for name in names], [len(e) for e in episodes])
         with threadpool_limits(1):
-            for name, run in zip(names, self._runs([e.stream for e in episodes]), strict=True):
-                lately = lfilter([LATELY], [1.0, LATELY - 1.0], run.contexts, axis=0)
-                contexts.append(lately.astype(np.float32))
-                skills.append(np.full(len(lately), known.index(name)))
             rng = np.random.default_rng(self.seed)
-            W_K, b_K = learn_readout(np.concatenate(contexts), np.concatenate(skills), len(known), rng)
+            W_K, b_K = learn_readout(inputs, self.network_.association.V, skills, len(known), rng)
         self.learned_ = self.learned_ | {"W_K": W_K, "b_K": b_K}
         self.skills_ = tuple(known)
         return self
 
+    def skills(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.str_]:
+        """(T,) the skill that seems to run in each step of a stream (T, D), by what came before.
+
+        Raises:
+            RuntimeError: no skill has a name: ``name_skills`` comes first.
+        """
+        if not self.skills_:
+            raise RuntimeError("no skill has a name yet: call name_skills(episodes) first")
+        assert self.network_ is not None
+        units = hidden_units(self.senses_.read_episode(np.asarray(stream)).inputs, self.network_.association.V)
+        L, named = np.zeros((1, len(self.skills_)), np.float32), []
+        for f in units:
+            L = add_up(L, f[None], self.learned_["W_K"], self.learned_["b_K"])
+            named.append(int(L.argmax()))
+        return np.array(self.skills_)[named]
+
+    def adapt(
+        self,
+        before: PredictiveState,
+        stream: NDArray[np.floating[Any]],
+        surprise: Surprise,
+        rate: float = 5e-3,
+        below: float = 0.5,
+    ) -> NDArray[np.bool_]:
+        """Learns from rows that were just observed, where they were not surprising: for a body that slowly wears.
+
+        Nothing calls this unless asked to. It changes this memory for whoever watches with it; the promise of
+        ``calibrate`` holds for the weights it was made with, so calibrate anew now and then.
+
+        Args:
+            before: the state that ``observe`` was given.
+            stream: (B, D) the rows that ``observe`` was given.
+            surprise: what it made of them.
+            rate: share of an error that one step takes away, in (0, 1].
+            below: only rows whose surprise is under this share of the threshold are learned from.
+
+        Returns:
+            (B,) which rows were learned from.
+
+        Raises:
+            RuntimeError: there is no threshold yet.
+        """
+        require("rate", rate, 0.0 < rate <= 1.0, "in (0, 1]")
+        require("below", below, 0.0 < below <= 1.0, "in (0, 1]")
+        assert self.network_ is not None
+        model, rows = before.model, np.asarray(stream, np.float64)
+        quiet = (surprise.value < below * self.threshold) & (model.steps > 1)
+        reading = self.senses_.read(rows, model.before, model.earlier)
+        learned: NDArray[np.bool_] = quiet & (reading.whole[:, 0] > 0)
+        if learned.any():
+            senses, size = self.senses_, self._units_each(self.senses_)
+            exists = synapses(senses.groups, senses.changes, senses.inputs, size)
+            now = followed(self.network_.association, exists, reading.inputs[learned], reading.changes[learned], rate)
+            self.network_.association = now
+            self.learned_ = self.learned_ | {"U": now.U, "D": now.D}
+        return learned
+
+    def expected_action(self, state: PredictiveState) -> NDArray[np.float32]:
+        """(B, A) the motor prediction: what is likely to be commanded next, in the units of the action.
+
+        Args:
+            state: as ``observe`` handed it back.
+        """
+        assert self.network_ is not None
+        motor, senses = self.spec.motor, self.senses_
+        _, action = motor_prediction(state.model.hidden, self.network_.weights)
+        return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
+
+    def recall(self, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
+        """What comes after a cue, from memory alone: (steps, D) rows in the units of the stream.
+
+        Actions are the memory's own motor predictions. Fit with ``carry_prior`` above 0 to make it learn to run on.
+
+        Args:
+            cue: (T, D) the first rows of an episode, at least 2.
+            steps: how many rows to recall.
+
+        Raises:
+            ValueError: the cue is too short, not finite, or of another width; fewer than one step.
+        """
+        self._fitted()
+        assert self.network_ is not None
+        reading = self.senses_.read_episode(check_cue(self.senses_, cue, steps))
+        start = at_rest(self.network_, 1)
+        cued = follow(self.network_, start, reading.senses[:, None], reading.commands[:, None])
+        rows: NDArray[np.float64] = to_rows(self.senses_, run_on(self.network_, cued.hidden[-1], steps))[:, 0]
+        return rows
+
     def observe(self, state: PredictiveState, stream: NDArray[np.floating[Any]]) -> tuple[PredictiveState, Surprise]:
         state, surprise = super().observe(state, stream)
         if self.skills_:
-            p = certainty(state.evidence.context, self.learned_["W_K"], self.learned_["b_K"])
-            surprise = surprise._replace(skill=np.array(self.skills_)[p.argmax(axis=1)])
+            surprise = surprise._replace(skill=np.array(self.skills_)[state.model.skill.argmax(axis=1)])
         return state, surprise
 
     def _units_each(self, senses: Senses) -> int:

@@ -106,6 +106,8 @@ class PredictiveMonitor(CalibratedMonitor):
         self.build_model()
         whitening, ceiling, habit = (self.learned_[name] for name in ("whitening", "ceiling", "habit"))
         self.detector_ = Detector(whitening, ceiling, habit, np.array(self.gains), self.bound)
+        self._places = np.zeros((len(self.judged), self.spec.size))
+        self._places[np.arange(len(self.judged)), self.judged] = 1.0
 
     def start(self, batch: int) -> PredictiveState:
         assert self.detector_ is not None
@@ -124,9 +126,7 @@ class PredictiveMonitor(CalibratedMonitor):
 
     def attribute(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
         """(B, D) each number's share, from each error's (B, X)."""
-        shares = np.zeros((self.spec.size, len(parts)))
-        np.add.at(shares, self.judged, parts.T)
-        return shares.T
+        return parts @ self._places
 
     def _runs(self, streams: Sequence[NDArray[np.float32]]) -> list[Run]:
         """What the model says of whole episodes."""

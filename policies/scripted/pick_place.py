@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
-from asm_gym.policies.scripted.base import Vector
+from asm_gym.policies.scripted.base import Style, Vector
 from asm_gym.policies.scripted.carry import CarryExpert, Errand
 
 _WALL = 0.09  # how high above the bins' floor the fingertips stay clear of the walls' tops with the palm [m]
 
 
 class PickPlaceExpert(CarryExpert):
-    """A scripted expert for PickPlace, with one object or with all four."""
+    """A scripted expert for PickPlace, with one object or with all four.
+
+    Args:
+        env, seed, style: as for ``CarryExpert``.
+        things: names of the objects to sort; None for all.
+    """
 
     pace = 0.65
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        seed: int | None = None,
+        style: Style | None = None,
+        things: Collection[str] | None = None,
+    ) -> None:
+        super().__init__(env, seed, style)
+        self.things = things
 
     def next_errand(self, observation: Any) -> Errand | None:
         """The nearest object that is not in its bin; None where all are."""
@@ -24,6 +41,8 @@ class PickPlaceExpert(CarryExpert):
         left = []
         for i, thing in enumerate(env.objects):
             if env.single_object_mode and i != env.object_id:
+                continue
+            if self.things is not None and thing.name not in self.things:
                 continue
             at, _ = self.pose(observation, thing.name)
             if env.not_in_bin(at, i):

@@ -1,0 +1,85 @@
+"""``asm-gym benchmark fit``: what learning costs, the memory against a GRU trained by backpropagation through time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from asm_gym.episodes import Episode
+from asm_gym.memory.association import complete, hidden_units
+from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.gru import GRU
+from asm_gym.scripts.collect import collect
+from asm_gym.scripts.progress import stage
+
+HELD_OUT = 6
+"""One in so many episodes is not learned but tested on."""
+
+
+@dataclass
+class Fit:
+    """How long a memory takes to learn three skills, and how far off its expectations are, against a GRU."""
+
+    tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan")
+    """names of tasks"""
+    episodes: int = 60
+    """of each task"""
+    seed: int = 0
+    """of the episodes and of both monitors"""
+
+    def run(self, console: Console) -> int:
+        """Prints the table."""
+        seconds: dict[str, float] = {}
+        episodes: list[Episode] = []
+        for task in self.tasks:
+            with stage(f"recording {task}", console, seconds) as progress:
+                extra = -(-self.episodes // (HELD_OUT - 1))
+                env_id = f"asm_gym/{task}-v0"
+                episodes += collect(env_id, episodes=self.episodes + extra, seed=self.seed, progress=progress)
+        learned = [e for n, e in enumerate(episodes) if n % HELD_OUT]
+        held_out = [e for n, e in enumerate(episodes) if not n % HELD_OUT]
+        rows: dict[str, tuple[float, float]] = {}
+        NeuralASM(episodes[0].spec, epochs=1).fit(learned[:4])  # compiles
+        for name, monitor in (("neural_asm", NeuralASM), ("gru", GRU)):
+            with stage(f"fitting {name}", console, seconds) as progress:
+                start = time.process_time()
+                fitted: Any = monitor(episodes[0].spec, seed=self.seed).fit(learned, progress)
+                spent = time.process_time() - start
+            rows[name] = spent, float(np.median(np.abs(np.concatenate(errors(fitted, held_out)))))
+        table = Table(title=f"{len(learned)} episodes of {', '.join(self.tasks)}, one core")
+        for column in ("", "s", "against the GRU", "median error of a step [sd of the change]"):
+            table.add_column(column, justify="right" if table.columns else "left")
+        for name, (spent, off) in rows.items():
+            table.add_row(name, f"{spent:.0f}", f"{spent / rows['gru'][0]:.2f}×", f"{off:.3f}")
+        console.print(table)
+        console.print(
+            "The memory expects each group of senses from what the others do in the same step, the GRU from the past "
+            "alone: the errors are of different questions."
+        )
+        return 0
+
+
+def errors(monitor: NeuralASM | GRU, episodes: Sequence[Episode]) -> list[NDArray[np.float32]]:
+    """Δ - Δ̂ (T - 2, X) of each episode, in standard deviations of the step from row to row."""
+    made = []
+    for episode in episodes:
+        r = monitor.senses_.read_episode(episode.stream.astype(np.float64))
+        if isinstance(monitor, NeuralASM):
+            assert monitor.network_ is not None
+            w = monitor.network_.association
+            expected = complete(hidden_units(r.inputs, w.V), r.inputs, w.U, w.D)
+        else:
+            assert monitor.module_ is not None
+            before = np.hstack([np.vstack([r.senses[:1], r.senses[:-1]]), r.commands])
+            with torch.no_grad():
+                expected = monitor.module_(torch.from_numpy(before)[None])[0].numpy()[0]
+        made.append((r.changes - expected)[2:])
+    return made
