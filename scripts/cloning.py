@@ -140,7 +140,7 @@ def fill_buffer(learner: OffPolicyAlgorithm, episodes: Sequence[Episode], mean: 
         seen = ((episode.observations - mean) / scale).astype(np.float32)
         actions = as_kept(learner, episode.actions)
         for t, reward in enumerate(episode.rewards):
-            last = t == len(episode) - 1
+            last = t == len(episode.rewards) - 1
             # What was merely cut short is worth what would have followed.
             info: dict[str, Any] = {"TimeLimit.truncated": last and not episode.info.get("terminated", False)}
             row = seen[t][None], seen[t + 1][None], actions[t][None], np.array([reward]), np.array([last])
