@@ -16,6 +16,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 from asm_gym.episodes import Episode
 from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
@@ -64,7 +65,7 @@ def write_dataset(
         details: JSON-serialisable; kept in the metadata, for example versions.
 
     Raises:
-        ValueError: no episode, or episodes of several specs.
+        ValueError: no episode, episodes of several specs, or one without observations, actions and rewards.
     """
     storage_class = _minari("minari.dataset.minari_storage.MinariStorage")
     buffer = _minari("minari.data_collector.EpisodeBuffer")
@@ -73,6 +74,9 @@ def write_dataset(
     spec = episodes[0].spec
     for n, episode in enumerate(episodes):
         spec.require(episode.spec, f"episode {n}")
+        steps = len(episode.actions)
+        if not steps or len(episode.observations) != steps + 1 or len(episode.rewards) != steps:
+            raise ValueError(f"episode {n} needs an action, a reward and a flat observation of every step")
     folder = root / dataset_id
     unfinished = folder.with_name(f".{folder.name}.unfinished")
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -90,7 +94,7 @@ def write_dataset(
 
 def _columns(episode: Episode) -> dict[str, Any]:
     """An episode's arrays by Minari's names."""
-    T = len(episode)
+    T = len(episode.rewards)
     last = np.arange(T) == T - 1
     terminated = bool(episode.info.get("terminated", False))
     return {
@@ -190,7 +194,7 @@ def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec) ->
         if spec.source == "spaces":
             stream = np.concatenate([observations[1:], actions], axis=1)
         else:
-            stream = np.asarray(infos["stream"], np.float32)[-T:]  # others may keep the row of reset as well
+            stream = _without_reset(np.asarray(infos["stream"], np.float32), T)
         return Episode(
             stream=stream,
             spec=spec,
@@ -199,11 +203,19 @@ def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec) ->
             actions=actions,
             observations=observations,
             rewards=np.asarray(data.rewards, np.float32),
-            faults=np.asarray(infos.get("fault", np.zeros(T)), np.bool_)[-T:],
+            faults=_without_reset(np.asarray(infos.get("fault", np.zeros(len(stream))), np.bool_), T),
             info=json.loads(note.get("info", "{}")) | {"terminated": bool(np.any(data.terminations))},
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{folder}, episode {data.id}: {error}") from error
+
+
+def _without_reset(rows: NDArray[Any], T: int) -> NDArray[Any]:
+    """Rows of T steps, perhaps several of each; others may keep the row of reset as well."""
+    rows = rows[1:] if len(rows) == T + 1 else rows
+    if not T or len(rows) % T:
+        raise ValueError(f"{T} steps cannot have {len(rows)} rows of a stream")
+    return rows
 
 
 def _minari(name: str) -> Any:

@@ -9,7 +9,9 @@ from typing import Any
 import gymnasium as gym
 
 from asm_gym.policies.base import Policy
+from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.reflexes import Hold
+from asm_gym.policies.sb3 import read_archive
 from asm_gym.policies.scripted.door import DoorExpert
 from asm_gym.policies.scripted.lift import LiftExpert
 from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
@@ -32,20 +34,30 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
 """The scripted expert of each task."""
 
 POLICIES = ("scripted", "hold")
-"""Names that ``make_policy`` knows, besides the path of a stable-baselines3 agent."""
+"""Names that ``make_policy`` knows, besides agents."""
+
+
+SHIPPED = Path(__file__).resolve().parent / "agents"
+"""Trained agents that come with the package."""
+
+
+def agents() -> tuple[str, ...]:
+    """Names of the agents that come with the package."""
+    return tuple(sorted(f.stem for f in SHIPPED.glob("*.npz")))
 
 
 def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kwargs: Any) -> Policy:
     """The policy called ``name`` for ``env``.
 
     Args:
-        name: ``"scripted"`` (the task's expert), ``"hold"`` (stay where you are), or the path of an agent saved by
-            stable-baselines3, such as ``"lift_sac.zip"``; its file name must contain the algorithm's name.
+        name: ``"scripted"`` (the task's expert), ``"hold"`` (stay where you are), an agent that comes with the package,
+            such as ``"lift_sac"``, or the path of one: ``.npz`` of ``asm-gym train``, ``.zip`` of stable-baselines3.
         seed: of whatever the policy draws.
         kwargs: handed to the expert, for example ``style=Style(noise=0.1)``.
 
     Raises:
-        ValueError: an unknown name, or a task without an expert; the message lists what exists.
+        ValueError: an unknown name, a task without an expert, or an agent that was trained in another environment; the
+            message lists what exists, or what differs.
         FileNotFoundError: there is no such agent.
     """
     if name == "scripted":
@@ -56,17 +68,10 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
     if name == "hold":
         return Hold(env)
     if name.endswith(".zip"):
-        return _agent(Path(name), env)
-    raise ValueError(f"unknown policy {name!r}; known: {', '.join(POLICIES)}, or the path of an agent (.zip)")
-
-
-def _agent(path: Path, env: gym.Env[Any, Any]) -> Policy:
-    if not path.is_file():
-        raise FileNotFoundError(f"no agent at {path}")
-    import stable_baselines3
-
-    for algorithm in ("SAC", "PPO", "TD3", "A2C", "DDPG"):
-        if algorithm.lower() in path.stem.lower():
-            model: Policy = getattr(stable_baselines3, algorithm).load(path, env=env, device="cpu")
-            return model
-    raise ValueError(f"the file name must say the algorithm (sac, ppo, td3, a2c or ddpg), got {path.name!r}")
+        return read_archive(Path(name), seed).fit_to(env, name)
+    if name.endswith(".npz"):
+        return NetworkPolicy.load(name).fit_to(env, name)
+    if name in agents():
+        return NetworkPolicy.load(SHIPPED / f"{name}.npz").fit_to(env, name)
+    known = ", ".join((*POLICIES, *agents()))
+    raise ValueError(f"unknown policy {name!r}; known: {known}, or the path of an agent (.npz, .zip)")

@@ -33,7 +33,7 @@ Settings = tuple[tuple[str, Any], ...]
 class Args:
     """Episodes of a policy, as a Minari dataset."""
 
-    task: Annotated[str, tyro.conf.Positional] = "Lift"
+    task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")] = "Lift"
     """Name of a task, or any Gymnasium id with Box spaces."""
     policy: str = "scripted"
     """What acts: scripted, hold, a shipped agent, or the path of one."""

@@ -212,6 +212,18 @@ def test_streams_of_others_are_taken_without_the_row_of_reset(tmp_path, folder):
         np.testing.assert_array_equal(a.stream, b.stream)
 
 
+def test_streams_that_run_faster_than_control_are_kept_whole(tmp_path):
+    env = StreamRecorder(gym.make("asm_gym/Lift-v0", stream_freq=100, horizon=4))
+    rollout(env, make_policy("scripted", env, seed=0), 0)
+    episode = env.finish()
+    assert (len(episode.stream), len(episode.actions)) == (20, 4)
+    write_dataset(tmp_path, "asm_gym/lift-v0", [episode], env, {})
+    assert_same(read_dataset(tmp_path)[0], episode)
+    with pytest.raises(ValueError, match="episode 0 needs an action, a reward and a flat observation"):
+        write_dataset(tmp_path, "asm_gym/lift-v0", [replace(episode, observations=np.zeros((0, 0)))], env, {})
+    env.close()
+
+
 def test_what_cannot_be_read_is_refused_by_name(tmp_path, folder):
     with pytest.raises(FileNotFoundError, match="nowhere"):
         read_dataset(tmp_path / "nowhere")

@@ -142,3 +142,5 @@ def test_a_wheel_holds_real_files_under_one_name(tmp_path: Path) -> None:
         assert f"asm_gym/{link}/__init__.py" in names
     assert all(mode == 0o100000 for mode in modes.values()), "regular files, no links"
     assert {f"{name.replace('.', '/')}.py" for name in MODULES} <= names
+    agents = (ROOT / "policies" / "agents").iterdir()
+    assert {f"asm_gym/policies/agents/{agent.name}" for agent in agents} <= names

@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3 import PPO
 
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.reflexes import Comply, Hold, Retract
@@ -96,13 +95,6 @@ def test_hold_takes_the_users_safe_action_as_it_is():
         Hold(FakeEnv(), safe_action=np.array([2.0, 0, 0]))
 
 
-def test_a_saved_agent_is_a_policy(tmp_path):
-    env = FakeEnv()
-    PPO("MlpPolicy", env, n_steps=8, batch_size=8).save(tmp_path / "fake_ppo.zip")
-    action, _ = make_policy(str(tmp_path / "fake_ppo.zip"), env).predict(np.zeros(2, np.float32), deterministic=True)
-    assert env.action_space.contains(action)
-
-
 def test_what_cannot_be_made_is_refused_with_what_exists(lift, tmp_path):
     with pytest.raises(ValueError, match=r"'teleop'.*scripted, hold"):
         make_policy("teleop", lift)
@@ -111,7 +103,7 @@ def test_what_cannot_be_made_is_refused_with_what_exists(lift, tmp_path):
     with pytest.raises(FileNotFoundError, match="none_sac"):
         make_policy(str(tmp_path / "none_sac.zip"), lift)
     (tmp_path / "agent.zip").touch()
-    with pytest.raises(ValueError, match="algorithm"):
+    with pytest.raises(ValueError, match=r"agent\.zip is not an agent"):
         make_policy(str(tmp_path / "agent.zip"), lift)
     for bad in ({"noise": -1}, {"speed": 0}):
         with pytest.raises(ValueError, match="must be"):

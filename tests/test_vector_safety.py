@@ -22,6 +22,7 @@ OPTIONS = [
     {"on_alarm": "terminate"},
     {"on_alarm": "terminate", "truncate": True},
     {"on_alarm": "hold", "max_override": 2},
+    {"on_alarm": "hold", "try_after": 1, "max_override": 3},
 ]
 
 
@@ -31,6 +32,15 @@ class Counter:
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         count = 0 if state is None else state
         return np.full(3, 0.1 * count + 0.001 * observation[0], np.float32), count + 1
+
+
+class Broken:
+    """Fails in the first environment, and acts in the others."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        if observation[0] < 100:
+            raise RuntimeError("out of order")
+        return np.full(3, 0.5, np.float32), state
 
 
 def fakes(wrap, own_stream=True):
@@ -54,7 +64,7 @@ def both(options, mode, own_stream=True, many=SyncVectorEnv):
 
 
 def assert_same_report(ours, theirs, present, stepped):
-    for name in ("surprise", "threshold", "alarm", "intervened", "gave_up"):
+    for name in ("surprise", "threshold", "alarm", "intervened", "gave_up", "transition", "failure"):
         np.testing.assert_array_equal(ours["asm"][name][present], theirs["asm"][name][present], name)
     for label, shares in theirs["asm"]["attribution"].items():
         if not label.startswith("_"):
@@ -96,6 +106,18 @@ def test_one_wrapper_around_many_equals_many_wrappers(options, mode):
     acted, ended = assert_equal_step_by_step(*both(options, mode), steps=40)
     assert ended
     assert acted == (options["on_alarm"] not in ("monitor", "terminate"))
+
+
+@pytest.mark.filterwarnings("ignore:.*the reflex failed")
+@pytest.mark.parametrize("mode", [NEXT, SAME], ids=["next", "same"])
+def test_where_a_reflex_fails_only_that_environment_holds(mode):
+    ours, theirs = both({"on_alarm": Broken()}, mode)
+    assert_equal_step_by_step(ours, theirs, steps=25)
+    ours.reset()
+    for _ in range(4):
+        asm = ours.step(np.full((3, 3), 0.2, np.float32))[4]["asm"]
+    assert asm["failure"].tolist() == ["RuntimeError('out of order')", "", ""]
+    np.testing.assert_allclose(asm["executed_action"], [[0, 0, 0.2], [0.5] * 3, [0.2] * 3], rtol=1e-6)
 
 
 @pytest.mark.parametrize("mode", [NEXT, SAME], ids=["next", "same"])

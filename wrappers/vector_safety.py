@@ -211,7 +211,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         present: Mask,
     ) -> None:
         """Adds ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
-        alarm = surprise.value > self.threshold
+        alarm = ~(surprise.value <= self.threshold)  # what is no number is an alarm
         verdicts = verdicts or [NOTHING] * self.num_envs
         infos["asm"] = {
             "surprise": surprise.value,
@@ -220,6 +220,7 @@ class VectorNeuralASMSafety(VectorWrapper):
             "intervened": np.array([v.intervened for v in verdicts]),
             "gave_up": np.array([v.gave_up for v in verdicts]),
             "transition": np.array([v.transition for v in verdicts]),
+            "failure": np.array([arbiter.failure for arbiter in self._arbiters]),
             "executed_action": executed,
             "attribution": dict(zip(self.monitor.spec.labels, surprise.attribution.T, strict=True)),
         }

@@ -1,0 +1,172 @@
+"""Trained agents as what they are: a feed-forward network from observation to action, in arrays and JSON.
+
+    a = squash(W_n f(… f(W_1 (o - m) / s + b_1) …) + b_n)
+
+``squash`` is tanh, scaled from [-1, 1] to the action space (SAC, TD3, DDPG), or a clip to it (PPO, A2C). Nothing but
+numpy is needed to act, and loading one runs no code that the file brings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from asm_gym.choices import check_choice
+from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
+
+Array = NDArray[np.float32]
+
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "relu": lambda x: np.maximum(x, np.float32(0.0)),
+    "tanh": np.tanh,
+    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, np.float32(0.0)))),
+}
+SQUASHES = ("tanh", "clip")
+KIND = "agent"
+
+
+class NetworkPolicy:
+    """Acts by a network. A value: it keeps nothing between steps but its generator.
+
+    Args:
+        layers: (out, in) weights and (out,) biases, first to last.
+        activation: of the hidden layers, one of ``ACTIVATIONS``.
+        squash: what brings the output into the action space, one of ``SQUASHES``.
+        mean, scale: (O,) what observations are standardised by; 0 and 1 where None.
+        log_std: (A,) or the (A, hidden) weights and (A,) biases that give it: the noise of an agent that explores,
+            before ``squash``. None for one that does not.
+        trained_in: what the agent knows of its environment, by name: see ``describe``.
+        seed: of the noise.
+
+    Raises:
+        ValueError: layers that do not fit one another, or an unknown name.
+    """
+
+    def __init__(
+        self,
+        layers: Sequence[tuple[Array, Array]],
+        activation: str,
+        squash: str,
+        *,
+        mean: Array | None = None,
+        scale: Array | None = None,
+        log_std: tuple[Array, Array] | None = None,
+        trained_in: dict[str, Any] | None = None,
+        seed: int | None = None,
+    ) -> None:
+        check_choice("activation", activation, ACTIVATIONS)
+        check_choice("squash", squash, SQUASHES)
+        if not layers:
+            raise ValueError("a network needs at least one layer, got none")
+        self.layers = [(np.asarray(W, np.float32), np.asarray(b, np.float32)) for W, b in layers]
+        size = self.observation_size
+        for n, (W, b) in enumerate(self.layers):
+            if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
+                raise ValueError(f"layer {n} takes {size} numbers, got weights {W.shape} and biases {b.shape}")
+            if not (np.isfinite(W).all() and np.isfinite(b).all()):
+                raise ValueError(f"layer {n} must be finite")
+            size = len(W)
+        self.activation, self.squash = activation, squash
+        self.mean = np.zeros(self.observation_size, np.float32) if mean is None else np.asarray(mean, np.float32)
+        self.scale = np.ones(self.observation_size, np.float32) if scale is None else np.asarray(scale, np.float32)
+        self.log_std = log_std
+        self.trained_in = dict(trained_in or {})
+        self.np_random = np.random.default_rng(seed)
+        self._low, self._high = np.full(self.action_size, -1.0, np.float32), np.ones(self.action_size, np.float32)
+
+    @property
+    def observation_size(self) -> int:
+        """O."""
+        return int(self.layers[0][0].shape[1])
+
+    @property
+    def action_size(self) -> int:
+        """A."""
+        return len(self.layers[-1][1])
+
+    def fit_to(self, env: gym.Env[Any, Any], whose: str) -> NetworkPolicy:
+        """This policy, once it has been found to fit ``env``.
+
+        Raises:
+            ValueError: sizes differ, or the agent was trained in another environment; the message names both.
+        """
+        for what, size, space in (
+            ("observations", self.observation_size, env.observation_space),
+            ("actions", self.action_size, env.action_space),
+        ):
+            if not isinstance(space, spaces.Box) or space.shape != (size,):
+                raise ValueError(f"{whose} takes {what} of {size} numbers, {env.unwrapped} has {space}")
+        here = describe(env)
+        other = [f"{n}: {v} there, {here[n]} here" for n, v in self.trained_in.items() if n in here and here[n] != v]
+        if other:
+            raise ValueError(f"{whose} was trained in another environment ({'; '.join(other)})")
+        assert isinstance(env.action_space, spaces.Box)
+        self._low, self._high = env.action_space.low, env.action_space.high
+        return self
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[Array, Any]:
+        """The action (A,), or (n, A) for n observations."""
+        f = ACTIVATIONS[self.activation]
+        x = (np.asarray(observation, np.float32) - self.mean) / self.scale
+        for W, b in self.layers[:-1]:
+            x = f(x @ W.T + b)
+        W, b = self.layers[-1]
+        out = x @ W.T + b
+        if self.log_std is not None and not deterministic:
+            slope, offset = self.log_std
+            # The bounds are those of SB3's SAC; PPO's stay far within them.
+            std = np.exp(np.clip(x @ slope.T + offset, -20.0, 2.0))
+            out = out + std * self.np_random.standard_normal(out.shape).astype(np.float32)
+        if self.squash == "tanh":
+            out = self._low + 0.5 * (np.tanh(out) + 1.0) * (self._high - self._low)
+        return np.clip(out, self._low, self._high).astype(np.float32), state
+
+    def save(self, path: str | Path, **about: Any) -> None:
+        """Writes the agent without its noise.
+
+        Args:
+            about: JSON-serialisable; kept beside the weights.
+        """
+        arrays = {"mean": self.mean, "scale": self.scale}
+        for n, (W, b) in enumerate(self.layers):
+            arrays |= {f"W{n}": W, f"b{n}": b}
+        header = {"activation": self.activation, "squash": self.squash, "trained_in": self.trained_in, "about": about}
+        write_checkpoint(path, KIND, header, arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> NetworkPolicy:
+        """Reads what ``save`` wrote. Raises ValueError where the file is damaged or something else."""
+        saved = read_checkpoint(path, KIND)
+        try:
+            count = sum(name.startswith("W") for name in saved.arrays)
+            layers = [(saved.arrays[f"W{n}"], saved.arrays[f"b{n}"]) for n in range(count)]
+            header, mean, scale = saved.header, saved.arrays["mean"], saved.arrays["scale"]
+            how = header["activation"], header["squash"]
+            return cls(layers, *how, mean=mean, scale=scale, trained_in=header["trained_in"])
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def describe(env: gym.Env[Any, Any]) -> dict[str, Any]:
+    """What an agent's actions depend on beside the observation, as far as ``env`` says it."""
+    inner = env.unwrapped
+    found: dict[str, Any] = {"env": inner.spec.id} if inner.spec is not None else {}
+    if hasattr(inner, "robots"):
+        found["robots"] = list(inner.robots)
+    if hasattr(inner, "controller"):
+        found["controller"] = inner.controller
+    if "render_fps" in inner.metadata and hasattr(inner, "controller"):
+        found["control_freq"] = int(inner.metadata["render_fps"])
+    return found

@@ -1,0 +1,193 @@
+"""Trains a stable-baselines3 agent: cloned from an expert's episodes, then improved by its own.
+
+A run lives in one folder and can be killed at any time: the same command goes on from the last checkpoint. The best
+agent of its evaluations is written as arrays and JSON, beside the clone, and judged once more on seeds of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium as gym
+import torch
+import tyro
+from rich.console import Console
+
+from asm_gym.choices import check_choice
+from asm_gym.datasets import load_episode, read_dataset
+from asm_gym.episodes import Episode
+from asm_gym.policies.network import NetworkPolicy
+from asm_gym.scripts import collect
+from asm_gym.scripts.claims import claim_folder
+from asm_gym.scripts.collect import episode_seeds
+from asm_gym.scripts.dispatch import Progress
+from asm_gym.scripts.learners import ALGORITHMS
+from asm_gym.scripts.progress import stage
+from asm_gym.scripts.training import BEST, CLONE, Plan, Run, success_rate
+from asm_gym.tasks import task as task_spec
+
+
+@dataclass(frozen=True)
+class Args:
+    """An agent for a task."""
+
+    task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")] = "Lift"
+    """Name of a task, or any Gymnasium id with Box spaces."""
+    algorithm: str = "sac"
+    """sac, td3 or ppo."""
+    robot: str | None = None
+    """The arm; the task's own by default."""
+    steps: int = 20_000
+    """Control steps of its own that the agent learns from; 0 for a clone."""
+    demonstrations: int = 200
+    """Episodes of the scripted expert to begin with; 0 for none."""
+    dataset: Path | None = None
+    """Minari dataset of demonstrations, in place of the scripted expert's."""
+    cloning_updates: int = 15_000
+    """Of the actor, before it acts."""
+    evaluate_every: int = 5_000
+    """Control steps between evaluations."""
+    evaluation_episodes: int = 40
+    """Of each evaluation."""
+    final_episodes: int = 100
+    """Of the last one, on other seeds."""
+    checkpoint_every: int = 2_500
+    """Control steps between checkpoints: what a kill loses at most."""
+    workers: int = 1
+    """Processes that record demonstrations; learning is done by one."""
+    seed: int = 0
+    """Of everything."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/train")
+    """Folder of the run."""
+    quick: bool = False
+    """Few demonstrations, few steps: to see that everything runs."""
+
+    def __post_init__(self) -> None:
+        check_choice("algorithm", self.algorithm, ALGORITHMS)
+        if self.task not in gym.registry:
+            task_spec(self.task)
+        for name in ("cloning_updates", "evaluate_every", "evaluation_episodes", "final_episodes", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.steps < 0 or self.demonstrations < 0:
+            raise ValueError(f"steps and demonstrations must be >= 0, got {self.steps} and {self.demonstrations}")
+        if not self.steps and not self.demonstrations and self.dataset is None:
+            raise ValueError("there is nothing to learn from: neither steps nor demonstrations")
+
+    def scaled(self) -> Args:
+        """With ``quick``, little of everything."""
+        if not self.quick:
+            return self
+        return replace(
+            self,
+            steps=min(300, self.steps),
+            demonstrations=min(4, self.demonstrations),
+            cloning_updates=200,
+            evaluate_every=150,
+            evaluation_episodes=1,
+            final_episodes=2,
+            checkpoint_every=100,
+        )
+
+    @property
+    def env_id(self) -> str:
+        return self.task if self.task in gym.registry else task_spec(self.task).id
+
+    @property
+    def plan(self) -> Plan:
+        settings = {} if self.robot is None else {"robot": self.robot}
+        each = (
+            "algorithm",
+            "steps",
+            "cloning_updates",
+            "evaluate_every",
+            "evaluation_episodes",
+            "checkpoint_every",
+            "seed",
+        )
+        return Plan(self.env_id, settings, **{name: getattr(self, name) for name in each})
+
+
+def demonstrate(args: Args, tick: Progress) -> list[Episode]:
+    """Successful episodes to begin with, recorded or read."""
+    if args.dataset is not None:
+        episodes = read_dataset(args.dataset, env_id=args.env_id)
+    elif not args.demonstrations:
+        return []
+    else:
+        how = collect.Args(
+            task=args.task,
+            robot=args.robot,
+            episodes=args.demonstrations,
+            workers=args.workers,
+            seed=args.seed,
+            out=args.out / "demonstrations",
+        )
+        collect.check(how)
+        episodes = [load_episode(file) for file in collect.record_all(how, tick)]
+    kept = [e for e in episodes if e.success]
+    if not kept:
+        raise ValueError(f"none of {len(episodes)} demonstrations succeeded")
+    return kept
+
+
+def train(args: Args, console: Console) -> dict[str, Any]:
+    """Trains, and says how well the best agent does; it is left in ``out/agent.npz``."""
+    torch.set_num_threads(1)  # more of them slow networks this small down
+    seconds: dict[str, float] = {}
+    start = time.perf_counter()
+    with stage("recording demonstrations", console, seconds) as tick:
+        episodes = demonstrate(args, tick)
+    run = Run(args.plan, args.out, episodes)
+    try:
+        with stage("cloning", console, seconds) as tick:
+            run.begin(tick)
+        with stage("learning", console, seconds) as tick:
+            run.learn(tick)
+        with stage("judging", console, seconds):
+            agent = NetworkPolicy.load(args.out / (BEST if args.steps else CLONE)).fit_to(run.env, "the agent")
+            seeds = episode_seeds(args.seed, args.final_episodes, stage=3)
+            success = success_rate(agent, run.env, seeds)
+    finally:
+        run.close()
+    result = {
+        "success": success,
+        "episodes": args.final_episodes,
+        "curve": run.progressed.curve,
+        "seconds": seconds,
+        "minutes": round((time.perf_counter() - start) / 60, 1),
+        "command": _command(args),
+    }
+    agent.save(args.out / "agent.npz", **result)
+    (args.out / "result.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    return result
+
+
+def _command(args: Args) -> str:
+    changed = {k: v for k, v in vars(args).items() if v != getattr(Args, k, None) and k not in ("task", "out", "quick")}
+    options = " ".join(f"--{k.replace('_', '-')} {v}" for k, v in changed.items())
+    return f"asm-gym train {args.task} {options}".strip()
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Trains; 2 where the arguments make no sense."""
+    console = Console()
+    try:
+        args = tyro.cli(Args, args=argv, prog="asm-gym train", description=__doc__).scaled()
+        keys = ("env_id", "algorithm", "robot", "demonstrations", "dataset", "cloning_updates", "seed")
+        claim_folder(args.out, "train.json", {key: getattr(args, key) for key in keys})
+        result = train(args, console)
+    except (ValueError, TypeError, FileNotFoundError, ImportError, gym.error.Error) as error:
+        print(f"asm-gym train: {error}", file=sys.stderr)
+        return 2
+    console.print(f"success {result['success']:.0%} of {args.final_episodes} episodes: {args.out / 'agent.npz'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,209 @@
+"""Training: cloning, checkpoints, and going on after a kill."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.logger import configure
+
+from asm_gym.episodes import Episode
+from asm_gym.policies.network import NetworkPolicy
+from asm_gym.scripts.cli import main
+from asm_gym.scripts.cloning import Anchor, Cloner, fill_buffer, steps_of
+from asm_gym.scripts.learners import ALGORITHMS, RECIPES, export, make_learner, warm_critic
+from asm_gym.scripts.training import Plan, Run, Standard
+from asm_gym.scripts.training_state import Progressed, newest, resume, save
+from asm_gym.stream import StreamSpec
+
+PENDULUM = ["train", "Pendulum-v1", "--demonstrations", "0", "--evaluation-episodes", "1", "--final-episodes", "1"]
+
+
+@pytest.fixture
+def env():
+    env = gym.make("Pendulum-v1")
+    yield env
+    env.close()
+
+
+def linear_expert(count=4, steps=60, seed=0):
+    """Episodes in which the action is a linear function of the observation."""
+    rng = np.random.default_rng(seed)
+    spec = StreamSpec.from_spaces(gym.spaces.Box(-1, 1, (3,)), gym.spaces.Box(-1, 1, (1,)))
+    episodes = []
+    for _ in range(count):
+        observations = rng.uniform(-1, 1, (steps + 1, 3)).astype(np.float32)
+        actions = 0.4 * observations[:-1, :1] - 0.3 * observations[:-1, 1:2]
+        stream = np.concatenate([observations[1:], actions], axis=1)
+        rewards = rng.normal(size=steps).astype(np.float32)
+        episodes.append(Episode(stream, spec, actions=actions, observations=observations, rewards=rewards))
+    return episodes
+
+
+def small(algorithm, env, **kwargs):
+    return make_learner(algorithm, env, 0, kwargs.pop("cloned", True), 100)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_cloning_finds_the_experts_rule(algorithm, env):
+    learner = small(algorithm, env)
+    observations, actions = steps_of(linear_expert())
+    error = Cloner(learner, observations, actions).clone(600)
+    assert error < 1e-3
+    agent = export(learner, algorithm, np.zeros(3, np.float32), np.ones(3, np.float32), env)
+    fresh, wanted = steps_of(linear_expert(seed=9))
+    np.testing.assert_allclose(agent.predict(fresh)[0], wanted, atol=0.15)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_exported_agent_acts_as_the_learner_does_on_standardised_observations(algorithm, env):
+    learner = small(algorithm, env)
+    standard = Standard.of(np.random.default_rng(0).normal(2.0, 3.0, (100, 3)).astype(np.float32))
+    agent = export(learner, algorithm, standard.mean, standard.scale, env)
+    wrapped = standard.around(gym.make("Pendulum-v1"))
+    seen, _ = wrapped.reset(seed=3)
+    plain, _ = gym.make("Pendulum-v1").reset(seed=3)
+    np.testing.assert_allclose(seen, (plain - standard.mean) / standard.scale, rtol=1e-5)
+    np.testing.assert_allclose(agent.predict(plain)[0], learner.predict(seen, deterministic=True)[0], atol=1e-5)
+    assert agent.trained_in["env"] == "Pendulum-v1"
+
+
+def test_the_buffer_holds_the_demonstrations_and_knows_what_was_cut_short(env):
+    learner = small("sac", env)
+    (episode,) = linear_expert(1, steps=5)
+    mean, scale = np.full(3, 0.5, np.float32), np.full(3, 2.0, np.float32)
+    fill_buffer(learner, [episode], mean, scale)
+    buffer = learner.replay_buffer
+    assert buffer.size() == 5
+    np.testing.assert_allclose(buffer.observations[:5, 0], (episode.observations[:-1] - mean) / scale, rtol=1e-5)
+    np.testing.assert_allclose(buffer.next_observations[:5, 0], (episode.observations[1:] - mean) / scale, rtol=1e-5)
+    np.testing.assert_allclose(buffer.actions[:5, 0], episode.actions / 2, rtol=1e-5)  # of the pendulum's ±2 N m
+    np.testing.assert_array_equal(buffer.rewards[:5, 0], episode.rewards)
+    assert buffer.timeouts[:5, 0].tolist() == [0, 0, 0, 0, 1]
+    drawn = buffer.sample(64)
+    assert not drawn.dones.any()  # the episode was cut short: its end is worth what would have followed
+
+
+def test_warming_the_critic_leaves_the_actor_as_it_is(env):
+    learner = small("sac", env)
+    fill_buffer(learner, linear_expert(), 0.0, 1.0)
+    learner.set_logger(configure(None, []))
+    before = {n: p.detach().clone() for n, p in learner.policy.named_parameters()}
+    warm_critic(learner, 5)
+    for name, parameter in learner.policy.named_parameters():
+        same = torch.equal(before[name], parameter)
+        assert same if name.startswith("actor.") else (not same or "critic" not in name)
+    learner.train(2, 32)
+    assert not torch.equal(before["actor.mu.weight"], learner.policy.actor.mu.weight)
+    rates = [optimiser.param_groups[0]["lr"] for optimiser in (learner.actor.optimizer, learner.critic.optimizer)]
+    assert rates[0] == pytest.approx(RECIPES["sac"].actor_share * rates[1])
+
+
+def test_critics_have_layer_normalisation(env):
+    for algorithm in ("sac", "td3"):
+        critic = small(algorithm, env).policy.critic
+        for q in critic.q_networks:
+            assert [type(layer).__name__ for layer in q] == ["Linear", "LayerNorm", "ReLU"] * 2 + ["Linear"]
+        assert len(list(critic.parameters())) == 2 * (3 * 2 + 2 * 2)  # and their optimiser knows it
+        assert len(critic.optimizer.param_groups[0]["params"]) == 2 * (3 * 2 + 2 * 2)
+
+
+def test_an_anchored_actor_stays_with_its_expert(env):
+    learner = small("td3", env)
+    observations, actions = steps_of(linear_expert())
+    cloner = Cloner(learner, observations, actions)
+    cloner.clone(200)
+    with torch.no_grad():
+        learner.policy.actor.mu[0].weight.add_(0.3)
+    moved = learner.predict(observations, deterministic=True)[0]
+    anchor = Anchor(cloner, 300)
+    anchor._on_rollout_start()
+    kept = learner.predict(observations, deterministic=True)[0]
+    assert np.abs(kept - actions).mean() < 0.3 * np.abs(moved - actions).mean()
+
+
+def test_demonstrations_of_another_size_are_refused(tmp_path):
+    plan = Plan("MountainCarContinuous-v0", {}, "sac", 0, 1, 1, 1, 1, 0)
+    with pytest.raises(ValueError, match="demonstration 0 has observations of 3 numbers, the environment 2"):
+        Run(plan, tmp_path, linear_expert())
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_checkpoint_gives_back_the_learner(algorithm, env, tmp_path):
+    learner = small(algorithm, env, cloned=False)
+    learner.learn(120)
+    progressed = Progressed(120, 0.5, ((100, 0.25), (120, 0.5)))
+    save(tmp_path, learner, Progressed(7, 0.0, ()))
+    learner.num_timesteps += 1
+    folder = save(tmp_path, learner, progressed)
+    assert newest(tmp_path) == folder
+    assert len(list(tmp_path.iterdir())) == 1  # the older one is gone
+    other = small(algorithm, env, cloned=False)
+    assert resume(folder, other) == Progressed(learner.num_timesteps, 0.5, ((100, 0.25), (120, 0.5)))
+    assert other.num_timesteps == learner.num_timesteps
+    for a, b in zip(learner.policy.parameters(), other.policy.parameters(), strict=True):
+        assert torch.equal(a, b)
+    if algorithm != "ppo":
+        assert other.replay_buffer.size() == learner.replay_buffer.size() == 120
+        np.testing.assert_array_equal(other.replay_buffer.rewards, learner.replay_buffer.rewards)
+    if algorithm == "sac":
+        assert torch.equal(learner.log_ent_coef, other.log_ent_coef)
+    (folder / "state.json").write_text("{")
+    with pytest.raises(ValueError, match="no checkpoint to go on from"):
+        resume(folder, other)
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path):
+    how = ["--algorithm", "td3", "--checkpoint-every", "100", "--evaluate-every", "400", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "asm_gym.scripts.cli", *PENDULUM, *how, "--steps", "100000"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while (newest(tmp_path) is None or newest(tmp_path).name == "checkpoint_0") and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    folder = newest(tmp_path)
+    assert folder is not None
+    done = int(folder.name.rsplit("_", 1)[-1])
+    assert done >= 100
+    steps = done + 150
+    assert main([*PENDULUM, *how, "--steps", str(steps)]) == 0
+    assert (tmp_path / "log" / f"from_{done}" / "progress.csv").is_file()
+    assert newest(tmp_path).name == f"checkpoint_{steps}"
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["curve"][-1][0] == steps
+    agent = NetworkPolicy.load(tmp_path / "agent.npz")
+    assert (agent.observation_size, agent.action_size) == (3, 1)
+
+
+def test_an_expert_is_cloned_and_improved_end_to_end(tmp_path):
+    assert main(["train", "Lift", "--quick", "--steps", "0", "--out", str(tmp_path)]) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert [step for step, _ in result["curve"]] == [0]
+    assert NetworkPolicy.load(tmp_path / "agent.npz").trained_in["robots"] == ["Panda"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["Lift", "--algorithm", "dqn"], "sac, td3, ppo"),
+        (["Juggle"], "Juggle"),
+        (["Lift", "--steps", "0", "--demonstrations", "0"], "nothing to learn from"),
+        (["ToolHang", "--steps", "10"], "no scripted expert"),
+        (["Lift", "--dataset", "nowhere"], "nowhere"),
+        (["Lift", "--evaluate-every", "0"], "evaluate_every"),
+        (["CartPole-v1", "--demonstrations", "0"], "actions are a Box"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(arguments, message, tmp_path, capsys):
+    try:
+        code = main(["train", *arguments, "--out", str(tmp_path / "out")])
+    except SystemExit as end:
+        code = end.code
+    assert code == 2
+    assert message in capsys.readouterr().err
