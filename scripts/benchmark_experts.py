@@ -76,7 +76,7 @@ class Experts:
         """Prints a row for each task and robot."""
         seeds = episode_seeds(self.seed, min(self.episodes, _QUICK) if self.quick else self.episodes)
         table = Table(title=f"scripted experts, seeds of {self.seed}")
-        for column in ("task", "robot", "solved", "95 %", "held", "steps", "force [N]"):
+        for column in ("task", "robot", "solved", "95 %", "held", "steps", "force"):
             side = "left" if column in ("task", "robot") else "right"
             table.add_column(column, justify=side, no_wrap=True)  # type: ignore[arg-type]
         for name in self.tasks:
@@ -85,7 +85,7 @@ class Experts:
                     attempts = dispatch(partial(attempt, task=name, robot=robot), seeds, self.workers, progress)
                 table.add_row(name, robot, *_row(attempts))
         console.print(table)
-        console.print("held: also at the last step; steps: mean until solved; force: median largest")
+        console.print("held: also at the last step; steps: mean until solved; force: median largest [N]")
         return 0
 
 
