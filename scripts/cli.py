@@ -20,6 +20,7 @@ COMMANDS: dict[str, Command] = {
     "demo": Command("asm_gym.scripts.demo", "a robot that notices when something is wrong, in a few minutes"),
     "evaluate": Command("asm_gym.scripts.evaluate", "tasks x monitors x faults: who notices what, with a report"),
     "react": Command("asm_gym.scripts.react", "reflexes x faults: what acting on alarms is worth, paired by seed"),
+    "reproduce": Command("asm_gym.scripts.reproduce", "the method's claims: figures, tables, and where they fail"),
     "benchmark": Command("asm_gym.scripts.benchmark", "speeds, as ratios against rivals in the same run"),
     "doctor": Command("asm_gym.scripts.doctor", "what this machine lacks, and the command that installs it"),
 }
