@@ -27,7 +27,7 @@ def certainty(context: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
 
 
 def learn_readout(
-    context: Array, skill: NDArray[np.intp], count: int, rng: np.random.Generator
+    context: Array, skill: NDArray[np.intp], count: int, rng: np.random.Generator, updates: int = UPDATES
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """W_K (K, C) and b_K (K,) from N steps whose skill is known.
 
@@ -35,13 +35,14 @@ def learn_readout(
         context: (N, C).
         skill: (N,) each below ``count``.
         count: K.
+        updates: batches learned from.
     """
     W_K, b_K = np.zeros((count, context.shape[1]), np.float32), np.zeros(count, np.float32)
     weights, bias = Synapse(W_K), Synapse(b_K)
-    for n, chosen in zip(range(UPDATES), shuffled(len(skill), BATCH, rng), strict=False):
+    for n, chosen in zip(range(updates), shuffled(len(skill), BATCH, rng), strict=False):
         c = np.ascontiguousarray(context[chosen], np.float32)
         error = np.eye(count, dtype=np.float32)[skill[chosen]] - certainty(c, W_K, b_K)
-        rate = cosine_decay(RATE, n / UPDATES)
+        rate = cosine_decay(RATE, n / updates)
         weights.learn(error.T @ c / np.float32(len(chosen)), rate)
         bias.learn(error.mean(axis=0), rate)
     return W_K, b_K

@@ -104,11 +104,19 @@ class Backpropagated:
 
     @classmethod
     def learned(
-        cls, episodes: Sequence[Episode], cell: str, hidden: int, rng: np.random.Generator, updates: int, **how: float
+        cls,
+        episodes: Sequence[Episode],
+        cell: str,
+        hidden: int,
+        rng: np.random.Generator,
+        updates: int,
+        noise: float = 0.3,
+        rate: float = 1e-2,
     ) -> Backpropagated:
-        """From whole episodes; ``cell``, ``updates`` and ``how`` are those of ``recurrent.train``."""
+        """From whole episodes; the other arguments are those of ``recurrent.train``."""
         reader = Senses.fit(episodes[0].spec, [e.stream for e in episodes])
-        return cls(reader, recurrent.train(trajectories(reader, episodes), cell, hidden, updates, rng, **how))
+        learned = trajectories(reader, episodes)
+        return cls(reader, recurrent.train(learned, cell, hidden, updates, rng, noise, rate))
 
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = recurrent.expected(self.network, *read(self.reader, streams), cue)

@@ -3,7 +3,7 @@
 Repertoires of handwriting-like movements in two and three dimensions, and three robosuite skills. The temporal
 predictive coding network, learned by local rules, against a GRU and a plain RNN of the same width trained by
 backpropagation through time, a modern continuous Hopfield network, which keeps every window, and a library of movement
-primitives, which is told the skill. Online, every row is read after it was expected; offline, nothing is read after the cue.
+primitives, which is told the skill. Online, every row is read after it was expected; offline, none after the cue.
 """
 
 from __future__ import annotations

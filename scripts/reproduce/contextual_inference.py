@@ -1,0 +1,379 @@
+"""Contextual inference: the state says which skill is running, and nobody told it.
+
+A memory learns letters without labels, among them pairs that begin alike and part later. A readout, for us and not for
+the memory, is then taught to name the skill from the inferred state, from the present row alone, or from both: what
+the state knows beyond the row, it has inferred from what came before. Clusters of the states, found without any label,
+are compared with the skills. The reference is told every mean demonstration and compares it with the whole past.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.console import Console
+from scipy.cluster.vq import kmeans2
+from scipy.optimize import linear_sum_assignment
+
+from asm_gym.choices import check_choice
+from asm_gym.episodes import Episode
+from asm_gym.evaluation.plots import figure, look
+from asm_gym.evaluation.report import Table
+from asm_gym.memory.readout import certainty, learn_readout
+from asm_gym.scripts.dispatch import dispatch
+from asm_gym.scripts.progress import stage
+from asm_gym.scripts.reproduce.common import (
+    SKILLS,
+    Common,
+    Findings,
+    Record,
+    at_least_one,
+    demonstrations,
+    over_seeds,
+    reproduce,
+    shown,
+    wide_enough,
+)
+from asm_gym.scripts.reproduce.expression import Memory, Rows
+from asm_gym.scripts.reproduce.handwriting import (
+    NAMES,
+    STEPS,
+    Letter,
+    branching,
+    chosen,
+    copybook,
+    detoured,
+    repertoire,
+)
+
+SHARED = 2
+"""Strokes that the letters of a pair have in common."""
+
+SPLICE = 30
+"""Step at which another letter is gone on with."""
+
+MIRRORED = 2.6
+"""Turn of the stroke that is mirrored [rad]."""
+
+MIDDLE = (5, 10, 15, 20, 25, 30, 35, 40)
+"""Steps at which letters with one middle are told apart; they differ up to about 15 and from about 38 on."""
+
+SOURCES = {"state": "state of the memory", "row": "present row alone", "past": "whole past, told the demonstrations"}
+TIMES = (5, 10, 20, 30, 40, 59)
+
+
+@dataclass(frozen=True)
+class Args(Common):
+    """Which skill is running, read from the state."""
+
+    skills: tuple[str, ...] = ("a", "b", "c", "d", "e", "f")
+    """Letters to learn, of a to p; the second half of the repertoire begins as the first half does."""
+    repertoire: int = 6
+    """How many letters there are."""
+    hidden: int = 128
+    """Hidden units."""
+    writings: int = 16
+    """Of each letter to learn from; as many others are judged."""
+    steps: int = 12000
+    """In which the synapses change."""
+    robot_episodes: int = 20
+    """Of each robosuite skill to learn from; 0 leaves them out."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 2 <= self.repertoire <= len(NAMES):
+            raise ValueError(f"a repertoire has 2 to {len(NAMES)} skills here, got {self.repertoire}")
+        for name in self.skills:
+            check_choice("skill", name, NAMES[: self.repertoire])
+        if len(set(self.skills)) < 2:
+            raise ValueError(
+                f"two skills at least are needed to tell them apart, got {', '.join(self.skills) or 'none'}"
+            )
+        at_least_one("steps", self.steps)
+        if self.writings < 2:
+            raise ValueError(f"writings must be at least 2, got {self.writings}")
+        wide_enough(self.hidden, 4)
+
+    def scaled(self) -> Args:
+        """With ``quick``, little of everything."""
+        if not self.quick:
+            return self
+        return replace(self, seeds=min(self.seeds, 2), hidden=32, steps=1500, writings=6, robot_episodes=0)
+
+
+class Example(NamedTuple):
+    """What the first repetition saw, for the figure."""
+
+    paths: Rows  # (B, T, 2) written letters
+    plane: NDArray[np.float64]  # (B, T, 2) their states, in their first two principal components
+    skill: NDArray[np.intp]  # (B,)
+    certain: NDArray[np.float64]  # (T, 2) mean certainty of the first letter and of its twin, while it is written
+    switch: NDArray[np.float64]  # (T, 2) the same for the first letter and another one, where one goes on as the other
+
+
+def alphabet(args: Args, rng: np.random.Generator) -> list[Letter]:
+    """Letters, and from the second half on letters that begin as one of the first half does."""
+    first = repertoire(-(-args.repertoire // 2), 2, rng)
+    twins = [branching(first[n], NAMES[len(first) + n], SHARED, rng) for n in range(args.repertoire - len(first))]
+    return chosen([*first, *twins], sorted(set(args.skills)))
+
+
+def one_seed(seed: int, args: Args) -> tuple[list[Record], Example]:
+    """Learns the letters, and asks at every step which is being written."""
+    rng = np.random.default_rng(seed)
+    letters = alphabet(args, rng)
+    train, tests = copybook(letters, args.writings, 2, rng), copybook(letters, args.writings, 2, rng)
+    memory = Memory.learned(train, args.hidden, rng, args.steps)
+    names = [letter.name for letter in letters]
+    (rows, skill), (seen, truth) = (_stacked(e, names) for e in (train, tests))
+    features = _features(memory, rows, seen)
+    records, readouts = one_middle(seed, args), {}
+    for source, (known, asked) in features.items():
+        readouts[source] = learn_readout(_flat(known), np.tile(skill, len(known)), len(names), rng)
+        p = _certainty(asked, readouts[source])  # (T, B, K)
+        records += _over_time(source, "named", p.argmax(axis=2) == truth, seed)
+    records += _over_time("past", "named", _nearest_past(rows, skill, seen) == truth, seed)
+    records += _clustered("state", features["state"][1], truth, seed, rng)
+    records += _clustered("row", features["row"][1], truth, seed, rng)
+    records += _begun_late(memory, readouts["state"], seen, truth, seed)
+    records += _switched(memory, readouts["state"], seen, truth, seed)
+    return records, _example(memory, readouts["state"], seen, truth, features["state"][1])
+
+
+def one_middle(seed: int, args: Args) -> list[Record]:
+    """Two letters that begin differently, are one in the middle, and part again: is the beginning remembered?"""
+    rng = np.random.default_rng([seed, 1])
+    letter = repertoire(1, 2, rng)[0]
+    first = replace(letter.strokes[0], turn=MIRRORED, length=4.0)
+    letters = [Letter("a", (first, *letter.strokes[1:]))]
+    letters.append(detoured(letters[0], "b", rng))
+    train, tests = copybook(letters, 2 * args.writings, 2, rng), copybook(letters, 2 * args.writings, 2, rng)
+    memory = Memory.learned(train, args.hidden, rng, args.steps)
+    (rows, skill), (seen, truth) = (_stacked(e, "ab") for e in (train, tests))
+    records = []
+    for source, (known, asked) in _features(memory, rows, seen).items():
+        # A readout for each step, so that nothing hides behind what other steps need.
+        right = []
+        for k, a in zip(known, asked, strict=True):
+            named = certainty(a, *learn_readout(k, skill, 2, rng, updates=200)).argmax(axis=1)
+            right.append(named == truth)
+        records += _over_time(source, "one middle", np.array(right), seed)
+    return records
+
+
+def _features(memory: Memory, rows: Rows, seen: Rows) -> dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """What a readout may see (T, B, C), of what was learned and of what is judged, for each source."""
+    reader = memory.reader
+    known, asked = (((x - reader.mean) / reader.spread).astype(np.float32) for x in (rows, seen))
+    return {"state": (np.tanh(memory.hidden(rows)), np.tanh(memory.hidden(seen))), "row": (known, asked)}
+
+
+def _stacked(episodes: Sequence[Episode], names: Sequence[str]) -> tuple[Rows, NDArray[np.intp]]:
+    """(T, B, D) cut to the shortest, and the skill of each (B,)."""
+    shortest = min(map(len, episodes))
+    rows = np.stack([e.stream[:shortest] for e in episodes], axis=1).astype(np.float64)
+    return rows, np.array([list(names).index(str(e.info["skill"])) for e in episodes])
+
+
+def _flat(features: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.ascontiguousarray(features.reshape(-1, features.shape[2]))
+
+
+def _certainty(features: NDArray[np.float32], readout: tuple[Any, Any]) -> NDArray[np.float32]:
+    return certainty(_flat(features), *readout).reshape(*features.shape[:2], -1)
+
+
+def _over_time(source: str, how: str, right: NDArray[np.bool_], seed: int) -> list[Record]:
+    shares = right.mean(axis=1)
+    return [{"how": how, "source": source, "seed": seed, "step": t, "right": float(r)} for t, r in enumerate(shares)]
+
+
+def _nearest_past(rows: Rows, skill: NDArray[np.intp], seen: Rows) -> NDArray[np.intp]:
+    """(T, B) the skill whose mean demonstration has been nearest so far, over all steps read."""
+    spread = rows.std(axis=(0, 1))
+    means = np.stack([rows[:, skill == k].mean(axis=1) for k in range(skill.max() + 1)])  # (K, T, D)
+    apart = np.sum(((seen[:, :, None] - means.transpose(1, 0, 2)[:, None]) / spread) ** 2, axis=3)  # (T, B, K)
+    nearest: NDArray[np.intp] = np.cumsum(apart, axis=0).argmin(axis=2)
+    return nearest
+
+
+def _clustered(
+    source: str, features: NDArray[np.float32], truth: NDArray[np.intp], seed: int, rng: np.random.Generator
+) -> list[Record]:
+    """How well as many clusters as there are skills, found at one step without labels, match the skills."""
+    count, records = int(truth.max()) + 1, []
+    for t in (t for t in TIMES if t < len(features)):
+        spots = features[t].astype(np.float64)
+        best: tuple[float, float] = (np.inf, 0.0)
+        for _ in range(5):
+            centres, found = kmeans2(spots, count, minit="++", seed=rng)
+            table = np.zeros((count, count))
+            np.add.at(table, (found, truth), 1)
+            rows, columns = linear_sum_assignment(-table)
+            scatter = float(np.sum((spots - centres[found]) ** 2))
+            best = min(best, (scatter, float(table[rows, columns].sum() / len(truth))))
+        records.append({"how": "clustered", "source": source, "seed": seed, "step": t, "right": best[1]})
+    return records
+
+
+def _begun_late(memory: Memory, readout: Any, seen: Rows, truth: NDArray[np.intp], seed: int) -> list[Record]:
+    """Cues that begin in mid-letter: the memory is asked after so many steps."""
+    records = []
+    for length in (1, 2, 5, 10, 20):
+        right = []
+        for start in range(5, len(seen) - 20, 5):
+            state = np.tanh(memory.hidden(seen[start : start + length]))[-1:]
+            right.append(_certainty(state, readout).argmax(axis=2)[0] == truth)
+        records.append(
+            {"how": "begun late", "source": "state", "seed": seed, "step": length, "right": float(np.mean(right))}
+        )
+    return records
+
+
+def _switched(memory: Memory, readout: Any, seen: Rows, truth: NDArray[np.intp], seed: int) -> list[Record]:
+    """One letter up to ``SPLICE``, from there on another: the share that names the new one, since the switch."""
+    other = np.roll(np.arange(len(truth)), len(truth) // (int(truth.max()) + 1))
+    spliced = np.concatenate([seen[:SPLICE], seen[SPLICE:, other]])
+    named = _certainty(np.tanh(memory.hidden(spliced)), readout).argmax(axis=2)
+    return [
+        {"how": "switched", "source": "state", "seed": seed, "step": k, "right": float((row == truth[other]).mean())}
+        for k, row in enumerate(named[SPLICE:])
+    ]
+
+
+def _example(memory: Memory, readout: Any, seen: Rows, truth: NDArray[np.intp], states: NDArray[np.float32]) -> Example:
+    centred = states - states.mean(axis=(0, 1))
+    _, _, axes = np.linalg.svd(_flat(centred)[::3], full_matrices=False)
+    plane = centred @ axes[:2].T  # (T, B, 2)
+    twin = (int(truth.max()) + 1) // 2
+    written = _certainty(states[:, truth == 0], readout).mean(axis=1)
+    spliced = np.concatenate([seen[:SPLICE, truth == 0], seen[SPLICE:, truth == 1]])
+    switch = _certainty(np.tanh(memory.hidden(spliced)), readout).mean(axis=1)
+    few = np.concatenate([np.flatnonzero(truth == k)[:4] for k in range(int(truth.max()) + 1)])
+    return Example(
+        paths=seen[:, few, :2].transpose(1, 0, 2),
+        plane=plane[:, few].transpose(1, 0, 2).astype(np.float64),
+        skill=truth[few],
+        certain=written[:, [0, twin]].astype(np.float64),
+        switch=switch[:, [0, 1]].astype(np.float64),
+    )
+
+
+def robot(seed: int, train: Sequence[Episode], tests: Sequence[Episode], args: Args) -> list[Record]:
+    """The same question for robosuite skills in one memory."""
+    rng = np.random.default_rng(seed)
+    memory = Memory.learned(train, max(args.hidden, 128), rng, args.steps // 2)
+    (rows, skill), (seen, truth) = (_stacked(e, SKILLS) for e in (train, tests))
+    readout = learn_readout(_flat(np.tanh(memory.hidden(rows))), np.tile(skill, len(rows)), len(SKILLS), rng)
+    right = _certainty(np.tanh(memory.hidden(seen)), readout).argmax(axis=2) == truth
+    return _over_time("state", "robosuite", right, seed)
+
+
+def tables(records: Sequence[Record], args: Args) -> list[Table]:
+    """Over time, cues begun late, switches, robosuite."""
+
+    def row(name: str, steps: Sequence[int], **where: Any) -> tuple[str, ...]:
+        return (name, *(shown(records, "right", step=t, **where) for t in steps))
+
+    late, since = (1, 2, 5, 10, 20), (0, 1, 2, 5, 10, 20)
+    made = [
+        Table(
+            f"Right skill [share] of {len(set(args.skills))}, after so many steps; mean ± SD over seeds",
+            ("", *map(str, TIMES)),
+            [
+                *(row(label, TIMES, how="named", source=s) for s, label in SOURCES.items()),
+                row("clusters of states, no label", TIMES, how="clustered", source="state"),
+                row("clusters of rows, no label", TIMES, how="clustered", source="row"),
+            ],
+        ),
+        Table(
+            "Letters with one middle told apart [share], by step",
+            ("", *map(str, MIDDLE)),
+            [row(SOURCES[s], MIDDLE, how="one middle", source=s) for s in ("state", "row")],
+        ),
+        Table("Cue begun in mid-letter, by its length", ("", *map(str, late)), [row("state", late, how="begun late")]),
+        Table(
+            "The new skill named, so many steps after a switch",
+            ("", *map(str, since)),
+            [row("state", since, how="switched")],
+        ),
+    ]
+    if args.robot_episodes:
+        made.append(Table("Robosuite, three skills", ("", *map(str, TIMES)), [row("state", TIMES, how="robosuite")]))
+    return made
+
+
+def drawn(records: Sequence[Record], example: Example) -> Figure:
+    """Letters, states, certainty over time, a pair that parts, a switch, robosuite."""
+    with figure(height=6.2, width=9.5) as fig:
+        axes = fig.subplots(2, 3)
+        for path, plane, k in zip(example.paths, example.plane, example.skill, strict=True):
+            for ax, line in ((axes[0, 0], path), (axes[0, 1], plane)):
+                ax.plot(*line.T, color=look(int(k))[0], linewidth=1.2)
+                ax.plot(*line[:1].T, "o", color="#444444", markersize=3)
+        axes[0, 0].set(title="letters; two and two begin alike", xlabel="[cm]", ylabel="[cm]", aspect="equal")
+        axes[0, 1].set(title="their states, two principal components", xticks=[], yticks=[])
+        for i, (source, label) in enumerate(SOURCES.items()):
+            _curve(axes[0, 2], records, i, label, how="named", source=source)
+        axes[0, 2].set(title="which skill?", xlabel="steps read", ylabel="right [share]", ylim=(0, 1.02))
+        axes[0, 2].legend(fontsize=7, loc="lower right")
+        _pair(axes[1, 0], example.certain, ("the letter written", "its twin"), "a pair that parts", None)
+        _pair(axes[1, 1], example.switch, ("the letter begun", "the one gone on with"), "a switch", SPLICE)
+        for i, (source, label) in enumerate((("state", "state"), ("row", "row alone"))):
+            _curve(axes[1, 2], records, i, label, how="one middle", source=source)
+        _curve(axes[1, 2], records, 2, "robosuite, state", how="robosuite", source="state")
+        axes[1, 2].set(
+            title="one middle; robosuite", xlabel="step", ylabel="right [share]", ylim=(0, 1.02), xlim=(0, 60)
+        )
+        axes[1, 2].legend(fontsize=8)
+    return fig
+
+
+def _curve(ax: Any, records: Sequence[Record], i: int, label: str, **where: Any) -> None:
+    steps = sorted({r["step"] for r in records if all(r[k] == v for k, v in where.items())})
+    if not steps:
+        return
+    mean, spread = np.array([over_seeds(records, "right", step=t, **where) for t in steps]).T
+    colour, line, _ = look(i)
+    ax.plot(steps, mean, color=colour, linestyle=line, label=label)
+    ax.fill_between(steps, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
+
+
+def _pair(ax: Any, certain: NDArray[np.float64], labels: tuple[str, str], title: str, mark: int | None) -> None:
+    for i in range(2):
+        ax.plot(certain[:, i], color=look(i)[0], linestyle=look(i)[1], label=labels[i])
+    if mark is not None:
+        ax.axvline(mark, color="#888888", linewidth=1)
+    ax.set(title=title, xlabel="step", ylabel="certainty", ylim=(0, 1.02))
+    ax.legend(fontsize=8)
+
+
+def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+    """Letters for every seed, then robosuite."""
+    args = args.scaled()
+    with stage("learning letters", console, seconds) as progress:
+        found = dispatch(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
+    records = [r for own, _ in found for r in own]
+    if args.robot_episodes:
+        train = demonstrations(args, SKILLS, "fit", args.robot_episodes, console, seconds)
+        tests = demonstrations(args, SKILLS, "nominal", 15, console, seconds)
+        with stage("learning robosuite skills", console, seconds) as progress:
+            one = partial(robot, train=train, tests=tests, args=args)
+            for own in dispatch(one, list(args.repetitions), args.workers, progress):
+                records += own
+    return Findings(records, tables(records, args), drawn(records, found[0][1]), {"letter_steps": STEPS})
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the study; 2 where the arguments make no sense."""
+    return reproduce("contextual_inference", study, Args, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
