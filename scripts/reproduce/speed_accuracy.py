@@ -2,9 +2,9 @@
 
 One memory of letters is asked to recall, and to tell faulty writings from good ones, with 1 to 200 steps of inference
 for each row. The steps of this package are nearly as long as they can be and settle in a few; neurons integrate slowly,
-so steps a twentieth as long are asked for too. The error that it is left with by these is fitted by two laws: an exponential approach to a limit, which is what
-Fitts' law says of time and error (n = a + b log2 1/e), and a power law. Another memory learns letters at several speeds
-and is asked to write them at each: its error is fitted by the linear law of fast movements.
+so steps a twentieth as long are asked for too. The error these leave is fitted by two laws: an exponential approach to
+a limit, which is what Fitts' law says of time and error (n = a + b log2 1/e), and a power law. Another memory learns
+letters at several speeds and writes them at each: its error is fitted by the linear law of fast movements.
 
 Sources: Fitts 1954 (J. Exp. Psychol. 47(6)); Wickelgren 1977 (Acta Psychologica 41(1)) for the approach to a limit;
 Schmidt et al. 1979 (Psychological Review 86(5)) for error = a + b speed; Akaike 1974 for the comparison.
@@ -242,7 +242,7 @@ def fits(records: Sequence[Record]) -> dict[tuple[str, str], Fit]:
 
 
 def _within_seeds(records: Sequence[Record], x: str, y: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points, each seed's moved to the mean of all: repertoires differ in difficulty, and that is no noise of the law."""
+    """Points, each seed's moved to the mean of all: how hard its letters are is no noise of the law."""
     seed, xs, ys = (np.array([r[k] for r in records], np.float64) for k in ("seed", x, y))
     for s in np.unique(seed):
         ys[seed == s] += np.mean([r[y] for r in records]) - ys[seed == s].mean()
@@ -288,9 +288,9 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
     with figure(height=3.0, width=11) as fig:
         axes = fig.subplots(1, 4)
         for ax, (value, label) in zip(axes, MEASURES.items(), strict=False):
-            _points(
-                ax, args.iterations, [over_seeds(records, value, iterations=k) for k in args.iterations], 0, "measured"
-            )
+            for i, shorter in enumerate(SHORTER):
+                found = [over_seeds(records, value, iterations=k, shorter=shorter) for k in args.iterations]
+                _points(ax, args.iterations, found, 3 * i, "long steps" if shorter == 1 else "measured")
             x = np.geomspace(min(args.iterations), max(args.iterations), 200)
             for i, law in enumerate(("exponential", "power")):
                 if (one := laws.get((value, law))) is not None:
