@@ -12,10 +12,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 from scipy.cluster.vq import kmeans2
@@ -23,8 +22,6 @@ from scipy.optimize import linear_sum_assignment
 
 from asm_gym.choices import check_choice
 from asm_gym.episodes import Episode
-from asm_gym.evaluation.plots import figure, look
-from asm_gym.evaluation.report import Table
 from asm_gym.memory.readout import certainty, learn_readout
 from asm_gym.scripts.dispatch import dispatch
 from asm_gym.scripts.progress import stage
@@ -35,11 +32,10 @@ from asm_gym.scripts.reproduce.common import (
     Record,
     at_least_one,
     demonstrations,
-    over_seeds,
     reproduce,
-    shown,
     wide_enough,
 )
+from asm_gym.scripts.reproduce.contextual_report import SPLICE, TIMES, Example, drawn, tables
 from asm_gym.scripts.reproduce.expression import Memory, Rows
 from asm_gym.scripts.reproduce.handwriting import (
     NAMES,
@@ -55,17 +51,8 @@ from asm_gym.scripts.reproduce.handwriting import (
 SHARED = 2
 """Strokes that the letters of a pair have in common."""
 
-SPLICE = 30
-"""Step at which another letter is gone on with."""
-
 MIRRORED = 2.6
 """Turn of the stroke that is mirrored [rad]."""
-
-MIDDLE = (5, 10, 15, 20, 25, 30, 35, 40)
-"""Steps at which letters with one middle are told apart; they differ up to about 15 and from about 38 on."""
-
-SOURCES = {"state": "state of the memory", "row": "present row alone", "past": "whole past, told the demonstrations"}
-TIMES = (5, 10, 20, 30, 40, 59)
 
 
 @dataclass(frozen=True)
@@ -105,16 +92,6 @@ class Args(Common):
         if not self.quick:
             return self
         return replace(self, seeds=min(self.seeds, 2), hidden=32, steps=1500, writings=6, robot_episodes=0)
-
-
-class Example(NamedTuple):
-    """What the first repetition saw, for the figure."""
-
-    paths: Rows  # (B, T, 2) written letters
-    plane: NDArray[np.float64]  # (B, T, 2) their states, in their first two principal components
-    skill: NDArray[np.intp]  # (B,)
-    certain: NDArray[np.float64]  # (T, 2) mean certainty of the first letter and of its twin, while it is written
-    switch: NDArray[np.float64]  # (T, 2) the same for the first letter and another one, where one goes on as the other
 
 
 def alphabet(args: Args, rng: np.random.Generator) -> list[Letter]:
@@ -275,85 +252,6 @@ def robot(seed: int, train: Sequence[Episode], tests: Sequence[Episode], args: A
     return _over_time("state", "robosuite", right, seed)
 
 
-def tables(records: Sequence[Record], args: Args) -> list[Table]:
-    """Over time, cues begun late, switches, robosuite."""
-
-    def row(name: str, steps: Sequence[int], **where: Any) -> tuple[str, ...]:
-        return (name, *(shown(records, "right", step=t, **where) for t in steps))
-
-    late, since = (1, 2, 5, 10, 20), (0, 1, 2, 5, 10, 20)
-    made = [
-        Table(
-            f"Right skill [share] of {len(set(args.skills))}, after so many steps; mean ± SD over seeds",
-            ("", *map(str, TIMES)),
-            [
-                *(row(label, TIMES, how="named", source=s) for s, label in SOURCES.items()),
-                row("clusters of states, no label", TIMES, how="clustered", source="state"),
-                row("clusters of rows, no label", TIMES, how="clustered", source="row"),
-            ],
-        ),
-        Table(
-            "Letters with one middle told apart [share], by step",
-            ("", *map(str, MIDDLE)),
-            [row(SOURCES[s], MIDDLE, how="one middle", source=s) for s in ("state", "row")],
-        ),
-        Table("Cue begun in mid-letter, by its length", ("", *map(str, late)), [row("state", late, how="begun late")]),
-        Table(
-            "The new skill named, so many steps after a switch",
-            ("", *map(str, since)),
-            [row("state", since, how="switched")],
-        ),
-    ]
-    if args.robot_episodes:
-        made.append(Table("Robosuite, three skills", ("", *map(str, TIMES)), [row("state", TIMES, how="robosuite")]))
-    return made
-
-
-def drawn(records: Sequence[Record], example: Example) -> Figure:
-    """Letters, states, certainty over time, a pair that parts, a switch, robosuite."""
-    with figure(height=6.2, width=9.5) as fig:
-        axes = fig.subplots(2, 3)
-        for path, plane, k in zip(example.paths, example.plane, example.skill, strict=True):
-            for ax, line in ((axes[0, 0], path), (axes[0, 1], plane)):
-                ax.plot(*line.T, color=look(int(k))[0], linewidth=1.2)
-                ax.plot(*line[:1].T, "o", color="#444444", markersize=3)
-        axes[0, 0].set(title="letters; two and two begin alike", xlabel="[cm]", ylabel="[cm]", aspect="equal")
-        axes[0, 1].set(title="their states, two principal components", xticks=[], yticks=[])
-        for i, (source, label) in enumerate(SOURCES.items()):
-            _curve(axes[0, 2], records, i, label, how="named", source=source)
-        axes[0, 2].set(title="which skill?", xlabel="steps read", ylabel="right [share]", ylim=(0, 1.02))
-        axes[0, 2].legend(fontsize=7, loc="lower right")
-        _pair(axes[1, 0], example.certain, ("the letter written", "its twin"), "a pair that parts", None)
-        _pair(axes[1, 1], example.switch, ("the letter begun", "the one gone on with"), "a switch", SPLICE)
-        for i, (source, label) in enumerate((("state", "state"), ("row", "row alone"))):
-            _curve(axes[1, 2], records, i, label, how="one middle", source=source)
-        _curve(axes[1, 2], records, 2, "robosuite, state", how="robosuite", source="state")
-        axes[1, 2].set(
-            title="one middle; robosuite", xlabel="step", ylabel="right [share]", ylim=(0, 1.02), xlim=(0, 60)
-        )
-        axes[1, 2].legend(fontsize=8)
-    return fig
-
-
-def _curve(ax: Any, records: Sequence[Record], i: int, label: str, **where: Any) -> None:
-    steps = sorted({r["step"] for r in records if all(r[k] == v for k, v in where.items())})
-    if not steps:
-        return
-    mean, spread = np.array([over_seeds(records, "right", step=t, **where) for t in steps]).T
-    colour, line, _ = look(i)
-    ax.plot(steps, mean, color=colour, linestyle=line, label=label)
-    ax.fill_between(steps, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
-
-
-def _pair(ax: Any, certain: NDArray[np.float64], labels: tuple[str, str], title: str, mark: int | None) -> None:
-    for i in range(2):
-        ax.plot(certain[:, i], color=look(i)[0], linestyle=look(i)[1], label=labels[i])
-    if mark is not None:
-        ax.axvline(mark, color="#888888", linewidth=1)
-    ax.set(title=title, xlabel="step", ylabel="certainty", ylim=(0, 1.02))
-    ax.legend(fontsize=8)
-
-
 def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     """Letters for every seed, then robosuite."""
     args = args.scaled()
@@ -367,7 +265,9 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
             one = partial(robot, train=train, tests=tests, args=args)
             for own in dispatch(one, list(args.repetitions), args.workers, progress):
                 records += own
-    return Findings(records, tables(records, args), drawn(records, found[0][1]), {"letter_steps": STEPS})
+    return Findings(
+        records, tables(records, len(set(args.skills))), drawn(records, found[0][1]), {"letter_steps": STEPS}
+    )
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -193,3 +193,27 @@ class Library:
             made[t][:, hand] = state.place if t else streams[0][:, hand]
             state, _, _ = library.predict(state, streams[t])
         return made
+
+
+def mean_demonstrations(train: Sequence[Episode], dims: int) -> NDArray[np.float64]:
+    """(K, T, P) of the skills, in order of name."""
+    names = sorted({str(e.info["skill"]) for e in train})
+    return np.stack([np.mean([e.stream[:, :dims] for e in train if e.info["skill"] == n], axis=0) for n in names])
+
+
+def recalled(model: Expresser, tests: Sequence[Episode], means: NDArray[np.float64], cue: int) -> tuple[float, float]:
+    """Mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
+
+    Args:
+        tests: of one length.
+        means: (K, T, P) mean demonstration of each skill, in order of name.
+        cue: the whole length for online recall.
+    """
+    streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)  # (T, B, D)
+    dims, names = means.shape[2], sorted({str(e.info["skill"]) for e in tests})
+    first = cue if cue < len(streams) else 1
+    hand = model.express(streams, cue)[first:, :, :dims]  # (T', B, P)
+    error = np.linalg.norm(hand - streams[first:, :, :dims], axis=2).mean()
+    apart = np.linalg.norm(hand[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None], axis=3).mean(axis=0)
+    right = [names[k] == e.info["skill"] for k, e in zip(apart.argmin(axis=1), tests, strict=True)]
+    return float(error), float(np.mean(right))

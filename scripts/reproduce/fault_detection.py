@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -22,7 +22,6 @@ from rich.console import Console
 from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.episodes import Episode
-from asm_gym.evaluation.archive import Label
 from asm_gym.evaluation.metrics import auroc
 from asm_gym.evaluation.plots import figure, look
 from asm_gym.evaluation.report import Table
@@ -30,22 +29,19 @@ from asm_gym.faults.suite import KINDS, SEVERITIES
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.scripts.dispatch import dispatch
 from asm_gym.scripts.progress import stage
-from asm_gym.scripts.record import draw_onset, episode_seeds
 from asm_gym.scripts.reproduce.common import (
     SKILLS,
     Common,
     Findings,
     Record,
     at_least_one,
-    demonstrations,
     over_seeds,
-    recorded,
     reproduce,
     shown,
     wide_enough,
 )
-from asm_gym.scripts.reproduce.handwriting import NAMES, copybook, repertoire
-from asm_gym.scripts.reproduce.speed_accuracy import slips
+from asm_gym.scripts.reproduce.handwriting import NAMES
+from asm_gym.scripts.reproduce.trials import Trial, robot_trial, written_trial
 from asm_gym.tasks import task as task_spec
 
 WAYS = {
@@ -107,46 +103,6 @@ class Args(Common):
         if not self.quick:
             return self
         return replace(self, seeds=min(self.seeds, 2), letters=3, writings=8, hidden=32, robot_episodes=0)
-
-
-class Trial(NamedTuple):
-    """Episodes of one domain."""
-
-    domain: str
-    fit: list[Episode]
-    calibration: list[Episode]
-    nominal: list[Episode]
-    faulty: list[tuple[str, int, Episode]]  # kind, onset
-
-
-def written_trial(seed: int, args: Args) -> Trial:
-    """Letters, and letters with a slip of the pen."""
-    rng = np.random.default_rng(seed)
-    letters = repertoire(args.letters, 2, rng)
-    fit, calibration, nominal = (copybook(letters, args.writings, 2, rng) for _ in range(3))
-    slipped, onset = slips(np.stack([e.stream for e in nominal], axis=1).astype(np.float64), rng)
-    faulty = [
-        ("slip", int(k), Episode.from_stream(slipped[:, n], e.spec, info=e.info))
-        for n, (k, e) in enumerate(zip(onset, nominal, strict=True))
-    ]
-    return Trial("letters", fit, calibration, nominal, faulty)
-
-
-def robot_trial(args: Args, console: Console, seconds: dict[str, float]) -> Trial:
-    """Robosuite skills, and the twins of nominal episodes with a fault each."""
-    ask = partial(demonstrations, args, args.tasks, console=console, seconds=seconds)
-    nominal = max(args.faulty_episodes, 12)
-    labels = [
-        Label(task, "faulty", kind, args.severity, seed, draw_onset(seed, task_spec(task).horizon))
-        for task in args.tasks
-        for kind in args.faults
-        for seed in episode_seeds(0, task, "nominal", args.faulty_episodes)
-    ]
-    episodes = recorded(args, labels, console, seconds)
-    faulty = [(x.kind, int(x.onset or 0), e) for x, e in zip(labels, episodes, strict=True) if len(e) > (x.onset or 0)]
-    half = args.robot_episodes // 2
-    fit, calibration = ask("fit", args.robot_episodes), ask("calibration", half)
-    return Trial("robosuite", fit, calibration, ask("nominal", nominal), faulty)
 
 
 Scores = list[NDArray[np.float64]]
@@ -257,7 +213,7 @@ def drawn(records: Sequence[Record], example: dict[str, Any]) -> Figure:
         ("found", "found, without an alarm before [share]"),
         ("alarm", "false alarms [share]"),
     )
-    with figure(height=4.6, width=11) as fig:
+    with figure(height=3.6, width=11) as fig:
         axes = fig.subplots(1, 4, width_ratios=(1, 1, 1, 1.3))
         for ax, (value, label) in zip(axes, panels, strict=False):
             for i, domain in enumerate(domains):
@@ -283,7 +239,8 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     with stage("letters", console, seconds) as progress:
         found = dispatch(partial(_letters, args=args), list(args.repetitions), args.workers, progress)
     if args.robot_episodes:
-        trial = robot_trial(args, console, seconds)
+        faults = args.faults, args.severity, args.faulty_episodes
+        trial = robot_trial(args, args.tasks, args.robot_episodes, *faults, console, seconds)
         with stage("robosuite", console, seconds) as progress:
             one = partial(judged, trial=trial, args=args)
             found += dispatch(one, list(args.repetitions), args.workers, progress)
@@ -292,7 +249,7 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
 
 
 def _letters(seed: int, args: Args) -> tuple[list[Record], dict[str, Any]]:
-    return judged(seed, written_trial(seed, args), args)
+    return judged(seed, written_trial(seed, args.letters, args.writings), args)
 
 
 def main(argv: list[str] | None = None) -> int:

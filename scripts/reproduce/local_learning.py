@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
-from asm_gym.evaluation.plots import figure, look
+from asm_gym.evaluation.plots import figure
 from asm_gym.evaluation.report import Table
 from asm_gym.memory.inference import Weights
 from asm_gym.memory.learning import Batch, Learner, Schedule, Trajectory, batches, cosine_decay, side_by_side
@@ -40,6 +40,7 @@ from asm_gym.scripts.reproduce.common import (
     shown,
     wide_enough,
 )
+from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import trajectories
 from asm_gym.scripts.reproduce.gradients import COMPARED, Changes, cosine, exact, local
 from asm_gym.scripts.reproduce.handwriting import NAMES, copybook, repertoire
@@ -234,14 +235,14 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
         axes = fig.subplots(1, 4)
         for i, (target, label) in enumerate(TARGETS.items()):
             mean = [over_seeds(records, "degrees", target=target, epoch=e, **where) for e in epochs]
-            _line(axes[0], epochs, mean, i, label)
+            curve(axes[0], epochs, mean, i, label)
             ends = {"target": target, "epoch": args.epochs, "array": "all"}
             mean = [over_seeds(records, "degrees", **ends, iterations=k) for k in args.iterations]
-            _line(axes[1], args.iterations, mean, i, None)
+            curve(axes[1], args.iterations, mean, i, None)
         for i, how in enumerate(RATES):
-            _line(axes[2], epochs, [over_seeds(records, "mse", learned_by=how, epoch=e) for e in epochs], i + 2, how)
+            curve(axes[2], epochs, [over_seeds(records, "mse", learned_by=how, epoch=e) for e in epochs], i + 2, how)
             own = [r for r in records if r.get("cost_of") == how]
-            _line(axes[3], LENGTHS, [(r["bytes"] / 1024, 0.0) for r in own], i + 2, how)
+            curve(axes[3], LENGTHS, [(r["bytes"] / 1024, 0.0) for r in own], i + 2, how)
         axes[0].set(xlabel="epochs", ylabel="angle to the local change [°]", ylim=(0, 95), xscale="symlog")
         axes[1].set(xlabel="iterations of inference", ylim=(0, 95), xscale="log")
         axes[2].set(xlabel="epochs", ylabel="error of the next row [variance]", yscale="log", xscale="symlog")
@@ -251,13 +252,6 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
         for ax in (axes[0], axes[2], axes[3]):
             ax.legend(fontsize=7)
     return fig
-
-
-def _line(ax: Any, x: Sequence[int], found: Sequence[tuple[float, float]], i: int, label: str | None) -> None:
-    mean, spread = np.array(found).T
-    colour, line, marker = look(i)
-    ax.plot(x, mean, color=colour, linestyle=line, marker=marker, markersize=4, label=label)
-    ax.fill_between(x, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
 
 
 def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:

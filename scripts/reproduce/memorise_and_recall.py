@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from rich.console import Console
 
 from asm_gym.episodes import Episode
@@ -36,7 +35,16 @@ from asm_gym.scripts.reproduce.common import (
     shown,
     wide_enough,
 )
-from asm_gym.scripts.reproduce.expression import Backpropagated, Expresser, Hopfield, Library, Memory
+from asm_gym.scripts.reproduce.curves import curve
+from asm_gym.scripts.reproduce.expression import (
+    Backpropagated,
+    Expresser,
+    Hopfield,
+    Library,
+    Memory,
+    mean_demonstrations,
+    recalled,
+)
 from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, copybook, repertoire
 
 MODELS = ("memory", "gru", "rnn", "hopfield", "library")
@@ -117,24 +125,6 @@ def conditions(args: Args) -> list[Condition]:
     return [Condition(s, *p) for s in args.repetitions for p in dict.fromkeys(plan)]
 
 
-def recalled(model: Expresser, tests: Sequence[Episode], means: NDArray[np.float64], cue: int) -> tuple[float, float]:
-    """Mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
-
-    Args:
-        tests: of one length.
-        means: (K, T, P) mean demonstration of each skill, in order of name.
-        cue: the whole length for online recall.
-    """
-    streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)  # (T, B, D)
-    dims, names = means.shape[2], sorted({str(e.info["skill"]) for e in tests})
-    first = cue if cue < len(streams) else 1
-    hand = model.express(streams, cue)[first:, :, :dims]  # (T', B, P)
-    error = np.linalg.norm(hand - streams[first:, :, :dims], axis=2).mean()
-    apart = np.linalg.norm(hand[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None], axis=3).mean(axis=0)
-    right = [names[k] == e.info["skill"] for k, e in zip(apart.argmin(axis=1), tests, strict=True)]
-    return float(error), float(np.mean(right))
-
-
 def letters(condition: Condition, args: Args) -> list[Record]:
     """Every model on one repertoire."""
     seed, skills, hidden, dims = condition
@@ -157,12 +147,6 @@ def letters(condition: Condition, args: Args) -> list[Record]:
             where = {"domain": "letters", "model": name, **condition._asdict(), "cue": cue, "online": cue == STEPS}
             records.append({**where, "error_cm": error, "right": right})
     return records
-
-
-def mean_demonstrations(train: Sequence[Episode], dims: int) -> NDArray[np.float64]:
-    """(K, T, P) of the skills, in order of name."""
-    names = sorted({str(e.info["skill"]) for e in train})
-    return np.stack([np.mean([e.stream[:, :dims] for e in train if e.info["skill"] == n], axis=0) for n in names])
 
 
 def robot(seed: int, train: Sequence[Episode], tests: Sequence[Episode], args: Args) -> list[Record]:
@@ -243,7 +227,7 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
         for ax, (key, label, values, value) in zip(axes.flat, panels, strict=False):
             for i, model in enumerate(MODELS):
                 found = [over_seeds(records, value, **{**base, key: v, "model": model}) for v in values]
-                _line(ax, values, found, i, CALLED[model] if ax is axes[0, 0] else None)
+                curve(ax, values, found, i, CALLED[model] if ax is axes[0, 0] else None)
             ax.set(xlabel=label, ylabel="offline error [cm]" if value == "error_cm" else "right skill [share]", ylim=0)
             if key != "cue":
                 ax.set_xscale("log", base=2)
@@ -254,20 +238,13 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
     return fig
 
 
-def _line(ax: Any, values: Sequence[int], found: Sequence[tuple[float, float]], i: int, label: str | None) -> None:
-    mean, spread = np.array(found).T
-    colour, line, marker = look(i)
-    ax.plot(values, mean, color=colour, linestyle=line, marker=marker, markersize=4, label=label)
-    ax.fill_between(values, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
-
-
 def _online(ax: Any, records: Sequence[Record], args: Args, base: Record) -> None:
     for i, model in enumerate(MODELS):
         found = [
             over_seeds(records, "error_cm", **base | {"cue": STEPS, "skills": n, "model": model})
             for n in args.repertoires
         ]
-        _line(ax, args.repertoires, found, i, None)
+        curve(ax, args.repertoires, found, i, None)
     ax.set_xscale("log", base=2)
     ax.set_xticks(args.repertoires, [str(v) for v in args.repertoires])
     ax.set(xlabel="skills in the repertoire", ylabel="online error [cm]", ylim=0)

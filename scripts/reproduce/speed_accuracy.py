@@ -15,18 +15,15 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
-from scipy.optimize import curve_fit
-from scipy.stats import t as student
 from threadpoolctl import threadpool_limits
 
 from asm_gym.evaluation.metrics import auroc
@@ -46,8 +43,10 @@ from asm_gym.scripts.reproduce.common import (
     shown,
     wide_enough,
 )
+from asm_gym.scripts.reproduce.curves import points
 from asm_gym.scripts.reproduce.expression import Memory, Rows, read
 from asm_gym.scripts.reproduce.handwriting import NAMES, NOISE, STEPS, Letter, copybook, repertoire, written
+from asm_gym.scripts.reproduce.laws import LAWS, Fit, fit
 
 CUE = 20
 SLIP = 5 * NOISE
@@ -97,48 +96,6 @@ class Args(Common):
             return self
         few = {"iterations": (1, 3, 8, 20, 60), "speeds": (0.8, 1.25, 2.0), "hidden": 32, "steps": 1500}
         return replace(self, seeds=min(self.seeds, 2), skills=2, writings=4, **few)  # type: ignore[arg-type]
-
-
-class Fit(NamedTuple):
-    """A law fitted to points by least squares."""
-
-    law: str
-    names: tuple[str, ...]
-    values: tuple[float, ...]
-    low: tuple[float, ...]  # ends of the 95 % intervals
-    high: tuple[float, ...]
-    aic: float  # Akaike's criterion; the smaller, the better
-
-    @property
-    def text(self) -> str:
-        """Each parameter with its interval."""
-        parts = zip(self.names, self.values, self.low, self.high, strict=True)
-        return ", ".join(f"{n} = {v:.3g} ({lo:.3g} to {hi:.3g})" for n, v, lo, hi in parts)
-
-
-LAWS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
-    "exponential": (lambda n, limit, gain, tau: limit + gain * np.exp(-(n - 1) / tau), ("limit", "gain", "τ")),
-    "power": (lambda n, limit, gain, slope: limit + gain * n**-slope, ("limit", "gain", "exponent")),
-    "linear": (lambda v, start, slope: start + slope * v, ("start", "slope")),
-}
-
-
-def fit(law: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> Fit | None:
-    """The law that is nearest to the points, with intervals from the curvature of the fit; None where there is none."""
-    function, names = LAWS[law]
-    guess = (
-        [y[0], 0.0] if law == "linear" else [float(y[-1]), float(y[0] - y[-1]), 5.0 if law == "exponential" else 1.0]
-    )
-    bounds = (-np.inf, np.inf) if law == "linear" else ([-np.inf, -np.inf, 1e-2], [np.inf, np.inf, 1e3])
-    try:
-        values, covariance = curve_fit(function, x, y, p0=guess, bounds=bounds, maxfev=20_000)
-    except RuntimeError:
-        return None
-    count, free = len(x), len(names)
-    residual = max(float(np.sum((y - function(x, *values)) ** 2)), 1e-300)
-    half = student.ppf(0.975, max(1, count - free)) * np.sqrt(np.diag(covariance))
-    aic = count * math.log(residual / count) + 2 * (free + 1)
-    return Fit(law, names, tuple(values), tuple(values - half), tuple(values + half), aic)
 
 
 def one_seed(seed: int, args: Args) -> list[Record]:
@@ -290,7 +247,7 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
         for ax, (value, label) in zip(axes, MEASURES.items(), strict=False):
             for i, shorter in enumerate(SHORTER):
                 found = [over_seeds(records, value, iterations=k, shorter=shorter) for k in args.iterations]
-                _points(ax, args.iterations, found, 3 * i, "long steps" if shorter == 1 else "measured")
+                points(ax, args.iterations, found, 3 * i, "long steps" if shorter == 1 else "measured")
             x = np.geomspace(min(args.iterations), max(args.iterations), 200)
             for i, law in enumerate(("exponential", "power")):
                 if (one := laws.get((value, law))) is not None:
@@ -298,7 +255,7 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
             ax.set(xlabel="steps of inference", ylabel=label, xscale="log")
         for i, (value, label) in enumerate((("end_cm", "end point"), ("path_cm", "path"))):
             pace = [over_seeds(records, "cm_per_s", speed=s)[0] for s in args.speeds]
-            _points(axes[3], pace, [over_seeds(records, value, speed=s) for s in args.speeds], i, label)
+            points(axes[3], pace, [over_seeds(records, value, speed=s) for s in args.speeds], i, label)
             if (line := laws.get((value, "linear"))) is not None:
                 ends = np.array([min(pace), max(pace)])
                 axes[3].plot(ends, LAWS["linear"][0](ends, *line.values), color=look(i)[0], linewidth=1)
@@ -306,11 +263,6 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
         for ax in (axes[0], axes[3]):
             ax.legend(fontsize=8)
     return fig
-
-
-def _points(ax: Any, x: Sequence[float], found: Sequence[tuple[float, float]], i: int, label: str) -> None:
-    mean, spread = np.array(found).T
-    ax.errorbar(x, mean, spread, fmt=look(i)[2], color=look(i)[0], markersize=4, linewidth=1, label=label)
 
 
 def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
