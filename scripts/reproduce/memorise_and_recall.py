@@ -258,7 +258,7 @@ def _robot(ax: Any, records: Sequence[Record]) -> None:
         x = np.arange(len(RECALLED)) + 0.14 * (i - 2.5)
         ax.bar(x, mean, 0.13, yerr=spread, color=colour, error_kw={"linewidth": 1})
     ax.set_xticks(range(len(RECALLED)), list(RECALLED))
-    ax.set(ylabel="offline hand error [cm]", title="robosuite; grey: mean demonstration")
+    ax.set(ylabel="offline hand error [cm]", title="robosuite; grey: the mean")
 
 
 def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
