@@ -223,13 +223,15 @@ def drawn(records: Sequence[Record], example: dict[str, Any]) -> Figure:
             ax.set_yticks(range(len(WAYS)), list(WAYS.values()) if ax is axes[0] else [""] * len(WAYS))
             ax.invert_yaxis()
             ax.set(xlabel=label, xlim=(0.4 if value == "auroc" else 0, 1))
-        axes[0].legend(loc="lower right", fontsize=8)
+        axes[1].legend(loc="lower right", fontsize=8)
         for i, way in enumerate(("memory", "right", "wrong")):
             axes[3].plot(example[way], color=look(i)[0], linestyle=look(i)[1], label=WAYS[way])
         axes[3].axhline(1, color="#444444", linewidth=1)
         axes[3].axvline(example["onset"], color="#e69f00", linewidth=1.5)
-        axes[3].set(yscale="log", xlabel="step; the fault begins at the line", ylabel="surprise / threshold")
-        axes[3].legend(fontsize=7)
+        axes[3].set(yscale="log", xlabel="step", ylabel="surprise / threshold")
+        axes[3].set_ylim(top=30 * axes[3].get_ylim()[1])  # room for the legend
+        axes[3].set_title("one episode; the fault begins at the line", fontsize=8)
+        axes[3].legend(fontsize=7, loc="upper right")
     return fig
 
 
@@ -245,7 +247,9 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
             one = partial(judged, trial=trial, args=args)
             found += dispatch(one, list(args.repetitions), args.workers, progress)
     records = [r for own, _ in found for r in own]
-    return Findings(records, tables(records, args), drawn(records, found[-1][1]), {"false_alarm_rate": RATE})
+    example = found[-1][1]
+    facts = {"false_alarm_rate": RATE, "example": {k: np.asarray(v).tolist() for k, v in example.items()}}
+    return Findings(records, tables(records, args), drawn(records, example), facts)
 
 
 def _letters(seed: int, args: Args) -> tuple[list[Record], dict[str, Any]]:
