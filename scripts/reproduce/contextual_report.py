@@ -19,6 +19,7 @@ SPLICE = 30
 """Step at which another letter is gone on with."""
 
 TIMES = (5, 10, 20, 30, 40, 59)
+ROBOT_TIMES = (5, 10, 20, 40, 60, 80, 95)
 MIDDLE = (5, 10, 15, 20, 25, 30, 35, 40)
 """Steps at which letters with one middle are told apart; they differ up to about 15 and from about 38 on."""
 
@@ -65,7 +66,8 @@ def tables(records: Sequence[Record], skills: int) -> list[Table]:
         ),
     ]
     if any(r["how"] == "robosuite" for r in records):
-        made.append(Table("Robosuite, three skills", ("", *map(str, TIMES)), [row("state", TIMES, how="robosuite")]))
+        heads = ("", *map(str, ROBOT_TIMES))
+        made.append(Table("Robosuite, three skills, by step", heads, [row("state", ROBOT_TIMES, how="robosuite")]))
     return made
 
 

@@ -1,6 +1,6 @@
 """Laws of speed and accuracy, fitted by least squares.
 
-    exponential   e = limit + gain exp(-(n - 1)/τ)        n steps of inference; Fitts' law, n = a + b log2 1/(e - limit)
+    exponential   e = limit + gain exp(-n/τ)        n the time of inference; Fitts' law, n = a + b log2 1/(e - limit)
     power         e = limit + gain n^-exponent
     linear        e = start + slope v                     v the speed
 
@@ -38,7 +38,7 @@ class Fit(NamedTuple):
 
 
 LAWS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
-    "exponential": (lambda n, limit, gain, tau: limit + gain * np.exp(-(n - 1) / tau), ("limit", "gain", "τ")),
+    "exponential": (lambda n, limit, gain, tau: limit + gain * np.exp(-n / tau), ("limit", "gain", "τ")),
     "power": (lambda n, limit, gain, slope: limit + gain * n**-slope, ("limit", "gain", "exponent")),
     "linear": (lambda v, start, slope: start + slope * v, ("start", "slope")),
 }

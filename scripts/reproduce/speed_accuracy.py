@@ -2,9 +2,9 @@
 
 One memory of letters is asked to recall, and to tell faulty writings from good ones, with 1 to 200 steps of inference
 for each row. The steps of this package are nearly as long as they can be and settle in a few; neurons integrate slowly,
-so steps a twentieth as long are asked for too. The error these leave is fitted by two laws: an exponential approach to
-a limit, which is what Fitts' law says of time and error (n = a + b log2 1/e), and a power law. Another memory learns
-letters at several speeds and writes them at each: its error is fitted by the linear law of fast movements.
+so steps a twentieth as long are asked for too. The error is fitted by two laws of the time that was taken, steps times
+their length: an exponential approach to a limit, as Fitts' law has it (n = a + b log2 1/e), and a power law. Another
+memory learns letters at several speeds and writes them at each: its error is fitted by the linear law of fast movements.
 
 Sources: Fitts 1954 (J. Exp. Psychol. 47(6)); Wickelgren 1977 (Acta Psychologica 41(1)) for the approach to a limit;
 Schmidt et al. 1979 (Psychological Review 86(5)) for error = a + b speed; Akaike 1974 for the comparison.
@@ -188,9 +188,9 @@ def fits(records: Sequence[Record]) -> dict[tuple[str, str], Fit]:
     """Each law that could be fitted to each measure, over all seeds."""
     found = {}
     for value in MEASURES:
-        slow = [r for r in records if r.get("shorter") == SHORTER[0]]
+        timed = [{**r, "time": r["iterations"] / r["shorter"]} for r in records if value in r]
         for law in ("exponential", "power"):
-            if (one := fit(law, *_within_seeds(slow, "iterations", value))) is not None:
+            if (one := fit(law, *_within_seeds(timed, "time", value))) is not None:
                 found[value, law] = one
     for value in ("end_cm", "path_cm"):
         if (one := fit("linear", *_within_seeds([r for r in records if value in r], "cm_per_s", value))) is not None:
@@ -247,12 +247,13 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
         for ax, (value, label) in zip(axes, MEASURES.items(), strict=False):
             for i, shorter in enumerate(SHORTER):
                 found = [over_seeds(records, value, iterations=k, shorter=shorter) for k in args.iterations]
-                points(ax, args.iterations, found, 3 * i, "long steps" if shorter == 1 else "measured")
-            x = np.geomspace(min(args.iterations), max(args.iterations), 200)
+                time = [k / shorter for k in args.iterations]
+                points(ax, time, found, 3 * i, "long steps" if shorter == 1 else f"steps 1/{shorter} as long")
+            x = np.geomspace(min(args.iterations) / max(SHORTER), max(args.iterations), 200)
             for i, law in enumerate(("exponential", "power")):
                 if (one := laws.get((value, law))) is not None:
                     ax.plot(x, LAWS[law][0](x, *one.values), color=look(i + 1)[0], linestyle=look(i + 1)[1], label=law)
-            ax.set(xlabel="steps of inference", ylabel=label, xscale="log")
+            ax.set(xlabel="time of inference [long steps]", ylabel=label, xscale="log")
         for i, (value, label) in enumerate((("end_cm", "end point"), ("path_cm", "path"))):
             pace = [over_seeds(records, "cm_per_s", speed=s)[0] for s in args.speeds]
             points(axes[3], pace, [over_seeds(records, value, speed=s) for s in args.speeds], i, label)
@@ -260,8 +261,8 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
                 ends = np.array([min(pace), max(pace)])
                 axes[3].plot(ends, LAWS["linear"][0](ends, *line.values), color=look(i)[0], linewidth=1)
         axes[3].set(xlabel="mean speed [cm/s]", ylabel="recalled, offline [cm]", ylim=0)
-        for ax in (axes[0], axes[3]):
-            ax.legend(fontsize=8)
+        for ax in (axes[1], axes[3]):
+            ax.legend(fontsize=7)
     return fig
 
 
