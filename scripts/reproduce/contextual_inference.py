@@ -249,7 +249,8 @@ def robot(seed: int, train: Sequence[Episode], tests: Sequence[Episode], args: A
     (rows, skill), (seen, truth) = (_stacked(e, SKILLS) for e in (train, tests))
     readout = learn_readout(_flat(np.tanh(memory.hidden(rows))), np.tile(skill, len(rows)), len(SKILLS), rng)
     right = _certainty(np.tanh(memory.hidden(seen)), readout).argmax(axis=2) == truth
-    return _over_time("state", "robosuite", right, seed)
+    made = [(name, _over_time("state", "robosuite", right[:, truth == k], seed)) for k, name in enumerate(SKILLS)]
+    return [{**r, "skill": name} for name, records in made for r in records]
 
 
 def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from asm_gym.evaluation.plots import figure, look
 from asm_gym.evaluation.report import Table
-from asm_gym.scripts.reproduce.common import Record, over_seeds, shown
+from asm_gym.scripts.reproduce.common import SKILLS, Record, over_seeds, shown
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import Rows
 
@@ -67,7 +67,8 @@ def tables(records: Sequence[Record], skills: int) -> list[Table]:
     ]
     if any(r["how"] == "robosuite" for r in records):
         heads = ("", *map(str, ROBOT_TIMES))
-        made.append(Table("Robosuite, three skills, by step", heads, [row("state", ROBOT_TIMES, how="robosuite")]))
+        own = [row(name, ROBOT_TIMES, how="robosuite", skill=name) for name in SKILLS]
+        made.append(Table("Robosuite skills named from the state [share], by step", heads, own))
     return made
 
 
@@ -89,7 +90,7 @@ def drawn(records: Sequence[Record], example: Example) -> Figure:
         _pair(axes[1, 1], example.switch, ("the letter begun", "the one gone on with"), "a switch", SPLICE)
         for i, (source, label) in enumerate((("state", "state"), ("row", "row alone"))):
             _curve(axes[1, 2], records, i, label, how="one middle", source=source)
-        _curve(axes[1, 2], records, 2, "robosuite, state", how="robosuite", source="state")
+        _curve(axes[1, 2], records, 2, "robosuite, state", how="robosuite")
         axes[1, 2].set(
             title="one middle; robosuite", xlabel="step", ylabel="right [share]", ylim=(0, 1.02), xlim=(0, 60)
         )
@@ -98,7 +99,7 @@ def drawn(records: Sequence[Record], example: Example) -> Figure:
 
 
 def _curve(ax: Any, records: Sequence[Record], i: int, label: str, **where: Any) -> None:
-    steps = sorted({r["step"] for r in records if all(r[k] == v for k, v in where.items())})
+    steps = sorted({r["step"] for r in records if all(r.get(k) == v for k, v in where.items())})
     if not steps:
         return
     curve(ax, steps, [over_seeds(records, "right", step=t, **where) for t in steps], i, label, markers=False)

@@ -249,8 +249,10 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
         axes[3].set(xlabel="steps of the episode", ylabel="kept for the way back [KiB]", yscale="log")
         for ax in axes[:2]:
             ax.axhline(90, color="#999999", linewidth=1)
-        for ax in (axes[0], axes[2], axes[3]):
-            ax.legend(fontsize=7)
+        for ax in (axes[0], axes[2]):
+            ax.set_xlim(0, 1.2 * args.epochs)
+        for ax, place in ((axes[0], "lower right"), (axes[2], "upper right"), (axes[3], "center right")):
+            ax.legend(fontsize=7, loc=place)
     return fig
 
 
