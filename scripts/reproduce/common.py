@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
+from threadpoolctl import threadpool_limits
 
 import asm_gym
 from asm_gym.episodes import Episode
@@ -83,7 +84,8 @@ def reproduce(name: str, study: Study[Args], kind: type[Args], description: str 
     console, seconds = Console(), {}  # type: ignore[var-annotated]
     try:
         args = tyro.cli(kind, args=argv, prog=f"asm-gym reproduce {name}", description=description)
-        found = study(args, console, seconds)
+        with threadpool_limits(1):  # products this small are slowed down by several threads
+            found = study(args, console, seconds)
     except ValueError as error:
         print(f"asm-gym reproduce {name}: {error}", file=sys.stderr)
         return 2

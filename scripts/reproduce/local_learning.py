@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from rich.console import Console
-from threadpoolctl import threadpool_limits
 
 from asm_gym.evaluation.plots import figure
 from asm_gym.evaluation.report import Table
@@ -261,7 +260,7 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     args = args.scaled()
     with stage("learning both ways", console, seconds) as progress:
         found = dispatch(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
-    with stage("measuring costs", console, seconds), threadpool_limits(1):
+    with stage("measuring costs", console, seconds):
         records = [r for own in found for r in own] + costs(args)
     return Findings(records, tables(records, args), drawn(records, args), {"rates": RATES})
 

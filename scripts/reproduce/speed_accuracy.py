@@ -24,7 +24,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
-from threadpoolctl import threadpool_limits
 
 from asm_gym.evaluation.metrics import auroc
 from asm_gym.evaluation.plots import figure, look
@@ -102,8 +101,7 @@ def one_seed(seed: int, args: Args) -> list[Record]:
     """Both questions, for one repertoire."""
     rng = np.random.default_rng(seed)
     letters = repertoire(args.skills, 2, rng)
-    with threadpool_limits(1):
-        return by_iterations(seed, letters, args, rng) + by_speed(seed, letters, args, rng)
+    return by_iterations(seed, letters, args, rng) + by_speed(seed, letters, args, rng)
 
 
 def by_iterations(seed: int, letters: Sequence[Letter], args: Args, rng: np.random.Generator) -> list[Record]:
