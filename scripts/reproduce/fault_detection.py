@@ -210,8 +210,8 @@ def drawn(records: Sequence[Record], example: dict[str, Any]) -> Figure:
     domains = list(dict.fromkeys(r["domain"] for r in records))
     panels = (
         ("auroc", "AUROC"),
-        ("found", "found, without an alarm before [share]"),
-        ("alarm", "false alarms [share]"),
+        ("found", "found, no alarm before"),
+        ("alarm", "false alarms"),
     )
     with figure(height=3.6, width=11) as fig:
         axes = fig.subplots(1, 4, width_ratios=(1, 1, 1, 1.3))
@@ -230,7 +230,7 @@ def drawn(records: Sequence[Record], example: dict[str, Any]) -> Figure:
         axes[3].axvline(example["onset"], color="#e69f00", linewidth=1.5)
         axes[3].set(yscale="log", xlabel="step", ylabel="surprise / threshold")
         axes[3].set_ylim(top=30 * axes[3].get_ylim()[1])  # room for the legend
-        axes[3].set_title("one episode; the fault begins at the line", fontsize=8)
+        axes[3].set_title("one episode, fault at the line", fontsize=8)
         axes[3].legend(fontsize=7, loc="upper right")
     return fig
 
