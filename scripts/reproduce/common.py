@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import platform
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -80,15 +79,11 @@ Study = Callable[[Args, Console, dict[str, float]], Findings]
 
 
 def reproduce(name: str, study: Study[Args], kind: type[Args], description: str | None, argv: list[str] | None) -> int:
-    """Runs a study and publishes what it found; 2 where the arguments make no sense."""
-    console, seconds = Console(), {}  # type: ignore[var-annotated]
-    try:
-        args = tyro.cli(kind, args=argv, prog=f"asm-gym reproduce {name}", description=description)
-        with threadpool_limits(1):  # products this small are slowed down by several threads
-            found = study(args, console, seconds)
-    except ValueError as error:
-        print(f"asm-gym reproduce {name}: {error}", file=sys.stderr)
-        return 2
+    """Runs a study and publishes what it found. Raises SystemExit(2) where the arguments make no sense."""
+    args = tyro.cli(kind, args=argv, prog=f"asm-gym reproduce {name}", description=description)
+    console, seconds = Console(), dict[str, float]()
+    with threadpool_limits(1):  # products this small are slowed down by several threads
+        found = study(args, console, seconds)
     publish(name, found, args, seconds)
     for table in found.tables:
         console.print(_console_table(table))

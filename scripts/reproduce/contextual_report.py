@@ -91,9 +91,7 @@ def drawn(records: Sequence[Record], example: Example) -> Figure:
         for i, (source, label) in enumerate((("state", "state"), ("row", "row alone"))):
             _curve(axes[1, 2], records, i, label, how="one middle", source=source)
         _curve(axes[1, 2], records, 2, "robosuite, state", how="robosuite")
-        axes[1, 2].set(
-            title="one middle; robosuite", xlabel="step", ylabel="right [share]", ylim=(0, 1.02), xlim=(0, 60)
-        )
+        axes[1, 2].set(title="one middle; robosuite", xlabel="step", ylabel="right [share]", ylim=(0, 1.02))
         axes[1, 2].legend(fontsize=8)
     return fig
 

@@ -257,7 +257,7 @@ def _letters(seed: int, args: Args) -> tuple[list[Record], dict[str, Any]]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the study; 2 where the arguments make no sense."""
+    """Runs the study, and returns the exit code."""
     return reproduce("fault_detection", study, Args, __doc__, argv)
 
 

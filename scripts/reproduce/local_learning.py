@@ -217,7 +217,7 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
         ),
         Table(
             "A change along a batch of 16: time [ms] / kept for the way back [KiB], by steps",
-            ("", *map(str, LENGTHS)),
+            ("", *(str(r["steps"]) for r in records if r.get("cost_of") == "local")),
             [
                 (how, *(f"{r['ms']:.1f} / {r['bytes'] / 1024:.0f}" for r in records if r.get("cost_of") == how))
                 for how in RATES
@@ -241,7 +241,7 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
         for i, how in enumerate(RATES):
             curve(axes[2], epochs, [over_seeds(records, "mse", learned_by=how, epoch=e) for e in epochs], i + 2, how)
             own = [r for r in records if r.get("cost_of") == how]
-            curve(axes[3], LENGTHS, [(r["bytes"] / 1024, 0.0) for r in own], i + 2, how)
+            curve(axes[3], [r["steps"] for r in own], [(r["bytes"] / 1024, 0.0) for r in own], i + 2, how)
         axes[0].set(xlabel="epochs", ylabel="angle to the local change [°]", ylim=(0, 95), xscale="symlog")
         axes[1].set(xlabel="iterations of inference", ylim=(0, 95), xscale="log")
         axes[2].set(xlabel="epochs", ylabel="error of the next row [variance]", yscale="log", xscale="symlog")
@@ -266,7 +266,7 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the study; 2 where the arguments make no sense."""
+    """Runs the study, and returns the exit code."""
     return reproduce("local_learning", study, Args, __doc__, argv)
 
 

@@ -275,7 +275,7 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the study; 2 where the arguments make no sense."""
+    """Runs the study, and returns the exit code."""
     return reproduce("speed_accuracy", study, Args, __doc__, argv)
 
 
