@@ -12,14 +12,17 @@ pytest = $(one_thread) $(bin)/python -m pytest -n $(JOBS) --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo doctor test test-all check format clean
+.PHONY: help demo reproduce doctor test test-all check format clean
 
 help: ## list the commands
 	@sed -nE 's/^([a-z-]+):.* ## (.*)/  make \1\t\2/p' Makefile | expand -t 20
-	@echo "Variables: PYTHON=$(PYTHON) makes .venv, JOBS=$(JOBS) test processes, ARGS goes to demo and to pytest."
+	@echo "Variables: PYTHON=$(PYTHON) makes .venv, JOBS=$(JOBS) test processes, ARGS goes to demo, reproduce and pytest."
 
 demo: $(stamp) ## a robot that notices when something is wrong; ARGS=--help lists its options
 	@$(bin)/asm-gym demo $(ARGS)
+
+reproduce: $(stamp) ## the method's claims, each with a figure and a table; ARGS=--quick to see that they run
+	@$(bin)/asm-gym reproduce all $(ARGS)
 
 doctor: $(stamp) ## what this machine lacks, and the command that installs it
 	@$(bin)/asm-gym doctor

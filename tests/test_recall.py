@@ -199,7 +199,7 @@ def test_after_the_cue_the_expected_state_and_action_are_handed_on(free):
     length = int(rehearsal.carried.cue[0, 0])
     assert 1 <= length < LONGEST_CUE
     rehearsal.run(itertools.islice(stream, len(episode.senses) - 1), 0.0, free)
-    net = replace_weights(weights)
+    net = Network(weights, network().association, 20, 1.0, 1.0)
     read = len(episode.senses) if free == 0.0 else length
     z = at_rest(net, 1)
     for t, (x, u) in enumerate(zip(episode.senses[:, None], episode.commands[:, None], strict=True)):
@@ -211,11 +211,6 @@ def test_after_the_cue_the_expected_state_and_action_are_handed_on(free):
         taken = u[:, :-1] if t == read - 1 else action
         z = h + taken @ weights.W_U[:, :-1].T
     np.testing.assert_allclose(rehearsal.carried.z, z, atol=1e-4)
-
-
-def replace_weights(weights) -> Network:
-    net = network()
-    return Network(weights, net.association, 20, 1.0, 1.0)
 
 
 def test_a_broken_episode_is_refused_before_it_is_learned():

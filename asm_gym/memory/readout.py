@@ -11,15 +11,16 @@ Source: Wald and Wolfowitz 1948 for adding up log likelihoods.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import hidden_units
 from asm_gym.memory.energy import Array
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 
-UPDATES, PASSES = 6000, 40
-"""Batches learned from, and passes over the steps, at most."""
+UPDATES = 6000
+"""Batches learned from."""
 
 BATCH = 512
 RATE = 1e-2
@@ -46,22 +47,25 @@ def add_up(L: Array, units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32
 
 
 def learn_readout(
-    inputs: Array, V: Array, skill: NDArray[np.intp], count: int, rng: np.random.Generator
+    look: Callable[[NDArray[np.intp]], Array],
+    skill: NDArray[np.intp],
+    count: int,
+    rng: np.random.Generator,
+    updates: int = UPDATES,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """W_K (K, M) and b_K (K,) from N steps whose skill is known.
 
     Args:
-        inputs: (N, I) of association.
-        V: (M, I) its synapses onto the units.
+        look: firing rates (B, M) of the steps of B indices; all of them at once might not fit.
         skill: (N,) each below ``count``.
         count: K.
+        updates: batches learned from.
     """
-    W_K, b_K = np.zeros((count, len(V)), np.float32), np.zeros(count, np.float32)
+    W_K, b_K = np.zeros((count, look(np.arange(1)).shape[1]), np.float32), np.zeros(count, np.float32)
     weights, bias = Synapse(W_K), Synapse(b_K)
     rarity = (len(skill) / (count * np.bincount(skill, minlength=count))).astype(np.float32)  # (K,) n
-    updates = max(1, min(UPDATES, PASSES * len(skill) // BATCH))
     for n, chosen in zip(range(updates), shuffled(len(skill), BATCH, rng), strict=False):
-        f = hidden_units(inputs[chosen], V)
+        f = np.ascontiguousarray(look(chosen), np.float32)
         error = np.eye(count, dtype=np.float32)[skill[chosen]] - certainty(f, W_K, b_K)
         error *= rarity[skill[chosen], None]
         rate = cosine_decay(RATE, n / updates)

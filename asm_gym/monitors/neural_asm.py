@@ -177,9 +177,10 @@ class NeuralASM(PredictiveMonitor):
         assert self.network_ is not None
         inputs = np.concatenate([self.senses_.read_episode(e.stream).inputs for e in episodes])
         skills = np.repeat([known.index(name) for name in names], [len(e) for e in episodes])
+        V = self.network_.association.V
         with threadpool_limits(1):
             rng = np.random.default_rng(self.seed)
-            W_K, b_K = learn_readout(inputs, self.network_.association.V, skills, len(known), rng)
+            W_K, b_K = learn_readout(lambda i: hidden_units(inputs[i], V), skills, len(known), rng)
         self.learned_ = self.learned_ | {"W_K": W_K, "b_K": b_K}
         self.skills_ = tuple(known)
         return self

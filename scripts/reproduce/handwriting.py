@@ -89,6 +89,18 @@ def branching(letter: Letter, name: str, shared: int, rng: np.random.Generator) 
     return Letter(name, letter.strokes[:shared] + tuple(own))
 
 
+def detoured(letter: Letter, name: str, rng: np.random.Generator) -> Letter:
+    """A letter that begins as the mirror image of another about its first chord, goes on as that one, and ends apart.
+
+    A stroke ends where its mirror image does: ∫ Λ exp(i(θ + Δθ Φ)) dt = ∫_0^1 exp(i(θ + Δθ u)) du, along θ + Δθ/2.
+    """
+    first, *middle, last = letter.strokes
+    mirrored = replace(first, direction=first.direction + first.turn, turn=-first.turn)
+    dims = 2 if last.rise == 0.0 else 3
+    own = replace(_stroke(len(middle) + 1, dims, rng), direction=last.direction + math.pi)
+    return Letter(name, (mirrored, *middle, own))
+
+
 def chosen(letters: Sequence[Letter], names: Sequence[str]) -> list[Letter]:
     """The letters of those names. Raises ValueError where the repertoire lacks one."""
     known = {letter.name: letter for letter in letters}

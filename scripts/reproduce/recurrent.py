@@ -70,8 +70,8 @@ def train(
     hidden: int,
     updates: int,
     rng: np.random.Generator,
-    noise: float = 0.1,
-    rate: float = 3e-3,
+    noise: float = 0.3,
+    rate: float = 1e-2,
     batch_size: int = 16,
 ) -> Recurrent:
     """A network that has learned from whole episodes.

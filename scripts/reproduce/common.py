@@ -1,0 +1,173 @@
+"""What the studies share: arguments, robosuite demonstrations, and how findings are written down."""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, TypeVar
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
+from threadpoolctl import threadpool_limits
+
+import asm_gym
+from asm_gym.episodes import Episode
+from asm_gym.evaluation.archive import Label, read
+from asm_gym.evaluation.plots import save
+from asm_gym.evaluation.report import Table
+from asm_gym.scripts.dispatch import dispatch
+from asm_gym.scripts.progress import stage
+from asm_gym.scripts.publish import markdown
+from asm_gym.scripts.record import Course, episode_seeds, record
+
+Record = dict[str, Any]
+"""One measurement: what was varied, the seed, and what came out."""
+
+SKILLS = ("Lift", "Stack", "PickPlaceCan")
+"""The robosuite skills of one memory."""
+
+
+@dataclass(frozen=True)
+class Common:
+    """Arguments of every study."""
+
+    seed: int = 0
+    """Of everything; a study repeats itself with this seed and those that follow."""
+    seeds: int = 3
+    """How often it repeats itself."""
+    workers: int = 2
+    """Processes."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/reproduce")
+    """Folder of the results, and of the robosuite episodes, which are recorded once."""
+    quick: bool = False
+    """Little of everything: to see that it runs, not to judge the figures."""
+
+    def __post_init__(self) -> None:
+        for name in ("seeds", "workers"):
+            at_least_one(name, getattr(self, name))
+        if self.seed < 0:
+            raise ValueError(f"seed must be at least 0, got {self.seed}")
+
+    @property
+    def repetitions(self) -> range:
+        """The seeds."""
+        return range(self.seed, self.seed + self.seeds)
+
+
+class Findings(NamedTuple):
+    """What a study found."""
+
+    records: Sequence[Record]
+    tables: Sequence[Table]
+    figure: Figure
+    facts: dict[str, Any]  # whatever else is worth keeping; JSON-serialisable
+
+
+Args = TypeVar("Args", bound=Common)
+Study = Callable[[Args, Console, dict[str, float]], Findings]
+"""Handed the arguments, where to print, and where to note how long each stage took."""
+
+
+def reproduce(name: str, study: Study[Args], kind: type[Args], description: str | None, argv: list[str] | None) -> int:
+    """Runs a study and publishes what it found. Raises SystemExit(2) where the arguments make no sense."""
+    args = tyro.cli(kind, args=argv, prog=f"asm-gym reproduce {name}", description=description)
+    console, seconds = Console(), dict[str, float]()
+    with threadpool_limits(1):  # products this small are slowed down by several threads
+        found = study(args, console, seconds)
+    publish(name, found, args, seconds)
+    for table in found.tables:
+        console.print(_console_table(table))
+    console.print(f"Wrote {args.out / name}.png, .svg, .csv, .md and .json")
+    return 0
+
+
+def publish(name: str, found: Findings, args: Common, seconds: dict[str, float]) -> None:
+    """Writes the figure (PNG, SVG), every measurement (CSV), the tables (Markdown), and how it was made (JSON)."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    save(found.figure, args.out / f"{name}.png")
+    found.figure.savefig(args.out / f"{name}.svg", format="svg", metadata={"Date": None})
+    columns = list(dict.fromkeys(key for r in found.records for key in r))
+    with (args.out / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(found.records)
+    text = "\n\n".join(markdown(t) for t in found.tables)
+    (args.out / f"{name}.md").write_text(text + "\n", encoding="utf-8")
+    packages = ("numpy", "scipy", "torch", "mujoco", "robosuite", "matplotlib")
+    details = {
+        "arguments": {**asdict(args), "out": str(args.out)},
+        "seed": args.seed,
+        "versions": {"asm_gym": asm_gym.__version__, **{p: metadata.version(p) for p in packages}},
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "seconds": seconds,
+        **found.facts,
+    }
+    (args.out / f"{name}.json").write_text(json.dumps(details, indent=2) + "\n", encoding="utf-8")
+
+
+def over_seeds(records: Sequence[Record], value: str, **where: Any) -> tuple[float, float]:
+    """Mean, and standard deviation over seeds, of the records that are as ``where`` says; NaN where there are none."""
+    chosen = [r for r in records if all(r.get(k) == v for k, v in where.items()) and r.get(value) is not None]
+    each = [np.mean([r[value] for r in chosen if r["seed"] == s]) for s in dict.fromkeys(r["seed"] for r in chosen)]
+    if not each:
+        return float("nan"), float("nan")
+    return float(np.mean(each)), float(np.std(each, ddof=1)) if len(each) > 1 else 0.0
+
+
+def shown(records: Sequence[Record], value: str, digits: int = 2, **where: Any) -> str:
+    """``mean ± spread`` over seeds, for a table; empty where there is nothing."""
+    mean, spread = over_seeds(records, value, **where)
+    return "" if np.isnan(mean) else f"{mean:.{digits}f} ± {spread:.{digits}f}"
+
+
+def recorded(args: Common, labels: Sequence[Label], console: Console, seconds: dict[str, float]) -> list[Episode]:
+    """The episodes of these labels, recorded where they are not there yet; those that failed are among them."""
+    missing = [label for label in labels if not (args.out / label.path).is_file()]
+    if missing:
+        with stage("recording robosuite episodes", console, seconds) as progress:
+            dispatch(partial(record, course=Course(), folder=args.out.resolve()), missing, args.workers, progress)
+    return [read(args.out / label.path).episode for label in labels]
+
+
+def nominal_labels(tasks: Sequence[str], role: str, episodes: int) -> list[Label]:
+    """The first so many nominal episodes of each task; the same for every seed of a study."""
+    return [Label(task, role, seed=s) for task in tasks for s in episode_seeds(0, task, role, episodes)]
+
+
+def demonstrations(
+    args: Common, tasks: Sequence[str], role: str, episodes: int, console: Console, seconds: dict[str, float]
+) -> list[Episode]:
+    """Nominal episodes of the scripted experts that succeeded."""
+    return [e for e in recorded(args, nominal_labels(tasks, role, episodes), console, seconds) if e.success]
+
+
+def at_least_one(name: str, number: int) -> None:
+    """Raises ValueError unless it is."""
+    if number < 1:
+        raise ValueError(f"{name} must be at least 1, got {number}")
+
+
+def wide_enough(hidden: int, channels: int) -> None:
+    """Raises ValueError where a network has fewer hidden units than numbers to predict."""
+    if hidden < channels:
+        raise ValueError(f"hidden must be at least the number of channels, {channels}, got {hidden}")
+
+
+def _console_table(table: Table) -> RichTable:
+    made = RichTable(title=escape(table.caption))
+    for i, heading in enumerate(table.headings):
+        made.add_column(escape(heading), justify="right" if i else "left")
+    for row in table.rows:
+        made.add_row(*map(str, row))
+    return made

@@ -1,0 +1,26 @@
+"""Marks that the figures of the studies share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from asm_gym.evaluation.plots import look
+
+
+def curve(
+    ax: Axes, x: Sequence[float], found: Sequence[tuple[float, float]], i: int, label: str | None, markers: bool = True
+) -> None:
+    """The i-th curve: means over seeds, and a band of a standard deviation; ``found`` as ``over_seeds`` gives it."""
+    mean, spread = np.array(found).T
+    colour, line, marker = look(i)
+    ax.plot(x, mean, color=colour, linestyle=line, marker=marker if markers else "", markersize=4, label=label)
+    ax.fill_between(x, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
+
+
+def points(ax: Axes, x: Sequence[float], found: Sequence[tuple[float, float]], i: int, label: str) -> None:
+    """Means over seeds with their standard deviations."""
+    mean, spread = np.array(found).T
+    ax.errorbar(x, mean, spread, fmt=look(i)[2], color=look(i)[0], markersize=4, linewidth=1, label=label)

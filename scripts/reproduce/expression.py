@@ -1,0 +1,219 @@
+"""Whatever expresses a skill from a cue, behind one call: the memory, and its rivals.
+
+express(streams, cue)      rows of which the first ``cue`` are read, and the rest expected from memory alone
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.episodes import Episode
+from asm_gym.memory.association import Association, association_shapes
+from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.network import Network, initial_weights
+from asm_gym.memory.recall import Recalled, at_rest, follow, run_on, to_rows
+from asm_gym.memory.rehearsal import rehearse
+from asm_gym.memory.senses import Senses
+from asm_gym.monitors.skill_library import SkillLibrary
+from asm_gym.scripts.reproduce import recurrent
+
+Rows = NDArray[np.float64]
+
+
+class Expresser(Protocol):
+    """Knows skills."""
+
+    def express(self, streams: Rows, cue: int) -> Rows:
+        """What was expected of each row of B streams (T, B, D), knowing those before it up to the ``cue``-th."""
+        ...
+
+
+def read(reader: Senses, streams: Rows) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Senses (T, B, S) and commands (T, B, A + 1) of streams (T, B, D)."""
+    readings = [reader.read_episode(streams[:, n]) for n in range(streams.shape[1])]
+    return np.stack([r.senses for r in readings], axis=1), np.stack([r.commands for r in readings], axis=1)
+
+
+def trajectories(reader: Senses, episodes: Sequence[Episode]) -> list[Trajectory]:
+    """Episodes as a network reads them."""
+    readings = [reader.read_episode(e.stream) for e in episodes]
+    return [Trajectory(r.senses, r.commands, r.inputs) for r in readings]
+
+
+@dataclass(frozen=True)
+class Memory:
+    """The temporal predictive coding network alone: nothing is judged here, so there is no association."""
+
+    reader: Senses
+    network: Network
+
+    @classmethod
+    def learned(
+        cls,
+        episodes: Sequence[Episode],
+        hidden: int,
+        rng: np.random.Generator,
+        steps: int,
+        carry_prior: float = 0.95,
+        iterations: int = 10,
+        rate: float = 1e-3,
+    ) -> Memory:
+        """From whole episodes, no labels.
+
+        Args:
+            steps: in which its synapses change, with 32 episodes side by side.
+            carry_prior, iterations, rate: as in ``NeuralASM``.
+        """
+        reader = Senses.fit(episodes[0].spec, [e.stream for e in episodes])
+        learned = trajectories(reader, episodes)
+        weights = initial_weights(hidden, reader.size, len(reader.spec.motor), rng)
+        size = 32
+        epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
+        rehearse(weights, learned, Schedule(epochs, size, rate, iterations, 1.0, 1.0, carry_prior), rng, lambda: None)
+        return cls(reader, Network(weights, unassociated(), iterations, 1.0, 1.0))
+
+    def hidden(self, streams: Rows) -> NDArray[np.float32]:
+        """The inferred states (T, B, H) of streams (T, B, D)."""
+        return follow(self.network, at_rest(self.network, streams.shape[1]), *read(self.reader, streams)).hidden
+
+    def express(self, streams: Rows, cue: int) -> Rows:
+        senses, commands = read(self.reader, streams[:cue])
+        cued = follow(self.network, at_rest(self.network, streams.shape[1]), senses, commands)
+        rows = to_rows(self.reader, cued)
+        if cue == len(streams):
+            return rows
+        return np.concatenate([rows, to_rows(self.reader, run_on(self.network, cued.hidden[-1], len(streams) - cue))])
+
+
+def unassociated() -> Association:
+    """An association without units."""
+    return Association(*(np.zeros(shape, np.float32) for shape in association_shapes(1, 0, 0).values()))
+
+
+@dataclass(frozen=True)
+class Backpropagated:
+    """A recurrent network trained by backpropagation through time."""
+
+    reader: Senses
+    network: Any
+
+    @classmethod
+    def learned(
+        cls,
+        episodes: Sequence[Episode],
+        cell: str,
+        hidden: int,
+        rng: np.random.Generator,
+        updates: int,
+        noise: float = 0.3,
+        rate: float = 1e-2,
+    ) -> Backpropagated:
+        """From whole episodes; the other arguments are those of ``recurrent.train``."""
+        reader = Senses.fit(episodes[0].spec, [e.stream for e in episodes])
+        learned = trajectories(reader, episodes)
+        return cls(reader, recurrent.train(learned, cell, hidden, updates, rng, noise, rate))
+
+    def express(self, streams: Rows, cue: int) -> Rows:
+        senses, commands = recurrent.expected(self.network, *read(self.reader, streams), cue)
+        return to_rows(self.reader, Recalled(senses, commands, commands))
+
+
+@dataclass(frozen=True)
+class Hopfield:
+    """A modern continuous Hopfield network over windows of rows; it keeps every window it has seen.
+
+        ξ = Σ_i softmax_i(-½ β ‖q - k_i‖²) v_i      q the last rows, k_i those of a window, v_i the row that followed
+
+    The distance is the scaled dot product for keys whose lengths differ. Source: Ramsauer et al. 2021 (ICLR).
+    """
+
+    reader: Senses
+    keys: NDArray[np.float64]  # (N, window · D)
+    values: NDArray[np.float64]  # (N, D)
+    window: int
+    beta: float
+
+    @classmethod
+    def learned(cls, episodes: Sequence[Episode], window: int = 5, beta: float = 100.0) -> Hopfield:
+        """Every window of ``window`` rows, with what followed it; the first windows reach back before the episode."""
+        reader = Senses.fit(episodes[0].spec, [e.stream for e in episodes])
+        keys, values = [], []
+        for e in episodes:
+            rows = (e.stream - reader.mean) / reader.spread
+            padded = np.concatenate([np.zeros((window, rows.shape[1])), rows])
+            keys += [padded[t : t + window].ravel() for t in range(1, len(rows))]
+            values += list(rows[1:])
+        return cls(reader, np.array(keys), np.array(values), window, beta)
+
+    def retrieve(self, query: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What follows windows (B, window · D): (B, D)."""
+        size = self.values.shape[1]  # as a mean over channels, β means the same for any stream
+        distance = np.sum(query**2, 1)[:, None] + np.sum(self.keys**2, 1) - 2 * query @ self.keys.T
+        drive = -0.5 * self.beta * distance / size
+        share = np.exp(drive - drive.max(axis=1, keepdims=True))
+        found: NDArray[np.float64] = share @ self.values / share.sum(axis=1, keepdims=True)
+        return found
+
+    def express(self, streams: Rows, cue: int) -> Rows:
+        rows = (streams - self.reader.mean) / self.reader.spread  # (T, B, D)
+        past = np.zeros((self.window, *rows.shape[1:]))
+        made = np.zeros_like(rows)
+        for t in range(len(rows)):
+            made[t] = self.retrieve(past.transpose(1, 0, 2).reshape(rows.shape[1], -1)) if t else 0.0
+            past = np.concatenate([past[1:], rows[t][None] if t < cue else made[t][None]])
+        return np.asarray(self.reader.mean + self.reader.spread * made)
+
+
+@dataclass(frozen=True)
+class Library:
+    """Movement primitives, one a skill, and told which skill to express; only the hand is expressed."""
+
+    library: SkillLibrary
+    skills: tuple[str, ...]
+
+    @classmethod
+    def learned(cls, episodes: Sequence[Episode], skills: Sequence[str]) -> Library:
+        """From episodes that say their skill; ``skills`` are those of the streams that ``express`` will be given."""
+        return cls(SkillLibrary(episodes[0].spec).fit(episodes), tuple(skills))
+
+    def express(self, streams: Rows, cue: int) -> Rows:
+        library, made = self.library, np.full(streams.shape, np.nan)
+        state = library.start_model(streams.shape[1])
+        number = np.array([library.skills_.index(s) for s in self.skills])
+        state = state._replace(skill=number)
+        hand = [
+            i for n, s in library.spec.slices.items() if n.endswith("hand_position") for i in range(s.start, s.stop)
+        ]
+        for t in range(len(streams)):
+            made[t][:, hand] = state.place if t else streams[0][:, hand]
+            state, _, _ = library.predict(state, streams[t])
+        return made
+
+
+def mean_demonstrations(train: Sequence[Episode], dims: int) -> NDArray[np.float64]:
+    """(K, T, P) of the skills, in order of name."""
+    names = sorted({str(e.info["skill"]) for e in train})
+    return np.stack([np.mean([e.stream[:, :dims] for e in train if e.info["skill"] == n], axis=0) for n in names])
+
+
+def recalled(model: Expresser, tests: Sequence[Episode], means: NDArray[np.float64], cue: int) -> tuple[float, float]:
+    """Mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
+
+    Args:
+        tests: of one length.
+        means: (K, T, P) mean demonstration of each skill, in order of name.
+        cue: the whole length for online recall.
+    """
+    streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)  # (T, B, D)
+    dims, names = means.shape[2], sorted({str(e.info["skill"]) for e in tests})
+    first = cue if cue < len(streams) else 1
+    hand = model.express(streams, cue)[first:, :, :dims]  # (T', B, P)
+    error = np.linalg.norm(hand - streams[first:, :, :dims], axis=2).mean()
+    apart = np.linalg.norm(hand[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None], axis=3).mean(axis=0)
+    right = [names[k] == e.info["skill"] for k, e in zip(apart.argmin(axis=1), tests, strict=True)]
+    return float(error), float(np.mean(right))

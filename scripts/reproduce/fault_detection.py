@@ -1,0 +1,265 @@
+"""Fault detection: surprise across a whole repertoire, against a library that is told the right or the wrong skill.
+
+One Neural ASM learns all skills without labels and has one threshold. The library of movement primitives holds a skill
+each with the usual course of every sense, and has to be told which one is running: the right one, a wrong one, or the
+one that has matched best so far. Letters with slips of the pen, and robosuite skills with faults of body, actuators,
+sensors and actions. Each fault is compared with nominal episodes of its own skill in the same steps.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.console import Console
+
+from asm_gym.choices import check_choice
+from asm_gym.detection import conformal_episodes, conformal_threshold
+from asm_gym.episodes import Episode
+from asm_gym.evaluation.metrics import auroc
+from asm_gym.evaluation.plots import figure, look
+from asm_gym.evaluation.report import Table
+from asm_gym.faults.suite import KINDS, SEVERITIES
+from asm_gym.monitors import NeuralASM, make_monitor
+from asm_gym.scripts.dispatch import dispatch
+from asm_gym.scripts.progress import stage
+from asm_gym.scripts.reproduce.common import (
+    SKILLS,
+    Common,
+    Findings,
+    Record,
+    at_least_one,
+    over_seeds,
+    reproduce,
+    shown,
+    wide_enough,
+)
+from asm_gym.scripts.reproduce.handwriting import NAMES
+from asm_gym.scripts.reproduce.trials import Trial, robot_trial, written_trial
+from asm_gym.tasks import task as task_spec
+
+WAYS = {
+    "memory": "Neural ASM, told nothing",
+    "right": "library, told the right skill",
+    "best": "library, best match so far",
+    "wrong": "library, told a wrong skill",
+    "right+evidence": "library, right, our detection",
+    "wrong+evidence": "library, wrong, our detection",
+}
+WINDOW = 20
+"""Steps after its onset within which a fault is to be seen: 1 s in robosuite."""
+
+RATE = 0.05
+"""Share of nominal episodes that may raise an alarm."""
+
+
+@dataclass(frozen=True)
+class Args(Common):
+    """Surprise without selection against a library that needs it."""
+
+    letters: int = 8
+    """In the repertoire of handwriting."""
+    writings: int = 16
+    """Of each letter to learn from; as many more to calibrate on, and to judge."""
+    hidden: int = 128
+    """Hidden units."""
+    tasks: tuple[str, ...] = SKILLS
+    """Robosuite skills."""
+    robot_episodes: int = 30
+    """Of each robosuite skill to learn from, and half as many to calibrate on; 0 leaves them out."""
+    faults: tuple[str, ...] = ("push", "weak_joint", "encoder_bias", "wrist_bias", "action_delay")
+    """Kinds of fault."""
+    severity: str = "medium"
+    """How bad they are."""
+    faulty_episodes: int = 4
+    """Of each robosuite skill and kind."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 2 <= self.letters <= len(NAMES):
+            raise ValueError(f"to tell a wrong skill takes a repertoire of 2 to {len(NAMES)}, got {self.letters}")
+        for name in self.tasks:
+            task_spec(name)
+        for name in self.faults:
+            check_choice("kind of fault", name, KINDS)
+        check_choice("severity", self.severity, SEVERITIES)
+        if len(set(self.tasks)) < 2 or not self.faults:
+            raise ValueError("there must be at least two tasks and a kind of fault")
+        at_least_one("faulty_episodes", self.faulty_episodes)
+        needed = conformal_episodes(RATE)
+        for what, count in (("letters", self.letters * self.writings), ("tasks", self.robot_episodes)):
+            if 0 < (count if what == "letters" else len(self.tasks) * (count // 2)) < needed or count < 0:
+                raise ValueError(f"a false-alarm rate of {RATE} needs {needed} calibration episodes of {what}")
+        wide_enough(self.hidden, 4)
+
+    def scaled(self) -> Args:
+        """With ``quick``, letters only, and few of them."""
+        if not self.quick:
+            return self
+        return replace(self, seeds=min(self.seeds, 2), letters=3, writings=8, hidden=32, robot_episodes=0)
+
+
+Scores = list[NDArray[np.float64]]
+
+
+def told(monitor: Any, episodes: Sequence[Episode], skills: Sequence[str], how: str) -> Scores:
+    """The surprise of every step of each episode, with the skill that a library is told.
+
+    Args:
+        how: ``right``, ``wrong`` (the next one by name) or ``best``, at every step the one that has surprised least
+            up to then.
+    """
+    if how == "best":
+        each = [_as(monitor, episodes, [s] * len(episodes)) for s in skills]
+        return [_best(np.stack([own[n] for own in each])) for n in range(len(episodes))]
+    shift = 1 if how == "wrong" else 0
+    return _as(monitor, episodes, [skills[(skills.index(_skill(e)) + shift) % len(skills)] for e in episodes])
+
+
+def _as(monitor: Any, episodes: Sequence[Episode], names: Sequence[str]) -> Scores:
+    renamed = [replace(e, info={**e.info, "skill": n}) for e, n in zip(episodes, names, strict=True)]
+    return [s.value for s in monitor.score_episodes(renamed)]
+
+
+def _best(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T,) of (K, T): at each step the surprise of the skill whose mean surprise has been least so far."""
+    chosen = np.cumsum(values, axis=1).argmin(axis=0)
+    picked: NDArray[np.float64] = values[chosen, np.arange(values.shape[1])]
+    return picked
+
+
+def _skill(episode: Episode) -> str:
+    return str(episode.info["skill"])
+
+
+def judged(seed: int, trial: Trial, args: Args) -> tuple[list[Record], dict[str, Any]]:
+    """Every way of telling faults, on one domain; and the surprise in one faulty episode, for the figure."""
+    skills = sorted({_skill(e) for e in trial.fit})
+    spec = trial.fit[0].spec
+    hidden = args.hidden if trial.domain == "letters" else 2 * args.hidden
+    # With few rows a wide association would learn them by heart.
+    size = 960 if trial.domain == "robosuite" else 64
+    memory = NeuralASM(spec, hidden, size, iterations=10, seed=seed).fit(trial.fit)
+    library = make_monitor("skill_library", spec, seed=seed).fit(trial.fit)
+    evident = make_monitor("skill_library+evidence", spec, seed=seed).fit(trial.fit)
+    records: list[Record] = []
+    example: dict[str, Any] = {}
+    shown_one = next((n for n, (_, k, e) in enumerate(trial.faulty) if len(e) > k + WINDOW), 0)
+    for way in WAYS:
+        monitor = memory if way == "memory" else evident if way.endswith("+evidence") else library
+        how = "right" if way == "memory" else way.removesuffix("+evidence")
+        # Nobody who calibrates means to name the wrong skill.
+        before = told(monitor, trial.calibration, skills, "right" if how == "wrong" else how)
+        threshold = conformal_threshold(np.array([v.max() for v in before]), RATE)
+        nominal = told(monitor, trial.nominal, skills, how)
+        faulty = told(monitor, [e for _, _, e in trial.faulty], skills, how)
+        where = {"domain": trial.domain, "way": way, "seed": seed}
+        records += [{**where, "alarm": float(v.max() > threshold)} for v in nominal]
+        records += _found(trial, nominal, faulty, threshold, where)
+        example[way] = faulty[shown_one] / threshold
+    example["onset"] = trial.faulty[shown_one][1]
+    return records, example
+
+
+def _found(trial: Trial, nominal: Scores, faulty: Scores, threshold: float, where: Record) -> list[Record]:
+    """AUROC and detection of each faulty episode."""
+    records = []
+    for (kind, onset, episode), values in zip(trial.faulty, faulty, strict=True):
+        window = slice(onset, onset + WINDOW)
+        own = [
+            v[window].max()
+            for v, e in zip(nominal, trial.nominal, strict=True)
+            if _skill(e) == _skill(episode) and len(v) > onset
+        ]
+        if own:
+            # Already in alarm before anything happened is no detection.
+            raised = values[window].max() > threshold and not values[:onset].max(initial=0) > threshold
+            score = auroc([values[window].max()], own)
+            records.append({**where, "kind": kind, "auroc": score, "found": float(raised)})
+    return records
+
+
+def tables(records: Sequence[Record], args: Args) -> list[Table]:
+    """By domain, and by kind."""
+    made = []
+    for domain in dict.fromkeys(r["domain"] for r in records):
+        rows = [
+            (label, *(shown(records, v, domain=domain, way=way) for v in ("auroc", "found", "alarm")))
+            for way, label in WAYS.items()
+        ]
+        caption = f"{domain}: thresholds for {100 * RATE:g} % of nominal episodes; mean ± SD over seeds"
+        made.append(Table(caption, ("", "AUROC", "found within 20 steps", "nominal episodes in alarm"), rows))
+    if args.robot_episodes:
+        rows = [
+            (label, *(shown(records, "auroc", domain="robosuite", way=w, kind=k) for k in args.faults))
+            for w, label in WAYS.items()
+        ]
+        heads = ("", *(k.replace("_", " ") for k in args.faults))
+        made.append(Table(f"AUROC by kind of fault, {args.severity}", heads, rows))
+    return made
+
+
+def drawn(records: Sequence[Record], example: dict[str, Any]) -> Figure:
+    """AUROC, found and false alarms of each way; surprise over time in one episode."""
+    domains = list(dict.fromkeys(r["domain"] for r in records))
+    panels = (
+        ("auroc", "AUROC"),
+        ("found", "found, no alarm before"),
+        ("alarm", "false alarms"),
+    )
+    with figure(height=3.6, width=11) as fig:
+        axes = fig.subplots(1, 4, width_ratios=(1, 1, 1, 1.3))
+        for ax, (value, label) in zip(axes, panels, strict=False):
+            for i, domain in enumerate(domains):
+                mean, spread = np.array([over_seeds(records, value, domain=domain, way=w) for w in WAYS]).T
+                y = np.arange(len(WAYS)) + 0.38 * (i - (len(domains) - 1) / 2)
+                ax.barh(y, mean, 0.36, xerr=spread, color=look(i)[0], label=domain, error_kw={"linewidth": 1})
+            ax.set_yticks(range(len(WAYS)), list(WAYS.values()) if ax is axes[0] else [""] * len(WAYS))
+            ax.invert_yaxis()
+            ax.set(xlabel=label, xlim=(0.4 if value == "auroc" else 0, 1))
+        axes[1].legend(loc="lower right", fontsize=8)
+        for i, way in enumerate(("memory", "right", "wrong")):
+            axes[3].plot(example[way], color=look(i)[0], linestyle=look(i)[1], label=WAYS[way])
+        axes[3].axhline(1, color="#444444", linewidth=1)
+        axes[3].axvline(example["onset"], color="#e69f00", linewidth=1.5)
+        axes[3].set(yscale="log", xlabel="step", ylabel="surprise / threshold")
+        axes[3].set_ylim(top=30 * axes[3].get_ylim()[1])  # room for the legend
+        axes[3].set_title("one episode, fault at the line", fontsize=8)
+        axes[3].legend(fontsize=7, loc="upper right")
+    return fig
+
+
+def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+    """Letters for every seed, then robosuite."""
+    args = args.scaled()
+    with stage("letters", console, seconds) as progress:
+        found = dispatch(partial(_letters, args=args), list(args.repetitions), args.workers, progress)
+    if args.robot_episodes:
+        faults = args.faults, args.severity, args.faulty_episodes
+        trial = robot_trial(args, args.tasks, args.robot_episodes, *faults, console, seconds)
+        with stage("robosuite", console, seconds) as progress:
+            one = partial(judged, trial=trial, args=args)
+            found += dispatch(one, list(args.repetitions), args.workers, progress)
+    records = [r for own, _ in found for r in own]
+    example = found[-1][1]
+    facts = {"false_alarm_rate": RATE, "example": {k: np.asarray(v).tolist() for k, v in example.items()}}
+    return Findings(records, tables(records, args), drawn(records, example), facts)
+
+
+def _letters(seed: int, args: Args) -> tuple[list[Record], dict[str, Any]]:
+    return judged(seed, written_trial(seed, args.letters, args.writings), args)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the study, and returns the exit code."""
+    return reproduce("fault_detection", study, Args, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,62 @@
+"""Laws of speed and accuracy, fitted by least squares.
+
+    exponential   e = limit + gain exp(-n/τ)        n the time of inference; Fitts' law, n = a + b log2 1/(e - limit)
+    power         e = limit + gain n^-exponent
+    linear        e = start + slope v                     v the speed
+
+Sources: Fitts 1954 (J. Exp. Psychol. 47(6)); Wickelgren 1977 (Acta Psychologica 41(1)); Schmidt et al. 1979
+(Psychological Review 86(5)); Akaike 1974 for the comparison.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import curve_fit
+from scipy.stats import t as student
+
+
+class Fit(NamedTuple):
+    """A law fitted to points by least squares."""
+
+    law: str
+    names: tuple[str, ...]
+    values: tuple[float, ...]
+    low: tuple[float, ...]  # ends of the 95 % intervals
+    high: tuple[float, ...]
+    aic: float  # Akaike's criterion; the smaller, the better
+
+    @property
+    def text(self) -> str:
+        """Each parameter with its interval."""
+        parts = zip(self.names, self.values, self.low, self.high, strict=True)
+        return ", ".join(f"{n} = {v:.3g} ({lo:.3g} to {hi:.3g})" for n, v, lo, hi in parts)
+
+
+LAWS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
+    "exponential": (lambda n, limit, gain, tau: limit + gain * np.exp(-n / tau), ("limit", "gain", "τ")),
+    "power": (lambda n, limit, gain, slope: limit + gain * n**-slope, ("limit", "gain", "exponent")),
+    "linear": (lambda v, start, slope: start + slope * v, ("start", "slope")),
+}
+
+
+def fit(law: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> Fit | None:
+    """The law that is nearest to the points, with intervals from the curvature of the fit; None where there is none."""
+    function, names = LAWS[law]
+    guess = (
+        [y[0], 0.0] if law == "linear" else [float(y[-1]), float(y[0] - y[-1]), 5.0 if law == "exponential" else 1.0]
+    )
+    bounds = (-np.inf, np.inf) if law == "linear" else ([-np.inf, -np.inf, 1e-2], [np.inf, np.inf, 1e3])
+    try:
+        values, covariance = curve_fit(function, x, y, p0=guess, bounds=bounds, maxfev=20_000)
+    except RuntimeError:
+        return None
+    count, free = len(x), len(names)
+    residual = max(float(np.sum((y - function(x, *values)) ** 2)), 1e-300)
+    half = student.ppf(0.975, max(1, count - free)) * np.sqrt(np.diag(covariance))
+    aic = count * math.log(residual / count) + 2 * (free + 1)
+    return Fit(law, names, tuple(values), tuple(values - half), tuple(values + half), aic)

@@ -1,0 +1,274 @@
+"""Local learning: the Hebbian changes against the exact gradient of backpropagation through time, and what each costs.
+
+A memory learns letters by its local rules. On the way, with the weights held still, the local change summed along a
+batch is compared with two gradients of the same network: of the energy, and of the error of predicting the next row. An
+angle below 90° lowers what the gradient descends. Then the same network learns from the same letters by either, and the
+time and the memory of a change are measured, by length of the episode.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from asm_gym.evaluation.plots import figure
+from asm_gym.evaluation.report import Table
+from asm_gym.memory.inference import Weights
+from asm_gym.memory.learning import Batch, Learner, Schedule, Trajectory, batches, cosine_decay, side_by_side
+from asm_gym.memory.network import initial_weights
+from asm_gym.memory.senses import Senses
+from asm_gym.scripts.dispatch import dispatch
+from asm_gym.scripts.progress import stage
+from asm_gym.scripts.reproduce.common import (
+    Common,
+    Findings,
+    Record,
+    at_least_one,
+    over_seeds,
+    reproduce,
+    shown,
+    wide_enough,
+)
+from asm_gym.scripts.reproduce.curves import curve
+from asm_gym.scripts.reproduce.expression import trajectories
+from asm_gym.scripts.reproduce.gradients import COMPARED, Changes, cosine, exact, local
+from asm_gym.scripts.reproduce.handwriting import NAMES, copybook, repertoire
+
+TARGETS = {"energy": "gradient of the energy", "error": "gradient of the prediction error"}
+LENGTHS = (30, 60, 120)
+RATES = {"local": 1e-3, "backpropagation": 1e-2}
+"""Of a change per step, and of one per batch."""
+
+
+@dataclass(frozen=True)
+class Args(Common):
+    """Angles between local changes and exact gradients."""
+
+    skills: int = 8
+    """Letters."""
+    hidden: int = 64
+    """Hidden units."""
+    writings: int = 8
+    """Of each letter."""
+    epochs: int = 40
+    """Passes over them."""
+    iterations: tuple[int, ...] = (1, 5, 20, 60)
+    """Steps of inference at which angles are measured; the memory learns with 20."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.skills <= len(NAMES):
+            raise ValueError(f"a repertoire has 1 to {len(NAMES)} skills, got {self.skills}")
+        for name in ("writings", "epochs"):
+            at_least_one(name, getattr(self, name))
+        for count in (*self.iterations, len(self.iterations)):
+            at_least_one("iterations", count)
+        wide_enough(self.hidden, 4)
+
+    def scaled(self) -> Args:
+        """With ``quick``, little of everything."""
+        if not self.quick:
+            return self
+        return replace(self, seeds=min(self.seeds, 2), skills=2, hidden=16, writings=4, epochs=3, iterations=(5, 20))
+
+
+def usual(args: Args) -> int:
+    """Steps of inference at which angles are followed over learning."""
+    return 20 if 20 in args.iterations else max(args.iterations)
+
+
+def checkpoints(epochs: int) -> list[int]:
+    """Epochs before which angles are measured: dense at first."""
+    return sorted({0, *(round(epochs ** (k / 6)) for k in range(7)), epochs})
+
+
+def one_seed(seed: int, args: Args) -> list[Record]:
+    """Angles over learning, and the error that either way of learning reaches."""
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(seed)
+    letters = repertoire(args.skills, 2, rng)
+    train, tests = copybook(letters, args.writings, 2, rng), copybook(letters, 2, 2, rng)
+    reader = Senses.fit(train[0].spec, [e.stream for e in train])
+    learned, judged = trajectories(reader, train), side_by_side(trajectories(reader, tests))
+    weights = initial_weights(args.hidden, reader.size, 2, rng)
+    probe, start = side_by_side(learned[:: max(1, len(learned) // 16)]), Weights(*(w.copy() for w in weights))
+    records: list[Record] = []
+    measured = checkpoints(args.epochs)
+    learner = Learner(weights, Schedule(args.epochs, 16, RATES["local"], 20, 1.0, 1.0, 0.0), rng)
+    for epoch in range(args.epochs + 1):
+        if epoch in measured:
+            last = epoch == args.epochs
+            records += angles(weights, probe, args.iterations if last else (usual(args),), seed, epoch)
+            records.append(_reached("local", weights, judged, seed, epoch))
+        if epoch < args.epochs:
+            for batch in batches(learned, 16, rng):
+                learner.run(batch, cosine_decay(RATES["local"], epoch / args.epochs))
+    return records + backpropagated(start, learned, judged, args, seed)
+
+
+def angles(weights: Weights, probe: Batch, iterations: Sequence[int], seed: int, epoch: int) -> list[Record]:
+    """Cosines between the local change and both gradients, of all synapses and of each array."""
+    records = []
+    for count in iterations:
+        ours = local(weights, probe, count)
+        for target, theirs in exact(weights, probe, count).items():
+            where = {"seed": seed, "epoch": epoch, "iterations": count, "target": target}
+            for name in (*COMPARED, "all"):
+                value = cosine(ours, theirs, COMPARED if name == "all" else (name,))
+                records.append({**where, "array": name, "cosine": value, "degrees": math.degrees(math.acos(value))})
+    return records
+
+
+def backpropagated(
+    weights: Weights, learned: Sequence[Trajectory], judged: Batch, args: Args, seed: int
+) -> list[Record]:
+    """The same network, from the same weights, by Adam on the exact gradient of the prediction error."""
+    rng, records = np.random.default_rng(seed), []
+    W = {name: torch.from_numpy(getattr(weights, name)) for name in COMPARED}  # shares memory with the weights
+    adam = torch.optim.Adam(W.values(), RATES["backpropagation"])
+    for epoch in range(args.epochs + 1):
+        if epoch in checkpoints(args.epochs):
+            records.append(_reached("backpropagation", weights, judged, seed, epoch))
+        for group in adam.param_groups:
+            group["lr"] = cosine_decay(RATES["backpropagation"], epoch / args.epochs)
+        for batch in batches(learned, 16, rng) if epoch < args.epochs else ():
+            gradient = exact(weights, batch, 5, ("error",))["error"].arrays
+            for name, w in W.items():
+                w.grad = torch.from_numpy(-gradient[name].astype(np.float32))
+            adam.step()
+    return records
+
+
+def _reached(how: str, weights: Weights, judged: Batch, seed: int, epoch: int) -> Record:
+    """Mean squared error of a predicted number [variance of the stream]; inference as in learning."""
+    error = local(weights, judged, 20 if how == "local" else 5).error
+    return {"seed": seed, "epoch": epoch, "learned_by": how, "mse": 2 * error / judged.senses[:, 0].size}
+
+
+def costs(args: Args) -> list[Record]:
+    """Time and memory of one change, by length of the episode."""
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(args.seed)
+    weights, records = initial_weights(args.hidden, 4, 2, rng), []
+    for length in LENGTHS[:2] if args.quick else LENGTHS:
+        senses = rng.normal(size=(length, 16, 4)).astype(np.float32)
+        commands = rng.normal(size=(length, 16, 3)).astype(np.float32)
+        batch = Batch(senses, commands, np.full(length, 16))
+        ways: dict[str, Callable[[], Changes]] = {
+            "local": partial(local, weights, batch, 20),
+            "backpropagation": partial(_exact_error, weights, batch),
+        }
+        for how, change in ways.items():
+            saved, taken = change().saved, []
+            for _ in range(3):
+                since = time.perf_counter()
+                change()
+                taken.append(time.perf_counter() - since)
+            records.append({"seed": args.seed, "cost_of": how, "steps": length, "ms": 1e3 * min(taken), "bytes": saved})
+    return records
+
+
+def _exact_error(weights: Weights, batch: Batch) -> Changes:
+    return exact(weights, batch, 20, ("error",))["error"]
+
+
+def tables(records: Sequence[Record], args: Args) -> list[Table]:
+    """Angles over learning, by array, by iterations; errors; costs."""
+    epochs = checkpoints(args.epochs)
+
+    def angle(value: str = "degrees", **where: Any) -> str:
+        return shown(records, value, 0, **{"array": "all", "iterations": usual(args), **where})
+
+    heads = ("", *map(str, epochs))
+    return [
+        Table(
+            f"Angle [°] between the local change and the exact one, before so many epochs, {usual(args)} iterations; "
+            "mean ± SD over seeds",
+            heads,
+            [(label, *(angle(target=t, epoch=e) for e in epochs)) for t, label in TARGETS.items()],
+        ),
+        Table(
+            "Of each array, to the gradient of the energy",
+            heads,
+            [(n, *(angle(target="energy", array=n, epoch=e) for e in epochs)) for n in COMPARED],
+        ),
+        Table(
+            "By iterations, after learning",
+            ("", *map(str, args.iterations)),
+            [
+                (label, *(angle(target=t, epoch=args.epochs, iterations=k) for k in args.iterations))
+                for t, label in TARGETS.items()
+            ],
+        ),
+        Table(
+            "Mean squared error of the next row [variance], before so many epochs",
+            heads,
+            [(how, *(shown(records, "mse", 3, learned_by=how, epoch=e) for e in epochs)) for how in RATES],
+        ),
+        Table(
+            "A change along a batch of 16: time [ms] / kept for the way back [KiB], by steps",
+            ("", *(str(r["steps"]) for r in records if r.get("cost_of") == "local")),
+            [
+                (how, *(f"{r['ms']:.1f} / {r['bytes'] / 1024:.0f}" for r in records if r.get("cost_of") == how))
+                for how in RATES
+            ],
+        ),
+    ]
+
+
+def drawn(records: Sequence[Record], args: Args) -> Figure:
+    """Angles, errors, costs."""
+    epochs = checkpoints(args.epochs)
+    where = {"array": "all", "iterations": usual(args)}
+    with figure(height=3.0, width=11) as fig:
+        axes = fig.subplots(1, 4)
+        for i, (target, label) in enumerate(TARGETS.items()):
+            mean = [over_seeds(records, "degrees", target=target, epoch=e, **where) for e in epochs]
+            curve(axes[0], epochs, mean, i, label)
+            ends = {"target": target, "epoch": args.epochs, "array": "all"}
+            mean = [over_seeds(records, "degrees", **ends, iterations=k) for k in args.iterations]
+            curve(axes[1], args.iterations, mean, i, None)
+        for i, how in enumerate(RATES):
+            curve(axes[2], epochs, [over_seeds(records, "mse", learned_by=how, epoch=e) for e in epochs], i + 2, how)
+            own = [r for r in records if r.get("cost_of") == how]
+            curve(axes[3], [r["steps"] for r in own], [(r["bytes"] / 1024, 0.0) for r in own], i + 2, how)
+        axes[0].set(xlabel="epochs", ylabel="angle to the local change [°]", ylim=(0, 95), xscale="symlog")
+        axes[1].set(xlabel="iterations of inference", ylim=(0, 95), xscale="log")
+        axes[2].set(xlabel="epochs", ylabel="error of the next row [variance]", yscale="log", xscale="symlog")
+        axes[3].set(xlabel="steps of the episode", ylabel="kept for the way back [KiB]", yscale="log")
+        for ax in axes[:2]:
+            ax.axhline(90, color="#999999", linewidth=1)
+        for ax in (axes[0], axes[2]):
+            ax.set_xlim(0, 1.2 * args.epochs)
+        for ax, place in ((axes[0], "lower right"), (axes[2], "upper right"), (axes[3], "center right")):
+            ax.legend(fontsize=7, loc=place)
+    return fig
+
+
+def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+    """Every seed, then the costs."""
+    args = args.scaled()
+    with stage("learning both ways", console, seconds) as progress:
+        found = dispatch(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
+    with stage("measuring costs", console, seconds):
+        records = [r for own in found for r in own] + costs(args)
+    return Findings(records, tables(records, args), drawn(records, args), {"rates": RATES})
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the study, and returns the exit code."""
+    return reproduce("local_learning", study, Args, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

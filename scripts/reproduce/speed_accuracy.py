@@ -1,0 +1,283 @@
+"""Speed and accuracy: more inference, or slower movements, for more accuracy.
+
+One memory of letters is asked to recall, and to tell faulty writings from good ones, with 1 to 200 steps of inference
+for each row. The steps of this package are nearly as long as they can be and settle in a few; neurons integrate slowly,
+so steps a twentieth as long are asked for too. The error is fitted by two laws of the time that was taken, steps times
+their length: an exponential approach to a limit, as Fitts' law has it (n = a + b log2 1/e), and a power law. Another
+memory learns letters at several speeds and writes them at each: its error is fitted by the linear law of movements.
+
+Sources: Fitts 1954 (J. Exp. Psychol. 47(6)); Wickelgren 1977 (Acta Psychologica 41(1)) for the approach to a limit;
+Schmidt et al. 1979 (Psychological Review 86(5)) for error = a + b speed; Akaike 1974 for the comparison.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.console import Console
+
+from asm_gym.evaluation.metrics import auroc
+from asm_gym.evaluation.plots import figure, look
+from asm_gym.evaluation.report import Table
+from asm_gym.memory.network import Network
+from asm_gym.memory.recall import at_rest, follow
+from asm_gym.scripts.dispatch import dispatch
+from asm_gym.scripts.progress import stage
+from asm_gym.scripts.reproduce.common import (
+    Common,
+    Findings,
+    Record,
+    at_least_one,
+    over_seeds,
+    reproduce,
+    shown,
+    wide_enough,
+)
+from asm_gym.scripts.reproduce.curves import points
+from asm_gym.scripts.reproduce.expression import Memory, Rows, read
+from asm_gym.scripts.reproduce.handwriting import NAMES, NOISE, STEPS, Letter, copybook, repertoire, written
+from asm_gym.scripts.reproduce.laws import LAWS, Fit, fit
+
+CUE = 20
+SLIP = 5 * NOISE
+"""How far the pen slips in a faulty writing [cm], from one step to the next and for good."""
+
+WINDOW = 10
+"""Steps after its onset within which a slip is to be seen."""
+
+SHORTER = (20, 1)
+"""How many times shorter than this package's steps of inference are, the slow ones first."""
+
+MEASURES = {"recall_cm": "recalled, offline [cm]", "online_cm": "next row [cm]", "auroc": "slips told, AUROC"}
+
+
+@dataclass(frozen=True)
+class Args(Common):
+    """What accuracy costs."""
+
+    iterations: tuple[int, ...] = (1, 2, 3, 5, 8, 12, 20, 35, 60, 100, 200)
+    """Steps of inference."""
+    speeds: tuple[float, ...] = (0.6, 0.8, 1.0, 1.25, 1.6, 2.0)
+    """Of writing, times the usual one."""
+    skills: int = 4
+    """Letters."""
+    hidden: int = 64
+    """Hidden units."""
+    writings: int = 12
+    """Of each letter."""
+    steps: int = 16000
+    """In which the synapses change."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.skills <= len(NAMES):
+            raise ValueError(f"a repertoire has 1 to {len(NAMES)} skills, got {self.skills}")
+        for name in ("writings", "steps"):
+            at_least_one(name, getattr(self, name))
+        if len(set(self.iterations)) < 4 or min(self.iterations) < 1:
+            raise ValueError(f"a curve needs 4 different numbers of iterations, at least 1 each, got {self.iterations}")
+        if len(set(self.speeds)) < 3 or not all(0.2 <= s <= 4 for s in self.speeds):
+            raise ValueError(f"a line needs 3 different speeds from 0.2 to 4, got {self.speeds}")
+        wide_enough(self.hidden, 4)
+
+    def scaled(self) -> Args:
+        """With ``quick``, little of everything."""
+        if not self.quick:
+            return self
+        few = {"iterations": (1, 3, 8, 20, 60), "speeds": (0.8, 1.25, 2.0), "hidden": 32, "steps": 1500}
+        return replace(self, seeds=min(self.seeds, 2), skills=2, writings=4, **few)  # type: ignore[arg-type]
+
+
+def one_seed(seed: int, args: Args) -> list[Record]:
+    """Both questions, for one repertoire."""
+    rng = np.random.default_rng(seed)
+    letters = repertoire(args.skills, 2, rng)
+    return by_iterations(seed, letters, args, rng) + by_speed(seed, letters, args, rng)
+
+
+def by_iterations(seed: int, letters: Sequence[Letter], args: Args, rng: np.random.Generator) -> list[Record]:
+    """Recall, prediction, detection and time of one memory, by steps of inference."""
+    memory = Memory.learned(copybook(letters, args.writings, 2, rng), args.hidden, rng, args.steps, iterations=20)
+    rows = np.stack([e.stream for e in copybook(letters, 12, 2, rng)], axis=1).astype(np.float64)
+    slipped, onset = slips(rows, rng)
+    records = []
+    for count, shorter in product(args.iterations, SHORTER):
+        net = memory.network
+        asked = Memory(memory.reader, Network(net.weights, net.association, count, 1.0, 1.0))
+        asked.network.curvature *= shorter  # a step is as long as its inverse
+        hand, online = asked.express(rows, CUE)[CUE:, :, :2], asked.express(rows, len(rows))[1:, :, :2]
+        errors = [np.linalg.norm(h - rows[-len(h) :, :, :2], axis=2).mean() for h in (hand, online)]
+        records.append(
+            {
+                "seed": seed,
+                "iterations": count,
+                "shorter": shorter,
+                "recall_cm": float(errors[0]),
+                "online_cm": float(errors[1]),
+                "auroc": told_apart(asked, rows, slipped, onset),
+                "us": 1e6 * _seconds_a_row(asked, rows),
+            }
+        )
+    return records
+
+
+def slips(rows: Rows, rng: np.random.Generator) -> tuple[Rows, NDArray[np.intp]]:
+    """The same writings with a slip of the pen each, and the step it comes at (B,)."""
+    onset = rng.integers(CUE, len(rows) - WINDOW, rows.shape[1])
+    angle = rng.uniform(-math.pi, math.pi, rows.shape[1])
+    after = np.arange(len(rows))[:, None] >= onset
+    moved = rows.copy()
+    moved[:, :, 0] += SLIP * after * np.cos(angle)
+    moved[:, :, 1] += SLIP * after * np.sin(angle)
+    return moved, onset
+
+
+def told_apart(memory: Memory, rows: Rows, slipped: Rows, onset: NDArray[np.intp]) -> float:
+    """AUROC of the greatest surprise within the window, each slip against all good writings in the same steps."""
+    good, bad = (_surprise(memory, x) for x in (rows, slipped))
+    spread = good.std(axis=(0, 1))
+    good, bad = (np.sum((x / spread) ** 2, axis=2) for x in (good, bad))  # (T, B)
+    own = [auroc([bad[k : k + WINDOW, n].max()], good[k : k + WINDOW].max(axis=0)) for n, k in enumerate(onset)]
+    return float(np.mean(own))
+
+
+def _surprise(memory: Memory, rows: Rows) -> NDArray[np.float64]:
+    """(T, B, S) errors of the senses expected before they were read."""
+    senses, commands = read(memory.reader, rows)
+    expected = follow(memory.network, at_rest(memory.network, rows.shape[1]), senses, commands).senses
+    return (senses - expected).astype(np.float64)
+
+
+def _seconds_a_row(memory: Memory, rows: Rows) -> float:
+    senses, commands = read(memory.reader, rows[:, :1])
+    follow(memory.network, at_rest(memory.network, 1), senses, commands)
+    since = time.perf_counter()
+    for _ in range(5):
+        follow(memory.network, at_rest(memory.network, 1), senses, commands)
+    return (time.perf_counter() - since) / (5 * len(rows))
+
+
+def by_speed(seed: int, letters: Sequence[Letter], args: Args, rng: np.random.Generator) -> list[Record]:
+    """Where a memory of letters at all speeds has the hand at the end of one, after a third of it as a cue."""
+    each = max(2, args.writings // 3)
+    memory = Memory.learned(copybook(letters, each, 2, rng, args.speeds), args.hidden, rng, args.steps)
+    records = []
+    for speed in args.speeds:
+        tests = [written(letter, 2, rng, speed) for letter in letters for _ in range(8)]
+        rows = np.stack([e.stream for e in tests], axis=1).astype(np.float64)
+        hand = memory.express(rows, len(rows) // 3)[len(rows) // 3 :, :, :2]
+        errors = np.linalg.norm(hand - rows[-len(hand) :, :, :2], axis=2)
+        pace = float(np.linalg.norm(rows[:, :, 2:], axis=2).mean())
+        where = {"seed": seed, "speed": speed, "cm_per_s": pace}
+        records.append({**where, "end_cm": float(errors[-1].mean()), "path_cm": float(errors.mean())})
+    return records
+
+
+def fits(records: Sequence[Record]) -> dict[tuple[str, str], Fit]:
+    """Each law that could be fitted to each measure, over all seeds."""
+    found = {}
+    for value in MEASURES:
+        timed = [{**r, "time": r["iterations"] / r["shorter"]} for r in records if value in r]
+        for law in ("exponential", "power"):
+            if (one := fit(law, *_within_seeds(timed, "time", value))) is not None:
+                found[value, law] = one
+    for value in ("end_cm", "path_cm"):
+        if (one := fit("linear", *_within_seeds([r for r in records if value in r], "cm_per_s", value))) is not None:
+            found[value, "linear"] = one
+    return found
+
+
+def _within_seeds(records: Sequence[Record], x: str, y: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points, each seed's moved to the mean of all: how hard its letters are is no noise of the law."""
+    seed, xs, ys = (np.array([r[k] for r in records], np.float64) for k in ("seed", x, y))
+    for s in np.unique(seed):
+        ys[seed == s] += np.mean([r[y] for r in records]) - ys[seed == s].mean()
+    return xs, ys
+
+
+def tables(records: Sequence[Record], args: Args) -> list[Table]:
+    """By iterations, by speed, and the laws."""
+    labels = {**MEASURES, "us": "time a row [µs]"}
+    return [
+        Table(
+            f"By steps of inference, {args.skills} letters, cue of {CUE}; mean ± SD over seeds",
+            ("", *map(str, args.iterations)),
+            [
+                (
+                    label + (", long steps" if shorter == 1 else ""),
+                    *(shown(records, v, 0 if v == "us" else 3, iterations=k, shorter=shorter) for k in args.iterations),
+                )
+                for shorter in SHORTER
+                for v, label in labels.items()
+                if v != "us" or shorter == 1
+            ],
+        ),
+        Table(
+            "By speed of writing, cue of a third",
+            ("", *(f"{s:g}×" for s in args.speeds)),
+            [
+                (label, *(shown(records, v, speed=s) for s in args.speeds))
+                for v, label in {"end_cm": "end point [cm]", "path_cm": "path [cm]"}.items()
+            ],
+        ),
+        Table(
+            "Laws, with 95 % intervals",
+            ("", "law", "parameters", "AIC"),
+            [(v, law, one.text, f"{one.aic:.1f}") for (v, law), one in fits(records).items()],
+        ),
+    ]
+
+
+def drawn(records: Sequence[Record], args: Args) -> Figure:
+    """Each measure by steps of inference with its laws, and error by speed."""
+    laws = fits(records)
+    with figure(height=3.0, width=11) as fig:
+        axes = fig.subplots(1, 4)
+        for ax, (value, label) in zip(axes, MEASURES.items(), strict=False):
+            for i, shorter in enumerate(SHORTER):
+                found = [over_seeds(records, value, iterations=k, shorter=shorter) for k in args.iterations]
+                time = [k / shorter for k in args.iterations]
+                points(ax, time, found, 3 * i, "long steps" if shorter == 1 else f"steps 1/{shorter} as long")
+            x = np.geomspace(min(args.iterations) / max(SHORTER), max(args.iterations), 200)
+            for i, law in enumerate(("exponential", "power")):
+                if (one := laws.get((value, law))) is not None:
+                    ax.plot(x, LAWS[law][0](x, *one.values), color=look(i + 1)[0], linestyle=look(i + 1)[1], label=law)
+            ax.set(xlabel="time of inference [long steps]", ylabel=label, xscale="log")
+        for i, (value, label) in enumerate((("end_cm", "end point"), ("path_cm", "path"))):
+            pace = [over_seeds(records, "cm_per_s", speed=s)[0] for s in args.speeds]
+            points(axes[3], pace, [over_seeds(records, value, speed=s) for s in args.speeds], i, label)
+            if (line := laws.get((value, "linear"))) is not None:
+                ends = np.array([min(pace), max(pace)])
+                axes[3].plot(ends, LAWS["linear"][0](ends, *line.values), color=look(i)[0], linewidth=1)
+        axes[3].set(xlabel="mean speed [cm/s]", ylabel="recalled, offline [cm]", ylim=0)
+        for ax in (axes[1], axes[3]):
+            ax.legend(fontsize=7)
+    return fig
+
+
+def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+    """Every seed."""
+    args = args.scaled()
+    with stage("learning letters", console, seconds) as progress:
+        found = dispatch(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
+    records = [r for own in found for r in own]
+    laws = {f"{value}, {law}": one._asdict() for (value, law), one in fits(records).items()}
+    return Findings(records, tables(records, args), drawn(records, args), {"laws": laws, "letter_steps": STEPS})
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the study, and returns the exit code."""
+    return reproduce("speed_accuracy", study, Args, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

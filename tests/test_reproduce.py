@@ -1,0 +1,332 @@
+"""The studies: their instruments against oracles, the direction of each claim on small data, and every quick run."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from asm_gym.memory.inference import Weights
+from asm_gym.memory.learning import Batch
+from asm_gym.memory.network import initial_weights
+from asm_gym.scripts.cli import main as cli
+from asm_gym.scripts.reproduce import (
+    STUDIES,
+    contextual_inference,
+    fault_detection,
+    memorise_and_recall,
+    speed_accuracy,
+)
+from asm_gym.scripts.reproduce.common import Common, over_seeds, shown
+from asm_gym.scripts.reproduce.expression import (
+    Backpropagated,
+    Hopfield,
+    Library,
+    Memory,
+    mean_demonstrations,
+    recalled,
+)
+from asm_gym.scripts.reproduce.gradients import COMPARED, TARGETS, cosine, exact, local
+from asm_gym.scripts.reproduce.handwriting import (
+    DT,
+    NOISE,
+    STEPS,
+    Letter,
+    Stroke,
+    branching,
+    chosen,
+    copybook,
+    detoured,
+    repertoire,
+    velocity,
+    written,
+)
+from asm_gym.scripts.reproduce.laws import LAWS, fit
+from asm_gym.scripts.reproduce.trials import written_trial
+
+STROKE = Stroke(length=4.0, direction=0.3, turn=1.5, rise=0.0, onset=-0.05, sigma=0.3)
+
+
+def test_a_stroke_ends_at_its_chord():
+    time = (np.arange(200_000) + 0.5) * 2e-5
+    end = (velocity(Letter("a", (STROKE,)), time) * 2e-5).sum(axis=0)
+    # ∫_0^1 exp(i (θ + Δθ u)) du = (exp(i (θ + Δθ)) - exp(i θ)) / (i Δθ)
+    chord = 4.0 * (np.exp(1j * 1.8) - np.exp(1j * 0.3)) / (1j * 1.5)
+    np.testing.assert_allclose(end, [chord.real, chord.imag, 0.0], atol=1e-3)
+
+
+def test_a_stroke_is_fastest_at_the_mode_of_its_lognormal():
+    time = np.linspace(0.01, 1.0, 100_000)
+    speed = np.linalg.norm(velocity(Letter("a", (STROKE,)), time), axis=1)
+    assert time[speed.argmax()] == pytest.approx(-0.05 + math.exp(-1.75 - 0.3**2), abs=1e-4)
+
+
+def test_the_pen_goes_where_its_commands_take_it():
+    episode = written(repertoire(1, 3, np.random.default_rng(0))[0], 3, np.random.default_rng(1))
+    gone = episode.stream[:, :3] - np.cumsum(episode.stream[:, 3:], axis=0) * DT
+    assert episode.stream.shape == (STEPS, 6)
+    assert gone.std() == pytest.approx(NOISE, rel=0.2)
+
+
+def test_writing_twice_as_fast_goes_the_same_way_in_half_the_steps():
+    letter = repertoire(1, 2, np.random.default_rng(0))[0]
+    slow, fast = (written(letter, 2, np.random.default_rng(1), speed, wobble=0.0) for speed in (1.0, 2.0))
+    assert len(fast) == len(slow) / 2
+    np.testing.assert_allclose(fast.stream[:, :2], slow.stream[1::2, :2], atol=6 * NOISE)
+    np.testing.assert_allclose(fast.stream[:, 2:], slow.stream[::2, 2:] + slow.stream[1::2, 2:], atol=0.05)  # [cm/s]
+
+
+def test_pairs_begin_alike_or_have_one_middle():
+    rng = np.random.default_rng(0)
+    letter = repertoire(1, 2, rng)[0]
+    letter = replace(letter, strokes=(STROKE, *letter.strokes[1:]))
+    time = np.arange(4000) / 4000
+    paths = [
+        np.cumsum(velocity(x, time), axis=0) / 4000
+        for x in (letter, branching(letter, "b", 2, rng), detoured(letter, "c", rng))
+    ]
+    begun, detour = (np.linalg.norm(p - paths[0], axis=1) for p in paths[1:])
+    assert begun[: int(0.3 * 4000)].max() < 0.05
+    assert begun[-1] > 1.0
+    assert detour[: int(0.3 * 4000)].max() > 0.3
+    assert detour[int(0.45 * 4000) : int(0.5 * 4000)].max() < 0.1
+    assert detour[-1] > 1.0
+
+
+def letters_of(count: int, each: int = 6, seed: int = 0) -> tuple[list, list]:
+    rng = np.random.default_rng(seed)
+    letters = repertoire(count, 2, rng)
+    return copybook(letters, each, 2, rng), copybook(letters, 3, 2, rng)
+
+
+def test_a_hopfield_network_completes_what_it_has_stored():
+    train, _ = letters_of(3, each=1)
+    streams = np.stack([e.stream for e in train], axis=1).astype(np.float64)
+    made = Hopfield.learned(train, beta=1e5).express(streams, 10)
+    np.testing.assert_allclose(made[1:], streams[1:], atol=1e-4)
+
+
+def test_a_cold_hopfield_network_answers_with_the_mean():
+    train, _ = letters_of(2)
+    hopfield = Hopfield.learned(train, beta=0.0)
+    np.testing.assert_allclose(hopfield.retrieve(np.ones((1, 20)))[0], hopfield.values.mean(axis=0), atol=1e-9)
+
+
+def test_a_recurrent_rival_offline_reads_its_own_predictions():
+    train, tests = letters_of(2)
+    model = Backpropagated.learned(train, "gru", 16, np.random.default_rng(0), updates=5)
+    streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)
+    offline = model.express(streams, 20)
+    np.testing.assert_allclose(offline[:20], model.express(streams, STEPS)[:20], atol=1e-5)
+    np.testing.assert_array_equal(
+        offline, model.express(np.where(np.arange(STEPS)[:, None, None] < 20, streams, 9.0), 20)
+    )
+
+
+def test_the_library_is_told_and_expresses_another_skill_when_told_another():
+    train, tests = letters_of(2)
+    skills = [str(e.info["skill"]) for e in tests]
+    means = mean_demonstrations(train, 2)
+    right = recalled(Library.learned(train, skills), tests, means, 20)
+    wrong = recalled(Library.learned(train, skills[::-1]), tests, means, 20)
+    assert right[1] == 1.0
+    assert wrong[1] == 0.0
+    assert right[0] < 0.5 * wrong[0]
+
+
+def test_the_memory_recalls_each_letter_from_its_cue():
+    train, tests = letters_of(2, each=8)
+    memory = Memory.learned(train, 32, np.random.default_rng(0), 4000)
+    error, right = recalled(memory, tests, mean_demonstrations(train, 2), 20)
+    streams = np.stack([e.stream for e in tests], axis=1)
+    still = np.linalg.norm(streams[20:, :, :2] - streams[19, :, :2], axis=2).mean()
+    assert right >= 5 / 6
+    assert error < 0.5 * still
+
+
+def small_batch(steps: int, seed: int = 0) -> tuple[Weights, Batch]:
+    rng = np.random.default_rng(seed)
+    senses, commands = (rng.normal(size=(steps, 4, n)).astype(np.float32) for n in (5, 3))
+    return initial_weights(7, 5, 2, rng), Batch(senses, commands, np.full(steps, 4))
+
+
+def test_the_differentiated_network_has_the_energy_of_the_memory():
+    weights, batch = small_batch(6)
+    ours, theirs = local(weights, batch, 15), exact(weights, batch, 15)
+    for target in TARGETS:
+        assert theirs[target].energy == pytest.approx(ours.energy, rel=1e-4)
+        assert theirs[target].error == pytest.approx(ours.error, rel=1e-4)
+
+
+def test_of_one_step_at_converged_inference_the_local_change_is_the_exact_gradient():
+    weights, batch = small_batch(1)
+    ours, theirs = local(weights, batch, 400), exact(weights, batch, 400)["energy"]
+    for name in COMPARED:
+        # W_H has nothing before it at the first step, and changes nothing.
+        np.testing.assert_allclose(ours.arrays[name], theirs.arrays[name], atol=2e-4)
+
+
+def test_the_exact_gradient_is_that_of_finite_differences():
+    weights, batch = small_batch(4)
+    gradient = exact(weights, batch, 8)
+    for name, index in (("W_H", (2, 3)), ("W_F", (1, 4)), ("W_U", (0, 2)), ("b_F", (3,))):
+        ends = []
+        for step in (0.02, -0.02):
+            moved = getattr(weights, name).copy()
+            moved[index] += step
+            ends.append(local(weights._replace(**{name: moved}), batch, 8).error)
+        assert -gradient["error"].arrays[name][index] == pytest.approx((ends[0] - ends[1]) / 0.04, rel=0.05, abs=0.02)
+
+
+def test_along_an_episode_the_local_change_lowers_both_but_is_not_their_gradient():
+    weights, batch = small_batch(20)
+    ours, theirs = local(weights, batch, 50), exact(weights, batch, 50)
+    for target in TARGETS:
+        assert 0.2 < cosine(ours, theirs[target]) < 0.999
+    assert cosine(ours, ours) == pytest.approx(1.0)
+    assert exact(weights, batch, 5, ("error",))["error"].saved > 100 * ours.saved
+
+
+@pytest.mark.parametrize(
+    ("law", "true"),
+    [("exponential", (0.4, 1.5, 6.0)), ("power", (0.2, 2.0, 0.7)), ("linear", (0.5, 0.3))],
+)
+def test_a_law_is_found_again_within_its_intervals(law, true):
+    x = np.repeat([1.0, 2, 4, 8, 16, 32, 64, 128], 4)
+    y = LAWS[law][0](x, *true) + 0.01 * np.random.default_rng(0).normal(size=len(x))
+    found = fit(law, x, y)
+    np.testing.assert_allclose(found.values, true, rtol=0.15)
+    # Within twice the 95 % interval, which chance leaves once in ten thousand times.
+    assert all(abs(v - t) <= hi - lo for v, t, lo, hi in zip(found.values, true, found.low, found.high, strict=True))
+    if law != "linear":
+        other = fit({"exponential": "power", "power": "exponential"}[law], x, y)
+        assert found.aic < other.aic
+
+
+def test_more_inference_predicts_the_next_row_better():
+    args = speed_accuracy.Args(skills=2, hidden=32, writings=4, steps=2000, iterations=(1, 5, 30, 200))
+    rng = np.random.default_rng(0)
+    records = speed_accuracy.by_iterations(0, repertoire(2, 2, rng), args, rng)
+    slow = [r["online_cm"] for r in records if r["shorter"] == speed_accuracy.SHORTER[0]]
+    assert slow[0] > 1.1 * slow[-1]
+
+
+def test_a_slip_is_one_of_so_many_centimetres_from_its_onset_on():
+    rows = np.zeros((STEPS, 5, 4))
+    moved, onset = speed_accuracy.slips(rows, np.random.default_rng(0))
+    for n, k in enumerate(onset):
+        assert not moved[:k, n].any()
+        np.testing.assert_allclose(np.linalg.norm(moved[k:, n, :2], axis=1), speed_accuracy.SLIP)
+    assert not moved[:, :, 2:].any()
+
+
+def test_the_state_tells_a_pair_apart_only_once_it_has_parted():
+    args = contextual_inference.Args(skills=("a", "c"), repertoire=4, hidden=32, writings=8, steps=1500)
+    records, _ = contextual_inference.one_seed(0, args)
+    right = {r["step"]: r["right"] for r in records if (r["how"], r["source"]) == ("named", "state")}
+    assert np.mean([right[t] for t in range(40, 60)]) > 0.9
+    assert np.mean([right[t] for t in range(3, 15)]) < 0.8
+
+
+def test_a_library_told_a_wrong_skill_is_always_in_alarm_and_the_memory_needs_none():
+    args = fault_detection.Args(letters=3, writings=8, hidden=32)
+    records, _ = fault_detection.judged(0, written_trial(0, 3, 8), args)
+    alarms = {way: over_seeds(records, "alarm", way=way)[0] for way in fault_detection.WAYS}
+    assert alarms["wrong"] == 1.0
+    assert alarms["memory"] < 0.35
+    assert alarms["right"] < 0.35
+    scores = {way: over_seeds(records, "auroc", way=way)[0] for way in fault_detection.WAYS}
+    assert scores["memory"] > max(0.75, scores["wrong"] + 0.1, scores["right"] + 0.1)
+
+
+def test_spread_is_over_seeds_and_not_over_measurements():
+    records = [{"seed": s, "x": x, "kind": "a"} for s, xs in enumerate([(1, 3), (5, 7)]) for x in xs]
+    assert over_seeds(records, "x", kind="a") == pytest.approx((4.0, math.sqrt(8)))
+    assert shown(records, "x", 1, kind="a") == "4.0 ± 2.8"
+    assert shown(records, "x", kind="b") == ""
+
+
+@pytest.mark.parametrize(
+    ("study", "arguments", "message"),
+    [
+        ("memorise_and_recall", ["--cues", "60"], "shorter than the letter, 1 to 59 steps, got 60"),
+        ("memorise_and_recall", ["--repertoires", "0"], "1 to 16 skills, got 0"),
+        ("memorise_and_recall", ["--hidden", "3"], "at least the number of channels, 6, got 3"),
+        ("memorise_and_recall", ["--robot-hidden", "20"], "at least the number of channels, 75, got 20"),
+        ("memorise_and_recall", ["--seeds", "0"], "seeds must be at least 1, got 0"),
+        ("contextual_inference", ["--skills", "a", "zebra"], "unknown skill 'zebra'; known: a, b, c"),
+        ("contextual_inference", ["--skills", "a"], "two skills at least.*got a"),
+        ("contextual_inference", ["--repertoire", "0"], "2 to 16 skills here, got 0"),
+        ("local_learning", ["--skills", "0"], "1 to 16 skills, got 0"),
+        ("local_learning", ["--hidden", "1"], "at least the number of channels, 4, got 1"),
+        ("speed_accuracy", ["--iterations", "1", "2"], "needs 4 different numbers of iterations"),
+        ("speed_accuracy", ["--speeds", "1", "2", "9"], "3 different speeds from 0.2 to 4"),
+        ("fault_detection", ["--faults", "gremlin"], "unknown kind of fault 'gremlin'; known: push"),
+        ("fault_detection", ["--tasks", "Juggle", "Lift"], "Juggle.*Lift"),
+        ("fault_detection", ["--letters", "1"], "a repertoire of 2 to 16, got 1"),
+        ("fault_detection", ["--robot-episodes", "2"], "needs 19 calibration episodes"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_words(study, arguments, message, capsys, tmp_path):
+    with pytest.raises(SystemExit, match="2"):
+        cli(["reproduce", study, *arguments, "--out", str(tmp_path)])
+    said = re.sub(r"[\s│╭╮╰╯─|-]+", " ", capsys.readouterr().err)  # it is printed in a box
+    assert re.search(message, said), said
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unknown_study_is_refused_with_those_that_exist(capsys):
+    assert cli(["reproduce", "everything"]) == 2
+    assert "unknown study 'everything'; the studies are all, memorise_and_recall" in capsys.readouterr().err
+    assert cli(["reproduce", "--help"]) == 0
+    said = capsys.readouterr().out
+    assert all(study in said for study in STUDIES)
+
+
+def test_a_skill_that_the_repertoire_lacks_is_named():
+    with pytest.raises(ValueError, match="unknown skill 'z'; known: a, b"):
+        chosen(repertoire(2, 2, np.random.default_rng(0)), ["z"])
+
+
+def test_arguments_that_all_studies_share_are_checked():
+    with pytest.raises(ValueError, match="workers must be at least 1, got 0"):
+        Common(workers=0)
+    with pytest.raises(ValueError, match="seed must be at least 0, got -1"):
+        Common(seed=-1)
+    with pytest.raises(ValueError, match="cue must be shorter"):
+        memorise_and_recall.Args(cues=(10, STEPS))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("study", STUDIES)
+def test_every_study_runs_from_end_to_end(study, tmp_path, capsys):
+    assert cli(["reproduce", study, "--quick", "--workers", "1", "--seed", "3", "--out", str(tmp_path)]) == 0
+    assert {p.name for p in tmp_path.iterdir()} == {f"{study}.{e}" for e in ("png", "svg", "csv", "md", "json")}
+    kept = json.loads((tmp_path / f"{study}.json").read_text())
+    assert kept["seed"] == 3
+    assert kept["versions"].keys() >= {"asm_gym", "numpy", "torch"}
+    with (tmp_path / f"{study}.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert {r["seed"] for r in rows} >= {"3", "4"}
+    assert "±" in (tmp_path / f"{study}.md").read_text()
+    assert "±" in capsys.readouterr().out
+    assert (tmp_path / f"{study}.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_numbers(tmp_path):
+    runs = []
+    for folder in ("a", "b"):
+        where = ["--workers", "1", "--out", str(tmp_path / folder)]
+        assert cli(["reproduce", "contextual_inference", "--quick", *where]) == 0
+        with (tmp_path / folder / "contextual_inference.csv").open(encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        runs.append({seed: np.array([float(r["right"]) for r in rows if r["seed"] == seed]) for seed in "01"})
+    # To rounding, which depends on where arrays lie in memory, and can turn a close decision.
+    again, other = np.abs(runs[0]["0"] - runs[1]["0"]).mean(), np.abs(runs[0]["0"] - runs[0]["1"]).mean()
+    assert again < 0.1 * other
