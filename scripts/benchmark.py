@@ -22,12 +22,9 @@ from rich.table import Table
 
 import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
-from asm_gym.evaluation.metrics import Share
-from asm_gym.policies.registry import EXPERTS
+from asm_gym.scripts.benchmark_experts import Experts
 from asm_gym.scripts.benchmark_fit import Fit
 from asm_gym.scripts.benchmark_memory import Memory, Safety
-from asm_gym.scripts.collect import collect
-from asm_gym.scripts.progress import stage
 from asm_gym.tasks import task as task_spec
 
 
@@ -175,46 +172,6 @@ class Leaks:
         growth = sizes[-1] / sizes[min(1, len(sizes) - 1)] - 1
         console.print(f"  growth since the second: {100 * growth:+.1f} %")
         return int(growth > 0.05)
-
-
-@dataclass
-class Experts:
-    """How often each scripted expert succeeds."""
-
-    tasks: tuple[str, ...] = tuple(EXPERTS)
-    """names of tasks"""
-    robot: str = "Panda"
-    """the arm"""
-    episodes: int = 100
-    """of each"""
-    workers: int = 2
-    """processes"""
-    seed: int = 0
-    """of the episodes"""
-
-    def run(self, console: Console) -> int:
-        """Prints a row for each task."""
-        table = Table(title=f"scripted experts, {self.robot}")
-        for column in ("task", "solved", "95 %", "at the end", "time [s]"):
-            table.add_column(column, justify="left" if column == "task" else "right", no_wrap=True)
-        for name in self.tasks:
-            bar = f"{name}, {self.robot}"
-            with stage(bar, console, {}) as progress:
-                episodes = collect(
-                    f"asm_gym/{name}-v0", "scripted", self.episodes, self.seed, self.workers,
-                    progress=progress, robot=self.robot, reward_shaping=False,
-                )  # fmt: skip
-            solved = [e.rewards > 0.999 for e in episodes]  # the sparse reward, whole in every step that is solved
-            share = Share.of([bool(s.any()) for s in solved])
-            low, high = share.interval
-            times = [float(np.argmax(s) + 1) * e.spec.dt for s, e in zip(solved, episodes, strict=True) if s.any()]
-            last = Share.of([bool(s[-1]) for s in solved])
-            time_s = f"{np.median(times):.1f}" if times else ""
-            table.add_row(
-                name, f"{share.k} of {share.n}", f"{100 * low:.0f} to {100 * high:.0f} %", f"{last.k}", time_s
-            )
-        console.print(table)
-        return 0
 
 
 def _resident() -> float:

@@ -24,7 +24,7 @@ COMMANDS: dict[str, Command] = {
     "evaluate": Command("asm_gym.scripts.evaluate", "tasks x monitors x faults: who notices what, with a report"),
     "repertoire": Command("asm_gym.scripts.repertoire", "one memory of all skills against one for each, over seeds"),
     "react": Command("asm_gym.scripts.react", "reflexes x faults: what acting on alarms is worth, paired by seed"),
-    "benchmark": Command("asm_gym.scripts.benchmark", "speeds, as ratios against rivals in the same run"),
+    "benchmark": Command("asm_gym.scripts.benchmark", "speeds, as ratios against rivals in the same run, and experts"),
     "doctor": Command("asm_gym.scripts.doctor", "what this machine lacks, and the command that installs it"),
 }
 

@@ -7,6 +7,7 @@ import torch
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.gru import GRU
 from asm_gym.scripts.benchmark import main
+from asm_gym.scripts.benchmark_experts import Attempt, _row, attempt
 from asm_gym.scripts.benchmark_fit import errors
 from asm_gym.scripts.benchmark_memory import PlainTorch, synthetic
 
@@ -41,3 +42,29 @@ def test_errors_of_both_learners_are_those_their_surprise_is_made_of():
         assert np.all(ratio > 0)
         assert off.shape == (len(episodes[-1]) - 2, 10)
     assert main(["fit", "--tasks", "Lift", "--episodes", "5"]) == 0
+
+
+def test_an_attempt_says_what_the_episode_was():
+    made = attempt(3, "Lift", "Panda")
+    assert made.solved
+    assert made.held
+    assert 20 < made.steps < 100
+    assert 1 < made.force < 40
+    assert attempt(3, "Lift", "Panda") == made
+
+
+def test_a_row_counts_what_was_solved_held_and_how_long_it_took():
+    row = _row([Attempt(True, True, 10, 1.0), Attempt(True, False, 20, 2.0), Attempt(False, False, 100, 9.0)])
+    assert row[0] == "2 of 3"
+    assert row[2:] == ("1", "15", "2")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["--tasks", "Lit"], "Lift"), (["--robots", "Pandas"], "Panda"), (["--episodes", "0"], "0")],
+)
+def test_experts_refuse_what_they_do_not_know(arguments, message, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["experts", *arguments])
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err

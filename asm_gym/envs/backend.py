@@ -102,6 +102,19 @@ def _configuration(controller: str | dict[str, Any], robot: str) -> dict[str, An
     return configuration
 
 
+def free_first_joints(env: Any) -> None:
+    """Lets every Sawyer turn in its base, once a model is loaded.
+
+    Robosuite's Sawyer touches its own base with its shoulder, to within rounding (1e-16 m): where that makes a contact,
+    which depends on the pose, its friction holds the first joint against 20 N m and more.
+    """
+    model = env.sim.model
+    for robot in env.robots:
+        if robot.name == "Sawyer":
+            shoulder = model.geom_name2id(f"{robot.robot_model.naming_prefix}link0_collision")
+            model.geom_contype[shoulder] = model.geom_conaffinity[shoulder] = 0
+
+
 def reseed(env: Any, rng: np.random.Generator) -> None:
     """Seeds the generator that all of robosuite's randomness comes from."""
     # In place: placement samplers hold the generator itself.

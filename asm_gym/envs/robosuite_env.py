@@ -145,6 +145,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
     def _bind(self) -> None:
         """Takes up what belongs to the present model, which a hard reset replaces."""
+        backend.free_first_joints(self.robosuite_env)
         self.simulation = Simulation(self.robosuite_env, self.substeps)
         """Physics, controllers and sensors of the loaded model."""
         self._objects = backend.ObjectSensors(self.robosuite_env, self.task)

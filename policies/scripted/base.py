@@ -15,6 +15,7 @@ Vector = NDArray[np.float64]
 # What one unit of action moves the hand's set-point by, in robosuite's OSC_POSE: 5 cm, 0.5 rad.
 _METRES, _RADIANS = 0.05, 0.5
 OPEN, CLOSE = -1.0, 1.0
+_STILL = 0.1  # below this a gripper's joints have come to rest [rad/s]
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,20 @@ class ObservationReader:
     def __call__(self, observation: Any, name: str) -> Vector:
         part = observation[self._slices[name]] if self._flat else observation[name]
         return np.asarray(part, dtype=np.float64)
+
+
+def has_settled(velocity: Vector, since: int, usual: int) -> bool:
+    """Whether fingers that were told to close or open ``since`` steps ago have done so.
+
+    Args:
+        velocity: of the gripper's joints.
+        since: control steps.
+        usual: how many steps fingers that slide take. Those that turn, in linkages, take several times as long, more
+            where they close on little, and are waited for until they stand still.
+    """
+    if velocity.size <= 2:
+        return since >= usual
+    return (since >= 2 * usual and float(np.abs(velocity).max()) < _STILL) or since >= 5 * usual
 
 
 def rotation(columns: Vector) -> Vector:

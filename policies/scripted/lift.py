@@ -14,6 +14,7 @@ from asm_gym.policies.scripted.base import (
     ObservationReader,
     Style,
     Vector,
+    has_settled,
     matrix,
     move,
     pointing_down,
@@ -49,7 +50,8 @@ class LiftExpert:
         self.style = style or Style()
         self.np_random = np.random.default_rng(seed)
         self._read = ObservationReader(env)
-        self._action_space = env.action_space
+        self._careful = tuple(env.unwrapped.robots) != ("Panda",)  # type: ignore[attr-defined]
+        """The pace of this plan is the Panda's; other arms drift further from their course."""
 
     def predict(
         self,
@@ -66,8 +68,11 @@ class LiftExpert:
         cube_at = self._read(observation, "cube_pos")
         cube = matrix(self._read(observation, "cube_quat"))
 
-        state = self._advance(state, hand_at, cube_at)
+        state = self._advance(state, hand_at, cube_at, self._read(observation, "gripper_velocity"))
         target, grip = self._target(state, cube_at)
+        if self._careful and state.phase == DESCEND:  # over the cube first, lest a finger comes down on it
+            astray = float(np.linalg.norm((hand_at - cube_at)[:2]))
+            target = target + np.array([0.0, 0.0, np.clip(4 * (astray - 0.012), 0.0, 0.06)])
         aligned = pointing_down(hand, cube if state.phase <= DESCEND else None)
         command = np.append(move(hand_at, target, hand, aligned, state.speed), grip)
         if not deterministic:
@@ -87,14 +92,14 @@ class LiftExpert:
             drift=np.zeros(7),
         )
 
-    def _advance(self, state: _State, hand_at: Vector, cube_at: Vector) -> _State:
+    def _advance(self, state: _State, hand_at: Vector, cube_at: Vector, fingers: Vector) -> _State:
         state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
         offset = hand_at - cube_at
         if state.phase == REACH and np.linalg.norm(offset - state.hover) < 0.02:
             return state._replace(phase=DESCEND, since=0)
         if state.phase == DESCEND and abs(offset[2] + state.depth) < 0.008 and np.linalg.norm(offset[:2]) < 0.015:
             return state._replace(phase=GRASP, since=0, grasped_at=hand_at)
-        if state.phase == GRASP and state.since >= 6:
+        if state.phase == GRASP and has_settled(fingers, state.since, 6):
             return state._replace(phase=LIFT, since=0)
         if state.phase == LIFT and np.linalg.norm(offset) > 0.05:  # lost it
             return state._replace(phase=REACH, since=0)

@@ -54,21 +54,35 @@ class PickPlaceExpert(CarryExpert):
         at, turned = self.pose(observation, name)
         half = self._half_extents(name)
         grip = max(0.0, half[2] - 0.02)
+        place = self._place(env, nearest, half[2], grip, 0.07 if self._careful else 0.04)
+        if self._careful:  # let go over the walls: stretched out, the arm may stand nearer to one than it should
+            place[2] += 0.04
+        closing = self._closing(half, at, turned, env.bin1_pos, env.bin_size, self._careful and name == "Can")
         return Errand(
             name=name,
             grip=np.array([0.0, 0.0, grip]),
-            closing=self._closing(half, at, turned, env.bin1_pos, env.bin_size),
+            closing=closing,
             turns=np.pi,
             clearance=0.1,
-            place=self._place(env, nearest, half[2], grip),
+            place=place,
             over=0.12,
+            headings=self._headings(closing, place - env.robots[0].base_pos) if self._careful else (),
+            heading_fit=0.3,
             fit=0.03,
         )
 
     @staticmethod
-    def _closing(half: Vector, at: Vector, turned: Vector, bin_at: Vector, bin_size: Vector) -> Vector:
+    def _headings(closing: Vector, reach: Vector) -> tuple[float, ...]:
+        """Where an object may point over its bin so that wide fingers open across the arm's ``reach``."""
+        across = float(np.arctan2(reach[0], -reach[1]) - np.arctan2(closing[1], closing[0]))
+        return across, across + np.pi
+
+    @staticmethod
+    def _closing(half: Vector, at: Vector, turned: Vector, bin_at: Vector, bin_size: Vector, round_: bool) -> Vector:
         """(3,) along which of the object's axes to close: of those it is narrow enough along, away from the walls."""
         axes = [np.eye(3)[i] for i in (0, 1) if half[i] < 0.035]
+        if round_:
+            axes += [np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.array([1.0, -1.0, 0.0]) / np.sqrt(2)]
 
         def room(axis: Vector) -> float:
             along = np.abs((turned @ axis)[:2])
@@ -77,11 +91,11 @@ class PickPlaceExpert(CarryExpert):
         return max(axes, key=room)
 
     @staticmethod
-    def _place(env: Any, compartment: int, half_height: float, grip: float) -> Vector:
-        """(3,) where to let go: near the arm, because it is stretched out at the far side of the bins."""
+    def _place(env: Any, compartment: int, half_height: float, grip: float, nearer: float) -> Vector:
+        """(3,) where to let go: ``nearer`` to the arm [m], because it is stretched out at the far side of the bins."""
         place = np.array(env.target_bin_placements[compartment], np.float64)
         away = place[:2] - env.robots[0].base_pos[:2]
-        place[:2] -= 0.04 * away / np.linalg.norm(away)
+        place[:2] -= nearer * away / np.linalg.norm(away)
         # Lower, and the palm would stand on a wall.
         place[2] += max(half_height + 0.015, _WALL - grip)
         return place

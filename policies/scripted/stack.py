@@ -21,14 +21,18 @@ class StackExpert(CarryExpert):
         red, turned = self.pose(observation, "cubeA")
         green, _ = self.pose(observation, "cubeB")
         place = green + np.array([0.0, 0.0, _SMALL + _LARGE])
-        if np.linalg.norm(red - place) < 0.02:
+        if np.linalg.norm(red - place) < (0.025 if self._careful else 0.02):
             return None
         side = turned[:, int(np.abs(turned[2]).argmin())]  # the one that lies flattest gives the cube's heading
+        turns = np.pi / 2
+        if self._careful:  # a wide gripper would stand on the green cube with one finger
+            sides = (side, np.cross([0.0, 0.0, 1.0], side))
+            side, turns = min(sides, key=lambda s: abs(s @ (green - red))), np.pi
         return Errand(
             name="cubeA",
             grip=np.zeros(3),
             closing=turned.T @ side,
-            turns=np.pi / 2,
+            turns=turns,
             clearance=0.08,
             place=place,
             over=0.06,
