@@ -29,6 +29,9 @@ OPTIONS = [
 class Counter:
     """Acts with the number of steps it has acted."""
 
+    def __str__(self):
+        return "counter"
+
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         count = 0 if state is None else state
         return np.full(3, 0.1 * count + 0.001 * observation[0], np.float32), count + 1
