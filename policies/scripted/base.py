@@ -41,6 +41,10 @@ class Style:
         if not self.speed > 0:
             raise ValueError(f"speed must be > 0, got {self.speed}")
 
+    def pace(self, usual: float, rng: np.random.Generator) -> float:
+        """The speed of one episode, where ``usual`` is the expert's own."""
+        return usual * self.speed * float(np.clip(1 + self.speed_spread * rng.standard_normal(), 0.5, 1.5))
+
     def drifted(self, drift: Vector, rng: np.random.Generator) -> Vector:
         """The next action noise after ``drift``: an AR(1) process that forgets in about 4 steps."""
         rho = 0.78
@@ -62,6 +66,24 @@ class ObservationReader:
     def __call__(self, observation: Any, name: str) -> Vector:
         part = observation[self._slices[name]] if self._flat else observation[name]
         return np.asarray(part, dtype=np.float64)
+
+
+class Expert:
+    """What every scripted expert has.
+
+    Args:
+        env: tells where things stand in the observation, and in the room where the observation does not say.
+        seed: of the noise and of the style drawn for each episode.
+        style: how much it varies.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
+        self.env = env
+        self.style = style or Style()
+        self.np_random = np.random.default_rng(seed)
+        self._read = ObservationReader(env)
+        self._careful = tuple(env.unwrapped.robots) != ("Panda",)  # type: ignore[attr-defined]
+        """Plans for one arm have the Panda's pace; other arms drift further from their course."""
 
 
 def has_settled(velocity: Vector, since: int, usual: int) -> bool:

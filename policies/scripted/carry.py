@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from asm_gym.policies.scripted.base import (
     CLOSE,
     OPEN,
-    ObservationReader,
+    Expert,
     Style,
     Vector,
     gripping,
@@ -65,25 +65,14 @@ class CarryState(NamedTuple):
     drift: Vector  # correlated action noise
 
 
-class CarryExpert(ABC):
-    """An expert that carries objects one after the other.
-
-    Args:
-        env: tells where things stand in the observation.
-        seed: of the noise and of the style drawn for each episode.
-        style: how much it varies.
-    """
+class CarryExpert(Expert, ABC):
+    """An expert that carries objects one after the other; the arguments are those of ``Expert``."""
 
     pace = 0.55
     """Hand speed in action units."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
-        self.style = style or Style()
-        self.np_random = np.random.default_rng(seed)
-        self.env = env
-        self._read = ObservationReader(env)
-        self._careful = tuple(env.unwrapped.robots) != ("Panda",)  # type: ignore[attr-defined]
-        """The pace of this plan is the Panda's; other arms drift further from their course."""
+        super().__init__(env, seed, style)
         self._gain = 3.0 if self._careful else 2.0
 
     @abstractmethod
@@ -111,7 +100,7 @@ class CarryExpert(ABC):
 
     def _begin(self, observation: Any) -> CarryState:
         style, rng = self.style, self.np_random
-        pace = self.pace * style.speed * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.5, 1.5))
+        pace = style.pace(self.pace, rng)
         spread = style.spread * rng.standard_normal(3)
         return CarryState(REACH, 0, pace, spread, self.next_errand(observation), np.zeros(3), np.zeros(7))
 

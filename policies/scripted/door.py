@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.policies.scripted.base import (
     CLOSE,
     OPEN,
-    ObservationReader,
-    Style,
+    Expert,
     Vector,
     move,
     rotation,
@@ -48,20 +46,8 @@ class DoorState(NamedTuple):
     drift: Vector  # (7,) correlated action noise
 
 
-class DoorExpert:
-    """A scripted expert for Door.
-
-    Args:
-        env: tells where things stand in the observation, and where the door stands in the room.
-        seed: of the noise and of the style drawn for each episode.
-        style: how much it varies.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
-        self.style = style or Style()
-        self.np_random = np.random.default_rng(seed)
-        self._env = env
-        self._read = ObservationReader(env)
+class DoorExpert(Expert):
+    """A scripted expert for Door."""
 
     def predict(
         self,
@@ -89,13 +75,13 @@ class DoorExpert:
 
     def _begin(self) -> DoorState:
         style, rng = self.style, self.np_random
-        speed = 0.4 * style.speed * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.5, 1.5))
+        speed = style.pace(0.4, rng)
         spread = 0.3 * style.spread * rng.standard_normal(3)
         return DoorState(REACH, 0, speed, spread, self._look(spread[0]), np.zeros(3), np.zeros(7))
 
     def _look(self, along: float) -> Hardware:
         """The door as it stands at the beginning of an episode, closed; the grip is moved ``along`` the handle [m]."""
-        simulation = self._env.unwrapped.simulation  # type: ignore[attr-defined]
+        simulation = self.env.unwrapped.simulation  # type: ignore[attr-defined]
         model, data = simulation.model, simulation.data
         hinge, latch = model.joint("Door_hinge").id, model.joint("Door_latch_joint").id
         handle = model.geom("Door_handle").id

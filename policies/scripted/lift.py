@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.policies.scripted.base import (
     CLOSE,
     OPEN,
-    ObservationReader,
-    Style,
+    Expert,
     Vector,
     has_settled,
     matrix,
@@ -37,21 +35,8 @@ class _State(NamedTuple):
     drift: Vector  # (7,) correlated action noise
 
 
-class LiftExpert:
-    """A scripted expert for Lift.
-
-    Args:
-        env: tells where things stand in the observation.
-        seed: of the noise and of the style drawn for each episode.
-        style: how much it varies.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
-        self.style = style or Style()
-        self.np_random = np.random.default_rng(seed)
-        self._read = ObservationReader(env)
-        self._careful = tuple(env.unwrapped.robots) != ("Panda",)  # type: ignore[attr-defined]
-        """The pace of this plan is the Panda's; other arms drift further from their course."""
+class LiftExpert(Expert):
+    """A scripted expert for Lift."""
 
     def predict(
         self,
@@ -84,7 +69,7 @@ class LiftExpert:
         return _State(
             phase=REACH,
             since=0,
-            speed=0.45 * style.speed * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.5, 1.5)),
+            speed=style.pace(0.45, rng),
             hover=np.array([0.0, 0.0, 0.07]) + style.spread * rng.standard_normal(3),
             goal=np.array([0.0, 0.0, 0.13]) + style.spread * rng.standard_normal(3),
             depth=float(np.clip(0.005 + 0.3 * style.spread * rng.standard_normal(), 0.0, 0.01)),

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.base import ObservationReader, Style, Vector, matrix
+from asm_gym.policies.scripted.base import Expert, Style, Vector, matrix
 from asm_gym.policies.scripted.two_arms import ARMS, Hands, move_arm
 
 TURN, ALIGN, INSERT = range(3)
@@ -38,19 +38,11 @@ class PegInHoleState(NamedTuple):
     drift: Vector  # (12,) correlated action noise
 
 
-class PegInHoleExpert:
-    """A scripted expert for TwoArmPegInHole.
-
-    Args:
-        env: tells where things stand in the observation, and how the arms stand in the room.
-        seed: of the noise and of the style drawn for each episode.
-        style: how much it varies.
-    """
+class PegInHoleExpert(Expert):
+    """A scripted expert for TwoArmPegInHole."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
-        self.style = style or Style()
-        self.np_random = np.random.default_rng(seed)
-        self._read = ObservationReader(env)
+        super().__init__(env, seed, style)
         self._hands = Hands(env)
 
     def predict(
@@ -102,7 +94,7 @@ class PegInHoleExpert:
         return PegInHoleState(
             phase=TURN,
             since=0,
-            speed=0.4 * style.speed * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.5, 1.5)),
+            speed=style.pace(0.4, rng),
             plate=plate + 2 * style.spread * np.clip(rng.standard_normal(3), -2, 2),
             through=_THROUGH + float(np.clip(style.spread * rng.standard_normal(), -0.03, 0.03)),
             bases=self._hands.bases(),

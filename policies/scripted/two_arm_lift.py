@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.base import CLOSE, OPEN, ObservationReader, Style, Vector, gripping, matrix
+from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, Style, Vector, gripping, matrix
 from asm_gym.policies.scripted.two_arms import ARMS, Hand, Hands, move_arm
 
 REACH, DESCEND, GRASP, LIFT, LOWER = range(5)
@@ -31,19 +31,11 @@ class TwoArmLiftState(NamedTuple):
     drift: Vector  # (14,) correlated action noise
 
 
-class TwoArmLiftExpert:
-    """A scripted expert for TwoArmLift.
-
-    Args:
-        env: tells where things stand in the observation, and how the arms stand in the room.
-        seed: of the noise and of the style drawn for each episode.
-        style: how much it varies.
-    """
+class TwoArmLiftExpert(Expert):
+    """A scripted expert for TwoArmLift."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
-        self.style = style or Style()
-        self.np_random = np.random.default_rng(seed)
-        self._read = ObservationReader(env)
+        super().__init__(env, seed, style)
         self._hands = Hands(env)
 
     def predict(
@@ -77,7 +69,7 @@ class TwoArmLiftExpert:
         return TwoArmLiftState(
             phase=REACH,
             since=0,
-            speed=0.45 * style.speed * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.5, 1.5)),
+            speed=style.pace(0.45, rng),
             spread=style.spread * rng.standard_normal((ARMS, 3)),
             height=_UP + float(np.clip(style.spread * rng.standard_normal(), -0.02, 0.05)),
             bases=self._hands.bases(),

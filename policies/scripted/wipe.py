@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.base import ObservationReader, Style, Vector, gripping, move, rotation
+from asm_gym.policies.scripted.base import Expert, Vector, gripping, move, rotation
 
 REACH, LOWER, WIPE, REST = range(4)
 
@@ -30,20 +29,8 @@ class WipeState(NamedTuple):
     drift: Vector  # (6,) correlated action noise
 
 
-class WipeExpert:
-    """A scripted expert for Wipe.
-
-    Args:
-        env: tells where the hand is in the observation, and where dirt is on the table.
-        seed: of the noise and of the style drawn for each episode.
-        style: how much it varies.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
-        self.style = style or Style()
-        self.np_random = np.random.default_rng(seed)
-        self._env = env
-        self._read = ObservationReader(env)
+class WipeExpert(Expert):
+    """A scripted expert for Wipe."""
 
     def predict(
         self,
@@ -67,9 +54,9 @@ class WipeExpert:
 
     def _begin(self, hand_at: Vector) -> WipeState:
         style, rng = self.style, self.np_random
-        pace = style.speed * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.5, 1.5))
+        pace = style.pace(1.0, rng)
         press = _PRESS * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.8, 1.2))
-        env = self._env.unwrapped.robosuite_env  # type: ignore[attr-defined]
+        env = self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
         bodies = [env.sim.model.body_name2id(mark.root_body) for mark in env.model.mujoco_arena.markers]
         dirt = env.sim.data.body_xpos[bodies].copy()
         order = np.arange(len(dirt))
@@ -80,7 +67,7 @@ class WipeExpert:
 
     def _dirty(self, order: NDArray[np.intp]) -> NDArray[np.bool_]:
         """(N,) which marks are still on the table."""
-        env = self._env.unwrapped.robosuite_env  # type: ignore[attr-defined]
+        env = self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
         wiped = set(env.wiped_markers)
         return np.array([mark not in wiped for mark in env.model.mujoco_arena.markers])[order]
 
