@@ -18,13 +18,14 @@ import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
+from asm_gym.evaluation.report import Table
 from asm_gym.scripts.benchmark_experts import Experts
 from asm_gym.scripts.benchmark_fit import Fit
 from asm_gym.scripts.benchmark_memory import Memory, Safety
+from asm_gym.scripts.tables import console_table
 from asm_gym.tasks import task as task_spec
 
 
@@ -47,29 +48,21 @@ class Env:
 
     def run(self, console: Console) -> int:
         """Prints the table."""
-        table = Table(
-            title=f"{self.task}, {self.robot}, {self.controller}, 20 Hz: median of {self.steps} control steps"
-        )
-        for column in ("", "ms", "steps/s", "against robosuite", "against mj_step"):
-            table.add_column(column, justify="left" if not column else "right", no_wrap=True)
         steps = _take_turns(self._rivals(), self.steps, console)
-        for name, seconds in steps.items():
-            table.add_row(
-                name,
-                f"{1e3 * seconds:.2f}",
-                f"{1 / seconds:.0f}",
-                f"{steps['robosuite'] / seconds:.2f}×",
-                f"{seconds / steps['mj_step only']:.2f}×",
-            )
-        console.print(table)
-        table = Table(title=f"median of {self.resets} resets")
-        for column in ("", "ms", "against robosuite"):
-            table.add_column(column, justify="left" if not column else "right", no_wrap=True)
+        physics, theirs = steps["mj_step only"], steps["robosuite"]
+        table = Table(
+            f"{self.task}, {self.robot}, {self.controller}, 20 Hz: median of {self.steps} control steps",
+            ("", "ms", "steps/s", "against robosuite", "against mj_step"),
+            [
+                (name, f"{1e3 * s:.2f}", f"{1 / s:.0f}", f"{theirs / s:.2f}×", f"{s / physics:.2f}×")
+                for name, s in steps.items()
+            ],
+        )
+        console.print(console_table(table))
         resets = _take_turns(self._resets(), self.resets, console)
-        for name, seconds in resets.items():
-            ratio = resets["robosuite, hard (its default)"] / seconds
-            table.add_row(name, f"{1e3 * seconds:.1f}", f"{ratio:.1f}×")
-        console.print(table)
+        default = resets["robosuite, hard (its default)"]
+        rows = [(name, f"{1e3 * s:.1f}", f"{default / s:.1f}×") for name, s in resets.items()]
+        console.print(console_table(Table(f"median of {self.resets} resets", ("", "ms", "against robosuite"), rows)))
         return 0
 
     def _make(self, **kwargs: Any) -> Any:

@@ -8,15 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from asm_gym.choices import check_choice
 from asm_gym.evaluation.metrics import Share
+from asm_gym.evaluation.report import Table
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.registry import EXPERTS
 from asm_gym.scripts.collect import episode_seeds
 from asm_gym.scripts.dispatch import dispatch, environment
 from asm_gym.scripts.progress import stage
+from asm_gym.scripts.tables import console_table
 from asm_gym.tasks import ROBOTS
 
 _QUICK = 5
@@ -75,16 +76,14 @@ class Experts:
     def run(self, console: Console) -> int:
         """Prints a row for each task and robot."""
         seeds = episode_seeds(self.seed, min(self.episodes, _QUICK) if self.quick else self.episodes)
-        table = Table(title=f"scripted experts, seeds of {self.seed}")
-        for column in ("task", "robot", "solved", "95 %", "held", "steps", "force"):
-            side = "left" if column in ("task", "robot") else "right"
-            table.add_column(column, justify=side, no_wrap=True)  # type: ignore[arg-type]
+        rows = []
         for name in self.tasks:
             for robot in self.robots:
                 with stage(f"{name}, {robot}", console, {}) as progress:
                     attempts = dispatch(partial(attempt, task=name, robot=robot), seeds, self.workers, progress)
-                table.add_row(name, robot, *_row(attempts))
-        console.print(table)
+                rows.append((name, robot, *_row(attempts)))
+        headings = ("task", "robot", "solved", "95 %", "held", "steps", "force")
+        console.print(console_table(Table(f"scripted experts, seeds of {self.seed}", headings, rows), left=2))
         console.print("held: also at the last step; steps: mean until solved; force: median largest [N]")
         return 0
 

@@ -11,14 +11,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
 from asm_gym.episodes import Episode
+from asm_gym.evaluation.report import Table
 from asm_gym.memory.association import complete, hidden_units
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.gru import GRU
 from asm_gym.scripts.collect import collect
 from asm_gym.scripts.progress import stage
+from asm_gym.scripts.tables import console_table
 
 HELD_OUT = 6
 """One in so many episodes is not learned but tested on."""
@@ -54,12 +55,12 @@ class Fit:
                 fitted: Any = monitor(episodes[0].spec, seed=self.seed).fit(learned, progress)
                 spent = time.process_time() - start
             rows[name] = spent, float(np.median(np.abs(np.concatenate(errors(fitted, held_out)))))
-        table = Table(title=f"{len(learned)} episodes of {', '.join(self.tasks)}, one core")
-        for column in ("", "s", "against the GRU", "median error of a step [sd of the change]"):
-            table.add_column(column, justify="right" if table.columns else "left")
-        for name, (spent, off) in rows.items():
-            table.add_row(name, f"{spent:.0f}", f"{spent / rows['gru'][0]:.2f}×", f"{off:.3f}")
-        console.print(table)
+        table = Table(
+            f"{len(learned)} episodes of {', '.join(self.tasks)}, one core",
+            ("", "s", "against the GRU", "median error of a step [sd of the change]"),
+            [(name, f"{t:.0f}", f"{t / rows['gru'][0]:.2f}×", f"{off:.3f}") for name, (t, off) in rows.items()],
+        )
+        console.print(console_table(table))
         console.print(
             "The memory expects each group of senses from what the others do in the same step, the GRU from the past "
             "alone: the errors are of different questions."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from asm_gym.detection import LATELY, POWER
 from asm_gym.episodes import Episode
+from asm_gym.evaluation.report import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.collect import collect
+from asm_gym.scripts.tables import console_table
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 
@@ -133,6 +134,15 @@ def watching_plainly(asm: NeuralASM, episode: Episode) -> Callable[[], Any]:
     return call
 
 
+def _fitted(hidden: int, channels: int, skills: int = 1) -> tuple[NeuralASM, Episode]:
+    """A memory that has learned little: the cost is the same. It names skills where there are several."""
+    episodes = synthetic(channels, max(10, skills + 2), skills)
+    asm = NeuralASM(episodes[0].spec, hidden_size=hidden, epochs=1).fit(episodes[:-2])
+    if skills > 1:
+        asm.name_skills([replace(e, info={"skill": str(n % skills)}) for n, e in enumerate(episodes[:-2])])
+    return asm, episodes[-1]
+
+
 @dataclass
 class Memory:
     """What one call of observe() costs, against the same equations written plainly in torch."""
@@ -144,14 +154,14 @@ class Memory:
     steps: int = 2000
     """calls of each rival"""
     sweep: bool = True
-    """also print the cost against hidden units and channels"""
+    """also print the cost against hidden units, channels and named skills"""
 
     def run(self, console: Console, take_turns: Callable[..., dict[str, float]]) -> int:
         """Prints the tables."""
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
-            asm, episode = self._fitted(self.hidden, self.channels)
+            asm, episode = _fitted(self.hidden, self.channels)
             rivals = {
                 "asm_gym, one stream": watching(asm, episode, 1),
                 "asm_gym, 64 streams": watching(asm, episode, 64),
@@ -162,30 +172,25 @@ class Memory:
             torch.set_num_threads(threads)
         seconds["asm_gym, 64 streams"] /= 64
         title = f"{self.hidden} hidden units, {self.channels} channels, {asm.iterations} iterations: a stream's row"
-        table = _table(title, "", "µs", "against torch")
-        for name, s in seconds.items():
-            table.add_row(name, f"{1e6 * s:.0f}", f"{seconds['plain torch, one stream'] / s:.1f}×")
-        console.print(table)
+        plain = seconds["plain torch, one stream"]
+        rows = [(name, f"{1e6 * s:.0f}", f"{plain / s:.1f}×") for name, s in seconds.items()]
+        console.print(console_table(Table(title, ("", "µs", "against torch"), rows)))
         if self.sweep:
             self._sweep(console, take_turns)
         return 0
 
     def _sweep(self, console: Console, take_turns: Callable[..., dict[str, float]]) -> None:
-        for what, sizes in (("hidden units", (64, 256, 1024, 2048)), ("channels", (15, 30, 60, 120))):
-            rivals = {}
-            for size in sizes:
-                hidden, channels = (size, self.channels) if what == "hidden units" else (self.hidden, size)
-                rivals[str(size)] = watching(*self._fitted(hidden, channels), 1)
-            table = _table(f"one stream, by {what}", what, "µs", f"against {sizes[0]}")
+        makers: dict[str, tuple[Callable[[int], tuple[NeuralASM, Episode]], tuple[int, ...]]] = {
+            "hidden units": (lambda n: _fitted(n, self.channels), (64, 256, 1024, 2048)),
+            "channels": (lambda n: _fitted(self.hidden, n), (15, 30, 60, 120)),
+            "skills": (lambda n: _fitted(self.hidden, self.channels, n), (2, 8, 32, 128)),
+        }
+        for what, (make, sizes) in makers.items():
+            rivals = {str(size): watching(*make(size), 1) for size in sizes}
             seconds = take_turns(rivals, max(1, self.steps // 4), console)
-            for name, s in seconds.items():
-                table.add_row(name, f"{1e6 * s:.0f}", f"{s / seconds[str(sizes[0])]:.1f}×")
-            console.print(table)
-
-    @staticmethod
-    def _fitted(hidden: int, channels: int) -> tuple[NeuralASM, Episode]:
-        episodes = synthetic(channels, 10)
-        return NeuralASM(episodes[0].spec, hidden_size=hidden, epochs=1).fit(episodes[:8]), episodes[-1]
+            least = seconds[str(sizes[0])]
+            rows = [(name, f"{1e6 * s:.0f}", f"{s / least:.1f}×") for name, s in seconds.items()]
+            console.print(console_table(Table(f"one stream, by {what}", (what, "µs", f"against {sizes[0]}"), rows)))
 
 
 @dataclass
@@ -213,10 +218,9 @@ class Safety:
             env.reset(seed=0)
         rivals = {name: partial(env.step, action) for name, env in envs.items()}
         seconds = take_turns(rivals, self.steps, console)
-        table = _table(f"{self.task}, 20 Hz, {self.hidden} hidden units: a control step", "", "ms", "against step")
-        for name, s in seconds.items():
-            table.add_row(name, f"{1e3 * s:.2f}", f"{s / seconds['step']:.2f}×")
-        console.print(table)
+        caption = f"{self.task}, 20 Hz, {self.hidden} hidden units: a control step"
+        rows = [(name, f"{1e3 * s:.2f}", f"{s / seconds['step']:.2f}×") for name, s in seconds.items()]
+        console.print(console_table(Table(caption, ("", "ms", "against step"), rows)))
         return 0
 
     def _make(self, rate: int | None) -> gym.Env[Any, Any]:
@@ -230,10 +234,3 @@ class Safety:
         asm = NeuralASM(episodes[0].spec, hidden_size=self.hidden, epochs=1).fit(episodes)
         asm.threshold_ = np.inf
         return asm
-
-
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title)
-    for column in columns:
-        table.add_column(column, justify="right" if table.columns else "left", no_wrap=True)
-    return table

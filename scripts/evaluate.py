@@ -29,8 +29,9 @@ from asm_gym.scripts.dispatch import Crew, Progress, dispatch
 from asm_gym.scripts.film import Scene, film, prepare_film
 from asm_gym.scripts.judge import Judgement, calibrated, judge
 from asm_gym.scripts.progress import stage
-from asm_gym.scripts.publish import console_tables, publish
+from asm_gym.scripts.publish import brief_tables, publish
 from asm_gym.scripts.record import EXECUTIONS, Course, draw_onset, episode_seeds, record
+from asm_gym.scripts.tables import console_table
 from asm_gym.tasks import task as task_spec
 
 _HARMLESS = (*HARMLESS, *EXECUTIONS)
@@ -240,8 +241,8 @@ def main(argv: list[str] | None = None) -> int:
     except ValueError as error:
         print(f"asm-gym evaluate: {error}", file=sys.stderr)
         return 2
-    for table in console_tables(judgement):
-        console.print(table)
+    for table in brief_tables(judgement):
+        console.print(console_table(table))
     console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.parquet'}")
     return 0
 

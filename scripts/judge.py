@@ -126,7 +126,7 @@ def judge(
     made = dispatch(opine, list(models.values()), crew, lambda k, n: progress(k * len(monitors) // n, len(monitors)))
     found = {name: opinion for opinions in made for name, opinion in opinions.items()}
     opinions = {name: found[name] for name in monitors}
-    by_role, failed, twins = sorted_by_role(folder, labels)
+    by_role, failed, twins = sorted_by_role(recordings_of(folder, labels))
     return Judgement(
         {n: o.verdicts for n, o in opinions.items()},
         {n: o.harmless for n, o in opinions.items()},
@@ -143,7 +143,7 @@ def judge(
 def _opinions(
     names: Sequence[str], folder: Path, labels: Sequence[Label], rate: float, seed: int
 ) -> dict[str, Opinion]:
-    by_role, _, _ = sorted_by_role(folder, labels)
+    by_role, _, _ = sorted_by_role(recordings_of(folder, labels))
     return {name: opinion_of(name, folder, by_role, rate, seed) for name in names}
 
 
@@ -158,21 +158,26 @@ def opinion_of(name: str, folder: Path, by_role: Mapping[str, Sequence[Recording
     return Opinion(verdicts, harmless, thresholds, _examples(monitor, verdicts, tested, thresholds[rate]))
 
 
-def sorted_by_role(folder: Path, labels: Sequence[Label]) -> tuple[dict[str, list[Recording]], int, list[Recording]]:
+def recordings_of(folder: Path, labels: Sequence[Label]) -> list[Recording]:
+    """Read from the folder of a run."""
+    return [read(folder / label.path) for label in labels]
+
+
+def sorted_by_role(recordings: Sequence[Recording]) -> tuple[dict[str, list[Recording]], int, list[Recording]]:
     """Recordings by role, how many nominal ones failed and are not among them, and all twins of faulty ones."""
-    recordings = {label: read(folder / label.path) for label in labels}
     by_role: dict[str, list[Recording]] = {}
     failed = 0
-    for label, recording in recordings.items():
+    for recording in recordings:
+        role = recording.label.role
         # A nominal episode that fails is no example of what should feel normal, nor an alarm in it a false one.
-        if label.role in NOMINAL and not recording.episode.success:
+        if role in NOMINAL and not recording.episode.success:
             failed += 1
         else:
-            by_role.setdefault(label.role, []).append(recording)
+            by_role.setdefault(role, []).append(recording)
     for role in NOMINAL:
         if not by_role.get(role):
             raise ValueError(f"none of the {role} episodes succeeded: there is nothing normal to learn or to test on")
-    twins = [r for label, r in recordings.items() if label.role == "nominal"]
+    twins = [r for r in recordings if r.label.role == "nominal"]
     return by_role, failed, twins
 
 
@@ -193,7 +198,7 @@ def fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) 
 
 def calibrated(folder: Path, name: str, labels: Sequence[Label], seed: int, threshold: float) -> Any:
     """The monitor as it judged the run, with the threshold it judged by."""
-    by_role, _, _ = sorted_by_role(folder, [label for label in labels if label.role in NOMINAL])
+    by_role, _, _ = sorted_by_role(recordings_of(folder, [label for label in labels if label.role in NOMINAL]))
     monitor: Any = fitted(folder, name, by_role["fit"], seed)
     monitor.threshold_ = threshold
     return monitor

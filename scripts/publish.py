@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table as RichTable
 
 from asm_gym.evaluation import comparison_plots as plots
 from asm_gym.evaluation.comparison import IDEAL, Cell, Score, Sight
@@ -18,6 +17,7 @@ from asm_gym.evaluation.plots import attribution_figure, stream_figure, surprise
 from asm_gym.evaluation.report import Table, write_report
 from asm_gym.evaluation.scoring import Verdict
 from asm_gym.scripts.judge import Judgement
+from asm_gym.scripts.tables import markdown
 
 _HEADINGS = ("Monitor", "AUROC", "AP", "Found at 0.5 %", "at 1 %", "at 5 %", "Median delay [ms]", "p95 [ms]")
 _MORE = ("False alarms", "per hour", "Balanced accuracy", "Timestep-weighted", "Right channel")
@@ -63,26 +63,23 @@ def harmless_table(judgement: Judgement) -> Table:
     return Table("Episodes with an alarm under harmless variations.", ("Variation", *cries), rows)
 
 
-def console_tables(judgement: Judgement) -> list[RichTable]:
+def brief_tables(judgement: Judgement) -> list[Table]:
     """The chief columns of the main table, and the harmless variations, narrow enough for a terminal."""
     rate = judgement.rate
-    summary = RichTable(title=f"found within {judgement.window_s:g} s at a false-alarm rate of {100 * rate:g} %")
-    for i, heading in enumerate(("monitor", "AUROC", "found", "median [ms]", "alarms/h", "right channel")):
-        summary.add_column(heading, justify="left" if i == 0 else "right", no_wrap=i == 0)
-    for name, cell in ((IDEAL, judgement.ideal()), *((s.monitor, s.cell) for s in judgement.scores)):
-        score = next((s for s in judgement.scores if s.monitor == name), None)
-        summary.add_row(
-            name,
-            f"{cell.auroc:.3f}",
-            _interval(cell.found.get(rate)),
-            _milliseconds(cell.median_ms),
-            f"{score.false_alarms_per_hour:.1f}" if score else "",
-            _percent(score.attribution) if score else "",
-        )
+
+    def row(name: str, cell: Cell, score: Score | None) -> tuple[str, ...]:
+        found, delay = _interval(cell.found.get(rate)), _milliseconds(cell.median_ms)
+        alarms, right = (f"{score.false_alarms_per_hour:.1f}", _percent(score.attribution)) if score else ("", "")
+        return name, f"{cell.auroc:.3f}", found, delay, alarms, right
+
+    summary = Table(
+        f"found within {judgement.window_s:g} s at a false-alarm rate of {100 * rate:g} %",
+        ("monitor", "AUROC", "found", "median [ms]", "alarms/h", "right channel"),
+        [row(IDEAL, judgement.ideal(), None), *(row(s.monitor, s.cell, s) for s in judgement.scores)],
+    )
     first = next(iter(judgement.verdicts))
-    harmless = RichTable(title=f"episodes with an alarm of {first} under harmless variations")
-    for row in harmless_table(judgement).rows:
-        harmless.add_row(*map(str, row[:2]))
+    caption = f"episodes with an alarm of {first} under harmless variations"
+    harmless = Table(caption, ("variation", "alarms"), [r[:2] for r in harmless_table(judgement).rows])
     return [summary, harmless]
 
 
@@ -209,11 +206,3 @@ def _interval(share: Share | None) -> str:
 
 def _of(share: Share | None) -> str:
     return f"{share.k} of {share.n}" if share is not None and share.n else ""
-
-
-def markdown(table: Table) -> str:
-    def line(cells: Sequence[object]) -> str:
-        return "| " + " | ".join(map(str, cells)) + " |"
-
-    rule = line(["---"] * len(table.headings))
-    return "\n".join([table.caption, "", line(table.headings), rule, *map(line, table.rows)])

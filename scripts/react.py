@@ -17,7 +17,6 @@ from typing import Annotated
 
 import tyro
 from rich.console import Console
-from rich.table import Table as RichTable
 
 from asm_gym.choices import check_choice
 from asm_gym.evaluation.archive import Label, Recording, read
@@ -31,8 +30,8 @@ from asm_gym.scripts.claims import claim_folder
 from asm_gym.scripts.dispatch import Crew, Progress, dispatch
 from asm_gym.scripts.judge import fitted
 from asm_gym.scripts.progress import stage
-from asm_gym.scripts.publish import markdown
 from asm_gym.scripts.record import Course, episode_seeds, record
+from asm_gym.scripts.tables import console_table, markdown
 from asm_gym.wrappers.safety import ON_ALARM
 
 FAULTS = (NOMINAL, PASSING, "collision", "held_by_person", "stuck_joint", "encoder_bias")
@@ -219,12 +218,7 @@ def main(argv: list[str] | None = None) -> int:
     except ValueError as error:
         print(f"asm-gym react: {error}", file=sys.stderr)
         return 2
-    shown = RichTable()
-    for heading in made.headings:
-        shown.add_column(heading)
-    for row in made.rows:
-        shown.add_row(*map(str, row))
-    console.print(shown)
+    console.print(console_table(made, left=2))
     console.print(f"Wrote {args.out / 'reactions.md'} and {args.out / 'reactions.json'}")
     return 0
 

@@ -18,7 +18,6 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table as RichTable
 
 from asm_gym.choices import check_choice
 from asm_gym.evaluation import comparison, plots
@@ -30,8 +29,8 @@ from asm_gym.monitors import MONITORS, NeuralASM
 from asm_gym.scripts.dispatch import dispatch
 from asm_gym.scripts.judge import fitted, opinion_of, sights_of, sorted_by_role
 from asm_gym.scripts.progress import stage
-from asm_gym.scripts.publish import markdown
 from asm_gym.scripts.switching import NAMES, Switch, record_switch
+from asm_gym.scripts.tables import console_table, markdown
 
 AFTER_S = (0.5, 1.0, 2.0, 5.0)
 """How long after a skill began it is asked for [s]."""
@@ -115,8 +114,7 @@ def jobs(args: Args) -> list[Job]:
 def recorded(run: Path, tasks: tuple[str, ...]) -> tuple[dict[str, list[Recording]], list[Recording]]:
     """Recordings by role, and the twins of faulty ones."""
     folders = [run / "episodes" / t / role for t in tasks for role in ("fit", "calibration", "nominal", "faulty")]
-    labels = [read(p).label for folder in folders for p in sorted(folder.glob("*.npz"))]
-    found, _, twins = sorted_by_role(run, labels)
+    found, _, twins = sorted_by_role([read(p) for folder in folders for p in sorted(folder.glob("*.npz"))])
     return found, twins
 
 
@@ -253,12 +251,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"asm-gym repertoire: {error}", file=sys.stderr)
         return 2
     for table in made:
-        shown = RichTable(title=table.caption)
-        for heading in table.headings:
-            shown.add_column(heading)
-        for row in table.rows:
-            shown.add_row(*map(str, row))
-        console.print(shown)
+        console.print(console_table(table))
     console.print(f"Wrote {args.out / 'repertoire.md'} and {args.out / 'repertoire.json'}")
     return 0
 

@@ -16,8 +16,6 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table as RichTable
 from threadpoolctl import threadpool_limits
 
 import asm_gym
@@ -27,8 +25,8 @@ from asm_gym.evaluation.plots import save
 from asm_gym.evaluation.report import Table
 from asm_gym.scripts.dispatch import dispatch
 from asm_gym.scripts.progress import stage
-from asm_gym.scripts.publish import markdown
 from asm_gym.scripts.record import Course, episode_seeds, record
+from asm_gym.scripts.tables import console_table, markdown
 
 Record = dict[str, Any]
 """One measurement: what was varied, the seed, and what came out."""
@@ -86,7 +84,7 @@ def reproduce(name: str, study: Study[Args], kind: type[Args], description: str 
         found = study(args, console, seconds)
     publish(name, found, args, seconds)
     for table in found.tables:
-        console.print(_console_table(table))
+        console.print(console_table(table))
     console.print(f"Wrote {args.out / name}.png, .svg, .csv, .md and .json")
     return 0
 
@@ -162,12 +160,3 @@ def wide_enough(hidden: int, channels: int) -> None:
     """Raises ValueError where a network has fewer hidden units than numbers to predict."""
     if hidden < channels:
         raise ValueError(f"hidden must be at least the number of channels, {channels}, got {hidden}")
-
-
-def _console_table(table: Table) -> RichTable:
-    made = RichTable(title=escape(table.caption))
-    for i, heading in enumerate(table.headings):
-        made.add_column(escape(heading), justify="right" if i else "left")
-    for row in table.rows:
-        made.add_row(*map(str, row))
-    return made
