@@ -77,12 +77,12 @@ def to_rows(reader: Senses, recalled: Recalled) -> NDArray[np.float64]:
 
 def check_cue(reader: Senses, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
     """The cue (T, D) to recall ``steps`` rows from. Raises ValueError unless it can be recalled from."""
-    rows = np.asarray(cue, np.float64)
+    rows, least = np.asarray(cue, np.float64), 2 * reader.lag
     if rows.ndim != 2:
         raise ValueError(f"a cue has the shape (T, {reader.spec.size}), got {rows.shape}")
     reader.spec.check_row(rows)
-    if len(rows) < 2:
-        raise ValueError(f"a cue must be at least 2 rows long, or nothing in it moves, got {len(rows)}")
+    if len(rows) < least:
+        raise ValueError(f"a cue must be at least {least} rows long, or nothing in it moves, got {len(rows)}")
     bad = np.argwhere(~np.isfinite(rows))
     if len(bad):
         row, column = bad[0]

@@ -5,8 +5,11 @@ senses both the value, which says where in a skill the robot is, and the change,
 (generalised coordinates of motion: Friston 2008, PLOS Comput Biol 4(11)). Association judges the change of every
 channel, given all values before and all other changes.
 
-    s_t = [v_t, Δ_t,slow]      v_t = (x_t - m) / σ      Δ_t = (x_t - x_{t-1}) / σ_Δ      slow:  σ_Δ < 0.3 σ
-    a_t = [v_{t-1}, Δ_t, Δ_{t-1},slow, u_t, 1]
+    s_t = [v_t, Δ_t,slow]      v_t = (x_t - m) / σ      Δ_t = (x_t - x_{t-l}) / σ_Δ      slow:  σ_Δ < 0.3 σ
+    a_t = [v_{t-l}, Δ_t, Δ_{t-l},slow, u_t, 1]
+
+l is 1 at a robot's control rate. Where rows come faster, what moves between two of them drowns in the sensors' noise,
+and the change is taken over the l rows of a twentieth of a second.
 """
 
 from __future__ import annotations
@@ -27,6 +30,9 @@ Ints = NDArray[np.intp]
 
 SLOW = 0.3
 """A channel is slow where a step's change is under this share of its spread."""
+
+LAPSE = 0.05
+"""Over how long a change is taken, where rows come faster [s]."""
 
 FARTHEST = 1e3
 """Where standardised numbers are cut off, so that no finite row can overflow.
@@ -55,23 +61,25 @@ class Senses:
         spec: of the stream.
         mean: (D,) of the training rows [unit of each channel].
         spread: (D,) their standard deviation.
-        change: (D,) standard deviation of the step from row to row.
+        change: (D,) standard deviation of the change over ``lag`` rows.
+        lag: l, how many rows later the change of a row is taken.
     """
 
     spec: StreamSpec
     mean: NDArray[np.float64]
     spread: NDArray[np.float64]
     change: NDArray[np.float64]
+    lag: int = 1
 
     @classmethod
-    def fit(cls, spec: StreamSpec, streams: Sequence[NDArray[np.float32]]) -> Self:
-        """From training episodes (T, D) each."""
+    def fit(cls, spec: StreamSpec, streams: Sequence[NDArray[np.float32]], lag: int = 1) -> Self:
+        """From training episodes (T, D) each, of more than ``lag`` rows."""
         rows = np.concatenate(streams).astype(np.float64)  # (N, D)
-        steps = np.concatenate([np.diff(s.astype(np.float64), axis=0) for s in streams])
+        steps = np.concatenate([s[lag:].astype(np.float64) - s[:-lag] for s in streams])
         mean = rows.mean(axis=0)
         spread = _spread(rows, mean, spec.noise)
         change = steps.std(axis=0)
-        return cls(spec, mean, spread, np.where(change > 0, change, spread))
+        return cls(spec, mean, spread, np.where(change > 0, change, spread), lag)
 
     @cached_property
     def slow(self) -> NDArray[np.intp]:
@@ -103,9 +111,9 @@ class Senses:
         return self.spec.size + len(self.spec.sensory) + len(self.slow) + len(self.spec.motor) + 1
 
     def read_episode(self, stream: NDArray[np.floating[Any]]) -> Reading:
-        """All rows of an episode (T, D); nothing has moved before the first."""
-        before = np.concatenate([stream[:1], stream[:-1]])
-        return self.read(stream, before, np.concatenate([before[:1], before[:-1]]))
+        """All rows of an episode (T, D); nothing has moved before the first ``lag``."""
+        before = np.concatenate([stream[: self.lag], stream[: -self.lag]])
+        return self.read(stream, before, np.concatenate([before[: self.lag], before[: -self.lag]]))
 
     def read(
         self,
@@ -113,7 +121,7 @@ class Senses:
         before: NDArray[np.floating[Any]],
         earlier: NDArray[np.floating[Any]],
     ) -> Reading:
-        """Rows (B, D), those that came just before, and those before them; what is not finite is unseen."""
+        """Rows (B, D), those ``lag`` rows before, and as long before those; what is not finite is unseen."""
         x, y, z = (np.ascontiguousarray(r, np.float64) for r in (rows, before, earlier))
         sensory, motor = self.spec.sensory, self.spec.motor
         return Reading(*_read(x, y, z, self.mean, self.spread, self.change, sensory, motor, self.slow))
@@ -177,6 +185,11 @@ def _read(
             inputs[n, D + X + L + j] = commands[n, j] if abs(commands[n, j]) < FARTHEST else 0.0
         inputs[n, D + X + L + A] = 1.0
     return senses, seen, commands, inputs, changes, whole, finite
+
+
+def rows_apart(dt: float) -> int:
+    """l for rows that come every ``dt`` seconds."""
+    return max(1, round(LAPSE / dt))
 
 
 def _spread(rows: NDArray[np.float64], mean: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -43,7 +43,7 @@ class CalibratedMonitor(ABC):
     hyperparameters: ClassVar[tuple[str, ...]] = ("seed",)
     """Arguments of ``__init__`` beside the spec, kept under their own names."""
 
-    shortest: ClassVar[int] = 1
+    shortest: int = 1
     """Steps that an episode must have to be learned from."""
 
     def __init__(self, spec: StreamSpec, seed: int = 0) -> None:

@@ -22,7 +22,7 @@ from asm_gym.memory.network import Network, train
 from asm_gym.memory.online import followed
 from asm_gym.memory.readout import add_up, learn_readout
 from asm_gym.memory.recall import at_rest, check_cue, follow, run_on, to_rows
-from asm_gym.memory.senses import Senses
+from asm_gym.memory.senses import Reading, Senses, rows_apart
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated import Progress, require
 from asm_gym.monitors.predictive import BOUND, GAINS, PredictiveMonitor, PredictiveState
@@ -30,11 +30,15 @@ from asm_gym.stream import StreamSpec
 
 
 class MemoryState(NamedTuple):
-    """Where the memory is, one row a stream."""
+    """Where the memory is, one entry a stream.
 
-    hidden: NDArray[np.float32]  # (B, H) the inferred state z
-    before: NDArray[np.float64]  # (B, D) the row seen last
-    earlier: NDArray[np.float64]  # (B, D) the one before
+    Each row is compared with that of l rows before, and carries on from the state of that time: there are l states,
+    which take turns. The first of each is the one whose turn comes next.
+    """
+
+    hidden: NDArray[np.float32]  # (B, l, H) the inferred states z
+    before: NDArray[np.float64]  # (B, l, D) the rows seen last
+    earlier: NDArray[np.float64]  # (B, l, D) those before
     steps: NDArray[np.int64]  # (B,) how many rows were seen
     skill: NDArray[np.float32]  # (B, K) L, what speaks for each skill; K is 0 where none has a name
 
@@ -100,6 +104,7 @@ class NeuralASM(PredictiveMonitor):
         for name, number in {"learning_rate": learning_rate, **precisions}.items():
             require(name, number, 0.0 < number < math.inf, "positive and finite")
         require("carry_prior", carry_prior, 0.0 <= carry_prior <= 1.0, "in [0, 1]")
+        self.shortest = 1 + self._lag
         # Plain Python numbers, for a checkpoint holds them as JSON.
         self.hidden_size, self.association_size = int(hidden_size), int(association_size)
         self.epochs, self.batch_size, self.iterations = int(epochs), int(batch_size), int(iterations)
@@ -110,9 +115,8 @@ class NeuralASM(PredictiveMonitor):
     def learn_model(
         self, streams: Sequence[NDArray[np.float32]], rng: np.random.Generator, progress: Progress
     ) -> dict[str, NDArray[Any]]:
-        senses = Senses.fit(self.spec, streams)
-        readings = [senses.read_episode(s) for s in streams]
-        trajectories = [Trajectory(r.senses, r.commands, r.inputs) for r in readings]
+        senses = Senses.fit(self.spec, streams, self._lag)
+        trajectories = [t for s in streams for t in taking_turns(senses.read_episode(s), self._lag)]
         schedule = Schedule(*(getattr(self, name) for name in Schedule._fields))
         sizes = self.hidden_size, self._units_each(senses)
         self.skills_ = ()
@@ -123,7 +127,7 @@ class NeuralASM(PredictiveMonitor):
     def build_model(self) -> None:
         found = self.learned_
         self.energy_ = found["energy"]
-        self.senses_ = senses = Senses(self.spec, found["mean"], found["spread"], found["change"])
+        self.senses_ = senses = Senses(self.spec, found["mean"], found["spread"], found["change"], self._lag)
         X, A = len(self.spec.sensory), len(self.spec.motor)
         units = self._units_each(senses) * (int(senses.groups.max()) + 1)
         shapes = weight_shapes(self.hidden_size, senses.size, A) | association_shapes(senses.inputs, units, X)
@@ -139,7 +143,8 @@ class NeuralASM(PredictiveMonitor):
         self.network_ = Network(weights, association, *how)
 
     def start_model(self, batch: int) -> MemoryState:
-        hidden, rows = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.spec.size))
+        hidden = np.zeros((batch, self._lag, self.hidden_size), np.float32)
+        rows = np.zeros((batch, self._lag, self.spec.size))
         skill = np.zeros((batch, len(self.skills_)), np.float32)
         return MemoryState(hidden, rows, rows, np.zeros(batch, np.int64), skill)
 
@@ -147,15 +152,21 @@ class NeuralASM(PredictiveMonitor):
         self, state: MemoryState, rows: NDArray[np.float64]
     ) -> tuple[MemoryState, NDArray[np.float32], NDArray[np.float32]]:
         assert self.network_ is not None
-        before, earlier = state.before, state.earlier
-        if state.steps.min() < 2:  # before the first row nothing has moved
-            before = np.where(state.steps[:, None] > 0, before, rows)
-            earlier = np.where(state.steps[:, None] > 1, earlier, before)
-        step = self.network_.step(state.hidden, self.senses_.read(rows, before, earlier))
+        before, earlier, lag = state.before[:, 0], state.earlier[:, 0], self._lag
+        if state.steps.min() < 2 * lag:  # before the first rows nothing has moved
+            before = np.where(state.steps[:, None] >= lag, before, rows)
+            earlier = np.where(state.steps[:, None] >= 2 * lag, earlier, before)
+        step = self.network_.step(np.ascontiguousarray(state.hidden[:, 0]), self.senses_.read(rows, before, earlier))
         skill = state.skill
         if self.skills_:
             skill = add_up(skill, step.units, self.learned_["W_K"], self.learned_["b_K"])
-        state = MemoryState(step.hidden, rows, before, state.steps + 1, skill)
+        state = MemoryState(
+            hidden=next_turn(state.hidden, step.hidden),
+            before=next_turn(state.before, rows),
+            earlier=next_turn(state.earlier, before),
+            steps=state.steps + 1,
+            skill=skill,
+        )
         return state, step.error, activate(step.expected)
 
     def name_skills(self, episodes: Sequence[Episode]) -> Self:
@@ -231,8 +242,8 @@ class NeuralASM(PredictiveMonitor):
         require("below", below, 0.0 < below <= 1.0, "in (0, 1]")
         assert self.network_ is not None
         model, rows = before.model, np.asarray(stream, np.float64)
-        quiet = (surprise.value < below * self.threshold) & (model.steps > 1)
-        reading = self.senses_.read(rows, model.before, model.earlier)
+        quiet = (surprise.value < below * self.threshold) & (model.steps >= 2 * self._lag)
+        reading = self.senses_.read(rows, model.before[:, 0], model.earlier[:, 0])
         learned: NDArray[np.bool_] = quiet & (reading.whole[:, 0] > 0)
         if learned.any():
             senses, size = self.senses_, self._units_each(self.senses_)
@@ -250,7 +261,7 @@ class NeuralASM(PredictiveMonitor):
         """
         assert self.network_ is not None
         motor, senses = self.spec.motor, self.senses_
-        _, action = motor_prediction(state.model.hidden, self.network_.weights)
+        _, action = motor_prediction(state.model.hidden[:, 0], self.network_.weights)
         return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
 
     def recall(self, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
@@ -259,7 +270,7 @@ class NeuralASM(PredictiveMonitor):
         Actions are the memory's own motor predictions. Fit with ``carry_prior`` above 0 to make it learn to run on.
 
         Args:
-            cue: (T, D) the first rows of an episode, at least 2.
+            cue: (T, D) the first rows of an episode, at least a tenth of a second and 2 rows.
             steps: how many rows to recall.
 
         Raises:
@@ -267,11 +278,13 @@ class NeuralASM(PredictiveMonitor):
         """
         self._fitted()
         assert self.network_ is not None
-        reading = self.senses_.read_episode(check_cue(self.senses_, cue, steps))
-        start = at_rest(self.network_, 1)
-        cued = follow(self.network_, start, reading.senses[:, None], reading.commands[:, None])
-        rows: NDArray[np.float64] = to_rows(self.senses_, run_on(self.network_, cued.hidden[-1], steps))[:, 0]
-        return rows
+        rows, lag = check_cue(self.senses_, cue, steps), self._lag
+        # States that take turns are recalled side by side, from equally many rows each.
+        reading = self.senses_.read_episode(rows[len(rows) % lag :])
+        senses, commands = (x.reshape(-1, lag, x.shape[1]) for x in (reading.senses, reading.commands))
+        cued = follow(self.network_, at_rest(self.network_, lag), senses, commands)
+        recalled = to_rows(self.senses_, run_on(self.network_, cued.hidden[-1], -(-steps // lag)))
+        return recalled.reshape(-1, self.spec.size)[:steps]
 
     def observe(self, state: PredictiveState, stream: NDArray[np.floating[Any]]) -> tuple[PredictiveState, Surprise]:
         state, surprise = super().observe(state, stream)
@@ -279,6 +292,22 @@ class NeuralASM(PredictiveMonitor):
             surprise = surprise._replace(skill=np.array(self.skills_)[state.model.skill.argmax(axis=1)])
         return state, surprise
 
+    @property
+    def _lag(self) -> int:
+        """l."""
+        return rows_apart(self.spec.dt)
+
     def _units_each(self, senses: Senses) -> int:
         """Hidden units of association for each group."""
         return max(1, self.association_size // (int(senses.groups.max()) + 1))
+
+
+def taking_turns(reading: Reading, lag: int) -> list[Trajectory]:
+    """An episode as each of the ``lag`` states that take turns comes to know it."""
+    known = reading.senses, reading.commands, reading.inputs
+    return [Trajectory(*(x[first::lag] for x in known)) for first in range(lag)]
+
+
+def next_turn(turns: NDArray[Any], now: NDArray[Any]) -> NDArray[Any]:
+    """(B, l, ...) the first has had its turn, and waits behind the others for its next, as it is ``now`` (B, ...)."""
+    return now[:, None] if turns.shape[1] == 1 else np.concatenate([turns[:, 1:], now[:, None]], axis=1)

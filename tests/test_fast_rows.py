@@ -1,0 +1,94 @@
+"""Rows that come faster than what a body does: the memory compares those that are a twentieth of a second apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from asm_gym.memory.senses import Senses
+from asm_gym.monitors import NeuralASM
+from tests.streams import sine_episodes, sine_spec
+
+LAG = 3
+FAST = replace(sine_spec(), dt=0.05 / LAG)
+
+
+@pytest.fixture(scope="module")
+def fast() -> NeuralASM:
+    return NeuralASM(FAST, hidden_size=24, association_size=60, epochs=2).fit(sine_episodes(12, spec=FAST))
+
+
+@pytest.fixture(scope="module")
+def slow(fast) -> NeuralASM:
+    """The same weights, for a stream at the control rate."""
+    made = NeuralASM(sine_spec(), hidden_size=24, association_size=60, epochs=2)
+    made.learned_ = fast.learned_
+    made.build_model()
+    return made
+
+
+def told(asm: NeuralASM, stream: np.ndarray) -> np.ndarray:
+    """(T, X) errors, row by row."""
+    state, errors = asm.start_model(1), []
+    for row in stream.astype(np.float64):
+        state, error, _ = asm.predict(state, row[None])
+        errors.append(error[0])
+    return np.array(errors)
+
+
+def test_every_third_row_feels_as_if_there_were_no_others(fast, slow):
+    stream = sine_episodes(1, seed=3)[0].stream
+    errors = told(fast, stream)
+    for first in range(LAG):
+        np.testing.assert_allclose(errors[first::LAG], told(slow, stream[first::LAG]), rtol=2e-5, atol=2e-6)
+    assert np.abs(errors[2 * LAG :]).max() > 0.1
+
+
+def test_a_whole_episode_is_read_as_its_rows_are(fast):
+    stream = sine_episodes(1, seed=4)[0].stream.astype(np.float64)
+    senses = fast.senses_
+    assert senses.lag == LAG
+    whole = senses.read_episode(stream)
+    for t in (0, LAG - 1, LAG, 2 * LAG - 1, 2 * LAG, 30):
+        before = stream[t - LAG] if t >= LAG else stream[t]
+        earlier = stream[t - 2 * LAG] if t >= 2 * LAG else before
+        one = senses.read(*(x[None] for x in (stream[t], before, earlier)))
+        np.testing.assert_array_equal(whole.inputs[t], one.inputs[0])
+
+
+def test_changes_are_standardised_over_as_many_rows():
+    streams = [e.stream for e in sine_episodes(5)]
+    by_hand = np.concatenate([s[LAG:].astype(np.float64) - s[:-LAG] for s in streams]).std(axis=0)
+    np.testing.assert_allclose(Senses.fit(FAST, streams, LAG).change, by_hand)
+
+
+def test_side_by_side_is_as_one_by_one_whenever_each_began(fast):
+    streams = [e.stream[:20].astype(np.float64) for e in sine_episodes(2, seed=5)]
+    state = fast.start_model(2)
+    begun = fast.start_model(1)
+    late = []
+    for t in range(20):
+        state, error, _ = fast.predict(state, np.stack([s[t] for s in streams]))
+        if t == 4:  # the second stream begins anew, as after a reset
+            state = type(state)(*(np.concatenate([a[:1], b]) for a, b in zip(state, begun, strict=True)))
+        if t > 4:
+            late.append(error[1])
+    np.testing.assert_allclose(late, told(fast, streams[1][5:]), rtol=2e-5, atol=2e-6)
+
+
+def test_recall_goes_on_with_each_state_in_its_turn(fast, slow):
+    cue = sine_episodes(1, seed=6)[0].stream[:16]
+    rows = fast.recall(cue, 7)
+    for turn in range(LAG):  # the cue's first row belongs to none of them
+        expected = slow.recall(cue[1 + turn :: LAG], 3)
+        np.testing.assert_allclose(rows[turn::LAG], expected[: len(rows[turn::LAG])], rtol=1e-4, atol=1e-5)
+    with pytest.raises(ValueError, match="at least 6 rows long"):
+        fast.recall(cue[:5], 1)
+
+
+def test_episodes_too_short_to_have_a_change_are_refused():
+    short = sine_episodes(1, spec=FAST, steps=(LAG, LAG))
+    with pytest.raises(ValueError, match="episode 0 must be at least 4 steps long, got 3"):
+        NeuralASM(FAST).fit(short)
