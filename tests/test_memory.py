@@ -362,12 +362,14 @@ def test_network_reports_the_errors_of_association_in_the_spread_that_is_expecte
     seen = np.ones_like(x)
     seen[1, 3] = 0
     whole = seen.min(axis=1, keepdims=True)
-    step = network.step(z, Reading(x, seen, u, inputs, inputs[:, CHANGES], whole, np.ones((2, 7), bool)))
-    np.testing.assert_allclose(step.expected, np.tanh(z) @ w.W_H.T + u @ w.W_U.T, atol=1e-5)
+    found, units = network.associate(Reading(x, seen, u, inputs, inputs[:, CHANGES], whole, np.ones((2, 7), bool)))
+    expected, _ = network.follow(z, u, x, seen)
+    np.testing.assert_allclose(expected, np.tanh(z) @ w.W_H.T + u @ w.W_U.T, atol=1e-5)
     V, U, D, W_S, b_S = association
     f = np.tanh(inputs @ V.T)
     error = inputs[:, CHANGES] - f @ U.T - inputs @ D.T
-    np.testing.assert_allclose(step.error, whole * error * np.exp(-0.5 * (f @ W_S.T + b_S)), atol=1e-4)
+    np.testing.assert_allclose(units, f, atol=1e-5)
+    np.testing.assert_allclose(found, whole * error * np.exp(-0.5 * (f @ W_S.T + b_S)), atol=1e-4)
 
 
 def test_nothing_is_predicted_from_its_own_group():

@@ -28,11 +28,15 @@ REFERENCE_WIDTH = 256
 
 
 class Trajectory(NamedTuple):
-    """One episode as the network reads it; float32, standardised."""
+    """One episode as the network reads it; float32, standardised.
+
+    ``senses`` and ``commands`` are those of the T steps of the temporal network; where rows come faster than these,
+    N is larger.
+    """
 
     senses: Array  # (T, X)
     commands: Array  # (T, A + 1), the last one a constant 1
-    inputs: Array  # (T, I) of association
+    inputs: Array  # (N, I) of association
 
 
 class Batch(NamedTuple):

@@ -21,15 +21,6 @@ from asm_gym.memory.rehearsal import rehearse
 from asm_gym.memory.senses import Reading
 
 
-class Step(NamedTuple):
-    """What the network made of one row of each stream in a batch."""
-
-    hidden: Array  # (B, H) z_t, the state to carry on with
-    expected: Array  # (B, H) μ_t, the state expected before the row was seen
-    error: Array  # (B, X) (Δ_t - Δ̂_t)/σ_t; 0 where a row was not whole
-    units: Array  # (B, M) f(h_t) of association
-
-
 def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> Weights:
     """Random weights of about unit gain; no biases."""
     weights = {n: np.zeros(shape, np.float32) for n, shape in weight_shapes(hidden, sensory, motor).items()}
@@ -69,14 +60,13 @@ class Network:
     def hidden_size(self) -> int:
         return self.weights.W_H.shape[0]
 
-    def step(self, z: Array, reading: Reading) -> Step:
-        """One control step from the state ``z`` (B, H)."""
-        mu, after = self.follow(z, reading.commands, reading.senses, reading.seen)
+    def associate(self, reading: Reading) -> tuple[Array, Array]:
+        """(Δ_t - Δ̂_t)/σ_t (B, X), 0 where a row was not whole; and f(h_t) (B, M) of association."""
         error, units = normalised_errors(reading.inputs, reading.changes, reading.whole, *self.association)
-        return Step(after, mu, error, units)
+        return error, units
 
     def follow(self, z: Array, u: Array, x: Array, seen: Array) -> tuple[Array, Array]:
-        """μ_t and z_t (B, H).
+        """μ_t, expected before the row was seen, and z_t, the state to carry on with; (B, H).
 
         Args:
             z: (B, H) the state carried so far.

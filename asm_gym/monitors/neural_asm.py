@@ -32,12 +32,12 @@ from asm_gym.stream import StreamSpec
 class MemoryState(NamedTuple):
     """Where the memory is, one entry a stream.
 
-    Each row is compared with that of l rows before, and carries on from the state of that time: there are l states,
-    which take turns. The first of each is the one whose turn comes next.
+    Association compares each row with that of l rows before; the state is inferred anew every l rows.
     """
 
-    hidden: NDArray[np.float32]  # (B, l, H) the inferred states z
-    before: NDArray[np.float64]  # (B, l, D) the rows seen last
+    hidden: NDArray[np.float32]  # (B, H) the inferred state z
+    expected: NDArray[np.float32]  # (B, H) f(μ), of the state that was expected then
+    before: NDArray[np.float64]  # (B, l, D) the rows seen last, the oldest first
     earlier: NDArray[np.float64]  # (B, l, D) those before
     steps: NDArray[np.int64]  # (B,) how many rows were seen
     skill: NDArray[np.float32]  # (B, K) L, what speaks for each skill; K is 0 where none has a name
@@ -116,7 +116,9 @@ class NeuralASM(PredictiveMonitor):
         self, streams: Sequence[NDArray[np.float32]], rng: np.random.Generator, progress: Progress
     ) -> dict[str, NDArray[Any]]:
         senses = Senses.fit(self.spec, streams, self._lag)
-        trajectories = [t for s in streams for t in taking_turns(senses.read_episode(s), self._lag)]
+        readings = [senses.read_episode(s) for s in streams]
+        lag = self._lag
+        trajectories = [Trajectory(r.senses[::lag], r.commands[::lag], r.inputs) for r in readings]
         schedule = Schedule(*(getattr(self, name) for name in Schedule._fields))
         sizes = self.hidden_size, self._units_each(senses)
         self.skills_ = ()
@@ -143,10 +145,10 @@ class NeuralASM(PredictiveMonitor):
         self.network_ = Network(weights, association, *how)
 
     def start_model(self, batch: int) -> MemoryState:
-        hidden = np.zeros((batch, self._lag, self.hidden_size), np.float32)
+        hidden = np.zeros((batch, self.hidden_size), np.float32)
         rows = np.zeros((batch, self._lag, self.spec.size))
         skill = np.zeros((batch, len(self.skills_)), np.float32)
-        return MemoryState(hidden, rows, rows, np.zeros(batch, np.int64), skill)
+        return MemoryState(hidden, hidden, rows, rows, np.zeros(batch, np.int64), skill)
 
     def predict(
         self, state: MemoryState, rows: NDArray[np.float64]
@@ -156,18 +158,37 @@ class NeuralASM(PredictiveMonitor):
         if state.steps.min() < 2 * lag:  # before the first rows nothing has moved
             before = np.where(state.steps[:, None] >= lag, before, rows)
             earlier = np.where(state.steps[:, None] >= 2 * lag, earlier, before)
-        step = self.network_.step(np.ascontiguousarray(state.hidden[:, 0]), self.senses_.read(rows, before, earlier))
+        reading = self.senses_.read(rows, before, earlier)
+        hidden, expected = self._carry_on(state, reading)
+        error, units = self.network_.associate(reading)
         skill = state.skill
         if self.skills_:
-            skill = add_up(skill, step.units, self.learned_["W_K"], self.learned_["b_K"])
+            skill = add_up(skill, units, self.learned_["W_K"], self.learned_["b_K"])
         state = MemoryState(
-            hidden=next_turn(state.hidden, step.hidden),
-            before=next_turn(state.before, rows),
-            earlier=next_turn(state.earlier, before),
+            hidden=hidden,
+            expected=expected,
+            before=newest(state.before, rows),
+            earlier=newest(state.earlier, before),
             steps=state.steps + 1,
             skill=skill,
         )
-        return state, step.error, activate(step.expected)
+        return state, error, expected
+
+    def _carry_on(self, state: MemoryState, reading: Reading) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """z and f(μ) (B, H) after a row, which are as they were in streams whose turn it is not."""
+        assert self.network_ is not None
+        due = state.steps % self._lag == 0
+        if not due.any():
+            return state.hidden, state.expected
+        if due.all():
+            mu, z = self.network_.follow(state.hidden, reading.commands, reading.senses, reading.seen)
+            return z, activate(mu)
+        hidden, expected = state.hidden.copy(), state.expected.copy()
+        mu, hidden[due] = self.network_.follow(
+            hidden[due], reading.commands[due], reading.senses[due], reading.seen[due]
+        )
+        expected[due] = activate(mu)
+        return hidden, expected
 
     def name_skills(self, episodes: Sequence[Episode]) -> Self:
         """Learns to tell which skill is running, from episodes whose ``info["skill"]`` says it.
@@ -261,7 +282,7 @@ class NeuralASM(PredictiveMonitor):
         """
         assert self.network_ is not None
         motor, senses = self.spec.motor, self.senses_
-        _, action = motor_prediction(state.model.hidden[:, 0], self.network_.weights)
+        _, action = motor_prediction(state.model.hidden, self.network_.weights)
         return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
 
     def recall(self, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
@@ -279,7 +300,7 @@ class NeuralASM(PredictiveMonitor):
         self._fitted()
         assert self.network_ is not None
         rows, lag = check_cue(self.senses_, cue, steps), self._lag
-        # States that take turns are recalled side by side, from equally many rows each.
+        # Every l-th row follows from those l apart: as many threads of rows, recalled side by side.
         reading = self.senses_.read_episode(rows[len(rows) % lag :])
         senses, commands = (x.reshape(-1, lag, x.shape[1]) for x in (reading.senses, reading.commands))
         cued = follow(self.network_, at_rest(self.network_, lag), senses, commands)
@@ -302,12 +323,6 @@ class NeuralASM(PredictiveMonitor):
         return max(1, self.association_size // (int(senses.groups.max()) + 1))
 
 
-def taking_turns(reading: Reading, lag: int) -> list[Trajectory]:
-    """An episode as each of the ``lag`` states that take turns comes to know it."""
-    known = reading.senses, reading.commands, reading.inputs
-    return [Trajectory(*(x[first::lag] for x in known)) for first in range(lag)]
-
-
-def next_turn(turns: NDArray[Any], now: NDArray[Any]) -> NDArray[Any]:
-    """(B, l, ...) the first has had its turn, and waits behind the others for its next, as it is ``now`` (B, ...)."""
-    return now[:, None] if turns.shape[1] == 1 else np.concatenate([turns[:, 1:], now[:, None]], axis=1)
+def newest(rows: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(B, l, D) without the oldest of the rows, and with this one (B, D)."""
+    return row[:, None] if rows.shape[1] == 1 else np.concatenate([rows[:, 1:], row[:, None]], axis=1)
