@@ -257,6 +257,18 @@ def test_a_trial_that_goes_well_is_forgotten():
     assert not any(i["asm"]["gave_up"] for i in infos)
 
 
+def test_an_alarm_that_is_back_at_once_has_not_gone_and_ends_the_episode():
+    """Quiet whenever the robot holds, and surprising again two steps after the policy goes on: a fault that lasts."""
+    env = NeuralASMSafety(FakeEnv(length=60), CueMonitor([3, 7, 11, 15, 19]), release_after=2, max_override=6)
+    env.reset(seed=0)
+    infos = []
+    while not infos or not infos[-1]["asm"]["gave_up"]:
+        infos.append(env.step(ACT)[4])
+    assert "".join("h" if i["asm"]["intervened"] else "p" for i in infos) == "pppp" + "hhpp" * 3 + "h"
+    later = NeuralASMSafety(FakeEnv(length=60), CueMonitor([3, 9, 15, 21, 27]), release_after=2, max_override=6)
+    assert not any(i["asm"]["gave_up"] for i in run(later, 40))
+
+
 def test_an_overrun_warns_once_or_counts_as_an_alarm(monkeypatch):
     class Slow(CueMonitor):
         def observe(self, state, stream):

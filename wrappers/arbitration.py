@@ -24,8 +24,9 @@ class Patience:
     Args:
         release_after: control steps of quiet after which it is.
         release_below: share of the threshold, in (0, 1], that surprise must be under to count as quiet.
-        max_override: control steps for which a reflex may act, trials between them not ending the count; None for as
-            many as it takes.
+        max_override: control steps for which a reflex may act. Those before a hand-back after which the alarm is back
+            within ``release_after`` steps count too: what comes back at once has not gone. None for as many as it
+            takes.
         try_after: control steps after which control is handed back on trial though surprise is not quiet, for a robot
             that holds still where it never did may surprise itself; after each trial that fails, twice as many. None
             for no trials.
@@ -100,7 +101,8 @@ class Arbiter:
         """Why the reflex could not act when it last should; empty where it could."""
         self._quiet = self._acted = self._held = 0
         self._wait: float = self._patience.try_after or math.inf
-        self._on_trial: int | None = None  # rows since control was handed back on trial
+        self._handed_back: int | None = None  # so many rows ago, as long as it may turn out too early
+        self._tried = False  # and it was on trial
         self._state: Any = None
         self._fresh = False
         if isinstance(self._reflex, Hold):
@@ -156,10 +158,10 @@ class Arbiter:
         self._quiet = self._quiet + 1 if quiet else 0
         if intervened:
             self._acted, self._held = self._acted + 1, self._held + 1
-        elif self._on_trial is not None:
-            self._on_trial += 1
-            if self._on_trial > self._patience.release_after:
-                self._on_trial = None
+        elif self._handed_back is not None:
+            self._handed_back += 1
+            if self._handed_back > self._patience.release_after:
+                self._handed_back = None
         transition = self._next(alarm, executed)
         if transition:
             _log.info("%s: surprise %.3g, threshold %.3g", transition, surprise, self._threshold)
@@ -172,19 +174,19 @@ class Arbiter:
                 self._take_over(executed)
             return "override" if alarm else ""
         if self._quiet >= self._patience.release_after:
-            self.overriding, self._on_trial = False, None
+            self.overriding, self._handed_back, self._tried = False, 0, False
             return "release"
         if self._acted >= (self._patience.max_override or math.inf):
             return "give_up"
         if self._held >= self._wait:
-            self.overriding, self._on_trial = False, 0
+            self.overriding, self._handed_back, self._tried = False, 0, True
             return "trial"
         return ""
 
     def _take_over(self, executed: NDArray[np.float32]) -> None:
-        if self._on_trial is None:
+        if self._handed_back is None:
             self._acted, self._wait = 0, self._patience.try_after or math.inf
-        else:
+        elif self._tried:
             self._wait *= 2
         self._held, self._before = 0, executed
         self.overriding = self._fresh = True

@@ -68,7 +68,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             the robot holds.
         release_after: control steps of quiet after which control is handed back.
         release_below: share of the threshold, in (0, 1], that surprise must be under to count as quiet.
-        max_override: control steps for which a reflex may act, after which the episode ends; None for as many as it
+        max_override: control steps for which a reflex may act, after which the episode ends; an alarm that is back
+            within ``release_after`` steps of handing back has not gone, and the count goes on. None for as many as it
             takes, with ``"graded"`` for 3 s.
         try_after: control steps of override after which control is handed back on trial, though surprise is not quiet;
             after each trial that fails, twice as many. None for no trials, with ``"graded"`` for 0.5 s.
