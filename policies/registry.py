@@ -13,11 +13,13 @@ from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.reflexes import Hold
 from asm_gym.policies.sb3 import read_archive
 from asm_gym.policies.scripted.door import DoorExpert
+from asm_gym.policies.scripted.handover import HandoverExpert
 from asm_gym.policies.scripted.lift import LiftExpert
 from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
 from asm_gym.policies.scripted.peg_in_hole import PegInHoleExpert
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
 from asm_gym.policies.scripted.stack import StackExpert
+from asm_gym.policies.scripted.transport import TransportExpert
 from asm_gym.policies.scripted.two_arm_lift import TwoArmLiftExpert
 from asm_gym.policies.scripted.wipe import WipeExpert
 
@@ -28,6 +30,8 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
     "Wipe": WipeExpert,
     "TwoArmLift": TwoArmLiftExpert,
     "TwoArmPegInHole": PegInHoleExpert,
+    "TwoArmHandover": HandoverExpert,
+    "TwoArmTransport": TransportExpert,
     **{f"NutAssembly{which}": NutAssemblyExpert for which in ("", "Single", "Square", "Round")},
     **{f"PickPlace{which}": PickPlaceExpert for which in ("", "Single", "Can", "Milk", "Bread", "Cereal")},
 }

@@ -9,8 +9,9 @@ import pytest
 import asm_gym  # noqa: F401
 from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS
-from asm_gym.policies.scripted.base import Style, gripping, has_settled
+from asm_gym.policies.scripted.base import ObservationReader, Style, grasping, gripping, has_settled
 from asm_gym.policies.scripted.door import _about
+from asm_gym.policies.scripted.handover import Hammer, Meeting
 from asm_gym.policies.scripted.two_arms import Hand, move_arm
 from asm_gym.scripts.benchmark_experts import attempt
 from asm_gym.scripts.collect import collect, episode_seeds
@@ -22,6 +23,7 @@ QUICK = [
     "Wipe",
     "TwoArmPegInHole",
     "TwoArmLift",
+    "TwoArmHandover",
     "NutAssemblySquare",
     "NutAssemblyRound",
     "PickPlaceCan",
@@ -67,8 +69,9 @@ def test_other_arms_succeed_on_most_of_100_seeds(task, robot):
 @pytest.mark.slow
 @pytest.mark.parametrize("task", sorted(EXPERTS))
 def test_an_expert_succeeds_on_95_of_100_seeds(task):
-    # Two nuts or four things in one episode are not mastered yet: 64 and 34 of 100 (asm-gym benchmark experts).
-    least = {"NutAssembly": 50, "PickPlace": 22}.get(task, 95)
+    # Two nuts or four things in one episode are not mastered yet: 64 and 34 of 100 (asm-gym benchmark experts); of the
+    # hammer's handovers a few fail, and so do more of those that begin and end in a bin.
+    least = {"NutAssembly": 50, "PickPlace": 22, "TwoArmHandover": 90, "TwoArmTransport": 70}.get(task, 95)
     assert sum(e.success for e in collect(f"asm_gym/{task}-v0", episodes=100, seed=99, workers=2)) >= least
 
 
@@ -96,6 +99,44 @@ def test_a_grasp_takes_the_nearest_of_equal_directions():
     target = gripping(hand, np.array([0.1, 1.0, 0.0]))
     assert np.degrees(np.arccos(target[:, 1] @ hand[:, 1])) == pytest.approx(5.71, abs=0.01)
     np.testing.assert_allclose(target.T @ target, np.eye(3), atol=1e-12)
+
+
+def test_a_hand_is_turned_no_further_than_its_grasp_asks_for():
+    down, side = np.array([0.0, 0.0, -1.0]), np.array([0.6, 0.8, 0.0])
+    for hand in (np.eye(3), np.diag([-1.0, -1.0, 1.0])):
+        turned = grasping(hand, down, side)
+        np.testing.assert_allclose(turned.T @ turned, np.eye(3), atol=1e-12)
+        assert np.linalg.det(turned) == pytest.approx(1)
+        np.testing.assert_allclose(turned[:, 1], side * hand[1, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize("length", [0.1, 0.15, 0.2, 0.25])  # those that robosuite draws from [m]
+def test_both_hands_find_room_on_a_handle(length):
+    hammer = Hammer.seen(np.array([1.0, 2.0, 3.0]), np.eye(3), length)
+    giving, taking = hammer.grips()
+    assert giving[2] - taking[2] >= 0.07  # a palm is 6 cm thick
+    assert max(abs(hammer.giving), abs(hammer.taking)) <= length / 2 - 0.01  # half a finger
+    np.testing.assert_allclose(giving[:2], [1.0, 2.0])
+
+
+def test_the_hands_that_meet_come_from_two_sides_at_right_angles():
+    meeting = Meeting.between(np.array([0.0, -0.8, 0.9]), np.array([0.0, 0.8, 0.9]), height=1.15)
+    np.testing.assert_allclose(meeting.at, [0, 0, 1.15], atol=1e-12)
+    first, second = meeting.giving(np.eye(3)), meeting.taking(np.array([1.0, 0.0, 0.0]))
+    assert first[:, 2] @ second[:, 2] == pytest.approx(0, abs=1e-12)
+    assert abs(first[:, 1] @ second[:, 2]) == pytest.approx(1)  # each closes on the sides the other leaves free
+    for turned in (first, second):
+        np.testing.assert_allclose(turned.T @ turned, np.eye(3), atol=1e-12)
+        assert turned[2, 2] < 0  # from above
+
+
+def test_a_reader_for_one_of_two_robots_finds_its_hand_and_what_belongs_to_none():
+    env = gym.make("asm_gym/TwoArmHandover-v0")
+    observation, _ = env.reset(seed=0)
+    both, second = ObservationReader(env), ObservationReader(env, "robot1")
+    np.testing.assert_array_equal(second(observation, "hand_position"), both(observation, "robot1_hand_position"))
+    np.testing.assert_array_equal(second(observation, "hammer_pos"), both(observation, "hammer_pos"))
+    env.close()
 
 
 def test_a_rotation_about_an_axis_keeps_it():

@@ -53,9 +53,15 @@ class Style:
 
 
 class ObservationReader:
-    """Named parts of an environment's flat or dict observation."""
+    """Named parts of an environment's flat or dict observation.
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    Args:
+        env: has the observation's layout.
+        robot: whose hand and fingers are meant where a name does not say, such as ``"robot0"``.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], robot: str = "") -> None:
+        self._robot = robot
         self._flat = isinstance(env.observation_space, spaces.Box)
         self._slices: dict[str, slice] = {}
         start = 0
@@ -64,6 +70,8 @@ class ObservationReader:
             start += size
 
     def __call__(self, observation: Any, name: str) -> Vector:
+        own = f"{self._robot}_{name}"
+        name = own if own in self._slices else name
         part = observation[self._slices[name]] if self._flat else observation[name]
         return np.asarray(part, dtype=np.float64)
 
@@ -82,8 +90,8 @@ class Expert:
         self.style = style or Style()
         self.np_random = np.random.default_rng(seed)
         self._read = ObservationReader(env)
-        self._careful = tuple(env.unwrapped.robots) != ("Panda",)  # type: ignore[attr-defined]
-        """Plans for one arm have the Panda's pace; other arms drift further from their course."""
+        self._careful = set(env.unwrapped.robots) != {"Panda"}  # type: ignore[attr-defined]
+        """Plans have the Panda's pace; other arms drift further from their course."""
 
 
 def has_settled(velocity: Vector, since: int, usual: int) -> bool:
@@ -144,6 +152,15 @@ def gripping(hand: Vector, closing: Vector | None, turns: float = np.pi) -> Vect
     y = np.array([np.cos(yaw), np.sin(yaw), 0.0])
     z = np.array([0.0, 0.0, -1.0])
     return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def grasping(hand: Vector, approach: Vector, closing: Vector) -> Vector:
+    """(3, 3) the rotation nearest ``hand`` (3, 3) whose fingers point along ``approach`` and close along ``closing``.
+
+    Both are unit vectors (3,) at right angles.
+    """
+    y = closing * (1.0 if hand[:, 1] @ closing > 0 else -1.0)
+    return np.stack([np.cross(y, approach), y, approach], axis=1)
 
 
 def move(

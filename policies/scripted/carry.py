@@ -200,8 +200,7 @@ class CarryExpert(Expert, ABC):
         """(3, 3) how to hold the hand for grasping."""
         return gripping(hand, None if errand.closing is None else turned @ errand.closing, errand.turns)
 
-    @staticmethod
-    def _held(errand: Errand, hand: Vector, turned: Vector) -> Vector:
+    def _held(self, errand: Errand, hand: Vector, turned: Vector) -> Vector:
         """(3, 3) how to hold the hand so that the object in it comes to fit its place."""
         down = gripping(hand, None)
         angle = _to_fit(errand.headings, turned)

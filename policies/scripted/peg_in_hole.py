@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.base import Expert, Style, Vector, matrix
+from asm_gym.policies.scripted.base import Expert, Style, Vector, grasping, matrix
 from asm_gym.policies.scripted.two_arms import ARMS, Hands, move_arm
 
 TURN, ALIGN, INSERT = range(3)
@@ -125,6 +125,4 @@ def _ahead(state: PegInHoleState, along: float, astray: float) -> float:
 
 def _facing(hand: Vector, state: PegInHoleState) -> Vector:
     """(3, 3) the rotation nearest ``hand`` that turns the plate, whose normal is the hand's y axis, to face the peg."""
-    y = state.course * (1.0 if hand[:, 1] @ state.course > 0 else -1.0)
-    z = np.cross(state.course, state.side)
-    return np.stack([np.cross(y, z), y, z], axis=1)
+    return grasping(hand, np.cross(state.course, state.side), state.course)

@@ -1,0 +1,189 @@
+"""Carries the payload from bin to bin with two arms: one lifts the lid off and hands the hammer under it to the other.
+
+Meanwhile the other has taken the trash out of the target bin.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.policies.scripted.base import Expert, ObservationReader, Style, Vector, gripping, move
+from asm_gym.policies.scripted.carry import CARRY, RAISE, RETREAT, CarryExpert, CarryState, Errand
+from asm_gym.policies.scripted.handover import PART, HandoverExpert, HandoverState
+from asm_gym.policies.scripted.two_arms import Hands
+
+_DEEP = 0.22  # how far above a bin's floor to come from: its walls are 15 cm high [m]
+_WITHDRAWN = 15  # after how many steps the first hand is out of the second's way
+_OFF_MIDDLE = 0.025  # how far the hammer's middle is from that of its handle, for its head [m]
+_PACE = 0.7  # it is a long way [action units]
+_ASIDE = np.array([-0.35, 0.0, -0.05])  # from the start bin's middle to the lid's handle on the table beside it [m]
+
+
+class Carrier(CarryExpert):
+    """One of two arms, which carries one thing.
+
+    Args:
+        env, seed, style: as for ``Expert``.
+        arm: 0 or 1.
+    """
+
+    pace = _PACE
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int, style: Style, arm: int) -> None:
+        super().__init__(env, seed, style)
+        self._careful, self._gain = True, 3.0  # near its own base, an arm drifts towards it
+        self._arm = arm
+        self._hands = Hands(env)
+        self._read = ObservationReader(env, f"robot{arm}")
+
+    def _command(self, state: CarryState, observation: Any, hand_at: Vector, hand: Vector) -> Vector:
+        """(7,) towards what the phase asks for, in the frame of the arm's base."""
+        base = self._hands.bases()[self._arm]
+        command = super()._command(state, observation, hand_at, hand)
+        if state.phase == RAISE:  # straight up, little by little: the walls of a bin are near
+            up = np.array([*state.anchor[:2], hand_at[2] + 0.03])
+            command[:6] = move(hand_at, up, hand, gripping(hand, None), state.speed, self._gain)
+        return np.concatenate([base.T @ command[:3], base.T @ command[3:6], command[6:]])
+
+    def _held(self, errand: Errand, hand: Vector, turned: Vector) -> Vector:
+        """(3, 3) how to hold the hand on its way: with the wrist in the middle, where it turns both ways."""
+        return gripping(hand, -self._hands.bases()[self._arm][:, 1], 2 * np.pi)
+
+    @staticmethod
+    def is_done(state: CarryState) -> bool:
+        """Whether everything is where it belongs, and the hand has left it."""
+        return state.errand is None or (state.phase == RETREAT and state.since > 14)
+
+
+class LidCarrier(Carrier):
+    """Puts the lid of the start bin on the table."""
+
+    def next_errand(self, observation: Any) -> Errand | None:
+        """The lid, until it is off."""
+        env = self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
+        start = env.sim.data.body_xpos[env.sim.model.body_name2id(env.transport.start_bin.root_body)]
+        at, _ = self.pose(observation, "lid_handle")
+        if np.linalg.norm((at - start)[:2]) > 0.25:
+            return None
+        return Errand(
+            name="lid_handle",
+            grip=np.zeros(3),
+            closing=np.array([1.0, 0.0, 0.0]),
+            turns=np.pi,
+            clearance=0.1,
+            place=start + _ASIDE,
+            over=0.22,
+        )
+
+
+class TrashCarrier(Carrier):
+    """Throws the trash into its bin."""
+
+    def next_errand(self, observation: Any) -> Errand | None:
+        """The trash, until it is in its bin."""
+        at, turned = self.pose(observation, "trash")
+        trash_bin = self._read(observation, "trash_bin_pos")
+        if np.linalg.norm((at - trash_bin)[:2]) < 0.14:
+            return None
+        side = turned[:, int(np.abs(turned[2]).argmin())]  # the one that lies flattest gives the cube's heading
+        return Errand(
+            name="trash",
+            grip=np.zeros(3),
+            closing=turned.T @ side,
+            turns=np.pi / 2,
+            clearance=_DEEP,
+            place=trash_bin + np.array([0.0, 0.0, 0.17]),
+            over=0.08,
+            fit=0.04,
+        )
+
+
+class PayloadCarrier(Carrier):
+    """Lets the hammer down into the target bin.
+
+    Args:
+        env, seed, style, arm: as for ``Carrier``.
+        handover: knows where the hand holds it.
+    """
+
+    pace = 0.55
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int, style: Style, arm: int, handover: HandoverExpert) -> None:
+        super().__init__(env, seed, style, arm)
+        self._handover = handover
+
+    def pose(self, observation: Any, name: str) -> tuple[Vector, Vector]:
+        """(3,) middle of the whole hammer, which has to fit between the walls, and its (3, 3) rotation."""
+        at, turned = super().pose(observation, name)
+        return at + _OFF_MIDDLE * turned[:, 2], turned
+
+    def next_errand(self, observation: Any) -> Errand | None:
+        """The hammer, until it is in the bin."""
+        at, _ = self.pose(observation, "payload")
+        target = self._read(observation, "target_bin_pos")
+        if np.linalg.norm((at - target)[:2]) < 0.14 and at[2] < target[2] + 0.05:
+            return None
+        return Errand(
+            name="payload",
+            grip=np.array([0.0, 0.0, self._handover.hammer(observation).taking - _OFF_MIDDLE]),
+            closing=np.array([1.0, 0.0, 0.0]),
+            turns=np.pi,
+            clearance=_DEEP,
+            place=target + np.array([0.0, 0.0, 0.13]),
+            over=0.2,
+            fit=0.04,
+        )
+
+    def take_over(self, observation: Any) -> CarryState:
+        """Where an episode stands in which the hand already has the hammer."""
+        return self._begin(observation)._replace(phase=CARRY)
+
+
+class TransportState(NamedTuple):
+    """Where one episode stands in each of its four parts; None before a part begins."""
+
+    lid: CarryState | None = None
+    trash: CarryState | None = None
+    handover: HandoverState | None = None
+    payload: CarryState | None = None
+
+
+class TransportExpert(Expert):
+    """A scripted expert for TwoArmTransport."""
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
+        super().__init__(env, seed, style)
+        seeds = [int(s) for s in self.np_random.integers(2**31, size=4)]
+        self._lid = LidCarrier(env, seeds[0], self.style, arm=0)
+        self._trash = TrashCarrier(env, seeds[1], self.style, arm=1)
+        self._handover = HandoverExpert(env, seeds[2], self.style, name="payload", over=_DEEP, pace=_PACE)
+        self._payload = PayloadCarrier(env, seeds[3], self.style, arm=1, handover=self._handover)
+
+    def predict(
+        self,
+        observation: Any,
+        state: TransportState | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], TransportState]:
+        """The action (14,); ``deterministic`` leaves the action noise out, not the style."""
+        if state is None or (episode_start is not None and np.any(episode_start)):
+            state = TransportState()
+        first, lid = self._lid.predict(observation, state.lid, deterministic=deterministic)
+        second, trash = self._trash.predict(observation, state.trash, deterministic=deterministic)
+        state = state._replace(lid=lid, trash=trash)
+        if not Carrier.is_done(lid):
+            return np.concatenate([first, second]), state
+        both, shared = self._handover.predict(observation, state.handover, deterministic=deterministic)
+        state = state._replace(handover=shared)
+        if not Carrier.is_done(trash):
+            return np.concatenate([both[:7], second]), state
+        if shared.phase == PART and shared.since > _WITHDRAWN:
+            started = state.payload or self._payload.take_over(observation)
+            second, payload = self._payload.predict(observation, started, deterministic=deterministic)
+            return np.concatenate([both[:7], second]), state._replace(payload=payload)
+        return both, state
