@@ -21,6 +21,9 @@ COMMANDS: dict[str, Command] = {
     "collect": Command("asm_gym.scripts.collect", "episodes of a policy, as a Minari dataset"),
     "import": Command("asm_gym.scripts.demonstrations", "robosuite's or robomimic's HDF5 demonstrations, likewise"),
     "train": Command("asm_gym.scripts.train", "an agent: cloned from an expert, improved by SAC, TD3 or PPO"),
+    "train-safely": Command(
+        "asm_gym.scripts.train_safely", "the same agent trained alone and under the safety wrapper"
+    ),
     "evaluate": Command("asm_gym.scripts.evaluate", "tasks x monitors x faults: who notices what, with a report"),
     "repertoire": Command("asm_gym.scripts.repertoire", "one memory of all skills against one for each, over seeds"),
     "react": Command("asm_gym.scripts.react", "reflexes x faults: what acting on alarms is worth, paired by seed"),
