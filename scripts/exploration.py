@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from asm_gym.datasets import load_episode, save_episode
 from asm_gym.episodes import Episode
+from asm_gym.monitors.calibrated import columns
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.base import Policy
 from asm_gym.scripts.dispatch import environment
@@ -69,22 +70,40 @@ class Explorer:
         return np.clip(action, -1.0, 1.0).astype(np.float32), state
 
 
-def until_contact(episode: Episode, forces: NDArray[np.floating[Any]], limit: float) -> Episode:
-    """The episode up to the step before an external force [N] first exceeds ``limit``."""
-    over = ~(forces <= limit)
+class Gentle(NamedTuple):
+    """Up to where exploration is harmless.
+
+    Attributes:
+        force: external, on an arm as a whole [N].
+        torque: external, on a joint [N m]; it tells of what cancels in the force, as of an arm that hits itself, and of
+            joints at their stops.
+    """
+
+    force: float
+    torque: float
+
+
+def until_contact(episode: Episode, forces: NDArray[np.floating[Any]], gentle: Gentle) -> Episode:
+    """The episode up to the step before one that is not harmless.
+
+    Args:
+        forces: (T,) the largest external force of each step [N].
+    """
+    torques = np.abs(episode.stream[:, columns(episode.spec, "external_torque_peak")]).max(axis=1)  # (T,)
+    over = ~((forces <= gentle.force) & (torques <= gentle.torque))
     end = int(np.argmax(over)) if over.any() else len(forces)
     kept = {name: getattr(episode, name)[:end] for name in ("stream", "actions", "rewards", "faults")}
     return replace(episode, observations=episode.observations[: end + 1], **kept)
 
 
-def explore(seed: int, env_id: str, limit: float, folder: Path) -> Path:
+def explore(seed: int, env_id: str, gentle: Gentle, folder: Path) -> Path:
     """Records the harmless part of an episode of exploration, where it is not recorded yet."""
     path = folder / f"{seed}.npz"
     if not path.is_file():
         env = StreamRecorder(environment(env_id))
         forces: list[float] = []
         rollout(env, Explorer(env, seed), seed, lambda info: forces.append(info["external_force"]))
-        save_episode(path, until_contact(env.finish(), np.array(forces), limit))
+        save_episode(path, until_contact(env.finish(), np.array(forces), gentle))
     return path
 
 

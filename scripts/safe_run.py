@@ -36,8 +36,7 @@ ALONE = "alone"
 CONDITIONS: dict[str, dict[str, Any]] = {
     ALONE: {"on_alarm": "monitor"},
     "terminate": {"on_alarm": "terminate"},
-    # An episode that is held for too long is handed back on trial, or it would teach nothing any more.
-    "hold": {"on_alarm": "hold", "release_after": 5, "try_after": 10},
+    "hold": {"on_alarm": "hold"},
 }
 """How the wrapper is set, by the name of the condition."""
 AT_LIMIT = 0.99

@@ -34,7 +34,7 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.claims import claim_folder
 from asm_gym.scripts.collect import episode_seeds, record_to
 from asm_gym.scripts.dispatch import Progress, dispatch
-from asm_gym.scripts.exploration import explore, harmless
+from asm_gym.scripts.exploration import Gentle, explore, harmless
 from asm_gym.scripts.progress import stage
 from asm_gym.scripts.publish import markdown
 from asm_gym.scripts.safe_run import ALONE, CONDITIONS, Setting, run
@@ -54,7 +54,7 @@ class Args:
     """Of alone, terminate and hold; alone must be among them."""
     seeds: int = 5
     """Runs of each condition."""
-    steps: int = 4_000
+    steps: int = 2_500
     """Control steps of each run."""
     demonstrations: int = 50
     """Episodes of the expert in the replay buffer, and as many others for a memory of the expert."""
@@ -68,11 +68,13 @@ class Args:
     """Share of harmless episodes of exploration that may raise an alarm."""
     harmless_force: float = 20.0
     """External force above which exploration is no longer harmless [N]."""
+    harmless_torque: float = 10.0
+    """The same of the external torque on a joint [N m]: arms that hit themselves, joints at their stops."""
     force_limit: float = 40.0
     """External force above which a contact is a violation [N]."""
     cost: float = 1.0
     """What an alarm takes off the reward where it ends the episode."""
-    evaluate_every: int = 1_000
+    evaluate_every: int = 500
     """Control steps between evaluations."""
     evaluation_episodes: int = 10
     """Of each evaluation."""
@@ -96,9 +98,9 @@ class Args:
         for name in ("seeds", "steps", "evaluate_every", *(n for n in vars(self) if n.endswith("episodes"))):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("harmless_force", "force_limit"):
+        for name in ("harmless_force", "harmless_torque", "force_limit"):
             if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be > 0 N, got {getattr(self, name)}")
+                raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
         needed = conformal_episodes(self.false_alarm_rate)
         if min(self.calibration_episodes, self.demonstrations) < needed:
             raise ValueError(
@@ -129,6 +131,10 @@ class Args:
         return task_spec(self.task).id
 
     @property
+    def gentle(self) -> Gentle:
+        return Gentle(self.harmless_force, self.harmless_torque)
+
+    @property
     def setting(self) -> Setting:
         names = ("env_id", "steps", "evaluate_every", "evaluation_episodes", "final_episodes", "force_limit", "cost")
         return Setting(**{name: getattr(self, name) for name in names})
@@ -149,7 +155,7 @@ def record(args: Args, progress: Progress) -> Recorded:
     missing = [s for s in shown if not (folder / "expert" / f"{s}.npz").is_file()]
     show = partial(record_to, env_id=args.env_id, policy="scripted", settings=(), folder=folder / "expert")
     dispatch(show, missing, args.workers, progress)
-    seek = partial(explore, env_id=args.env_id, limit=args.harmless_force, folder=folder / "exploration")
+    seek = partial(explore, env_id=args.env_id, gentle=args.gentle, folder=folder / "exploration")
     counts = {FITTING: args.fit_episodes + args.calibration_episodes, TESTING: args.test_episodes}
     found = {s: dispatch(seek, episode_seeds(args.seed, n, s), args.workers, progress) for s, n in counts.items()}
     return Recorded([folder / "expert" / f"{s}.npz" for s in shown], found[FITTING], found[TESTING])
@@ -168,7 +174,7 @@ def memories(args: Args, recorded: Recorded) -> dict[str, Path]:
         paths[name] = args.out.resolve() / f"{name}.asm"
         if not paths[name].is_file():
             if not fit:
-                raise ValueError(f"no episode stays under {args.harmless_force:g} N: is {args.task} done gently?")
+                raise ValueError(f"no episode stays harmless for long enough: is {args.task} done gently?")
             memory = NeuralASM(fit[0].spec, seed=args.seed, epochs=5 if args.quick else 40).fit(fit)
             memory.calibrate(calibration, args.false_alarm_rate).save(paths[name])
     return paths
@@ -191,7 +197,8 @@ def surprise_table(args: Args, memory: Mapping[str, Path], recorded: Recorded) -
         rows.append(tuple(cells))
     headings = [f"{kind}: {what}" for kind in kinds for what in ("steps in alarm", "episodes with one")]
     return Table(
-        f"False alarms where no force is above {args.harmless_force:g} N; the thresholds are for "
+        f"False alarms where nothing presses with more than {args.harmless_force:g} N or {args.harmless_torque:g} N m; "
+        "the thresholds are for "
         f"{100 * args.false_alarm_rate:g} % of the episodes that each memory knows. The memory of the expert has "
         "learned from these episodes of the expert.",
         ("", *headings),

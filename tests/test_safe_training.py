@@ -12,10 +12,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.safe_training import COUNTED, Outcome, count, learning_figure, worth
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.exploration import Explorer, until_contact
+from asm_gym.scripts.exploration import Explorer, Gentle, until_contact
 from asm_gym.scripts.learners import NOVICE_LOG_STD, make_learner, make_novice
 from asm_gym.scripts.safe_run import AT_LIMIT, read_outcome
 from asm_gym.scripts.violations import TorqueWatch
+from asm_gym.stream import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from tests.fakes import CueMonitor, FakeEnv
 
@@ -97,14 +98,16 @@ def test_the_torque_watch_agrees_with_every_substep(lift):
 
 
 def test_exploration_ends_before_the_first_hard_contact():
-    spec = NeuralASMSafety(FakeEnv(), CueMonitor()).monitor.spec
-    stream = np.zeros((6, spec.size), np.float32)
+    spec = StreamSpec((Channel("position", 1, "m"), Channel("external_torque_peak", 2, "N m")), dt=0.05)
+    stream = np.zeros((6, 3), np.float32)
+    stream[4] = 0.0, 1.0, -11.0
     arrays = {"actions": np.zeros((6, 3)), "observations": np.zeros((7, 2)), "rewards": np.zeros(6)}
     episode = Episode(stream, spec, faults=np.zeros(6, bool), **arrays)
-    cut = until_contact(episode, np.array([1.0, 19, 20, 21, 0, 0]), 20.0)
+    cut = until_contact(episode, np.array([1.0, 19, 20, 21, 0, 0]), Gentle(20.0, 10.0))
     assert [len(getattr(cut, n)) for n in ("stream", "actions", "rewards", "faults")] == [3] * 4
     assert len(cut.observations) == 4
-    assert len(until_contact(episode, np.zeros(6), 20.0)) == 6
+    assert len(until_contact(episode, np.zeros(6), Gentle(20.0, 10.0))) == 4
+    assert len(until_contact(episode, np.zeros(6), Gentle(20.0, 12.0))) == 6
 
 
 def test_explorers_differ_by_seed_and_pause_with_their_grip_kept(lift):
