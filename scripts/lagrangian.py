@@ -137,10 +137,10 @@ def main(argv: list[str] | None = None) -> int:
     """Trains; 2 where the arguments make no sense."""
     console = Console()
     try:
-        args = tyro.cli(Args, args=argv, prog="python -m asm_gym.scripts.lagrangian", description=__doc__)
+        args = tyro.cli(Args, args=argv, prog="asm-gym lagrangian", description=__doc__)
         multiplier = train(args, console)
     except (ValueError, FileNotFoundError, RuntimeError) as error:
-        print(f"lagrangian: {error}", file=sys.stderr)
+        print(f"asm-gym lagrangian: {error}", file=sys.stderr)
         return 2
     console.print(f"multiplier {multiplier.value:.3g} after {args.steps} steps: {args.out / 'multiplier.json'}")
     return 0
