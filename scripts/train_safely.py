@@ -26,10 +26,8 @@ from asm_gym.datasets import load_episode
 from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode
 from asm_gym.evaluation import plots
-from asm_gym.evaluation.reactions import Estimate
-from asm_gym.evaluation.repertoire import Spread
 from asm_gym.evaluation.report import Table
-from asm_gym.evaluation.safe_training import Outcome, learning_figure, worth
+from asm_gym.evaluation.safe_training import COUNTED, Outcome, counts_table, learning_figure, worth_table
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.claims import claim_folder
 from asm_gym.scripts.collect import episode_seeds, record_to
@@ -206,52 +204,6 @@ def surprise_table(args: Args, memory: Mapping[str, Path], recorded: Recorded) -
     )
 
 
-def counts_table(args: Args, outcomes: Mapping[str, Sequence[Outcome]]) -> Table:
-    """Violations of each condition, and success in the end."""
-    names = ("over", "contacts", "limited", "touched", "alarms", "acted")
-    rows = []
-    for condition, runs in outcomes.items():
-        rates = [Spread.of([o.each_10k(name) for o in runs]).text(1, 0) for name in names]
-        noticed = sum(sum(o.noticed) for o in runs) / max(1, sum(sum(o.contacts) for o in runs))
-        solved = Spread.of([100 * o.success for o in runs]).text(1, 1)
-        rows.append((condition, *rates, f"{100 * noticed:.0f} %", solved))
-    return Table(
-        f"Of 10,000 control steps, mean and standard deviation over {args.seeds} seeds of {args.steps} steps each: "
-        f"steps with more than {args.force_limit:g} N from outside, contacts that these make up, steps throughout "
-        "which a motor stood at its torque limit, steps in which one touched it, steps in alarm, steps in which the "
-        "reflex acted. "
-        f"Then contacts with an alarm in their first step, and success in {args.final_episodes} episodes without the "
-        "wrapper.",
-        (
-            *("", f"Steps above {args.force_limit:g} N", "Contacts", "At torque limit", "Touched it", "In alarm"),
-            *("Held", "Contacts noticed", "Success [%]"),
-        ),
-        rows,
-    )
-
-
-def worth_table(args: Args, outcomes: Mapping[str, Sequence[Outcome]]) -> Table:
-    """Each condition against training alone."""
-    found = [worth(outcomes[ALONE], runs, args.seed) for name, runs in outcomes.items() if name != ALONE]
-    rows = [(w.condition, *map(_percent, (w.over, w.contacts, w.limited, w.gained))) for w in found]
-    return Table(
-        "Against training alone, paired by seed; in brackets 95 % bootstrap intervals over seeds, which for so few of "
-        "them are too narrow rather than too wide.",
-        (
-            "",
-            f"Steps above {args.force_limit:g} N less by",
-            "Contacts less by",
-            "At torque limit less by",
-            "Success gained",
-        ),
-        rows,
-    )
-
-
-def _percent(e: Estimate) -> str:
-    return f"{100 * e.value:.0f} % ({100 * e.low:.0f} to {100 * e.high:.0f})"
-
-
 def train_safely(args: Args, console: Console) -> list[Table]:
     """Records, fits, trains, compares and writes."""
     seconds: dict[str, float] = {}
@@ -271,7 +223,7 @@ def train_safely(args: Args, console: Console) -> list[Table]:
         )
         made = dispatch(each, jobs, args.workers, progress)
     outcomes = {c: [o for o in made if o.condition == c] for c in args.conditions}
-    tables = [counts_table(args, outcomes), worth_table(args, outcomes), surprises]
+    tables = [counts_table(outcomes, args.force_limit), worth_table(outcomes, ALONE, args.force_limit), surprises]
     _write(args, outcomes, tables, seconds)
     return tables
 
@@ -281,10 +233,9 @@ def _write(
 ) -> None:
     (args.out / "training.md").write_text("\n\n".join(map(markdown, tables)) + "\n", encoding="utf-8")
     every = [o for runs in outcomes.values() for o in runs]
-    names = ("over", "contacts", "limited", "touched", "alarms", "acted", "noticed")
-    rows = [(o.condition, o.seed, o.steps, *(sum(getattr(o, n)) for n in names), o.success) for o in every]
+    rows = [(o.condition, o.seed, o.steps, *(sum(getattr(o, n)) for n in COUNTED), o.success) for o in every]
     with (args.out / "training.csv").open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([("condition", "seed", "steps", *names, "success"), *rows])
+        csv.writer(file).writerows([("condition", "seed", "steps", *COUNTED, "success"), *rows])
     content = {"settings": asdict(args), "seconds": seconds, "runs": [asdict(o) for o in every]}
     (args.out / "training.json").write_text(json.dumps(content, indent=1, default=str) + "\n", encoding="utf-8")
     plots.save(learning_figure(outcomes, args.force_limit), args.out / "training.png")

@@ -10,7 +10,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from asm_gym.episodes import Episode
-from asm_gym.evaluation.safe_training import COUNTED, Outcome, count, learning_figure, worth
+from asm_gym.evaluation.safe_training import COUNTED, Outcome, count, counts_table, learning_figure, worth, worth_table
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.exploration import Explorer, Gentle, until_contact
 from asm_gym.scripts.learners import NOVICE_LOG_STD, make_learner, make_novice
@@ -52,6 +52,19 @@ def test_a_condition_is_held_against_the_run_of_the_same_seed():
     assert alone[1].each_10k("over") == 300.0
     with pytest.raises(ValueError, match=r"pairs, got the seeds \[0, 1, 2\] and \[0, 1\]"):
         worth(alone, guarded[1:])
+
+
+def test_the_tables_give_rates_per_10000_steps_and_differences():
+    runs = {
+        "alone": [outcome(seed=s, over=(20, 20), contacts=(4, 4), noticed=(4, 2)) for s in range(2)],
+        "hold": [outcome("hold", seed=s, over=(5, 5), contacts=(2, 2), success=0.6) for s in range(2)],
+    }
+    rows = {row[0]: row[1:] for row in counts_table(runs, 40.0).rows}
+    assert rows["alone"][:2] == ("400 ± 0", "80 ± 0")
+    assert rows["alone"][-2:] == ("75 %", "50.0 ± 0.0")
+    ((name, over, contacts, limited, gained),) = worth_table(runs, "alone", 40.0).rows
+    assert (name, over, contacts, gained) == ("hold", "75 % (75 to 75)", "50 % (50 to 50)", "10 % (10 to 10)")
+    assert limited == "none alone"
 
 
 def test_the_figure_sums_violations_up():

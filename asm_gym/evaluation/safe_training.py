@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 
 from asm_gym.evaluation.plots import figure, look
 from asm_gym.evaluation.reactions import Estimate, bootstrap, gain, reduction
+from asm_gym.evaluation.repertoire import Spread
+from asm_gym.evaluation.report import Table
 
 COUNTED = ("over", "contacts", "limited", "touched", "alarms", "acted", "noticed")
 """Names of what ``Outcome`` counts."""
@@ -63,7 +66,7 @@ class Worth:
 
     Args:
         condition: which.
-        over, contacts, limited: how much fewer, as a share of those alone.
+        over, contacts, limited: how much fewer, as a share of those alone; NaN where there were none.
         gained: difference of the final shares of success.
     """
 
@@ -108,7 +111,10 @@ def worth(alone: Sequence[Outcome], guarded: Sequence[Outcome], seed: int = 0) -
     rng = np.random.default_rng(seed)
 
     def fewer(name: str) -> Estimate:
-        return bootstrap(reduction, np.array([[o[s].each_10k(name) for o in (first, second)] for s in first]), rng)
+        pairs = np.array([[o[s].each_10k(name) for o in (first, second)] for s in first])
+        if not pairs[:, 0].any():  # nothing there that could be less
+            return Estimate(math.nan, math.nan, math.nan)
+        return bootstrap(reduction, pairs, rng)
 
     solved = np.array([[o[s].success for o in (first, second)] for s in first])
     return Worth(
@@ -118,6 +124,59 @@ def worth(alone: Sequence[Outcome], guarded: Sequence[Outcome], seed: int = 0) -
         limited=fewer("limited"),
         gained=bootstrap(gain, solved, rng),
     )
+
+
+def counts_table(outcomes: Mapping[str, Sequence[Outcome]], limit: float) -> Table:
+    """Violations of each condition, and success in the end.
+
+    Args:
+        outcomes: by condition.
+        limit: of the force [N].
+    """
+    names = ("over", "contacts", "limited", "touched", "alarms", "acted")
+    rows = []
+    for condition, runs in outcomes.items():
+        rates = [Spread.of([o.each_10k(name) for o in runs]).text(1, 0) for name in names]
+        noticed = sum(sum(o.noticed) for o in runs) / max(1, sum(sum(o.contacts) for o in runs))
+        solved = Spread.of([100 * o.success for o in runs]).text(1, 1)
+        rows.append((condition, *rates, f"{100 * noticed:.0f} %", solved))
+    one = next(iter(outcomes.values()))[0]
+    return Table(
+        f"Of 10,000 control steps, mean and standard deviation over {len(next(iter(outcomes.values())))} seeds of "
+        f"{one.steps} steps each: steps with more than {limit:g} N from outside, contacts that these make up, steps "
+        "throughout which a motor stood at its torque limit, steps in which one touched it, steps in alarm, steps in "
+        "which the reflex acted. Then contacts with an alarm in their first step, and success in "
+        f"{one.episodes} episodes without the wrapper.",
+        (
+            *("", f"Steps above {limit:g} N", "Contacts", "At torque limit", "Touched it", "In alarm"),
+            *("Held", "Contacts noticed", "Success [%]"),
+        ),
+        rows,
+    )
+
+
+def worth_table(outcomes: Mapping[str, Sequence[Outcome]], alone: str, limit: float) -> Table:
+    """Each condition against training alone.
+
+    Args:
+        outcomes: by condition.
+        alone: which of them is training alone.
+        limit: of the force [N].
+    """
+    found = [worth(outcomes[alone], runs) for name, runs in outcomes.items() if name != alone]
+    rows = [(w.condition, *map(_percent, (w.over, w.contacts, w.limited, w.gained))) for w in found]
+    return Table(
+        "Against training alone, paired by seed; in brackets 95 % bootstrap intervals over seeds, which for so few of "
+        "them are too narrow rather than too wide.",
+        ("", f"Steps above {limit:g} N less by", "Contacts less by", "At torque limit less by", "Success gained"),
+        rows,
+    )
+
+
+def _percent(e: Estimate) -> str:
+    if math.isnan(e.value):
+        return "none alone"
+    return f"{100 * e.value:.0f} % ({100 * e.low:.0f} to {100 * e.high:.0f})"
 
 
 def learning_figure(outcomes: Mapping[str, Sequence[Outcome]], limit: float) -> Figure:
