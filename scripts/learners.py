@@ -26,6 +26,8 @@ from asm_gym.policies.sb3 import network
 
 ALGORITHMS = ("sac", "td3", "ppo")
 HIDDEN = (256, 256)
+NOVICE_LOG_STD = -1.2
+"""Of an untrained actor before tanh: with the usual 0, noise drowns what demonstrations teach."""
 
 
 @dataclass(frozen=True)
@@ -97,11 +99,24 @@ class _SlowActor:
             group["lr"] *= self.actor_share
 
 
-class _SAC(_SlowActor, SAC):
+class _KeepsExecuted:
+    """A learner whose buffer keeps the action that was executed, where a safety wrapper says which.
+
+    Of the environment without the wrapper that is the truth, whoever chose the action.
+    """
+
+    def _store_transition(self, buffer: Any, action: Any, seen: Any, reward: Any, dones: Any, infos: Any) -> None:
+        done = [info.get("asm", {}).get("executed_action") for info in infos]
+        scale = self.policy.scale_action  # type: ignore[attr-defined]
+        kept = np.array([own if other is None else scale(other) for own, other in zip(action, done, strict=True)])
+        super()._store_transition(buffer, kept, seen, reward, dones, infos)  # type: ignore[misc]
+
+
+class _SAC(_KeepsExecuted, _SlowActor, SAC):
     pass
 
 
-class _TD3(_SlowActor, TD3):
+class _TD3(_KeepsExecuted, _SlowActor, TD3):
     pass
 
 
@@ -137,6 +152,23 @@ def make_learner(algorithm: str, env: gym.Env[Any, Any], seed: int, cloned: bool
     else:
         learner = _TD3(_TD3Policy, env, policy_kwargs=kwargs, action_noise=_noise(env), **settings)
     learner.actor_share = recipe.actor_share if cloned else 1.0
+    return learner
+
+
+def make_novice(env: gym.Env[Any, Any], seed: int) -> SAC:
+    """SAC with an untrained actor, for demonstrations in its replay buffer and an ``Anchor`` on them.
+
+    After 500 random steps it learns every other step: demonstrations make up for fewer updates.
+    """
+    entropy = -2.0 * float(np.prod(env.action_space.shape or ()))
+    settings = {**_OFF_POLICY, "learning_starts": 500, "train_freq": 2, "gradient_steps": 1}
+    settings |= {"ent_coef": "auto_0.05", "target_entropy": entropy}
+    learner = _SAC(_SACPolicy, env, policy_kwargs={"net_arch": list(HIDDEN)}, seed=seed, device="cpu", **settings)
+    learner.actor_share = 0.3
+    with torch.no_grad():
+        head: Any = learner.actor.log_std
+        head.weight.zero_()
+        head.bias.fill_(NOVICE_LOG_STD)
     return learner
 
 

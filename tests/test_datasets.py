@@ -121,6 +121,8 @@ def test_a_killed_run_loses_only_what_was_running(tmp_path):
         (["Lift", "--episodes", "0"], "episodes"),
         (["Lift", "--robot", "R2D2"], "R2D2"),
         (["Wipe", "--policy", "nowhere/agent_sac.zip"], "agent_sac"),
+        (["Door", "--policy", "lift_sac"], "lift_sac takes observations of 37 numbers"),
+        (["Lift", "--robot", "Sawyer", "--policy", "lift_sac"], "['Panda'] there, ['Sawyer'] here"),
     ],
 )
 def test_bad_arguments_are_refused_before_anything_runs(arguments, message, tmp_path, capsys):

@@ -5,13 +5,16 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import gymnasium as gym
+import h5py
 import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.logger import configure
 
+from asm_gym.datasets import write_dataset
 from asm_gym.episodes import Episode
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.scripts.cli import main
@@ -186,6 +189,41 @@ def test_an_expert_is_cloned_and_improved_end_to_end(tmp_path):
     result = json.loads((tmp_path / "result.json").read_text())
     assert [step for step, _ in result["curve"]] == [0]
     assert NetworkPolicy.load(tmp_path / "agent.npz").trained_in["robots"] == ["Panda"]
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory):
+    """Folders of Minari datasets: one of Door, and two that claim to be of Lift but are damaged or hold no streams."""
+    folder = tmp_path_factory.mktemp("datasets")
+    env = gym.make("Pendulum-v1")
+    episodes = [replace(e, faults=np.zeros(len(e), bool)) for e in linear_expert(2)]
+    for name, env_id in (("door", "asm_gym/Door-v0"), ("damaged", "asm_gym/Lift-v0"), ("bare", "asm_gym/Lift-v0")):
+        write_dataset(folder / name, "asm_gym/pendulum-v0", episodes, env, {})
+        (data,) = (folder / name).rglob("metadata.json")
+        about = json.loads(data.read_text())
+        if name == "bare":
+            del about["stream_spec"]
+        about["env_spec"] = json.dumps(json.loads(about["env_spec"]) | {"id": env_id})
+        data.write_text(json.dumps(about))
+    env.close()
+    (damaged,) = (folder / "damaged").rglob("main_data.hdf5")
+    damaged.write_bytes(damaged.read_bytes()[:1000])
+    (bare,) = (folder / "bare").rglob("main_data.hdf5")
+    with h5py.File(bare, "a") as file:
+        for episode in file.values():
+            del episode["infos"]
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("door", "asm_gym/Door-v0, not in asm_gym/Lift-v0"), ("damaged", "damaged"), ("bare", "holds no streams")],
+)
+def test_a_dataset_that_does_not_fit_is_refused_before_anything_is_learned(name, message, datasets, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["train", "Lift", "--dataset", str(datasets / name), "--out", str(out)]) == 2
+    assert message in capsys.readouterr().err
+    assert [p.name for p in out.iterdir()] == ["train.json"]
 
 
 @pytest.mark.parametrize(
