@@ -18,6 +18,7 @@ from asm_gym.memory.association import Association, association_shapes, hidden_u
 from asm_gym.memory.energy import activate
 from asm_gym.memory.inference import Weights, motor_prediction, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
 from asm_gym.memory.network import Network, train
 from asm_gym.memory.online import followed
 from asm_gym.memory.readout import add_up, learn_readout
@@ -65,6 +66,7 @@ class NeuralASM(PredictiveMonitor):
 
     Attributes:
         network_: the memory with its weights; None before ``fit``.
+        motor_: its motor association; None before ``learn_to_act``.
         senses_: how it reads a row.
         detector_: what turns errors into surprise; None before ``fit``.
         energy_: mean energy of a step in each pass.
@@ -106,6 +108,7 @@ class NeuralASM(PredictiveMonitor):
         self.prior_precision, self.sensory_precision = float(prior_precision), float(sensory_precision)
         self.carry_prior, self.learning_rate = float(carry_prior), float(learning_rate)
         self.network_: Network | None = None
+        self.motor_: Motor | None = None
 
     def learn_model(
         self, streams: Sequence[NDArray[np.float32]], rng: np.random.Generator, progress: Progress
@@ -137,6 +140,7 @@ class NeuralASM(PredictiveMonitor):
         association = Association(**{n: arrays[n] for n in Association._fields})
         how = self.iterations, self.prior_precision, self.sensory_precision
         self.network_ = Network(weights, association, *how)
+        self.motor_ = Motor.found(found, senses)
 
     def start_model(self, batch: int) -> MemoryState:
         hidden, rows = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.spec.size))
@@ -242,13 +246,36 @@ class NeuralASM(PredictiveMonitor):
             self.learned_ = self.learned_ | {"U": now.U, "D": now.D}
         return learned
 
+    def learn_to_act(self, episodes: Sequence[Episode], units: int = 512) -> Self:
+        """Learns what to command in which situation, so that ``NeuralASMPolicy`` can act by it.
+
+        Only ``expected_action`` depends on it: neither the other weights nor the surprise do.
+
+        Args:
+            episodes: whose ``actions`` say what was intended; where they are empty, the stream says what was commanded.
+            units: hidden units of the motor association.
+        """
+        self._fitted()
+        self._check(episodes)
+        require("units", units, isinstance(units, (int, np.integer)) and units >= 1, "a whole number of at least 1")
+        if not len(self.spec.motor):
+            raise ValueError(f"nothing is commanded in this stream; it has: {', '.join(self.spec.slices)}")
+        with threadpool_limits(1):
+            self.motor_ = learn_motor(*lessons(self.senses_, episodes), units, np.random.default_rng(self.seed))
+        self.learned_ = self.learned_ | self.motor_.named()
+        return self
+
     def expected_action(self, state: PredictiveState) -> NDArray[np.float32]:
         """(B, A) the motor prediction: what is likely to be commanded next, in the units of the action.
+
+        That of the motor association, where ``learn_to_act`` made one; else that of the state.
 
         Args:
             state: as ``observe`` handed it back.
         """
         assert self.network_ is not None
+        if self.motor_ is not None:
+            return self.motor_.command(situation(self.senses_, state.model.before))
         motor, senses = self.spec.motor, self.senses_
         _, action = motor_prediction(state.model.hidden, self.network_.weights)
         return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
