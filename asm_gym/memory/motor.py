@@ -90,8 +90,10 @@ class Motor(NamedTuple):
         """What ``named`` put there; None where it is not. Raises ValueError where it does not fit the senses."""
         if "motor_U" not in learned:
             return None
-        (A, M), I = learned["motor_U"].shape, int(np.count_nonzero(fineness(senses.spec))) + 1
-        shapes = {"V": (M, I), "U": (len(senses.spec.motor), M), "D": (A, I), "mean": (A,), "spread": (A,)}
+        units, motor = learned["motor_U"].shape[-1], len(senses.spec.motor)
+        inputs = int(np.count_nonzero(fineness(senses.spec))) + 1
+        shapes: dict[str, tuple[int, ...]] = {"V": (units, inputs), "U": (motor, units), "D": (motor, inputs)}
+        shapes |= {"mean": (motor,), "spread": (motor,)}
         for name, shape in shapes.items():
             array = learned.get(f"motor_{name}")
             if array is None or array.shape != shape:

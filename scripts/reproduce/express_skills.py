@@ -1,8 +1,8 @@
-"""Express skills: one memory of four robosuite skills closes the loop, and what it expects to be commanded is commanded.
+"""Express skills: one memory of four robosuite skills closes the loop; what it expects to be commanded is commanded.
 
 It has watched the scripted experts of Lift, Stack, PickPlaceCan and Door, was never told which was which, and is put in
-front of new scenes. A GRU policy of the same width, cloned by backpropagation through time from the same episodes, reads
-the same. The scripted experts themselves are the ceiling.
+front of new scenes. A GRU policy that was cloned by backpropagation through time from the same episodes reads the same.
+The scripted experts themselves are the ceiling.
 """
 
 from __future__ import annotations
@@ -42,6 +42,9 @@ from asm_gym.scripts.reproduce.common import (
 )
 
 MODELS = ("memory", "gru", "expert")
+INPUTS = 75
+"""Numbers read of the four tasks."""
+
 CALLED = {"memory": "Neural ASM, local rules", "gru": "GRU, BPTT", "expert": "scripted expert"}
 
 
@@ -53,12 +56,14 @@ class Args(Common):
     """Whose skills one memory learns."""
     demonstrations: int = 80
     """Of each task; those that fail are left out."""
+    units: int = 512
+    """Of the motor association of the memory."""
     hidden: int = 256
-    """Units of the GRU, and of the motor association of the memory."""
+    """Units of the GRU, which have several times as many weights."""
     updates: int = 600
     """Of the GRU, 16 episodes each."""
-    trials: int = 100
-    """Scenes of each task."""
+    trials: int = 34
+    """Scenes of each task, for each seed other ones."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -69,7 +74,8 @@ class Args(Common):
                 raise ValueError(f"unknown skill {task!r}; there is an expert of one arm for: {known}")
         for name in ("demonstrations", "updates", "trials"):
             at_least_one(name, getattr(self, name))
-        wide_enough(self.hidden, 70)
+        for width in (self.units, self.hidden):
+            wide_enough(width, INPUTS)
 
     def scaled(self) -> Args:
         """With ``quick``, little of everything."""
@@ -108,7 +114,7 @@ def learn(what: tuple[str, int], episodes: Sequence[Episode], args: Args) -> Pup
         # What watches may be small here, for only what acts is measured.
         sizes = {"hidden_size": 128, "association_size": 96, "epochs": 4}
         brain = NeuralASM(episodes[0].spec, seed=seed, **sizes).fit(episodes)  # type: ignore[arg-type]
-        brain.learn_to_act(episodes, args.hidden)
+        brain.learn_to_act(episodes, args.units)
     return Pupil(seed, model, brain, time.perf_counter() - start)
 
 
@@ -134,9 +140,9 @@ def trials(args: Args) -> list[Trial]:
     """Every policy in every scene, a task after the other, so that a process seldom makes a new environment."""
     plan = []
     for task in args.tasks:
-        scenes = episode_seeds(0, task, "express", args.trials)
-        each = [(m, s) for m in MODELS for s in args.repetitions if m != "expert" or s == args.seed]
-        plan += [Trial(task, m, s, tuple(scenes[i : i + 25])) for m, s in each for i in range(0, len(scenes), 25)]
+        for seed in args.repetitions:
+            scenes = tuple(episode_seeds(seed, task, "express", args.trials))
+            plan += [Trial(task, m, seed, scenes[i : i + 17]) for m in MODELS for i in range(0, len(scenes), 17)]
     return plan
 
 
@@ -157,7 +163,7 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
             low, high = wilson_interval(int(sum(won)), len(won))
             bounds.append(f"{100 * low:.0f} to {100 * high:.0f}")
         intervals.append((CALLED[model], *bounds))
-    scenes = f"{args.trials} scenes a task, {args.demonstrations} demonstrations a task, one network"
+    scenes = f"{args.trials} scenes a task and seed, {args.demonstrations} demonstrations a task, one network"
     return [
         Table(f"Success [%], {scenes}; mean ± SD over seeds", columns, [row(m, "success", 100, 1) for m in MODELS]),
         Table("Success [%], 95 % Wilson interval over all scenes and seeds", columns, intervals),
