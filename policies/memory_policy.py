@@ -51,9 +51,9 @@ class StreamReader:
     """
 
     def __init__(self, spec: StreamSpec, env: gym.Env[Any, Any]) -> None:
-        self._inner: Any = env.unwrapped
-        self._measures = hasattr(self._inner, "measured_spec")
-        theirs = self._inner.measured_spec if self._measures else _of_spaces(env)
+        inner: Any = env.unwrapped
+        self._inner, self._measures = inner, hasattr(inner, "measured_spec")
+        theirs = inner.measured_spec if self._measures else _of_spaces(env)
         if self._measures and spec.dt != control_period(env):
             raise ValueError(
                 f"the memory reads a row every {spec.dt} s, and is asked to act every {control_period(env)} s"

@@ -1,15 +1,16 @@
 """Motor association: the command that comes next, given how things stand.
 
-    m_t = [κ ⊙ v_t, 1]                             values of all that is no rate, standardised; κ how finely each is read
+    m_t = [κ ⊙ v_t, 1]                             values of all that is no rate, standardised; κ: how finely
     â_{t+1} = U f(V m_t) + D m_t
     ΔU ∝ ε f(h)ᵀ    ΔD ∝ ε mᵀ    ΔV ∝ ε_h mᵀ       ε = a_{t+1} - â_{t+1},  ε_h = f'(h) ⊙ Uᵀ ε
     W ← (1 - ηλ) W                                 each synapse forgets
 
-The command is one more group that is completed from the rest, by the rules of ``association``, with three differences.
-Errors are not bounded: where a gripper is to close, most rows around say that it is open, and bounded errors would find
-their median, with which the hand waits for ever. Neither rates nor the last command are read: they tell best what is
-commanded next, and whoever goes by them repeats himself, and never moves again once he stands still. And synapses forget:
-what lies about is the same through an episode, so that episodes would be known by their objects, and learned by heart.
+The command is one more group that is completed from the rest, by the rules of ``association``, with three
+differences. Errors are not bounded: where a gripper is to close, most rows around say that it is open, and bounded
+errors would find their median, with which the hand waits for ever. Neither rates nor the last command are read: they
+tell best what is commanded next, and whoever goes by them repeats himself, and never moves again once he stands
+still. And synapses forget: what lies about is the same through an episode, so that episodes would be known by their
+objects, and learned by heart.
 
 Sources: as ``association``; de Haan et al. 2019 (NeurIPS) for commands that are repeated; Krogh and Hertz 1991 (NeurIPS)
 for forgetting.

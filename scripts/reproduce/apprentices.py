@@ -144,7 +144,7 @@ class ClonePolicy:
         self._clone, self._space = clone, env.action_space
         self._size = require_motor(clone.senses.spec, env)
         self._read = StreamReader(clone.senses.spec, env)
-        self._grip = np.asarray(env.unwrapped.gripper_actions, dtype=int)  # type: ignore[attr-defined]
+        self._grip = np.asarray(getattr(env.unwrapped, "gripper_actions", ()), dtype=int)
 
     def predict(
         self,
