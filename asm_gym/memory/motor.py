@@ -12,8 +12,8 @@ tell best what is commanded next, and whoever goes by them repeats himself, and 
 still. And synapses forget: what lies about is the same through an episode, so that episodes would be known by their
 objects, and learned by heart.
 
-Sources: as ``association``; de Haan et al. 2019 (NeurIPS) for commands that are repeated; Krogh and Hertz 1991 (NeurIPS)
-for forgetting.
+Sources: as ``association``; de Haan et al. 2019 (NeurIPS) for commands that are repeated; Krogh and Hertz 1991
+(NeurIPS) for forgetting.
 """
 
 from __future__ import annotations
@@ -107,8 +107,13 @@ def lessons(senses: Senses, episodes: Sequence[Episode]) -> tuple[NDArray[np.flo
 
     That is what ``episode.actions`` says, which may differ from what was executed, where somebody disturbed it (DART:
     Laskey et al. 2017, CoRL); where it says nothing, what the stream says.
+
+    Raises:
+        ValueError: nothing is commanded in these streams.
     """
     motor = senses.spec.motor
+    if not len(motor):
+        raise ValueError(f"nothing is commanded in this stream; it has: {', '.join(senses.spec.slices)}")
     m, commands = [], []
     for e in episodes:
         intended = e.actions if len(e.actions) == len(e) else e.stream[:, motor]
@@ -133,7 +138,12 @@ def learn_motor(
         units: M.
         updates: batches learned from, at most.
         forgetting: λ, in units of the learning rate.
+
+    Raises:
+        ValueError: fewer than one unit.
     """
+    if units < 1:
+        raise ValueError(f"units must be at least 1, got {units}")
     mean, spread = commands.mean(axis=0, dtype=np.float64), commands.std(axis=0, dtype=np.float64)
     spread = np.where(spread > 0, spread, 1.0)
     wanted = ((commands - mean) / spread).astype(np.float32)

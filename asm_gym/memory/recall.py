@@ -75,6 +75,14 @@ def to_rows(reader: Senses, recalled: Recalled) -> NDArray[np.float64]:
     return rows
 
 
+def continued(network: Network, reader: Senses, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
+    """(steps, D) rows that come after a cue (T, D), in the units of the stream. Raises as ``check_cue`` does."""
+    reading = reader.read_episode(check_cue(reader, cue, steps))
+    cued = follow(network, at_rest(network, 1), reading.senses[:, None], reading.commands[:, None])
+    rows: NDArray[np.float64] = to_rows(reader, run_on(network, cued.hidden[-1], steps))[:, 0]
+    return rows
+
+
 def check_cue(reader: Senses, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
     """The cue (T, D) to recall ``steps`` rows from. Raises ValueError unless it can be recalled from."""
     rows = np.asarray(cue, np.float64)

@@ -21,8 +21,8 @@ from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
 from asm_gym.memory.network import Network, train
 from asm_gym.memory.online import followed
-from asm_gym.memory.readout import add_up, learn_readout
-from asm_gym.memory.recall import at_rest, check_cue, follow, run_on, to_rows
+from asm_gym.memory.readout import add_up, learn_readout, running
+from asm_gym.memory.recall import continued
 from asm_gym.memory.senses import Senses
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated import Progress, require
@@ -199,11 +199,7 @@ class NeuralASM(PredictiveMonitor):
             raise RuntimeError("no skill has a name yet: call name_skills(episodes) first")
         assert self.network_ is not None
         units = hidden_units(self.senses_.read_episode(np.asarray(stream)).inputs, self.network_.association.V)
-        L, named = np.zeros((1, len(self.skills_)), np.float32), []
-        for f in units:
-            L = add_up(L, f[None], self.learned_["W_K"], self.learned_["b_K"])
-            named.append(int(L.argmax()))
-        return np.array(self.skills_)[named]
+        return np.array(self.skills_)[running(units, self.learned_["W_K"], self.learned_["b_K"])]
 
     def adapt(
         self,
@@ -257,9 +253,6 @@ class NeuralASM(PredictiveMonitor):
         """
         self._fitted()
         self._check(episodes)
-        require("units", units, isinstance(units, (int, np.integer)) and units >= 1, "a whole number of at least 1")
-        if not len(self.spec.motor):
-            raise ValueError(f"nothing is commanded in this stream; it has: {', '.join(self.spec.slices)}")
         with threadpool_limits(1):
             self.motor_ = learn_motor(*lessons(self.senses_, episodes), units, np.random.default_rng(self.seed))
         self.learned_ = self.learned_ | self.motor_.named()
@@ -294,11 +287,7 @@ class NeuralASM(PredictiveMonitor):
         """
         self._fitted()
         assert self.network_ is not None
-        reading = self.senses_.read_episode(check_cue(self.senses_, cue, steps))
-        start = at_rest(self.network_, 1)
-        cued = follow(self.network_, start, reading.senses[:, None], reading.commands[:, None])
-        rows: NDArray[np.float64] = to_rows(self.senses_, run_on(self.network_, cued.hidden[-1], steps))[:, 0]
-        return rows
+        return continued(self.network_, self.senses_, cue, steps)
 
     def observe(self, state: PredictiveState, stream: NDArray[np.floating[Any]]) -> tuple[PredictiveState, Surprise]:
         state, surprise = super().observe(state, stream)
