@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 
 from asm_gym.policies.base import Policy
+from asm_gym.policies.memory_policy import NeuralASMPolicy
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.reflexes import Hold
 from asm_gym.policies.sb3 import read_archive
@@ -55,7 +56,8 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
 
     Args:
         name: ``"scripted"`` (the task's expert), ``"hold"`` (stay where you are), an agent that comes with the package,
-            such as ``"lift_sac"``, or the path of one: ``.npz`` of ``asm-gym train``, ``.zip`` of stable-baselines3.
+            such as ``"lift_sac"``, or the path of one: ``.npz`` of ``asm-gym train``, ``.zip`` of stable-baselines3,
+            ``.asm`` of a Neural ASM that learned to act.
         seed: of whatever the policy draws.
         kwargs: handed to the expert, for example ``style=Style(noise=0.1)``.
 
@@ -73,9 +75,11 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
         return Hold(env)
     if name.endswith(".zip"):
         return read_archive(Path(name), seed).fit_to(env, name)
+    if name.endswith(".asm"):
+        return NeuralASMPolicy.load(name, env)
     if name.endswith(".npz"):
         return NetworkPolicy.load(name).fit_to(env, name)
     if name in agents():
         return NetworkPolicy.load(SHIPPED / f"{name}.npz").fit_to(env, name)
     known = ", ".join((*POLICIES, *agents()))
-    raise ValueError(f"unknown policy {name!r}; known: {known}, or the path of an agent (.npz, .zip)")
+    raise ValueError(f"unknown policy {name!r}; known: {known}, or the path of an agent (.npz, .zip, .asm)")

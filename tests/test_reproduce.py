@@ -18,10 +18,12 @@ from asm_gym.scripts.cli import main as cli
 from asm_gym.scripts.reproduce import (
     STUDIES,
     contextual_inference,
+    express_skills,
     fault_detection,
     memorise_and_recall,
     speed_accuracy,
 )
+from asm_gym.scripts.reproduce.apprentices import DISTURBANCE, demonstrate, stream_of
 from asm_gym.scripts.reproduce.common import Common, over_seeds, shown
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
@@ -244,6 +246,30 @@ def test_a_library_told_a_wrong_skill_is_always_in_alarm_and_the_memory_needs_no
     assert scores["memory"] > max(0.75, scores["wrong"] + 0.1, scores["right"] + 0.1)
 
 
+def test_what_was_done_is_in_the_stream_and_what_was_intended_in_the_actions():
+    spec = stream_of(["Lift"])
+    episode = next(e for e in (demonstrate(("Lift", seed), spec) for seed in range(5)) if e is not None)
+    again = demonstrate(("Lift", episode.seed), spec)
+    np.testing.assert_array_equal(episode.stream, again.stream)
+    done, intended = episode.stream[:, spec.motor], episode.actions
+    np.testing.assert_array_equal(done[0], np.zeros(7))
+    np.testing.assert_array_equal(done[:, 6], intended[:, 6])
+    assert 0.0 < (done - intended)[:, :6].std() < DISTURBANCE
+    assert set(intended[1:, 6]) == {-1.0, 1.0}
+
+
+@pytest.mark.slow
+def test_a_memory_that_watched_lifts_the_cube_in_new_scenes():
+    args = express_skills.Args(tasks=("Lift",), demonstrations=25, units=256, trials=12, workers=1)
+    spec = stream_of(args.tasks)
+    lessons = [demonstrate(("Lift", seed), spec) for seed in range(args.demonstrations)]
+    pupil = express_skills.learn(("memory", 0), [e for e in lessons if e is not None], args)
+    trials = [t for t in express_skills.trials(replace(args, seeds=1)) if t.model != "gru"]
+    found = [r for t in trials for r in express_skills.attempt(t, {("memory", 0): pupil.brain})]
+    assert over_seeds(found, "success", model="memory")[0] >= 0.7
+    assert over_seeds(found, "success", model="expert")[0] == 1.0
+
+
 def test_spread_is_over_seeds_and_not_over_measurements():
     records = [{"seed": s, "x": x, "kind": "a"} for s, xs in enumerate([(1, 3), (5, 7)]) for x in xs]
     assert over_seeds(records, "x", kind="a") == pytest.approx((4.0, math.sqrt(8)))
@@ -270,6 +296,14 @@ def test_spread_is_over_seeds_and_not_over_measurements():
         ("fault_detection", ["--tasks", "Juggle", "Lift"], "Juggle.*Lift"),
         ("fault_detection", ["--letters", "1"], "a repertoire of 2 to 16, got 1"),
         ("fault_detection", ["--robot-episodes", "2"], "needs 19 calibration episodes"),
+        ("contextual_inference", ["--hidden", "3"], "at least the number of channels, 4, got 3"),
+        ("speed_accuracy", ["--skills", "0"], "1 to 16 skills, got 0"),
+        ("speed_accuracy", ["--hidden", "3"], "at least the number of channels, 4, got 3"),
+        ("fault_detection", ["--hidden", "3"], "at least the number of channels, 4, got 3"),
+        ("express_skills", ["--tasks"], "the number of tasks must be at least 1, got 0"),
+        ("express_skills", ["--tasks", "Lift", "Juggle"], "unknown skill 'Juggle'; there is an expert.*Lift, Stack"),
+        ("express_skills", ["--units", "10"], "at least the number of channels, 75, got 10"),
+        ("express_skills", ["--trials", "0"], "trials must be at least 1, got 0"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_words(study, arguments, message, capsys, tmp_path):

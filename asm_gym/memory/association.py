@@ -111,11 +111,13 @@ def normalised_errors(
     return out, f
 
 
-def association_change(a: Array, delta: Array, spread: Array, V: Array, U: Array, D: Array) -> tuple[Change, Array]:
+def association_change(
+    a: Array, delta: Array, spread: Array, V: Array, U: Array, D: Array, bound: float = 1.0
+) -> tuple[Change, Array]:
     """The local rules for inputs (B, I) and changes (B, X), as if every synapse existed; and the errors (B, X)."""
     f = hidden_units(a, V)
     error = delta - complete(f, a, U, D)
-    pulled = np.clip(error / spread, np.float32(-1), np.float32(1))
+    pulled = np.clip(error / spread, np.float32(-bound), np.float32(bound))
     upstream = (np.float32(1) - f * f) * (pulled @ U)  # (B, M) ε_h
     return Change(coincidence(upstream, a), coincidence(pulled, f), coincidence(pulled, a)), error
 

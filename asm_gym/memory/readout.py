@@ -46,6 +46,15 @@ def add_up(L: Array, units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32
     return added
 
 
+def running(units: Array, W_K: Array, b_K: Array) -> NDArray[np.intp]:
+    """(T,) the skill that seems to run in each step, from the units (T, M) of a stream."""
+    L, named = np.zeros((1, len(b_K)), np.float32), []
+    for f in units:
+        L = add_up(L, f[None], W_K, b_K)
+        named.append(L.argmax())
+    return np.array(named, dtype=np.intp)
+
+
 def learn_readout(
     look: Callable[[NDArray[np.intp]], Array],
     skill: NDArray[np.intp],

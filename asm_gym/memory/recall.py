@@ -75,6 +75,17 @@ def to_rows(reader: Senses, recalled: Recalled) -> NDArray[np.float64]:
     return rows
 
 
+def continued(network: Network, reader: Senses, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
+    """(steps, D) rows that come after a cue (T, D), in the units of the stream. Raises as ``check_cue`` does."""
+    rows, lag = check_cue(reader, cue, steps), reader.lag
+    # Every l-th row follows from those l apart: as many threads of rows, recalled side by side.
+    reading = reader.read_episode(rows[len(rows) % lag :])
+    senses, commands = (x.reshape(-1, lag, x.shape[1]) for x in (reading.senses, reading.commands))
+    cued = follow(network, at_rest(network, lag), senses, commands)
+    recalled = to_rows(reader, run_on(network, cued.hidden[-1], -(-steps // lag)))
+    return recalled.reshape(-1, reader.spec.size)[:steps]
+
+
 def check_cue(reader: Senses, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
     """The cue (T, D) to recall ``steps`` rows from. Raises ValueError unless it can be recalled from."""
     rows, least = np.asarray(cue, np.float64), 2 * reader.lag

@@ -18,10 +18,11 @@ from asm_gym.memory.association import Association, association_shapes, hidden_u
 from asm_gym.memory.energy import activate
 from asm_gym.memory.inference import Weights, motor_prediction, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
 from asm_gym.memory.network import Network, train
 from asm_gym.memory.online import followed
-from asm_gym.memory.readout import add_up, learn_readout
-from asm_gym.memory.recall import at_rest, check_cue, follow, run_on, to_rows
+from asm_gym.memory.readout import add_up, learn_readout, running
+from asm_gym.memory.recall import continued
 from asm_gym.memory.senses import Reading, Senses, rows_apart
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated import Progress, require
@@ -69,6 +70,7 @@ class NeuralASM(PredictiveMonitor):
 
     Attributes:
         network_: the memory with its weights; None before ``fit``.
+        motor_: its motor association; None before ``learn_to_act``.
         senses_: how it reads a row.
         detector_: what turns errors into surprise; None before ``fit``.
         energy_: mean energy of a step in each pass.
@@ -111,6 +113,7 @@ class NeuralASM(PredictiveMonitor):
         self.prior_precision, self.sensory_precision = float(prior_precision), float(sensory_precision)
         self.carry_prior, self.learning_rate = float(carry_prior), float(learning_rate)
         self.network_: Network | None = None
+        self.motor_: Motor | None = None
 
     def learn_model(
         self, streams: Sequence[NDArray[np.float32]], rng: np.random.Generator, progress: Progress
@@ -143,6 +146,7 @@ class NeuralASM(PredictiveMonitor):
         association = Association(**{n: arrays[n] for n in Association._fields})
         how = self.iterations, self.prior_precision, self.sensory_precision
         self.network_ = Network(weights, association, *how)
+        self.motor_ = Motor.found(found, senses)
 
     def start_model(self, batch: int) -> MemoryState:
         hidden = np.zeros((batch, self.hidden_size), np.float32)
@@ -227,11 +231,7 @@ class NeuralASM(PredictiveMonitor):
             raise RuntimeError("no skill has a name yet: call name_skills(episodes) first")
         assert self.network_ is not None
         units = hidden_units(self.senses_.read_episode(np.asarray(stream)).inputs, self.network_.association.V)
-        L, named = np.zeros((1, len(self.skills_)), np.float32), []
-        for f in units:
-            L = add_up(L, f[None], self.learned_["W_K"], self.learned_["b_K"])
-            named.append(int(L.argmax()))
-        return np.array(self.skills_)[named]
+        return np.array(self.skills_)[running(units, self.learned_["W_K"], self.learned_["b_K"])]
 
     def adapt(
         self,
@@ -274,13 +274,33 @@ class NeuralASM(PredictiveMonitor):
             self.learned_ = self.learned_ | {"U": now.U, "D": now.D}
         return learned
 
+    def learn_to_act(self, episodes: Sequence[Episode], units: int = 512) -> Self:
+        """Learns what to command in which situation, so that ``NeuralASMPolicy`` can act by it.
+
+        Only ``expected_action`` depends on it: neither the other weights nor the surprise do.
+
+        Args:
+            episodes: whose ``actions`` say what was intended; where they are empty, the stream says what was commanded.
+            units: hidden units of the motor association.
+        """
+        self._fitted()
+        self._check(episodes)
+        with threadpool_limits(1):
+            self.motor_ = learn_motor(*lessons(self.senses_, episodes), units, np.random.default_rng(self.seed))
+        self.learned_ = self.learned_ | self.motor_.named()
+        return self
+
     def expected_action(self, state: PredictiveState) -> NDArray[np.float32]:
         """(B, A) the motor prediction: what is likely to be commanded next, in the units of the action.
+
+        That of the motor association, where ``learn_to_act`` made one; else that of the state.
 
         Args:
             state: as ``observe`` handed it back.
         """
         assert self.network_ is not None
+        if self.motor_ is not None:
+            return self.motor_.command(situation(self.senses_, state.model.before[:, -1]))
         motor, senses = self.spec.motor, self.senses_
         _, action = motor_prediction(state.model.hidden, self.network_.weights)
         return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
@@ -299,13 +319,7 @@ class NeuralASM(PredictiveMonitor):
         """
         self._fitted()
         assert self.network_ is not None
-        rows, lag = check_cue(self.senses_, cue, steps), self._lag
-        # Every l-th row follows from those l apart: as many threads of rows, recalled side by side.
-        reading = self.senses_.read_episode(rows[len(rows) % lag :])
-        senses, commands = (x.reshape(-1, lag, x.shape[1]) for x in (reading.senses, reading.commands))
-        cued = follow(self.network_, at_rest(self.network_, lag), senses, commands)
-        recalled = to_rows(self.senses_, run_on(self.network_, cued.hidden[-1], -(-steps // lag)))
-        return recalled.reshape(-1, self.spec.size)[:steps]
+        return continued(self.network_, self.senses_, cue, steps)
 
     def observe(self, state: PredictiveState, stream: NDArray[np.floating[Any]]) -> tuple[PredictiveState, Surprise]:
         state, surprise = super().observe(state, stream)

@@ -8,6 +8,7 @@ from importlib import import_module
 STUDIES = {
     "memorise_and_recall": "one network learns a repertoire, and expresses each skill from a cue",
     "contextual_inference": "the state says which skill is running, and nobody told it",
+    "express_skills": "one memory closes the loop in robosuite: its own motor prediction drives the arm",
     "local_learning": "local updates against the gradient of backpropagation through time",
     "speed_accuracy": "more inference, or slower movements, for more accuracy",
     "fault_detection": "surprise across the repertoire against a library told the right or the wrong skill",

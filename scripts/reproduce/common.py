@@ -22,6 +22,7 @@ import asm_gym
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.archive import Label, read
 from asm_gym.evaluation.plots import save
+from asm_gym.evaluation.repertoire import Spread
 from asm_gym.evaluation.report import Table
 from asm_gym.scripts.dispatch import dispatch
 from asm_gym.scripts.progress import stage
@@ -114,19 +115,17 @@ def publish(name: str, found: Findings, args: Common, seconds: dict[str, float])
     (args.out / f"{name}.json").write_text(json.dumps(details, indent=2) + "\n", encoding="utf-8")
 
 
-def over_seeds(records: Sequence[Record], value: str, **where: Any) -> tuple[float, float]:
-    """Mean, and standard deviation over seeds, of the records that are as ``where`` says; NaN where there are none."""
+def over_seeds(records: Sequence[Record], value: str, **where: Any) -> Spread:
+    """Over the mean of each seed, of the records that are as ``where`` says; NaN where there are none."""
     chosen = [r for r in records if all(r.get(k) == v for k, v in where.items()) and r.get(value) is not None]
     each = [np.mean([r[value] for r in chosen if r["seed"] == s]) for s in dict.fromkeys(r["seed"] for r in chosen)]
-    if not each:
-        return float("nan"), float("nan")
-    return float(np.mean(each)), float(np.std(each, ddof=1)) if len(each) > 1 else 0.0
+    return Spread.of([float(mean) for mean in each]) if each else Spread(float("nan"), float("nan"))
 
 
 def shown(records: Sequence[Record], value: str, digits: int = 2, **where: Any) -> str:
     """``mean ± spread`` over seeds, for a table; empty where there is nothing."""
-    mean, spread = over_seeds(records, value, **where)
-    return "" if np.isnan(mean) else f"{mean:.{digits}f} ± {spread:.{digits}f}"
+    found = over_seeds(records, value, **where)
+    return "" if np.isnan(found.mean) else found.text(digits=digits)
 
 
 def recorded(args: Common, labels: Sequence[Label], console: Console, seconds: dict[str, float]) -> list[Episode]:

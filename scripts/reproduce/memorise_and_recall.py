@@ -9,7 +9,7 @@ primitives, which is told the skill. Online, every row is read after it was expe
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -264,19 +264,20 @@ def _robot(ax: Any, records: Sequence[Record]) -> None:
 def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     """Runs every condition and sums up."""
     args = args.scaled()
-    records: list[Record] = []
-    plan = conditions(args)
-    with stage("learning letters", console, seconds) as progress:
-        for found in dispatch(partial(letters, args=args), plan, args.workers, progress):
-            records += found
+    jobs: list[Callable[[], list[Record]]] = []
     if args.robot_episodes:
         train = demonstrations(args, SKILLS, "fit", args.robot_episodes, console, seconds)
         tests = demonstrations(args, SKILLS, "nominal", 15, console, seconds)
-        with stage("learning robosuite skills", console, seconds) as progress:
-            one = partial(robot, train=train, tests=tests, args=args)
-            for found in dispatch(one, list(args.repetitions), args.workers, progress):
-                records += found
+        jobs += [partial(robot, seed, train, tests, args) for seed in args.repetitions]
+    # The longest first, so that no process is left with one of them at the end.
+    jobs += [partial(letters, condition, args) for condition in conditions(args)]
+    with stage("learning", console, seconds) as progress:
+        records = [r for found in dispatch(_done, jobs, args.workers, progress) for r in found]
     return Findings(records, tables(records, args), drawn(records, args), {})
+
+
+def _done(job: Callable[[], list[Record]]) -> list[Record]:
+    return job()
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,0 +1,161 @@
+"""Motor association: the command that comes next, given how things stand.
+
+    m_t = [κ ⊙ v_t, 1]                             values of all that is no rate, standardised; κ: how finely
+    â_{t+1} = U f(V m_t) + D m_t
+    ΔU ∝ ε f(h)ᵀ    ΔD ∝ ε mᵀ    ΔV ∝ ε_h mᵀ       ε = a_{t+1} - â_{t+1},  ε_h = f'(h) ⊙ Uᵀ ε
+    W ← (1 - ηλ) W                                 each synapse forgets
+
+The command is one more group that is completed from the rest, by the rules of ``association``, with three
+differences. Errors are not bounded: where a gripper is to close, most rows around say that it is open, and bounded
+errors would find their median, with which the hand waits for ever. Neither rates nor the last command are read: they
+tell best what is commanded next, and whoever goes by them repeats himself, and never moves again once he stands
+still. And synapses forget: what lies about is the same through an episode, so that episodes would be known by their
+objects, and learned by heart.
+
+Sources: as ``association``; de Haan et al. 2019 (NeurIPS) for commands that are repeated; Krogh and Hertz 1991
+(NeurIPS) for forgetting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.episodes import Episode
+from asm_gym.memory.association import association_change, complete, hidden_units
+from asm_gym.memory.energy import Array
+from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
+from asm_gym.memory.senses import Senses
+from asm_gym.stream import MOTOR, StreamSpec
+
+UPDATES, PASSES = 12_000, 100
+"""Batches learned from at most, and passes over the steps at most."""
+
+BATCH = 256
+RATE = 3e-3
+FORGETTING = 0.3
+"""λ."""
+
+FINE = 8.0
+"""κ of where one thing is relative to another: a centimetre more or less decides there."""
+
+FARTHEST = 100.0
+"""What is further out counts as this far."""
+
+
+@lru_cache(maxsize=8)
+def fineness(spec: StreamSpec) -> NDArray[np.float64]:
+    """(D,) κ: how finely each number is read; 0 of commands and of what is measured per second."""
+
+    def of(name: str, unit: str, group: str) -> float:
+        if group == MOTOR or unit.endswith("/s"):
+            return 0.0
+        return FINE if group == "object" and "_to_" in name and "quat" not in name else 1.0
+
+    return np.array([of(c.name, c.unit, c.group) for c in spec.channels for _ in range(c.size)])
+
+
+def situation(senses: Senses, rows: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """m (B, I) of rows (B, D); 0 where a number is not finite."""
+    kappa = fineness(senses.spec)
+    read = np.flatnonzero(kappa)
+    values = (kappa * (np.asarray(rows, np.float64) - senses.mean) / senses.spread)[:, read]
+    values = np.clip(np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0), -FARTHEST, FARTHEST)
+    return np.hstack([values, np.ones((len(values), 1))]).astype(np.float32)
+
+
+class Motor(NamedTuple):
+    """The synapses, and the units of commands. I inputs, M hidden units, A motor."""
+
+    V: Array  # (M, I)
+    U: Array  # (A, M)
+    D: Array  # (A, I)
+    mean: NDArray[np.float64]  # (A,)
+    spread: NDArray[np.float64]  # (A,)
+
+    def command(self, m: Array) -> NDArray[np.float32]:
+        """â (B, A), in the units of the action, in the situations ``m`` (B, I)."""
+        expected = complete(hidden_units(m, self.V), m, self.U, self.D)
+        return (self.mean + self.spread * expected).astype(np.float32)
+
+    def named(self) -> dict[str, NDArray[Any]]:
+        """As a checkpoint keeps them."""
+        return {f"motor_{name}": array for name, array in self._asdict().items()}
+
+    @classmethod
+    def found(cls, learned: Mapping[str, NDArray[Any]], senses: Senses) -> Self | None:
+        """What ``named`` put there; None where it is not. Raises ValueError where it does not fit the senses."""
+        if "motor_U" not in learned:
+            return None
+        units, motor = learned["motor_U"].shape[-1], len(senses.spec.motor)
+        inputs = int(np.count_nonzero(fineness(senses.spec))) + 1
+        shapes: dict[str, tuple[int, ...]] = {"V": (units, inputs), "U": (motor, units), "D": (motor, inputs)}
+        shapes |= {"mean": (motor,), "spread": (motor,)}
+        for name, shape in shapes.items():
+            array = learned.get(f"motor_{name}")
+            if array is None or array.shape != shape:
+                raise ValueError(f"motor_{name} should be of shape {shape}, found {array is not None and array.shape}")
+        return cls(**{name: learned[f"motor_{name}"] for name in shapes})
+
+
+def lessons(senses: Senses, episodes: Sequence[Episode]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Situations (N, I), and what was to be commanded next in each (N, A).
+
+    That is what ``episode.actions`` says, which may differ from what was executed, where somebody disturbed it (DART:
+    Laskey et al. 2017, CoRL); where it says nothing, what the stream says.
+
+    Raises:
+        ValueError: nothing is commanded in these streams.
+    """
+    motor = senses.spec.motor
+    if not len(motor):
+        raise ValueError(f"nothing is commanded in this stream; it has: {', '.join(senses.spec.slices)}")
+    m, commands = [], []
+    for e in episodes:
+        intended = e.actions if len(e.actions) == len(e) else e.stream[:, motor]
+        m.append(situation(senses, e.stream[:-1]))
+        commands.append(intended[1:].astype(np.float32))
+    return np.concatenate(m), np.concatenate(commands)
+
+
+def learn_motor(
+    m: Array,
+    commands: Array,
+    units: int,
+    rng: np.random.Generator,
+    updates: int = UPDATES,
+    forgetting: float = FORGETTING,
+) -> Motor:
+    """Synapses learned from N steps, in random order.
+
+    Args:
+        m: (N, I) situations.
+        commands: (N, A) what was to be commanded next.
+        units: M.
+        updates: batches learned from, at most.
+        forgetting: λ, in units of the learning rate.
+
+    Raises:
+        ValueError: fewer than one unit.
+    """
+    if units < 1:
+        raise ValueError(f"units must be at least 1, got {units}")
+    mean, spread = commands.mean(axis=0, dtype=np.float64), commands.std(axis=0, dtype=np.float64)
+    spread = np.where(spread > 0, spread, 1.0)
+    wanted = ((commands - mean) / spread).astype(np.float32)
+    (_, inputs), A = m.shape, commands.shape[1]
+    V = (rng.standard_normal((units, inputs)) / np.sqrt(inputs)).astype(np.float32)
+    weights = V, np.zeros((A, units), np.float32), np.zeros((A, inputs), np.float32)
+    synapses, plain = [Synapse(W) for W in weights], np.ones(A, np.float32)
+    updates = max(1, min(updates, PASSES * len(m) // BATCH))
+    for n, chosen in zip(range(updates), shuffled(len(m), BATCH, rng), strict=False):
+        change, _ = association_change(m[chosen], wanted[chosen], plain, *weights, bound=np.inf)
+        rate = cosine_decay(RATE, n / updates)
+        for synapse, product in zip(synapses, change, strict=True):
+            synapse.W *= np.float32(1.0 - forgetting * rate)
+            synapse.learn(product, rate)
+    return Motor(*weights, mean, spread)

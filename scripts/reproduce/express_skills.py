@@ -1,0 +1,224 @@
+"""Express skills: one memory of four robosuite skills closes the loop; what it expects to be commanded is commanded.
+
+It has watched the scripted experts of Lift, Stack, PickPlaceCan and Door, was never told which was which, and is put in
+front of new scenes. A GRU policy that was cloned by backpropagation through time from the same episodes reads the same.
+The scripted experts themselves are the ceiling.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from asm_gym.episodes import Episode
+from asm_gym.evaluation.metrics import wilson_interval
+from asm_gym.evaluation.plots import figure, look
+from asm_gym.evaluation.report import Table
+from asm_gym.monitors import NeuralASM
+from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
+from asm_gym.policies.base import Policy
+from asm_gym.policies.registry import EXPERTS
+from asm_gym.scripts.dispatch import dispatch, environment
+from asm_gym.scripts.progress import stage
+from asm_gym.scripts.record import episode_seeds
+from asm_gym.scripts.reproduce.apprentices import CONSISTENT, SETTINGS, Clone, demonstrate, stream_of
+from asm_gym.scripts.reproduce.common import (
+    Common,
+    Findings,
+    Record,
+    at_least_one,
+    over_seeds,
+    reproduce,
+    shown,
+    wide_enough,
+)
+
+MODELS = ("memory", "gru", "expert")
+INPUTS = 75
+"""Numbers read of the four tasks."""
+
+CALLED = {"memory": "Neural ASM, local rules", "gru": "GRU, BPTT", "expert": "scripted expert"}
+
+
+@dataclass(frozen=True)
+class Args(Common):
+    """Skills expressed in closed loop, against a clone by backpropagation and the expert."""
+
+    tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan", "Door")
+    """Whose skills one memory learns."""
+    demonstrations: int = 80
+    """Of each task; those that fail are left out."""
+    units: int = 512
+    """Of the motor association of the memory."""
+    hidden: int = 256
+    """Units of the GRU, which have several times as many weights."""
+    updates: int = 600
+    """Of the GRU, 16 episodes each."""
+    trials: int = 34
+    """Scenes of each task, for each seed other ones."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least_one("the number of tasks", len(self.tasks))
+        for task in self.tasks:
+            if task not in EXPERTS or task.startswith("TwoArm"):
+                known = ", ".join(t for t in EXPERTS if not t.startswith("TwoArm"))
+                raise ValueError(f"unknown skill {task!r}; there is an expert of one arm for: {known}")
+        for name in ("demonstrations", "updates", "trials"):
+            at_least_one(name, getattr(self, name))
+        for width in (self.units, self.hidden):
+            wide_enough(width, INPUTS)
+
+    def scaled(self) -> Args:
+        """With ``quick``, little of everything."""
+        if not self.quick:
+            return self
+        few: dict[str, Any] = {"tasks": self.tasks[:1], "demonstrations": 6, "updates": 20, "trials": 2}
+        return replace(self, seeds=min(self.seeds, 2), **few)
+
+
+class Trial(NamedTuple):
+    """Scenes of a task, for one policy."""
+
+    task: str
+    model: str
+    seed: int
+    scenes: tuple[int, ...]
+
+
+class Pupil(NamedTuple):
+    """Somebody who has learned."""
+
+    seed: int
+    model: str
+    brain: NeuralASM | Clone
+    seconds: float
+
+
+def learn(what: tuple[str, int], episodes: Sequence[Episode], args: Args) -> Pupil:
+    """(model, seed) after the lessons."""
+    model, seed = what
+    start = time.perf_counter()
+    brain: NeuralASM | Clone
+    if model == "gru":
+        brain = Clone.learned(episodes, args.hidden, args.updates, np.random.default_rng(seed))
+    else:
+        # What watches may be small here, for only what acts is measured.
+        sizes = {"hidden_size": 128, "association_size": 96, "epochs": 4}
+        brain = NeuralASM(episodes[0].spec, seed=seed, **sizes).fit(episodes)  # type: ignore[arg-type]
+        brain.learn_to_act(episodes, args.units)
+    return Pupil(seed, model, brain, time.perf_counter() - start)
+
+
+def attempt(trial: Trial, brains: Mapping[tuple[str, int], NeuralASM | Clone]) -> list[Record]:
+    """How each scene went."""
+    env = environment(f"asm_gym/{trial.task}-v0", SETTINGS)
+    where = {"task": trial.task, "model": trial.model, "seed": trial.seed}
+    records = []
+    for scene in trial.scenes:
+        policy: Policy
+        brain = brains.get((trial.model, trial.seed))
+        if brain is None:
+            policy = make_policy("scripted", env, seed=scene, style=CONSISTENT)
+        else:
+            policy = NeuralASMPolicy(brain, env) if isinstance(brain, NeuralASM) else brain.bound(env)
+        steps: list[bool] = []
+        success = rollout(env, policy, scene, lambda info, s=steps: s.append(True))  # type: ignore[misc]
+        records.append({**where, "scene": scene, "success": float(success), "steps": len(steps)})
+    return records
+
+
+def trials(args: Args) -> list[Trial]:
+    """Every policy in every scene, a task after the other, so that a process seldom makes a new environment."""
+    plan = []
+    for task in args.tasks:
+        for seed in args.repetitions:
+            scenes = tuple(episode_seeds(seed, task, "express", args.trials))
+            plan += [Trial(task, m, seed, scenes[i : i + 17]) for m in MODELS for i in range(0, len(scenes), 17)]
+    return plan
+
+
+def tables(records: Sequence[Record], args: Args) -> list[Table]:
+    """Success, and how long it took."""
+    columns = ("", *args.tasks)
+    of = {m: [r for r in records if r["model"] == m] for m in MODELS}
+
+    def row(model: str, value: str, scale: float, digits: int) -> tuple[str, ...]:
+        own = [{**r, value: scale * r[value]} for r in of[model] if value == "success" or r["success"]]
+        return (CALLED[model], *(shown(own, value, digits, task=t) for t in args.tasks))
+
+    intervals = []
+    for model in MODELS:
+        bounds = []
+        for task in args.tasks:
+            won = [r["success"] for r in of[model] if r["task"] == task]
+            low, high = wilson_interval(int(sum(won)), len(won))
+            bounds.append(f"{100 * low:.0f} to {100 * high:.0f}")
+        intervals.append((CALLED[model], *bounds))
+    scenes = f"{args.trials} scenes a task and seed, {args.demonstrations} demonstrations a task, one network"
+    return [
+        Table(f"Success [%], {scenes}; mean ± SD over seeds", columns, [row(m, "success", 100, 1) for m in MODELS]),
+        Table("Success [%], 95 % Wilson interval over all scenes and seeds", columns, intervals),
+        Table("Steps to success; mean ± SD over seeds", columns, [row(m, "steps", 1, 0) for m in MODELS]),
+    ]
+
+
+def drawn(records: Sequence[Record], args: Args) -> Figure:
+    """Success by task, and how soon."""
+    with figure(height=3.4, width=9.0) as fig:
+        bars, curves = fig.subplots(1, 2)
+        for i, model in enumerate(MODELS):
+            found = [over_seeds(records, "success", task=t, model=model) for t in args.tasks]
+            mean, spread = 100 * np.array(found).T
+            x = np.arange(len(args.tasks)) + 0.26 * (i - 1)
+            bars.bar(x, mean, 0.24, yerr=spread, color=look(i)[0], error_kw={"linewidth": 1}, label=CALLED[model])
+            own = [r for r in records if r["model"] == model]
+            ended = np.sort([r["steps"] if r["success"] else np.inf for r in own])
+            steps = np.arange(1 + max(r["steps"] for r in records))
+            share = 100 * np.searchsorted(ended, steps, side="right") / len(ended)
+            curves.plot(steps, share, color=look(i)[0], linestyle=look(i)[1])
+        bars.set_xticks(range(len(args.tasks)), list(args.tasks))
+        bars.set(ylabel="success [% of scenes]", ylim=(0, 105))
+        curves.set(xlabel="steps", ylabel="solved so far, all tasks [%]", ylim=(0, 105), xlim=0)
+        fig.legend(loc="outside upper center", ncols=3)
+    return fig
+
+
+def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+    """Shows, teaches, and lets everybody try."""
+    args = args.scaled()
+    spec = stream_of(args.tasks)
+    plan = [(t, s) for t in args.tasks for s in episode_seeds(0, t, "demonstrate", args.demonstrations)]
+    with stage("demonstrating", console, seconds) as progress:
+        shown_ones = dispatch(partial(demonstrate, spec=spec), plan, args.workers, progress)
+    episodes = [e for e in shown_ones if e is not None]
+    pupils = [(m, s) for s in args.repetitions for m in ("gru", "memory")]
+    with stage("learning", console, seconds) as progress:
+        learned = dispatch(partial(learn, episodes=episodes, args=args), pupils, args.workers, progress)
+    brains = {(p.model, p.seed): p.brain for p in learned}
+    with stage("acting", console, seconds) as progress:
+        found = dispatch(partial(attempt, brains=brains), trials(args), args.workers, progress)
+    records = [r for each in found for r in each]
+    facts = {
+        "demonstrations": {t: sum(e.info["skill"] == t for e in episodes) for t in args.tasks},
+        "steps": sum(map(len, episodes)),
+        "seconds_to_learn": {m: [round(p.seconds, 1) for p in learned if p.model == m] for m in ("memory", "gru")},
+    }
+    return Findings(records, tables(records, args), drawn(records, args), facts)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the study, and returns the exit code."""
+    return reproduce("express_skills", study, Args, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
