@@ -26,9 +26,9 @@ from asm_gym.scripts import collect
 from asm_gym.scripts.claims import claim_folder
 from asm_gym.scripts.collect import episode_seeds
 from asm_gym.scripts.dispatch import Progress
-from asm_gym.scripts.learners import ALGORITHMS
 from asm_gym.scripts.progress import stage
-from asm_gym.scripts.training import BEST, CLONE, Plan, Run, success_rate
+from asm_gym.scripts.training.learners import ALGORITHMS
+from asm_gym.scripts.training.run import BEST, CLONE, Plan, Run, success_rate
 from asm_gym.tasks import task as task_spec
 
 

@@ -32,10 +32,10 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.claims import claim_folder
 from asm_gym.scripts.collect import episode_seeds, record_to
 from asm_gym.scripts.dispatch import Progress, dispatch
-from asm_gym.scripts.exploration import Gentle, explore, harmless
 from asm_gym.scripts.progress import stage
-from asm_gym.scripts.safe_run import ALONE, CONDITIONS, Setting, run
 from asm_gym.scripts.tables import markdown
+from asm_gym.scripts.training.exploration import Gentle, explore, harmless
+from asm_gym.scripts.training.safe_run import ALONE, CONDITIONS, Setting, run
 from asm_gym.tasks import task as task_spec
 
 DEMONSTRATIONS, FITTING, TESTING = 11, 12, 13

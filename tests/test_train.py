@@ -18,10 +18,10 @@ from asm_gym.datasets import write_dataset
 from asm_gym.episodes import Episode
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.cloning import Anchor, Cloner, fill_buffer, steps_of
-from asm_gym.scripts.learners import ALGORITHMS, RECIPES, export, make_learner, warm_critic
-from asm_gym.scripts.training import Plan, Run, Standard
-from asm_gym.scripts.training_state import Progressed, newest, resume, save
+from asm_gym.scripts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
+from asm_gym.scripts.training.learners import ALGORITHMS, RECIPES, export, make_learner, warm_critic
+from asm_gym.scripts.training.run import Plan, Run, Standard
+from asm_gym.scripts.training.state import Progressed, newest, resume, save
 from asm_gym.stream import StreamSpec
 
 PENDULUM = ["train", "Pendulum-v1", "--demonstrations", "0", "--evaluation-episodes", "1", "--final-episodes", "1"]

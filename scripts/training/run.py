@@ -20,11 +20,11 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from asm_gym.episodes import Episode
 from asm_gym.policies import rollout
 from asm_gym.policies.network import NetworkPolicy
-from asm_gym.scripts.cloning import Anchor, Cloner, fill_buffer, steps_of
 from asm_gym.scripts.collect import episode_seeds
 from asm_gym.scripts.dispatch import Progress
-from asm_gym.scripts.learners import RECIPES, export, make_learner, warm_critic
-from asm_gym.scripts.training_state import Progressed, newest, resume, save
+from asm_gym.scripts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
+from asm_gym.scripts.training.learners import RECIPES, export, make_learner, warm_critic
+from asm_gym.scripts.training.state import Progressed, newest, resume, save
 
 BEST, CLONE = "best.npz", "clone.npz"
 """The best agent of the evaluations, and what it was before it learned from its own steps."""

@@ -24,12 +24,12 @@ from asm_gym.datasets import load_episode
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.safe_training import Outcome, count
 from asm_gym.monitors import NeuralASM
-from asm_gym.scripts.cloning import Anchor, Cloner, fill_buffer, steps_of
 from asm_gym.scripts.collect import episode_seeds
 from asm_gym.scripts.lagrangian import CostlyReward
-from asm_gym.scripts.learners import export, make_novice
-from asm_gym.scripts.training import Standard, success_rate
-from asm_gym.scripts.violations import TorqueWatch
+from asm_gym.scripts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
+from asm_gym.scripts.training.learners import export, make_novice
+from asm_gym.scripts.training.run import Standard, success_rate
+from asm_gym.scripts.training.violations import TorqueWatch
 from asm_gym.wrappers import NeuralASMSafety
 
 ALONE = "alone"
