@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,6 @@ from threadpoolctl import threadpool_limits
 
 from asm_gym.episodes import Episode
 from asm_gym.memory.association import Association, association_shapes, hidden_units, synapses
-from asm_gym.memory.energy import activate
 from asm_gym.memory.inference import Weights, motor_prediction, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
@@ -23,25 +22,12 @@ from asm_gym.memory.network import Network, train
 from asm_gym.memory.online import followed
 from asm_gym.memory.readout import add_up, learn_readout, running
 from asm_gym.memory.recall import continued
-from asm_gym.memory.senses import Reading, Senses, rows_apart
+from asm_gym.memory.senses import Senses, rows_apart
+from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated import Progress, require
 from asm_gym.monitors.predictive import BOUND, GAINS, PredictiveMonitor, PredictiveState
 from asm_gym.stream import StreamSpec
-
-
-class MemoryState(NamedTuple):
-    """Where the memory is, one entry a stream.
-
-    Association compares each row with that of l rows before; the state is inferred anew every l rows.
-    """
-
-    hidden: NDArray[np.float32]  # (B, H) the inferred state z
-    expected: NDArray[np.float32]  # (B, H) f(μ), of the state that was expected then
-    before: NDArray[np.float64]  # (B, l, D) the rows seen last, the oldest first
-    earlier: NDArray[np.float64]  # (B, l, D) those before
-    steps: NDArray[np.int64]  # (B,) how many rows were seen
-    skill: NDArray[np.float32]  # (B, K) L, what speaks for each skill; K is 0 where none has a name
 
 
 class NeuralASM(PredictiveMonitor):
@@ -149,50 +135,21 @@ class NeuralASM(PredictiveMonitor):
         self.motor_ = Motor.found(found, senses)
 
     def start_model(self, batch: int) -> MemoryState:
-        hidden = np.zeros((batch, self.hidden_size), np.float32)
-        rows = np.zeros((batch, self._lag, self.spec.size))
-        skill = np.zeros((batch, len(self.skills_)), np.float32)
-        return MemoryState(hidden, hidden, rows, rows, np.zeros(batch, np.int64), skill)
+        return at_start(batch, self.hidden_size, self._lag, self.spec.size, len(self.skills_))
 
     def predict(
         self, state: MemoryState, rows: NDArray[np.float64]
     ) -> tuple[MemoryState, NDArray[np.float32], NDArray[np.float32]]:
         assert self.network_ is not None
-        before, earlier, lag = state.before[:, 0], state.earlier[:, 0], self._lag
-        if state.steps.min() < 2 * lag:  # before the first rows nothing has moved
-            before = np.where(state.steps[:, None] >= lag, before, rows)
-            earlier = np.where(state.steps[:, None] >= 2 * lag, earlier, before)
+        before, earlier = past(state, rows)
         reading = self.senses_.read(rows, before, earlier)
-        hidden, expected = self._carry_on(state, reading)
+        hidden, expected = carry_on(self.network_, state, reading)
         error, units = self.network_.associate(reading)
         skill = state.skill
         if self.skills_:
             skill = add_up(skill, units, self.learned_["W_K"], self.learned_["b_K"])
-        state = MemoryState(
-            hidden=hidden,
-            expected=expected,
-            before=newest(state.before, rows),
-            earlier=newest(state.earlier, before),
-            steps=state.steps + 1,
-            skill=skill,
-        )
-        return state, error, expected
-
-    def _carry_on(self, state: MemoryState, reading: Reading) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """z and f(μ) (B, H) after a row, which are as they were in streams whose turn it is not."""
-        assert self.network_ is not None
-        due = state.steps % self._lag == 0
-        if not due.any():
-            return state.hidden, state.expected
-        if due.all():
-            mu, z = self.network_.follow(state.hidden, reading.commands, reading.senses, reading.seen)
-            return z, activate(mu)
-        hidden, expected = state.hidden.copy(), state.expected.copy()
-        mu, hidden[due] = self.network_.follow(
-            hidden[due], reading.commands[due], reading.senses[due], reading.seen[due]
-        )
-        expected[due] = activate(mu)
-        return hidden, expected
+        seen = newest(state.before, rows), newest(state.earlier, before), state.steps + 1
+        return MemoryState(hidden, expected, *seen, skill), error, expected
 
     def name_skills(self, episodes: Sequence[Episode]) -> Self:
         """Learns to tell which skill is running, from episodes whose ``info["skill"]`` says it.
@@ -335,8 +292,3 @@ class NeuralASM(PredictiveMonitor):
     def _units_each(self, senses: Senses) -> int:
         """Hidden units of association for each group."""
         return max(1, self.association_size // (int(senses.groups.max()) + 1))
-
-
-def newest(rows: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(B, l, D) without the oldest of the rows, and with this one (B, D)."""
-    return row[:, None] if rows.shape[1] == 1 else np.concatenate([rows[:, 1:], row[:, None]], axis=1)
