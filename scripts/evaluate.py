@@ -24,6 +24,7 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation.archive import Label
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, possible, suite_fault
 from asm_gym.monitors import MONITORS
+from asm_gym.policies import make_policy
 from asm_gym.scripts.claims import claim_folder
 from asm_gym.scripts.dispatch import Crew, Progress, dispatch
 from asm_gym.scripts.film import Scene, film, prepare_film
@@ -142,10 +143,12 @@ class Args:
 
 
 def labels(args: Args) -> list[Label]:
-    """Every episode of the run, task by task."""
+    """Every episode of the run, task by task. Raises ValueError or OSError where the policy cannot act in one."""
     made: list[Label] = []
     for task in args.tasks:
-        env: Any = gym.make(f"asm_gym/{task}-v0", robot=args.robot).unwrapped
+        made_env = gym.make(f"asm_gym/{task}-v0", robot=args.robot)
+        make_policy(args.policy, made_env, seed=0)  # what does not fit is refused before anything is recorded
+        env: Any = made_env.unwrapped
         faults = [k for k in args.faults if possible(k, env)]
         harmless = [k for k in args.harmless if k in EXECUTIONS or possible(k, env)]
         horizon = env.horizon
@@ -166,14 +169,14 @@ def labels(args: Args) -> list[Label]:
     return made
 
 
-def record_all(args: Args, wanted: Sequence[Label], progress: Progress) -> None:
+def record_all(args: Args, wanted: Sequence[Label], crew: Crew, progress: Progress) -> None:
     """Records the episodes that are not there yet."""
     missing = [label for label in wanted if not (args.out / label.path).is_file()]
     done = len(wanted) - len(missing)
     progress(done, len(wanted))
     course = Course(args.robot, args.policy)
     task = partial(record, course=course, folder=args.out.resolve())
-    dispatch(task, missing, args.crew, lambda k, _: progress(done + k, len(wanted)))
+    dispatch(task, missing, crew, lambda k, _: progress(done + k, len(wanted)))
 
 
 def claim(args: Args) -> None:
@@ -213,13 +216,14 @@ def film_examples(args: Args, judgement: Judgement, wanted: Sequence[Label], pro
 def evaluate(args: Args, console: Console) -> Judgement:
     """Records, fits, judges and publishes."""
     seconds: dict[str, float] = {}
-    claim(args)
+    crew = args.crew
     with stage("listing episodes", console, seconds):
         wanted = labels(args)
+    claim(args)
     with stage("recording", console, seconds) as progress:
-        record_all(args, wanted, progress)
+        record_all(args, wanted, crew, progress)
     with stage("fitting and judging", console, seconds) as progress:
-        how = args.false_alarm_rate, args.window, args.seed, args.crew
+        how = args.false_alarm_rate, args.window, args.seed, crew
         judgement = judge(args.out, wanted, args.monitors, *how, progress)
     video = None
     if args.video and judgement.shown and prepare_film(console):
@@ -238,7 +242,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = tyro.cli(Args, args=argv, prog="asm-gym evaluate", description=__doc__).scaled()
         judgement = evaluate(args, console)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         print(f"asm-gym evaluate: {error}", file=sys.stderr)
         return 2
     for table in brief_tables(judgement):

@@ -91,6 +91,8 @@ def test_a_folder_of_other_settings_is_refused(run, capsys):
         ("--fit-episodes 0", "fit_episodes.*0"),
         ("--window -1", "window"),
         ("--backend dask", "address"),
+        ("--policy door_sac", "door_sac takes observations of 41"),
+        ("--policy nobody.npz", "nobody.npz"),
     ],
 )
 def test_arguments_that_make_no_sense_are_refused(arguments, message, tmp_path, capsys):
@@ -99,7 +101,7 @@ def test_arguments_that_make_no_sense_are_refused(arguments, message, tmp_path, 
     assert ended.value.code == 2
     shown = "".join(capsys.readouterr())
     assert re.search(message, re.sub(r"[│╭╮╰╯─\s]+", " ", shown))
-    assert not list(tmp_path.glob("episodes"))
+    assert not list(tmp_path.iterdir())
 
 
 def test_quick_is_less_of_everything():
