@@ -70,6 +70,7 @@ def run_bout(one: Bout, course: Course, max_override_s: float, memory: Path) -> 
         monitor,
         on_alarm="monitor" if alone else one.acting,
         max_override=None if alone else max(1, round(max_override_s / dt)),
+        on_overrun="ignore",
     )
     infos: list[dict[str, Any]] = []
     try:

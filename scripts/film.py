@@ -73,7 +73,8 @@ def _pictures(scene: Scene, monitor: Monitor) -> list[NDArray[np.uint8]]:
     base = gym.make(
         scene.env_id, robot=scene.robot, render_mode="rgb_array", camera="agentview", render_size=(512, 640)
     )
-    guarded = NeuralASMSafety(FaultInjection(base, scene.faults(base.unwrapped)), monitor, on_alarm=scene.on_alarm)
+    faulty = FaultInjection(base, scene.faults(base.unwrapped))
+    guarded = NeuralASMSafety(faulty, monitor, on_alarm=scene.on_alarm, on_overrun="ignore")
     watched = SurpriseOverlay(guarded, caption=scene.caption)
     pictures: list[NDArray[np.uint8]] = []
 

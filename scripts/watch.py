@@ -44,7 +44,7 @@ def _memory(path: Path, written_ns: int) -> NeuralASM:
 def guarded(env: gym.Env[Any, Any], monitor: NeuralASM, trial: Trial) -> gym.Env[Any, Any]:
     """``env`` with the trial's faults, under the safety wrapper."""
     on_alarm = "monitor" if trial.acting == POLICY_ALONE else trial.acting
-    return NeuralASMSafety(FaultInjection(env, trial.faults), monitor, on_alarm=on_alarm)
+    return NeuralASMSafety(FaultInjection(env, trial.faults), monitor, on_alarm=on_alarm, on_overrun="ignore")
 
 
 def watch_pair(trial: Trial, env_id: str, policy: str, memory: Path) -> list[Trace]:

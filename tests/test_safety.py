@@ -1,5 +1,7 @@
 """The safety wrapper's contract, on an environment and a monitor that follow a script."""
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -284,6 +286,10 @@ def test_an_overrun_warns_once_or_counts_as_an_alarm(monkeypatch):
     infos = run(NeuralASMSafety(FakeEnv(), Slow(), on_overrun="alarm"), 6)
     assert [i["asm"]["alarm"] for i in infos[1:]] == [False, False, False, True, False, False]
     assert infos[4]["asm"]["surprise"] == np.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        infos = run(NeuralASMSafety(FakeEnv(), Slow(), on_overrun="ignore"), 6)
+    assert not any(i["asm"]["alarm"] for i in infos)
     with pytest.raises(ValueError, match=r"on_overrun.*warn.*alarm"):
         NeuralASMSafety(FakeEnv(), CueMonitor(), on_overrun="panic")
 

@@ -78,8 +78,9 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             changes it for all who watch with it: for a robot that slowly wears.
         monitor_freq: rows watched a second [Hz], by a monitor fitted at that rate, on environments whose
             ``stream_freq`` can be set; it is set to this. None for the rate that the environment's stream has.
-        on_overrun: where the monitor takes longer for a row than a row lasts, ``"warn"`` says so once and ``"alarm"``
-            takes it for infinite surprise. The first row does not count.
+        on_overrun: where the monitor takes longer for a row than a row lasts, ``"warn"`` says so once, ``"alarm"``
+            takes it for infinite surprise, and ``"ignore"`` is for simulations, which wait. The first row does not
+            count.
 
     Raises:
         ValueError: an unknown ``on_alarm``, a monitor fitted for another stream or rate (the message names what
@@ -100,7 +101,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         truncate: bool = False,
         learning_rate: float = 0.0,
         monitor_freq: int | None = None,
-        on_overrun: Literal["warn", "alarm"] = "warn",
+        on_overrun: Literal["warn", "alarm", "ignore"] = "warn",
     ) -> None:
         RecordConstructorArgs.__init__(
             self,
@@ -118,7 +119,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
             raise TypeError(f"NeuralASMSafety needs a Box action space, got {env.action_space}")
-        check_choice("on_overrun", on_overrun, ("warn", "alarm"))
+        check_choice("on_overrun", on_overrun, ("warn", "alarm", "ignore"))
         if not 0.0 <= learning_rate <= 1.0:
             raise ValueError(f"learning_rate must be in [0, 1], got {learning_rate}")
         if learning_rate > 0 and not hasattr(monitor, "adapt"):

@@ -109,7 +109,7 @@ def run(job: tuple[str, int], setting: Setting, memory: Path, demonstrations: Se
     observations, actions = steps_of(episodes)
     standard = Standard.of(observations)
     env: gym.Env[Any, Any] = NeuralASMSafety(
-        TorqueWatch(gym.make(setting.env_id)), NeuralASM.load(memory), **CONDITIONS[condition]
+        TorqueWatch(gym.make(setting.env_id)), NeuralASM.load(memory), on_overrun="ignore", **CONDITIONS[condition]
     )
     if condition == "terminate":
         env = CostlyReward(env, setting.cost)
