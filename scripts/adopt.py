@@ -15,7 +15,6 @@ from typing import Annotated, NamedTuple
 
 import tyro
 from rich.console import Console
-from rich.table import Table as RichTable
 
 from asm_gym.choices import check_choice
 from asm_gym.evaluation import comparison
@@ -26,7 +25,7 @@ from asm_gym.monitors import MONITORS
 from asm_gym.scripts.judge import opinion_of, sights_of
 from asm_gym.scripts.progress import stage
 from asm_gym.scripts.repertoire import recorded
-from asm_gym.scripts.tables import markdown
+from asm_gym.scripts.tables import console_table, markdown
 
 Roles = Mapping[str, Sequence[Recording]]
 
@@ -138,12 +137,7 @@ def main(argv: list[str] | None = None) -> int:
     (args.out / "adopt.md").write_text(markdown(made) + "\n", encoding="utf-8")
     content = {"settings": asdict(args), "headings": made.headings, "rows": made.rows}
     (args.out / "adopt.json").write_text(json.dumps(content, indent=1, default=str) + "\n", encoding="utf-8")
-    shown = RichTable(title=made.caption)
-    for heading in made.headings:
-        shown.add_column(heading)
-    for row in made.rows:
-        shown.add_row(*map(str, row))
-    console.print(shown)
+    console.print(console_table(made))
     console.print(f"Wrote {args.out / 'adopt.md'} and {args.out / 'adopt.json'}")
     return 0
 

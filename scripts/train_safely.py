@@ -19,7 +19,6 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import tyro
 from rich.console import Console
-from rich.table import Table as RichTable
 
 from asm_gym.choices import check_choice
 from asm_gym.datasets import load_episode
@@ -33,7 +32,7 @@ from asm_gym.scripts.claims import claim_folder
 from asm_gym.scripts.collect import episode_seeds, record_to
 from asm_gym.scripts.dispatch import Progress, dispatch
 from asm_gym.scripts.progress import stage
-from asm_gym.scripts.tables import markdown
+from asm_gym.scripts.tables import console_table, markdown
 from asm_gym.scripts.training.exploration import Gentle, explore, harmless
 from asm_gym.scripts.training.safe_run import ALONE, CONDITIONS, Setting, run
 from asm_gym.tasks import task as task_spec
@@ -253,12 +252,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"asm-gym train-safely: {error}", file=sys.stderr)
         return 2
     for table in tables:
-        shown = RichTable(title=table.caption)
-        for heading in table.headings:
-            shown.add_column(heading)
-        for row in table.rows:
-            shown.add_row(*map(str, row))
-        console.print(shown)
+        console.print(console_table(table))
     console.print(f"Wrote {args.out / 'training.md'}, training.csv, training.json and training.png")
     return 0
 
