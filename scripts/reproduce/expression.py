@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -150,10 +151,16 @@ class Hopfield:
             values += list(rows[1:])
         return cls(reader, np.array(keys), np.array(values), window, beta)
 
+    @cached_property
+    def _lengths(self) -> NDArray[np.float64]:
+        """‖k_i‖² (N,)."""
+        squared: NDArray[np.float64] = np.einsum("ij,ij->i", self.keys, self.keys)
+        return squared
+
     def retrieve(self, query: NDArray[np.float64]) -> NDArray[np.float64]:
         """What follows windows (B, window · D): (B, D)."""
         size = self.values.shape[1]  # as a mean over channels, β means the same for any stream
-        distance = np.sum(query**2, 1)[:, None] + np.sum(self.keys**2, 1) - 2 * query @ self.keys.T
+        distance = np.sum(query**2, 1)[:, None] + self._lengths - 2 * query @ self.keys.T
         drive = -0.5 * self.beta * distance / size
         share = np.exp(drive - drive.max(axis=1, keepdims=True))
         found: NDArray[np.float64] = share @ self.values / share.sum(axis=1, keepdims=True)

@@ -18,11 +18,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from asm_gym.episodes import Episode
 from asm_gym.evaluation.plots import figure, look
 from asm_gym.evaluation.report import Table
 from asm_gym.scripts.dispatch import dispatch
 from asm_gym.scripts.progress import stage
+from asm_gym.scripts.reproduce import robot_recall
 from asm_gym.scripts.reproduce.common import (
     SKILLS,
     Common,
@@ -46,6 +46,7 @@ from asm_gym.scripts.reproduce.expression import (
     recalled,
 )
 from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, copybook, repertoire
+from asm_gym.scripts.reproduce.robot_recall import RECALLED, ROBOT_CUE
 
 MODELS = ("memory", "gru", "rnn", "hopfield", "library")
 CALLED = {
@@ -55,10 +56,6 @@ CALLED = {
     "hopfield": "modern Hopfield",
     "library": "primitives, told the skill",
 }
-RECALLED = {"Lift": 65, "Stack": 115, "PickPlaceCan": 145}
-"""Steps recalled of the robosuite skills."""
-
-ROBOT_CUE = 15
 
 
 @dataclass(frozen=True)
@@ -146,37 +143,6 @@ def letters(condition: Condition, args: Args) -> list[Record]:
             error, right = recalled(model, tests, means, cue)
             where = {"domain": "letters", "model": name, **condition._asdict(), "cue": cue, "online": cue == STEPS}
             records.append({**where, "error_cm": error, "right": right})
-    return records
-
-
-def robot(seed: int, train: Sequence[Episode], tests: Sequence[Episode], args: Args) -> list[Record]:
-    """Every model on the robosuite skills, in one network."""
-    rng, hidden = np.random.default_rng(seed), args.robot_hidden
-    models: dict[str, Any] = {
-        "memory": Memory.learned(train, hidden, rng, args.steps, carry_prior=0.98),
-        # Of noise from 0 to 1, a standard deviation was best here; less was better for letters.
-        "gru": Backpropagated.learned(train, "gru", hidden, rng, args.updates // 2, noise=1.0, rate=3e-3),
-        "rnn": Backpropagated.learned(train, "rnn", hidden, rng, args.updates // 2, noise=1.0, rate=3e-3),
-        "hopfield": Hopfield.learned(train),
-        "library": None,
-        "mean": None,
-    }
-    slices = train[0].spec.slices["hand_position"]
-    records = []
-    for task, steps in RECALLED.items():
-        own = [e for e in tests if e.info["skill"] == task]
-        streams = np.stack([e.stream[: ROBOT_CUE + steps] for e in own], axis=1).astype(np.float64)
-        true = streams[ROBOT_CUE:, :, slices]
-        for name, model in models.items():
-            if name == "mean":
-                shown_ones = [e.stream[: len(streams), slices] for e in train if e.info["skill"] == task]
-                hand = np.mean(shown_ones, axis=0)[ROBOT_CUE:, None]
-            else:
-                model = Library.learned(train, [task] * len(own)) if name == "library" else model
-                hand = model.express(streams, ROBOT_CUE)[ROBOT_CUE:, :, slices]
-            error = 100 * float(np.linalg.norm(hand - true, axis=2).mean())
-            where = {"domain": task, "model": name, "seed": seed, "skills": len(SKILLS), "hidden": hidden}
-            records.append({**where, "cue": ROBOT_CUE, "online": False, "error_cm": error})
     return records
 
 
@@ -268,7 +234,9 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     if args.robot_episodes:
         train = demonstrations(args, SKILLS, "fit", args.robot_episodes, console, seconds)
         tests = demonstrations(args, SKILLS, "nominal", 15, console, seconds)
-        jobs += [partial(robot, seed, train, tests, args) for seed in args.repetitions]
+        sizes = args.robot_hidden, args.steps, args.updates // 2
+        jobs += [partial(robot_recall.learned, seed, train, tests, *sizes) for seed in args.repetitions]
+        jobs.append(partial(robot_recall.stored, train, tests, {"seed": args.seed, "hidden": args.robot_hidden}))
     # The longest first, so that no process is left with one of them at the end.
     jobs += [partial(letters, condition, args) for condition in conditions(args)]
     with stage("learning", console, seconds) as progress:
