@@ -1,0 +1,111 @@
+"""Association and its precision, against gradients and known noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from asm_gym.memory.association import (
+    Association,
+    association_change,
+    association_shapes,
+    complete,
+    hidden_units,
+    learn_association,
+    synapses,
+)
+from asm_gym.memory.network import Network, initial_weights
+from asm_gym.memory.precision import LARGEST, SMALLEST, learn_precision, log_variance
+from asm_gym.memory.senses import Reading
+
+CHANGES = slice(5, 10)
+
+
+def some_association(rng: np.random.Generator, inputs: int, units: int, changes: int) -> Association:
+    shapes = association_shapes(inputs, units, changes).values()
+    return Association(*(rng.normal(scale=0.3, size=s).astype(np.float32) for s in shapes))
+
+
+def test_precision_recovers_noise_that_depends_on_context():
+    rng = np.random.default_rng(0)
+    context = rng.uniform(-1, 1, size=(8000, 6))
+    truth = np.stack([2.0 * context[:, 0] - 3.0, -1.0 - context[:, 1] + context[:, 2]], axis=1)
+    error = rng.normal(size=truth.shape) * np.exp(truth / 2)
+    f, W_S, b_S = context.astype(np.float32), np.ones((2, 6), np.float32), np.zeros(2, np.float32)
+    learn_precision(f, error.astype(np.float32), W_S, b_S, rng, rate=3e-3)
+    learned = log_variance(f, W_S, b_S)
+    np.testing.assert_allclose(learned.mean(axis=0), truth.mean(axis=0), atol=0.1)
+    assert np.sqrt(np.mean((learned - truth) ** 2)) < 0.15  # against 1.15 and 0.8 for the best constant
+
+
+def test_log_variance_stays_in_bounds():
+    f = np.ones((2, 3), np.float32)
+    for sign, bound in ((1, LARGEST), (-1, SMALLEST)):
+        W_S = np.full((2, 3), sign * 100, np.float32)
+        assert np.all(log_variance(f, W_S, np.zeros(2, np.float32)) == bound)
+
+
+def test_network_reports_the_errors_of_association_in_the_spread_that_is_expected_of_them():
+    rng = np.random.default_rng(0)
+    w, association = initial_weights(8, 5, 2, rng), some_association(rng, 13, 6, 5)
+    network = Network(w, association, 20, 1.0, 1.0)
+    z, u, x, inputs = (rng.normal(size=(2, n)).astype(np.float32) for n in (8, 3, 5, 13))
+    seen = np.ones_like(x)
+    seen[1, 3] = 0
+    whole = seen.min(axis=1, keepdims=True)
+    found, units = network.associate(Reading(x, seen, u, inputs, inputs[:, CHANGES], whole, np.ones((2, 7), bool)))
+    expected, _ = network.follow(z, u, x, seen)
+    np.testing.assert_allclose(expected, np.tanh(z) @ w.W_H.T + u @ w.W_U.T, atol=1e-5)
+    V, U, D, W_S, b_S = association
+    f = np.tanh(inputs @ V.T)
+    error = inputs[:, CHANGES] - f @ U.T - inputs @ D.T
+    np.testing.assert_allclose(units, f, atol=1e-5)
+    np.testing.assert_allclose(found, whole * error * np.exp(-0.5 * (f @ W_S.T + b_S)), atol=1e-4)
+
+
+def test_nothing_is_predicted_from_its_own_group():
+    groups = np.array([0, 0, 1, 2, 2])
+    exists = synapses(groups, CHANGES, 13, size=4)
+    reaches = (exists.U @ exists.V > 0) | (exists.D > 0)  # (X, I)
+    assert np.array_equal(reaches[:, CHANGES], groups[:, None] != groups)
+    assert reaches[:, :5].all()
+    assert reaches[:, 10:].all()
+
+
+def test_association_changes_are_the_gradient_of_half_the_squared_error():
+    rng = np.random.default_rng(3)
+    a, delta = rng.normal(size=(4, 13)).astype(np.float32), rng.normal(size=(4, 5)).astype(np.float32)
+    V, U, D, *_ = some_association(rng, 13, 6, 5)
+    spread = np.full(5, 1e3, np.float32)  # no error is so large that it is cut off
+    change, error = association_change(a, delta, spread, V, U, D)
+
+    def loss(V, U, D):
+        e = delta - np.tanh(a @ V.T) @ U.T - a @ D.T
+        return 0.5 * np.sum(e**2) / len(a)
+
+    np.testing.assert_allclose(error, delta - np.tanh(a @ V.T) @ U.T - a @ D.T, atol=1e-5)
+    exact = [W.astype(np.float64) for W in (V, U, D)]
+    for n, found in enumerate(change):
+        for place in [(0, 0), (2, 3), (4, 5)]:
+            up, down = ([W.copy() for W in exact] for _ in range(2))
+            up[n][place] += 1e-5
+            down[n][place] -= 1e-5
+            slope = (loss(*up) - loss(*down)) / 2e-5
+            assert found[place] * spread[0] == pytest.approx(-slope, rel=1e-2, abs=1e-4)
+
+
+def test_association_learns_what_ties_the_senses_together_and_how_sure_that_is():
+    rng = np.random.default_rng(0)
+    N = 6000
+    cause = rng.normal(size=(N, 2))
+    noise = 0.05 * rng.normal(size=(N, 2)) * np.where(cause[:, :1] > 0, 4.0, 1.0)
+    delta = np.stack([cause[:, 0], cause[:, 1], *(np.sin(2 * cause) + noise).T], axis=1).astype(np.float32)
+    inputs = np.hstack([delta, np.ones((N, 1), np.float32)])
+    w = learn_association(inputs, delta, np.array([0, 0, 1, 1]), slice(0, 4), 32, rng)
+    f = hidden_units(inputs, w.V)
+    error = (delta - complete(f, inputs, w.U, w.D))[:, 2:]
+    deviation = np.exp(0.5 * log_variance(f, w.W_S, w.b_S))[:, 2:]
+    assert error.std() < 0.25  # 0.15 is the noise alone, 0.66 the best that a line could do
+    rough = cause[:, 0] > 0.5
+    calm = cause[:, 0] < -0.5
+    assert deviation[rough].mean() > 2 * deviation[calm].mean()
