@@ -31,6 +31,7 @@ def test_a_spread_is_mean_and_sample_deviation():
         ({"seeds": 0}, "seeds must be at least 1, got 0"),
         ({"alone_seeds": 4}, r"alone_seeds must be in \[0, 3\], got 4"),
         ({"switches": -1}, "switches must be at least 0, got -1"),
+        ({"experience": -3}, "experience must be at least 0, got -3"),
         ({"monitors": ("oracle",)}, "unknown monitor 'oracle'"),
         ({"monitors": ()}, "at least one monitor"),
     ],
@@ -67,12 +68,25 @@ def test_it_compares_one_memory_with_one_for_each_task(tmp_path):
         *("--false-alarm-rate", "0.05"),
     ]
     assert evaluate.main([*recorded, "--out", str(tmp_path / "run")]) == 0
-    asked = ["--run", str(tmp_path / "run"), "--monitors", "neural_asm", "--seeds", "2", "--switches", "1"]
+    asked = [
+        "--run",
+        str(tmp_path / "run"),
+        "--monitors",
+        "neural_asm",
+        "--seeds",
+        "2",
+        "--switches",
+        "2",
+        "--experience",
+        "3",
+    ]
     assert repertoire.main([*asked, "--false-alarm-rate", "0.05", "--out", str(tmp_path / "out")]) == 0
-    seeds, alone, naming = json.loads((tmp_path / "out" / "repertoire.json").read_text())["tables"]
+    seeds, alone, naming, alarms = json.loads((tmp_path / "out" / "repertoire.json").read_text())["tables"]
     assert [r[0] for r in alone["rows"]] == ["Lift", "PickPlaceCan", "PickPlaceMilk"]
     assert len(seeds["rows"]) == 1
     assert float(seeds["rows"][0][1].split(" ± ")[0]) > 0.9  # strong pushes
     named = [float(cell.split(" ± ")[0]) for cell in naming["rows"][0][1:]]
     assert named[-1] > 80  # three skills, five seconds
+    assert [r[0] for r in alarms["rows"]] == ["of single skills", "that has seen 3 changes"]
+    assert {p.stem for p in (tmp_path / "out" / "experience").iterdir()} == {"5000", "5001", "5002"}
     assert (tmp_path / "out" / "naming.png").stat().st_size > 5000

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from asm_gym.evaluation.plots import figure, look
+from asm_gym.evaluation.report import Table
 
 
 class Spread(NamedTuple):
@@ -28,6 +29,13 @@ class Spread(NamedTuple):
         return f"{scale * self.mean:.{digits}f} ± {scale * self.sd:.{digits}f}"
 
 
+class Alarms(NamedTuple):
+    """Share of the episodes in which one memory raised an alarm."""
+
+    nominal: float
+    switched: float  # with a change of skill
+
+
 def share_right(right: Sequence[NDArray[np.bool_]], step: int) -> float:
     """Episodes whose running skill was named rightly ``step`` steps after it began (1 is its first row).
 
@@ -35,6 +43,16 @@ def share_right(right: Sequence[NDArray[np.bool_]], step: int) -> float:
         right: (T,) for each episode; of one that ends earlier its last step counts.
     """
     return float(np.mean([r[min(step, len(r)) - 1] for r in right]))
+
+
+def alarms_table(found: Mapping[str, Sequence[Alarms]]) -> Table:
+    """How often a change of skill is taken for a fault, by memory."""
+
+    def shares(alarms: Sequence[Alarms], which: str) -> str:
+        return Spread.of([100 * getattr(a, which) for a in alarms]).text(1, 1)
+
+    rows = [(name, shares(alarms, "switched"), shares(alarms, "nominal")) for name, alarms in found.items()]
+    return Table("Episodes with an alarm [%].", ("Memory", "with a change of skill", "nominal"), rows)
 
 
 def naming_figure(curves: Mapping[str, Sequence[NDArray[np.bool_]]], dt: float, longest_s: float = 8.0) -> Figure:
