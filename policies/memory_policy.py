@@ -1,6 +1,6 @@
 """The Neural ASM as a policy: what the memory expects to be commanded next is what is commanded.
 
-row → memory: expect, infer → motor prediction â → action → env → row
+row → memory: expect, infer → motor prediction â → action, grippers by ``grip`` → env → row
 
 Nothing selects a skill: the row says what lies about, and the memory's state what is being done with it.
 """
