@@ -1,6 +1,6 @@
 """The Neural ASM as a policy: what the memory expects to be commanded next is what is commanded.
 
-row → memory: expect, infer → motor prediction â → action → env → row
+row → memory: expect, infer → motor prediction â → action, grippers by ``grip`` → env → row
 
 Nothing selects a skill: the row says what lies about, and the memory's state what is being done with it.
 """
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import State
+from asm_gym.policies.grip import Grip, Readout
 from asm_gym.stream import MOTOR, StreamSpec, control_period
 
 OBJECT = "object"
@@ -93,6 +94,7 @@ class MemoryState(NamedTuple):
 
     memory: State
     action: NDArray[np.float32]  # (A,) commanded last
+    grip: Grip | None = None  # what grippers are told; None before the first step
 
 
 class NeuralASMPolicy:
@@ -116,8 +118,7 @@ class NeuralASMPolicy:
         self.memory = memory
         self._size = require_motor(memory.spec, env)
         self._read = StreamReader(memory.spec, env)
-        self._grip = np.asarray(getattr(env.unwrapped, "gripper_actions", ()), dtype=int)
-        self._space: Any = env.action_space
+        self._readout = Readout(env)
         memory.initial_state()
 
     @classmethod
@@ -137,8 +138,8 @@ class NeuralASMPolicy:
             state = MemoryState(self.memory.initial_state(), np.zeros(self._size, np.float32))
         row = self._read(observation, state.action)
         memory, _ = self.memory.observe(state.memory, row[None])
-        action = within(self.memory.expected_action(memory)[0], self._space, self._grip)
-        return action, MemoryState(memory, action)
+        action, grip = self._readout(self.memory.expected_action(memory)[0], state.grip)
+        return action, MemoryState(memory, action, grip)
 
 
 def require_motor(spec: StreamSpec, env: gym.Env[Any, Any]) -> int:
@@ -151,13 +152,6 @@ def require_motor(spec: StreamSpec, env: gym.Env[Any, Any]) -> int:
     if len(spec.motor) != int(np.prod(space.shape)):
         raise ValueError(f"this memory predicts {len(spec.motor)} commands, the environment takes {space.shape}")
     return len(spec.motor)
-
-
-def within(action: NDArray[np.float32], space: spaces.Box, grip: NDArray[np.intp]) -> NDArray[np.float32]:
-    """The action, kept in the space; of a gripper, which is told to open or to close, the expected one's sign."""
-    action = np.clip(np.nan_to_num(action), space.low, space.high).astype(np.float32)
-    action[grip] = np.where(action[grip] > 0, space.high[grip], space.low[grip])
-    return action
 
 
 def _of_spaces(env: gym.Env[Any, Any]) -> StreamSpec:

@@ -9,13 +9,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from asm_gym.episodes import Episode
-from asm_gym.memory.motor import FINE, fineness, learn_motor, lessons, situation
+from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, situation
 from asm_gym.memory.senses import Senses
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
-from asm_gym.policies.memory_policy import StreamReader, common_spec, within
+from asm_gym.policies.grip import ENOUGH, FORGETS, Readout
+from asm_gym.policies.memory_policy import StreamReader, common_spec
 from asm_gym.stream import Channel, StreamSpec
 
 SMALL: dict[str, Any] = {"hidden_size": 8, "association_size": 8, "epochs": 1}
@@ -26,7 +28,8 @@ class Point(gym.Env[Any, Any]):
 
     metadata = {"render_fps": 20}  # noqa: RUF012
 
-    def __init__(self) -> None:
+    def __init__(self, dt: float = 0.05) -> None:
+        self.dt = dt
         self.observation_space = spaces.Box(-5.0, 5.0, (2,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
         self.gripper_actions = (2,)
@@ -105,10 +108,10 @@ def scene() -> StreamSpec:
 
 def test_rates_and_commands_are_not_read_and_distances_finely():
     spec = scene()
-    assert fineness(spec).tolist() == [1, 1, 0, 0, 1, 1, FINE, FINE, 0, 0]
+    assert fineness(spec).tolist() == [PLACED, PLACED, 0, 0, 1, 1, FINE, FINE, 0, 0]
     senses = Senses(spec, np.full(10, 1.0), np.full(10, 2.0), np.ones(10))
     row = np.arange(10.0)[None]
-    expected = [(0 - 1) / 2, 0.0, 3 / 2, 4 / 2, FINE * 5 / 2, FINE * 6 / 2, 1.0]
+    expected = [PLACED * (0 - 1) / 2, 0.0, 3 / 2, 4 / 2, FINE * 5 / 2, FINE * 6 / 2, 1.0]
     np.testing.assert_allclose(situation(senses, row)[0], expected)
     row[0, 0] = np.nan
     assert situation(senses, row)[0, 0] == 0.0
@@ -121,7 +124,7 @@ def test_a_situation_is_paired_with_what_was_intended_next():
     done = Episode.from_stream(stream, spec)
     intended = replace(done, actions=np.full((4, 2), 7.0, np.float32))
     m, commands = lessons(senses, [done])
-    np.testing.assert_array_equal(m[:, 0], stream[:3, 0])
+    np.testing.assert_array_equal(m[:, 0], PLACED * stream[:3, 0])
     np.testing.assert_array_equal(commands, stream[1:, 8:])
     np.testing.assert_array_equal(lessons(senses, [intended])[1], np.full((3, 2), 7.0))
 
@@ -172,11 +175,42 @@ def test_learning_to_act_leaves_the_surprise_as_it_was(pilot):
     np.testing.assert_array_equal(plain.score(episodes[0]).value, pilot.score(episodes[0]).value)
 
 
-def test_a_gripper_is_told_to_open_or_to_close():
-    space = spaces.Box(-1.0, 1.0, (3,), np.float32)
-    made = within(np.array([2.0, np.nan, 0.1], np.float32), space, np.array([2]))
-    np.testing.assert_array_equal(made, [1.0, 0.0, 1.0])
-    np.testing.assert_array_equal(within(np.array([0.5, 0.5, -0.1], np.float32), space, np.array([2]))[2], -1.0)
+def told(shares: list[float], dt: float = 0.05) -> NDArray[np.float64]:
+    """What a gripper is told while these are expected, from -1 to 1."""
+    readout, grip, actions = Readout(Point(dt)), None, []
+    for share in shares:
+        action, grip = readout(np.array([2.0, np.nan, share], np.float32), grip)
+        actions.append(action)
+    np.testing.assert_array_equal(np.stack(actions)[:, :2], [[1.0, 0.0]] * len(shares))
+    return np.stack(actions)[:, 2]
+
+
+def test_a_gripper_is_told_at_first_what_is_likelier():
+    assert told([0.1]) == [1.0]
+    assert told([-0.1]) == [-1.0]
+
+
+@pytest.mark.parametrize("sure", [1.0, 0.5, 0.2, 0.1])
+def test_a_gripper_changes_once_the_sum_of_what_speaks_for_it_reaches_the_bound(sure):
+    ratio = np.exp(-0.05 / FORGETS)
+    reached = np.cumsum(0.05 * sure * ratio ** np.arange(200)) > ENOUGH  # a geometric series
+    waits = int(np.argmax(reached))
+    found = told([1.0] + [1.0 - 2 * sure] * (waits + 1))[1:]
+    np.testing.assert_array_equal(found, [1.0] * waits + [-1.0])
+    assert reached.any()
+
+
+def test_what_is_hardly_ever_expected_is_never_done():
+    assert 0.05 * 0.04 / (1 - np.exp(-0.05 / FORGETS)) < ENOUGH
+    assert set(told([0.92] * 2000)) == {1.0}
+
+
+def test_a_gripper_that_lets_go_is_not_told_to_close_by_what_is_sensed_meanwhile():
+    assert told([1.0] + [-1.0] * 4 + [0.6] * 3 + [-1.0] * 5).tolist() == [1.0] * 4 + [-1.0] * 9
+
+
+def test_with_long_steps_it_is_still_the_likelier_command_that_is_given():
+    assert told([1.0, 0.1, -0.1], dt=1.0).tolist() == [1.0, 1.0, -1.0]
 
 
 def test_objects_of_other_tasks_read_zero(lift):
@@ -238,3 +272,11 @@ def test_a_damaged_motor_association_is_refused(pilot, tmp_path):
     broken.save(tmp_path / "broken.asm")
     with pytest.raises(ValueError, match="motor_D should be of shape"):
         NeuralASM.load(tmp_path / "broken.asm")
+
+
+def test_a_motor_association_that_read_its_senses_otherwise_is_refused(pilot, tmp_path):
+    of_before = NeuralASM(pilot.spec, **SMALL)
+    of_before.learned_ = {name: array for name, array in pilot.learned_.items() if name != "motor_kappa"}
+    of_before.save(tmp_path / "before.asm")
+    with pytest.raises(ValueError, match="call learn_to_act with this one"):
+        NeuralASM.load(tmp_path / "before.asm")

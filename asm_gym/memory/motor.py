@@ -43,6 +43,9 @@ FORGETTING = 0.3
 FINE = 8.0
 """κ of where one thing is relative to another: a centimetre more or less decides there."""
 
+PLACED = 4.0
+"""κ of where the hand is: things are put down at places that nothing else marks."""
+
 FARTHEST = 100.0
 """What is further out counts as this far."""
 
@@ -54,6 +57,8 @@ def fineness(spec: StreamSpec) -> NDArray[np.float64]:
     def of(name: str, unit: str, group: str) -> float:
         if group == MOTOR or unit.endswith("/s"):
             return 0.0
+        if group == "hand" and unit == "m":
+            return PLACED
         return FINE if group == "object" and "_to_" in name and "quat" not in name else 1.0
 
     return np.array([of(c.name, c.unit, c.group) for c in spec.channels for _ in range(c.size)])
@@ -82,9 +87,10 @@ class Motor(NamedTuple):
         expected = complete(hidden_units(m, self.V), m, self.U, self.D)
         return (self.mean + self.spread * expected).astype(np.float32)
 
-    def named(self) -> dict[str, NDArray[Any]]:
-        """As a checkpoint keeps them."""
-        return {f"motor_{name}": array for name, array in self._asdict().items()}
+    def named(self, senses: Senses) -> dict[str, NDArray[Any]]:
+        """As a checkpoint keeps them, and κ, without which they mean something else."""
+        arrays = {**self._asdict(), "kappa": fineness(senses.spec)}
+        return {f"motor_{name}": array for name, array in arrays.items()}
 
     @classmethod
     def found(cls, learned: Mapping[str, NDArray[Any]], senses: Senses) -> Self | None:
@@ -92,7 +98,13 @@ class Motor(NamedTuple):
         if "motor_U" not in learned:
             return None
         units, motor = learned["motor_U"].shape[-1], len(senses.spec.motor)
-        inputs = int(np.count_nonzero(fineness(senses.spec))) + 1
+        kappa = fineness(senses.spec)
+        if not np.array_equal(learned.get("motor_kappa", ()), kappa):
+            raise ValueError(
+                "the motor association was learned by a version that reads the senses less or more finely: "
+                "fit the memory and call learn_to_act with this one"
+            )
+        inputs = int(np.count_nonzero(kappa)) + 1
         shapes: dict[str, tuple[int, ...]] = {"V": (units, inputs), "U": (motor, units), "D": (motor, inputs)}
         shapes |= {"mean": (motor,), "spread": (motor,)}
         for name, shape in shapes.items():

@@ -244,7 +244,7 @@ class NeuralASM(PredictiveMonitor):
         self._check(episodes)
         with threadpool_limits(1):
             self.motor_ = learn_motor(*lessons(self.senses_, episodes), units, np.random.default_rng(self.seed))
-        self.learned_ = self.learned_ | self.motor_.named()
+        self.learned_ = self.learned_ | self.motor_.named(self.senses_)
         return self
 
     def expected_action(self, state: PredictiveState) -> NDArray[np.float32]:

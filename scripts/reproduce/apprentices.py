@@ -24,7 +24,8 @@ from asm_gym.memory.motor import fineness, lessons, situation
 from asm_gym.memory.senses import Senses
 from asm_gym.monitors.torch_model import adam, descend, padded
 from asm_gym.policies import make_policy
-from asm_gym.policies.memory_policy import StreamReader, common_spec, require_motor, within
+from asm_gym.policies.grip import Grip, Readout
+from asm_gym.policies.memory_policy import StreamReader, common_spec, require_motor
 from asm_gym.policies.scripted.base import Style
 from asm_gym.scripts.dispatch import environment
 from asm_gym.stream import StreamSpec
@@ -101,6 +102,7 @@ class CloneState(NamedTuple):
 
     hidden: Tensor | None
     action: NDArray[np.float32]  # (A,) commanded last
+    grip: Grip | None
 
 
 class Clone:
@@ -141,10 +143,9 @@ class ClonePolicy:
     """A clone in an environment; see ``NeuralASMPolicy``."""
 
     def __init__(self, clone: Clone, env: gym.Env[Any, Any]) -> None:
-        self._clone, self._space = clone, env.action_space
+        self._clone, self._readout = clone, Readout(env)
         self._size = require_motor(clone.senses.spec, env)
         self._read = StreamReader(clone.senses.spec, env)
-        self._grip = np.asarray(getattr(env.unwrapped, "gripper_actions", ()), dtype=int)
 
     def predict(
         self,
@@ -155,9 +156,9 @@ class ClonePolicy:
     ) -> tuple[NDArray[np.float32], CloneState]:
         """The action (A,), and the state to pass in next time."""
         if state is None or (episode_start is not None and np.any(episode_start)):
-            state = CloneState(None, np.zeros(self._size, np.float32))
+            state = CloneState(None, np.zeros(self._size, np.float32), None)
         clone = self._clone
         m = situation(clone.senses, self._read(observation, state.action)[None])
         said, hidden = clone.module(torch.from_numpy(m)[None], state.hidden)
-        action = within(clone.mean + clone.spread * said[0, 0].numpy(), self._space, self._grip)  # type: ignore[arg-type]
-        return action, CloneState(hidden, action)
+        action, grip = self._readout(clone.mean + clone.spread * said[0, 0].numpy(), state.grip)
+        return action, CloneState(hidden, action, grip)
