@@ -1,0 +1,248 @@
+"""Stands the frame in its base and hangs the tool on it.
+
+The frame is an L: a rod with a tip, which goes down into the stand's square tube, and a bar with a hook at its end. It
+lies on the table, so the hand comes leaning, half-way between the two directions that it must point to: along the rod
+lies the table, across it, once the rod is upright, the bar. The tool is a wrench whose ring is as wide as the hook is high:
+it does not go on straight, but lies down over the hook and is then turned about the bar's end until it hangs.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.policies.scripted.base import (
+    CLOSE,
+    OPEN,
+    Expert,
+    Vector,
+    grasping,
+    has_settled,
+    matrix,
+    move,
+    rotation,
+)
+
+REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, TURN, RELEASE, RETREAT = range(9)
+FRAME, TOOL = range(2)
+
+_UP = np.array([0.0, 0.0, 1.0])
+_LEAN = np.pi / 3  # how far down the hand points at the frame as it lies; upright, the bar then passes under the palm
+_CLEAR = 1.1  # height at which the hand passes over stand and frame [m]
+_BEFORE = 0.1  # from where the hand comes to what it grasps, and to where it withdraws [m]
+
+# The frame's own frame: its origin is the corner, z along the rod away from the tip, x along the bar away from the hook.
+_FRAME_GRIP = np.array([0.0, -0.006, -0.048])  # higher, and the palm would stand on the hook [m]
+_TIP = np.array([0.0, 0.0, -0.2207])
+_HOOK = 0.0875  # from the corner along the bar to the middle of the hook [m]
+_HOOK_TOP = 0.016  # from the bar's middle [m]
+
+# The stand, from the middle of its base [m].
+_HOLE = np.array([0.0, 0.045, 0.0])
+_TUBE_TOP = 0.155
+_STANDS = 0.012  # the task asks for the tip within 0.021
+
+# The tool's own frame: its origin is the middle of its handle, x along it, away from the ring.
+_TOOL_GRIP = np.array([0.0, 0.0, 0.003])
+_RING = np.array([-0.0935, 0.0, 0.0])
+_ON, _HANGING = np.radians(20.0), np.radians(75.0)  # how steeply the tool points down, before and after it is turned
+_TURNING = 30  # control steps
+
+
+class Pose(NamedTuple):
+    """Where a thing is."""
+
+    at: Vector  # (3,) [m]
+    turned: Vector  # (3, 3)
+
+    def point(self, own: Vector) -> Vector:
+        """(3,) in the world, of a point (3,) in its own frame."""
+        return self.at + self.turned @ own
+
+
+class Scene(NamedTuple):
+    """What is seen."""
+
+    hand: Pose
+    frame: Pose
+    tool: Pose
+    hole: Vector  # (3,) under the tube, at the height of the base's middle [m]
+
+
+class Goal(NamedTuple):
+    """What the hand is to do."""
+
+    hand: Pose
+    grip: float
+    pace: float = 1.0  # of the episode's speed
+
+
+class ToolHangState(NamedTuple):
+    """Where one episode stands."""
+
+    thing: int
+    phase: int
+    since: int  # steps spent in the phase
+    speed: float  # action units
+    spread: Vector  # (3,) how this episode's way-points differ from the plan [m]
+    anchor: Pose  # the hand when the phase began
+    drift: Vector  # (7,) correlated action noise
+
+
+class ToolHangExpert(Expert):
+    """A scripted expert for ToolHang."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: ToolHangState | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], ToolHangState]:
+        """The action (7,); ``deterministic`` leaves the action noise out, not the style."""
+        scene = self._look(observation)
+        if state is None or (episode_start is not None and np.any(episode_start)):
+            state = self._begin(scene)
+        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
+        settled = has_settled(self._read(observation, "gripper_velocity"), state.since, 10)
+        phase = _next(state, scene, settled)
+        if phase != (state.thing, state.phase):
+            state = state._replace(thing=phase[0], phase=phase[1], since=0, anchor=scene.hand)
+        goal = _goal(state, scene)
+        command = np.append(move(*scene.hand[:1], goal.hand.at, scene.hand.turned, goal.hand.turned, goal.pace * state.speed, 2.0), goal.grip)
+        if not deterministic:
+            command[:6] += goal.pace * state.drift[:6]
+        return np.clip(command, -1.0, 1.0).astype(np.float32), state
+
+    def _begin(self, scene: Scene) -> ToolHangState:
+        style, rng = self.style, self.np_random
+        speed, spread = style.pace(0.6, rng), style.spread * np.clip(rng.standard_normal(3), -2, 2)
+        return ToolHangState(FRAME, REACH, 0, speed, spread, scene.hand, np.zeros(7))
+
+    def _look(self, observation: Any) -> Scene:
+        def pose(name: str) -> Pose:
+            return Pose(self._read(observation, f"{name}_pos"), matrix(self._read(observation, f"{name}_quat")))
+
+        hand = Pose(self._read(observation, "hand_position"), rotation(self._read(observation, "hand_orientation")))
+        return Scene(hand, pose("frame"), pose("tool"), pose("base").point(_HOLE))
+
+
+def _next(state: ToolHangState, scene: Scene, settled: bool) -> tuple[int, int]:
+    """The thing and the phase that come next, where this phase has done its work."""
+    thing, phase, since = state.thing, state.phase, state.since
+    grasp = _grasp(thing, scene)
+    far = float(np.linalg.norm(scene.hand.at - grasp.at))
+    there = _left(state, scene)
+    if phase == REACH:
+        return thing, DESCEND if there[0] < 0.015 and there[1] < 0.1 else REACH
+    if phase == DESCEND:
+        if far < 0.006 or (since > 30 and far < 0.015):
+            return thing, GRASP
+        return thing, REACH if since > 60 else DESCEND
+    if phase == GRASP:
+        return thing, RAISE if settled else GRASP
+    if phase in (RAISE, CARRY, LOWER) and far > 0.05:
+        return thing, REACH
+    if phase == RAISE:
+        return thing, CARRY if scene.hand.at[2] > 1.0 else RAISE
+    if phase == CARRY:
+        return thing, LOWER if there[0] < 0.003 and there[1] < 0.03 else CARRY
+    if phase == LOWER:
+        if thing == FRAME:
+            down = scene.frame.point(_TIP)[2] - scene.hole[2] < _STANDS
+            return thing, RELEASE if down else (CARRY if since > 120 else LOWER)
+        return thing, TURN if there[0] < 0.002 or since > 40 else LOWER
+    if phase == TURN:
+        return thing, RELEASE if since > _TURNING + 10 else TURN
+    if phase == RELEASE:
+        return thing, RETREAT if settled else RELEASE
+    if phase == RETREAT and thing == FRAME and there[0] < 0.02:
+        return TOOL, REACH
+    return thing, phase
+
+
+def _left(state: ToolHangState, scene: Scene) -> tuple[float, float]:
+    """How far the hand is from its goal: [m], [rad]."""
+    goal = _goal(state, scene).hand
+    angle = np.arccos(np.clip((np.trace(scene.hand.turned.T @ goal.turned) - 1) / 2, -1.0, 1.0))
+    return float(np.linalg.norm(goal.at - scene.hand.at)), float(angle)
+
+
+def _goal(state: ToolHangState, scene: Scene) -> Goal:
+    """What the hand is to do now."""
+    phase, anchor = state.phase, state.anchor
+    grasp = _grasp(state.thing, scene)
+    if phase == REACH:
+        at = grasp.at - _BEFORE * grasp.turned[:, 2] + 0.3 * state.spread
+        if np.linalg.norm((at - scene.hand.at)[:2]) > 0.1:
+            at = np.array([*at[:2], _CLEAR])
+        return Goal(Pose(at, grasp.turned), OPEN)
+    if phase == DESCEND:
+        return Goal(grasp, OPEN, 0.6)
+    if phase == GRASP:
+        return Goal(anchor, CLOSE)
+    if phase == RAISE:
+        return Goal(Pose(scene.hand.at + [0.0, 0.0, 0.05], anchor.turned), CLOSE)
+    if phase in (RELEASE, RETREAT):
+        back = 0.0 if phase == RELEASE else 1.2 * _BEFORE
+        return Goal(Pose(anchor.at - back * anchor.turned[:, 2], anchor.turned), OPEN, 0.5)
+    if state.thing == FRAME:
+        return _erect(state, scene)
+    return _hang(state, scene)
+
+
+def _grasp(thing: int, scene: Scene) -> Pose:
+    """How to hold the hand for grasping."""
+    if thing == TOOL:
+        turned = scene.tool.turned
+        return Pose(scene.tool.point(_TOOL_GRIP), grasping(scene.hand.turned, -turned[:, 2], turned[:, 1]))
+    x, y, z = scene.frame.turned.T
+    approach = np.sin(_LEAN) * y - np.cos(_LEAN) * z
+    # One way round alone: the other, the wrist would come to its limit in turning the rod upright.
+    return Pose(scene.frame.point(_FRAME_GRIP), np.stack([np.cross(-x, approach), -x, approach], axis=1))
+
+
+def _erect(state: ToolHangState, scene: Scene) -> Goal:
+    """The rod upright over the tube, or on its way down, with the bar towards the robot's right."""
+    upright = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    tip = scene.frame.point(_TIP)
+    over = scene.hole + (_TUBE_TOP + 0.025) * _UP
+    if state.phase == CARRY:
+        return Goal(_carried(scene.hand, scene.frame, _TIP, over, upright), CLOSE)
+    if tip[2] < scene.hole[2] + _TUBE_TOP - 0.02:
+        held = scene.frame.point(_FRAME_GRIP * [0, 0, 1])
+        goal = np.array([*scene.hole[:2], held[2] - 0.02])
+        return Goal(_carried(scene.hand, scene.frame, _FRAME_GRIP * [0, 0, 1], goal, upright), CLOSE, 0.5)
+    astray = float(np.linalg.norm((tip - scene.hole)[:2]))
+    down = 0.02 * float(np.clip(1.5 - astray / 0.002, 0.0, 1.0)) if tip[2] > scene.hole[2] + _TUBE_TOP - 0.01 else 0.02
+    goal = np.array([*scene.hole[:2], tip[2] - down])
+    return Goal(_carried(scene.hand, scene.frame, _TIP, goal, upright), CLOSE, 0.5)
+
+
+def _hang(state: ToolHangState, scene: Scene) -> Goal:
+    """The ring over the hook, or lowered on to it, or turned about the bar's end."""
+    bar, up = -scene.frame.turned[:, 0], scene.frame.turned[:, 2]
+    turned = float(np.clip(state.since / _TURNING, 0.0, 1.0)) if state.phase == TURN else 0.0
+    along = _HOOK - 0.011 * turned
+    height = 0.006 - 0.011 * turned
+    if state.phase == CARRY:
+        height = _HOOK_TOP + 0.03
+    ring = scene.frame.at + along * bar + height * up
+    steep = _ON + turned * (_HANGING - _ON)
+    pose = _carried(scene.hand, scene.tool, _RING, ring, _tilted(bar, up, steep))
+    return Goal(pose, CLOSE, 1.0 if state.phase == CARRY else 0.4)
+
+
+def _tilted(bar: Vector, up: Vector, steep: float) -> Vector:
+    """(3, 3) of a tool whose handle points outwards along the bar, and ``steep`` [rad] down."""
+    x = np.cos(steep) * bar - np.sin(steep) * up
+    z = np.sin(steep) * bar + np.cos(steep) * up
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _carried(hand: Pose, thing: Pose, own: Vector, goal: Vector, turned: Vector) -> Pose:
+    """How to hold the hand so that what is in it comes to be ``turned`` (3, 3), and a point of it to its ``goal`` (3,)."""
+    turn = turned @ thing.turned.T
+    return Pose(goal + turn @ (hand.at - thing.point(own)), turn @ hand.turned)
