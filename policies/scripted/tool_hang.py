@@ -29,7 +29,7 @@ REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, TURN, RELEASE, RETREAT = range(9)
 FRAME, TOOL = range(2)
 
 _UP = np.array([0.0, 0.0, 1.0])
-_LEAN = np.pi / 3  # how far down the hand points at the frame as it lies; upright, the bar then passes under the palm
+_LEAN = np.radians(55.0)  # how far down the hand points at the frame as it lies; upright, the bar then passes under the palm
 _CLEAR = 1.1  # height at which the hand passes over stand and frame [m]
 _BEFORE = 0.1  # from where the hand comes to what it grasps, and to where it withdraws [m]
 
@@ -186,7 +186,7 @@ def _goal(state: ToolHangState, scene: Scene) -> Goal:
     if phase == RAISE:
         return Goal(Pose(scene.hand.at + [0.0, 0.0, 0.05], anchor.turned), CLOSE)
     if phase in (RELEASE, RETREAT):
-        back = 0.0 if phase == RELEASE else 1.2 * _BEFORE
+        back = 0.0 if phase == RELEASE else 0.08
         return Goal(Pose(anchor.at - back * anchor.turned[:, 2], anchor.turned), OPEN, 0.5)
     if state.thing == FRAME:
         return _erect(state, scene)
