@@ -29,7 +29,9 @@ REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, TURN, RELEASE, RETREAT = range(9)
 FRAME, TOOL = range(2)
 
 _UP = np.array([0.0, 0.0, 1.0])
-_LEAN = np.radians(55.0)  # how far down the hand points at the frame as it lies; upright, the bar then passes under the palm
+_LEAN = np.radians(
+    55.0
+)  # how far down the hand points at the frame as it lies; upright, the bar then passes under the palm
 _CLEAR = 1.1  # height at which the hand passes over stand and frame [m]
 _BEFORE = 0.1  # from where the hand comes to what it grasps, and to where it withdraws [m]
 
@@ -47,8 +49,13 @@ _STANDS = 0.012  # the task asks for the tip within 0.021
 # The tool's own frame: its origin is the middle of its handle, x along it, away from the ring.
 _TOOL_GRIP = np.array([0.0, 0.0, 0.003])
 _RING = np.array([-0.0935, 0.0, 0.0])
-_ON, _HANGING = np.radians(20.0), np.radians(75.0)  # how steeply the tool points down, before and after it is turned
-_TURNING = 30  # control steps
+# How the ring passes round the bar's end without touching it: how steeply the tool points down, and where the middle of
+# the ring then is from that of the hook, along the bar and up. The room left is 2 mm at the narrowest.
+_STEEP = np.radians([20.0, 35.0, 45.0, 55.0, 65.0, 75.0])
+_ALONG = np.array([0.0, 0.0, -0.002, -0.004, -0.007, -0.011])  # [m]
+_ABOVE = np.array([0.007, 0.004, 0.002, 0.0, 0.0, -0.003])  # [m]
+
+_AHEAD = 0.2  # how much further to turn it than it is [rad]
 
 
 class Pose(NamedTuple):
@@ -77,6 +84,7 @@ class Goal(NamedTuple):
     hand: Pose
     grip: float
     pace: float = 1.0  # of the episode's speed
+    gain: float = 2.0
 
 
 class ToolHangState(NamedTuple):
@@ -111,10 +119,11 @@ class ToolHangExpert(Expert):
         if phase != (state.thing, state.phase):
             state = state._replace(thing=phase[0], phase=phase[1], since=0, anchor=scene.hand)
         goal = _goal(state, scene)
-        command = np.append(move(*scene.hand[:1], goal.hand.at, scene.hand.turned, goal.hand.turned, goal.pace * state.speed, 2.0), goal.grip)
+        speed = goal.pace * state.speed
+        command = move(scene.hand.at, goal.hand.at, scene.hand.turned, goal.hand.turned, speed, goal.gain)
         if not deterministic:
-            command[:6] += goal.pace * state.drift[:6]
-        return np.clip(command, -1.0, 1.0).astype(np.float32), state
+            command += goal.pace * state.drift[:6]
+        return np.clip(np.append(command, goal.grip), -1.0, 1.0).astype(np.float32), state
 
     def _begin(self, scene: Scene) -> ToolHangState:
         style, rng = self.style, self.np_random
@@ -155,7 +164,9 @@ def _next(state: ToolHangState, scene: Scene, settled: bool) -> tuple[int, int]:
             return thing, RELEASE if down else (CARRY if since > 120 else LOWER)
         return thing, TURN if there[0] < 0.002 or since > 40 else LOWER
     if phase == TURN:
-        return thing, RELEASE if since > _TURNING + 10 else TURN
+        if np.linalg.norm(scene.tool.point(_RING) - _course(scene, _steepness(scene))) > 0.012:
+            return thing, CARRY
+        return thing, RELEASE if _steepness(scene) > _STEEP[-1] - 0.06 or since > 80 else TURN
     if phase == RELEASE:
         return thing, RETREAT if settled else RELEASE
     if phase == RETREAT and thing == FRAME and there[0] < 0.02:
@@ -224,15 +235,26 @@ def _erect(state: ToolHangState, scene: Scene) -> Goal:
 def _hang(state: ToolHangState, scene: Scene) -> Goal:
     """The ring over the hook, or lowered on to it, or turned about the bar's end."""
     bar, up = -scene.frame.turned[:, 0], scene.frame.turned[:, 2]
-    turned = float(np.clip(state.since / _TURNING, 0.0, 1.0)) if state.phase == TURN else 0.0
-    along = _HOOK - 0.011 * turned
-    height = 0.006 - 0.011 * turned
-    if state.phase == CARRY:
-        height = _HOOK_TOP + 0.03
-    ring = scene.frame.at + along * bar + height * up
-    steep = _ON + turned * (_HANGING - _ON)
-    pose = _carried(scene.hand, scene.tool, _RING, ring, _tilted(bar, up, steep))
+    steep = _STEEP[0]
+    if state.phase == TURN:
+        steep = min(max(_steepness(scene), steep) + _AHEAD, _STEEP[-1])
+    over = _HOOK_TOP + 0.03 if state.phase == CARRY else 0.0
+    pose = _carried(scene.hand, scene.tool, _RING, _course(scene, steep) + over * up, _tilted(bar, up, steep))
+    if state.phase == TURN:  # at a gain of 1, the hand goes as fast round the ring as it turns
+        return Goal(pose, CLOSE, 0.7, 1.0)
     return Goal(pose, CLOSE, 1.0 if state.phase == CARRY else 0.4)
+
+
+def _steepness(scene: Scene) -> float:
+    """How far down the tool points from the bar's direction [rad]."""
+    handle = scene.frame.turned.T @ scene.tool.turned[:, 0]
+    return float(np.arctan2(-handle[2], -handle[0]))
+
+
+def _course(scene: Scene, steep: float) -> Vector:
+    """(3,) where the ring's middle is to be when the tool points ``steep`` [rad] down."""
+    along, above = np.interp(steep, _STEEP, _ALONG), np.interp(steep, _STEEP, _ABOVE)
+    return scene.frame.point(np.array([-_HOOK - along, 0.0, above]))
 
 
 def _tilted(bar: Vector, up: Vector, steep: float) -> Vector:
