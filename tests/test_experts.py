@@ -21,6 +21,7 @@ QUICK = [
     "Stack",
     "Door",
     "Wipe",
+    "ToolHang",
     "TwoArmPegInHole",
     "TwoArmLift",
     "TwoArmHandover",
