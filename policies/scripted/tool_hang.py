@@ -48,7 +48,7 @@ _RING = np.array([-0.0935, 0.0, 0.0])
 _STEEP = np.radians([20.0, 35.0, 45.0, 55.0, 65.0, 75.0])
 _ALONG = np.array([0.0, 0.0, -0.002, -0.004, -0.007, -0.011])  # [m]
 _ABOVE = np.array([0.007, 0.004, 0.002, 0.0, 0.0, -0.003])  # [m]
-_AHEAD = 0.2  # how much further to turn it than it is [rad]
+_AHEAD = 0.33  # how much further to turn it than it is, so that the hand keeps up at its speed of 1 [rad]
 
 
 class Pose(NamedTuple):
@@ -171,9 +171,9 @@ def _placed(state: ToolHangState, scene: Scene, settled: bool) -> int:
         return LOWER if left < 0.003 and turn < 0.03 else CARRY
     if phase == TURN:
         steep = _steepness(scene)
-        if np.linalg.norm(scene.tool.point(_RING) - _course(scene, steep)) > 0.012:
-            return CARRY  # it slipped off the hook
-        return RELEASE if steep > _STEEP[-1] - 0.06 or since > 80 else TURN
+        if np.linalg.norm(scene.tool.point(_RING) - _course(scene, steep)) > 0.012 or since > 80:
+            return CARRY  # it slipped off the hook, or jams there
+        return RELEASE if steep > _STEEP[-1] - 0.06 else TURN
     if state.thing == TOOL:
         return TURN if left < 0.002 or since > 40 else LOWER
     if scene.frame.point(_TIP)[2] - scene.hole[2] < _STANDS:
@@ -227,7 +227,8 @@ def _stand(state: ToolHangState, scene: Scene) -> Goal:
     if state.phase == CARRY:
         over = _TUBE + 0.025 + 0.3 * state.spread[2]
         goal = scene.hole + np.array([0.0, 0.0, over])
-        return Goal(_carried(scene.hand, scene.frame, _TIP, goal, _UPRIGHT), CLOSE)
+        near = np.linalg.norm(goal - tip) < 0.03
+        return Goal(_carried(scene.hand, scene.frame, _TIP, goal, _UPRIGHT), CLOSE, 0.5 if near else 1.0)
     if height < _TUBE - _IN:
         # Where the tube guides the tip, the hand stays over the hole: a rod that is pushed sideways at its tip jams.
         down = scene.frame.point(_ROD)[2] - 0.02
@@ -243,7 +244,7 @@ def _hang(state: ToolHangState, scene: Scene) -> Goal:
     """The ring over the hook, or lowered on to it, or turned about the bar's end."""
     steep = float(_STEEP[0])
     if state.phase == TURN:
-        steep = float(np.clip(_steepness(scene) + _AHEAD, *_STEEP[[0, -1]]))
+        steep = float(np.clip(_steepness(scene) + min(_AHEAD * state.speed, 0.2), *_STEEP[[0, -1]]))
     bar, up = -scene.frame.turned[:, 0], scene.frame.turned[:, 2]
     x, z = np.cos(steep) * bar - np.sin(steep) * up, np.sin(steep) * bar + np.cos(steep) * up
     over = _HOOK_TOP + 0.03 + 0.3 * state.spread[2] if state.phase == CARRY else 0.0
