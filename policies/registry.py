@@ -20,6 +20,7 @@ from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
 from asm_gym.policies.scripted.peg_in_hole import PegInHoleExpert
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
 from asm_gym.policies.scripted.stack import StackExpert
+from asm_gym.policies.scripted.tool_hang import ToolHangExpert
 from asm_gym.policies.scripted.transport import TransportExpert
 from asm_gym.policies.scripted.two_arm_lift import TwoArmLiftExpert
 from asm_gym.policies.scripted.wipe import WipeExpert
@@ -29,6 +30,7 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
     "Stack": StackExpert,
     "Door": DoorExpert,
     "Wipe": WipeExpert,
+    "ToolHang": ToolHangExpert,
     "TwoArmLift": TwoArmLiftExpert,
     "TwoArmPegInHole": PegInHoleExpert,
     "TwoArmHandover": HandoverExpert,

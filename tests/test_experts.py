@@ -21,6 +21,7 @@ QUICK = [
     "Stack",
     "Door",
     "Wipe",
+    "ToolHang",
     "TwoArmPegInHole",
     "TwoArmLift",
     "TwoArmHandover",
@@ -71,7 +72,10 @@ def test_other_arms_succeed_on_most_of_100_seeds(task, robot):
 def test_an_expert_succeeds_on_95_of_100_seeds(task):
     # Two nuts or four things in one episode are not mastered yet: 64 and 34 of 100 (asm-gym benchmark experts); of the
     # hammer's handovers a few fail, and so do more of those that begin and end in a bin.
-    least = {"NutAssembly": 50, "PickPlace": 22, "TwoArmHandover": 90, "TwoArmTransport": 70}.get(task, 95)
+    # The tool was hung in 98, which leaves room for other seeds.
+    least = {"NutAssembly": 50, "PickPlace": 22, "TwoArmHandover": 90, "TwoArmTransport": 70, "ToolHang": 92}.get(
+        task, 95
+    )
     assert sum(e.success for e in collect(f"asm_gym/{task}-v0", episodes=100, seed=99, workers=2)) >= least
 
 

@@ -1,0 +1,273 @@
+"""Stands the frame in its base and hangs the tool on it.
+
+The frame is an L: a rod with a tip, which goes down into the stand's square tube, and a bar with a hook at its end. It
+lies on the table, so the hand takes it leaning: taken from straight above, it would leave the hand level once the rod
+is upright; taken along the rod, as an upright one is held best, it would have the palm in the table. The tool is a
+wrench whose ring is no wider than the hook is high: it does not go straight on to the bar, but lies down over the hook
+and is then turned about the bar's end until it hangs.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, Vector, grasping, has_settled, matrix, move, rotation
+
+REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, TURN, RELEASE, RETREAT = range(9)
+FRAME, TOOL = range(2)
+
+_LEAN = np.radians(55.0)  # how far down the hand points at the lying frame; less, and its palm meets the table
+_CLEAR = 1.1  # height at which the hand passes over stand and frame [m]
+_RAISED = 1.0  # height of the hand at which what it holds may be turned [m]
+_BEFORE = 0.1  # from where the hand comes to what it grasps [m]
+_BACK = 0.08  # how far it withdraws: further, and the arm would be stretched out [m]
+_LOST = 0.05  # from the grip, where the hand no longer holds the thing [m]
+
+# The frame's own frame: origin in the corner, z along the rod away from the tip, x along the bar away from the hook.
+_FRAME_GRIP = np.array([0.0, -0.006, -0.048])  # higher, and the palm would stand on the hook [m]
+_ROD = np.array([0.0, 0.0, -0.048])  # the rod beside the grip
+_TIP = np.array([0.0, 0.0, -0.2207])
+_HOOK = 0.0875  # from the corner along the bar to the middle of the hook [m]
+_HOOK_TOP = 0.016  # from the bar's middle [m]
+_UPRIGHT = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # with the bar to the robot's right
+
+# The stand, from the middle of its base [m].
+_HOLE = np.array([0.0, 0.045, 0.0])
+_TUBE = 0.155  # its upper end
+_IN = 0.02  # how deep in the tube the tip no longer can miss it
+_STANDS = 0.012  # the tip's height when the frame stands; the task asks for 0.021
+
+# The tool's own frame: origin in the middle of its handle, x along it, away from the ring, z along the ring's axis.
+_TOOL_GRIP = np.array([0.0, 0.0, 0.003])
+_RING = np.array([-0.0935, 0.0, 0.0])
+# How the ring passes round the bar's end without touching it: how steeply the tool points down, and where the middle of
+# the ring then is from that of the hook, along the bar and up. The room left is 2 mm at the narrowest.
+_STEEP = np.radians([20.0, 35.0, 45.0, 55.0, 65.0, 75.0])
+_ALONG = np.array([0.0, 0.0, -0.002, -0.004, -0.007, -0.011])  # [m]
+_ABOVE = np.array([0.007, 0.004, 0.002, 0.0, 0.0, -0.003])  # [m]
+_AHEAD = 0.33  # how much further to turn it than it is, so that the hand keeps up at its speed of 1 [rad]
+
+
+class Pose(NamedTuple):
+    """Where a thing is."""
+
+    at: Vector  # (3,) [m]
+    turned: Vector  # (3, 3)
+
+    def point(self, own: Vector) -> Vector:
+        """(3,) in the world, of a point (3,) in its own frame."""
+        return self.at + self.turned @ own
+
+
+class Scene(NamedTuple):
+    """What is seen."""
+
+    hand: Pose
+    frame: Pose
+    tool: Pose
+    hole: Vector  # (3,) under the tube, at the height of the base's middle [m]
+
+
+class Goal(NamedTuple):
+    """What the hand is to do."""
+
+    hand: Pose
+    grip: float
+    pace: float = 1.0  # of the episode's speed
+    gain: float = 2.0
+
+
+class ToolHangState(NamedTuple):
+    """Where one episode stands."""
+
+    thing: int
+    phase: int
+    since: int  # steps spent in the phase
+    speed: float  # action units
+    spread: Vector  # (3,) how this episode's way-points differ from the plan [m]
+    anchor: Pose  # the hand when the phase began
+    drift: Vector  # (6,) correlated action noise
+
+
+class ToolHangExpert(Expert):
+    """A scripted expert for ToolHang, on the Panda."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: ToolHangState | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], ToolHangState]:
+        """The action (7,); ``deterministic`` leaves the action noise out, not the style."""
+        scene = self._look(observation)
+        if state is None or (episode_start is not None and np.any(episode_start)):
+            state = self._begin(scene)
+        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
+        state = _advance(state, scene, has_settled(self._read(observation, "gripper_velocity"), state.since, 10))
+        goal = _goal(state, scene)
+        speed = goal.pace * state.speed
+        command = move(scene.hand.at, goal.hand.at, scene.hand.turned, goal.hand.turned, speed, goal.gain)
+        if not deterministic:
+            # A hand that goes slowly is steadier: its noise grows with the command (Harris and Wolpert 1998).
+            command += goal.pace * state.drift
+        return np.clip(np.append(command, goal.grip), -1.0, 1.0).astype(np.float32), state
+
+    def _begin(self, scene: Scene) -> ToolHangState:
+        style, rng = self.style, self.np_random
+        speed, spread = style.pace(0.6, rng), style.spread * np.clip(rng.standard_normal(3), -2, 2)
+        return ToolHangState(FRAME, REACH, 0, speed, spread, scene.hand, np.zeros(6))
+
+    def _look(self, observation: Any) -> Scene:
+        def pose(name: str) -> Pose:
+            return Pose(self._read(observation, f"{name}_pos"), matrix(self._read(observation, f"{name}_quat")))
+
+        hand = Pose(self._read(observation, "hand_position"), rotation(self._read(observation, "hand_orientation")))
+        return Scene(hand, pose("frame"), pose("tool"), pose("base").point(_HOLE))
+
+
+def _advance(state: ToolHangState, scene: Scene, settled: bool) -> ToolHangState:
+    """The phase that comes next, where this one has done its work; ``settled``: the fingers have closed or opened."""
+    thing, phase = state.thing, (_grasped if state.phase <= RAISE else _placed)(state, scene, settled)
+    if state.phase == RETREAT and thing == FRAME and _left(state, scene)[0] < 0.02:
+        thing, phase = TOOL, REACH
+    if (thing, phase) == (state.thing, state.phase):
+        return state
+    return state._replace(thing=thing, phase=phase, since=0, anchor=scene.hand)
+
+
+def _grasped(state: ToolHangState, scene: Scene, settled: bool) -> int:
+    """The phase that follows one of those up to ``RAISE``."""
+    phase = state.phase
+    far = float(np.linalg.norm(scene.hand.at - _grasp(state.thing, scene).at))
+    if phase == REACH:
+        left, turn = _left(state, scene)
+        return DESCEND if left < 0.015 and turn < 0.1 else REACH
+    if phase == DESCEND:
+        if far < 0.006 or (state.since > 30 and far < 0.015):
+            return GRASP
+        return REACH if state.since > 60 else DESCEND
+    if phase == GRASP:
+        return RAISE if settled else GRASP
+    if far > _LOST:
+        return REACH
+    return CARRY if scene.hand.at[2] > _RAISED else RAISE
+
+
+def _placed(state: ToolHangState, scene: Scene, settled: bool) -> int:
+    """The phase that follows one of those from ``CARRY`` on."""
+    phase, since = state.phase, state.since
+    if phase == RELEASE:
+        return RETREAT if settled else RELEASE
+    if phase == RETREAT:
+        return RETREAT
+    if np.linalg.norm(scene.hand.at - _grasp(state.thing, scene).at) > _LOST:
+        return REACH
+    left, turn = _left(state, scene)
+    if phase == CARRY:
+        return LOWER if left < 0.003 and turn < 0.03 else CARRY
+    if phase == TURN:
+        steep = _steepness(scene)
+        if np.linalg.norm(scene.tool.point(_RING) - _course(scene, steep)) > 0.012 or since > 80:
+            return CARRY  # it slipped off the hook, or jams there
+        return RELEASE if steep > _STEEP[-1] - 0.06 else TURN
+    if state.thing == TOOL:
+        return TURN if left < 0.002 or since > 40 else LOWER
+    if scene.frame.point(_TIP)[2] - scene.hole[2] < _STANDS:
+        return RELEASE
+    return CARRY if since > 120 else LOWER
+
+
+def _left(state: ToolHangState, scene: Scene) -> tuple[float, float]:
+    """How far the hand is from its goal: [m], [rad]."""
+    goal = _goal(state, scene).hand
+    angle = np.arccos(np.clip((np.trace(scene.hand.turned.T @ goal.turned) - 1) / 2, -1.0, 1.0))
+    return float(np.linalg.norm(goal.at - scene.hand.at)), float(angle)
+
+
+def _goal(state: ToolHangState, scene: Scene) -> Goal:
+    """What the hand is to do now."""
+    phase, anchor = state.phase, state.anchor
+    if phase == REACH:
+        grasp = _grasp(state.thing, scene)
+        at = grasp.at - _BEFORE * grasp.turned[:, 2] + 0.3 * state.spread
+        if np.linalg.norm((at - scene.hand.at)[:2]) > 0.1:
+            at = np.array([*at[:2], _CLEAR])
+        return Goal(Pose(at, grasp.turned), OPEN)
+    if phase == DESCEND:
+        return Goal(_grasp(state.thing, scene), OPEN, 0.6)
+    if phase == GRASP:
+        return Goal(anchor, CLOSE)
+    if phase == RAISE:
+        return Goal(Pose(scene.hand.at + np.array([0.0, 0.0, 0.05]), anchor.turned), CLOSE)
+    if phase in (RELEASE, RETREAT):
+        back = 0.0 if phase == RELEASE else _BACK
+        return Goal(Pose(anchor.at - back * anchor.turned[:, 2], anchor.turned), OPEN, 0.5)
+    return _stand(state, scene) if state.thing == FRAME else _hang(state, scene)
+
+
+def _grasp(thing: int, scene: Scene) -> Pose:
+    """How to hold the hand for grasping."""
+    if thing == TOOL:
+        turned = scene.tool.turned
+        return Pose(scene.tool.point(_TOOL_GRIP), grasping(scene.hand.turned, -turned[:, 2], turned[:, 1]))
+    x, y, z = scene.frame.turned.T
+    approach = np.sin(_LEAN) * y - np.cos(_LEAN) * z
+    # This way round alone: the other, the wrist would come to its limit in turning the rod upright.
+    return Pose(scene.frame.point(_FRAME_GRIP), np.stack([np.cross(-x, approach), -x, approach], axis=1))
+
+
+def _stand(state: ToolHangState, scene: Scene) -> Goal:
+    """The frame upright over the tube, or on its way down."""
+    tip = scene.frame.point(_TIP)
+    height = float(tip[2] - scene.hole[2])
+    if state.phase == CARRY:
+        over = _TUBE + 0.025 + 0.3 * state.spread[2]
+        goal = scene.hole + np.array([0.0, 0.0, over])
+        near = np.linalg.norm(goal - tip) < 0.03
+        return Goal(_carried(scene.hand, scene.frame, _TIP, goal, _UPRIGHT), CLOSE, 0.5 if near else 1.0)
+    if height < _TUBE - _IN:
+        # Where the tube guides the tip, the hand stays over the hole: a rod that is pushed sideways at its tip jams.
+        down = scene.frame.point(_ROD)[2] - 0.02
+        goal = np.array([*scene.hole[:2], down])
+        return Goal(_carried(scene.hand, scene.frame, _ROD, goal, _UPRIGHT), CLOSE, 0.5)
+    astray = float(np.linalg.norm((tip - scene.hole)[:2]))
+    down = 0.02 * float(np.clip(1.5 - astray / 0.002, 0.0, 1.0)) if height > _TUBE - 0.01 else 0.02
+    goal = np.array([*scene.hole[:2], tip[2] - down])
+    return Goal(_carried(scene.hand, scene.frame, _TIP, goal, _UPRIGHT), CLOSE, 0.5)
+
+
+def _hang(state: ToolHangState, scene: Scene) -> Goal:
+    """The ring over the hook, or lowered on to it, or turned about the bar's end."""
+    steep = float(_STEEP[0])
+    if state.phase == TURN:
+        steep = float(np.clip(_steepness(scene) + min(_AHEAD * state.speed, 0.2), *_STEEP[[0, -1]]))
+    bar, up = -scene.frame.turned[:, 0], scene.frame.turned[:, 2]
+    x, z = np.cos(steep) * bar - np.sin(steep) * up, np.sin(steep) * bar + np.cos(steep) * up
+    over = _HOOK_TOP + 0.03 + 0.3 * state.spread[2] if state.phase == CARRY else 0.0
+    turned = np.stack([x, np.cross(z, x), z], axis=1)
+    pose = _carried(scene.hand, scene.tool, _RING, _course(scene, steep) + over * up, turned)
+    if state.phase == TURN:
+        return Goal(pose, CLOSE, 0.7, gain=1.0)  # at more, the hand would run ahead of its own turning
+    return Goal(pose, CLOSE, 1.0 if state.phase == CARRY else 0.4)
+
+
+def _steepness(scene: Scene) -> float:
+    """How far down from the bar's direction the tool points [rad]."""
+    handle = scene.frame.turned.T @ scene.tool.turned[:, 0]
+    return float(np.arctan2(-handle[2], -handle[0]))
+
+
+def _course(scene: Scene, steep: float) -> Vector:
+    """(3,) where the ring's middle is to be when the tool points ``steep`` [rad] down."""
+    along, above = np.interp(steep, _STEEP, _ALONG), np.interp(steep, _STEEP, _ABOVE)
+    return scene.frame.point(np.array([-_HOOK - along, 0.0, above]))
+
+
+def _carried(hand: Pose, thing: Pose, own: Vector, goal: Vector, turned: Vector) -> Pose:
+    """How to hold the hand so that the thing in it is ``turned`` (3, 3), and a point of its ``own`` at the ``goal``."""
+    turn = turned @ thing.turned.T
+    return Pose(goal + turn @ (hand.at - thing.point(own)), turn @ hand.turned)
