@@ -67,16 +67,16 @@ def test_other_arms_succeed_on_most_of_100_seeds(task, robot):
     assert sum(m.solved for m in made) >= least
 
 
+LEAST = {"NutAssembly": 0.5, "PickPlace": 0.22, "TwoArmHandover": 0.9, "TwoArmTransport": 0.7, "ToolHang": 0.9}
+"""What share is asked for where it is not 95 %: a few points under what ``asm-gym benchmark experts`` printed."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("task", sorted(EXPERTS))
-def test_an_expert_succeeds_on_95_of_100_seeds(task):
-    # Two nuts or four things in one episode are not mastered yet: 64 and 34 of 100 (asm-gym benchmark experts); of the
-    # hammer's handovers a few fail, and so do more of those that begin and end in a bin.
-    # The tool was hung in 98, which leaves room for other seeds.
-    least = {"NutAssembly": 50, "PickPlace": 22, "TwoArmHandover": 90, "TwoArmTransport": 70, "ToolHang": 92}.get(
-        task, 95
-    )
-    assert sum(e.success for e in collect(f"asm_gym/{task}-v0", episodes=100, seed=99, workers=2)) >= least
+def test_an_expert_succeeds_on_nearly_all_of_100_seeds(task):
+    count = 30 if task in ("TwoArmTransport", "ToolHang") else 100  # their episodes take seconds
+    made = collect(f"asm_gym/{task}-v0", episodes=count, seed=99, workers=2)
+    assert sum(e.success for e in made) >= LEAST.get(task, 0.95) * count
 
 
 def test_speed_and_noise_change_the_course():
