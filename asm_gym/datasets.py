@@ -77,7 +77,7 @@ def write_dataset(
         steps = len(episode.actions)
         if not steps or len(episode.observations) != steps + 1 or len(episode.rewards) != steps:
             raise ValueError(f"episode {n} needs an action, a reward and a flat observation of every step")
-    folder = root / dataset_id
+    folder = root.resolve() / dataset_id  # Minari doubles a relative path
     unfinished = folder.with_name(f".{folder.name}.unfinished")
     shutil.rmtree(unfinished, ignore_errors=True)
     (unfinished / "data").mkdir(parents=True)
@@ -218,9 +218,14 @@ def _without_reset(rows: NDArray[Any], T: int) -> NDArray[Any]:
     return rows
 
 
-def _minari(name: str) -> Any:
-    """Something of Minari's, which is an extra. Raises ImportError that says how to get it."""
+def require_minari() -> None:
+    """Raises ImportError that says how to get what datasets need, where it is missing."""
     if importlib.util.find_spec("minari") is None or importlib.util.find_spec("h5py") is None:
         raise ImportError("datasets need the packages minari and h5py: pip install 'asm-gym[data]'")
+
+
+def _minari(name: str) -> Any:
+    """Something of Minari's, which is an extra."""
+    require_minari()
     module, attribute = name.rsplit(".", 1)
     return getattr(importlib.import_module(module), attribute)

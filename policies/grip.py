@@ -8,7 +8,11 @@ them say that it holds on, and a hand that stands still there would, by the sign
 evidence is summed: what is expected one time in five is done about five times as late. What is expected without a doubt
 waits too, for fingers that let go press on for a while, and what is sensed meanwhile would have them close again.
 
-Source: Usher and McClelland 2001 (Psychological Review 108(3)) for leaky evidence that is summed up to a bound.
+There is no evidence for the command that is given already, so what is expected one time in five all along is done now
+and then: this is for expectations that a situation brings about and its end takes back.
+
+Source: Usher and McClelland 2001 (Psychological Review 108(3)) for leaky evidence that is summed up to a bound; their
+mutual inhibition is left out.
 """
 
 from __future__ import annotations
@@ -53,8 +57,9 @@ class Readout:
         """The action (A,) for what is expected (A,), and the grip to pass in next time; None before the first."""
         low, high = self._space.low, self._space.high
         action = np.clip(np.nan_to_num(expected), low, high).astype(np.float32)
-        share = ((action - low) / (high - low))[self._grip].astype(np.float64)  # (G,) 1 where the upper end is certain
-        grip = self._decided(share, before or Grip(share > 0.5, np.zeros(len(share))))
+        g = self._grip
+        share = ((action - low)[g] / (high - low)[g]).astype(np.float64)  # (G,) 1 where the upper end is certain
+        grip = self._decided(share, Grip(share > 0.5, np.zeros(len(share))) if before is None else before)
         action[self._grip] = np.where(grip.high, high[self._grip], low[self._grip])
         return action, grip
 

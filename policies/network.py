@@ -39,8 +39,8 @@ class NetworkPolicy:
         activation: of the hidden layers, one of ``ACTIVATIONS``.
         squash: what brings the output into the action space, one of ``SQUASHES``.
         mean, scale: (O,) what observations are standardised by; 0 and 1 where None.
-        log_std: (A,) or the (A, hidden) weights and (A,) biases that give it: the noise of an agent that explores,
-            before ``squash``. None for one that does not.
+        log_std: the (A, hidden) weights and (A,) biases that give it: the noise of an agent that explores, before
+            ``squash``. None for one that does not.
         trained_in: what the agent knows of its environment, by name: see ``describe``.
         seed: of the noise.
 
@@ -65,6 +65,8 @@ class NetworkPolicy:
         if not layers:
             raise ValueError("a network needs at least one layer, got none")
         self.layers = [(np.asarray(W, np.float32), np.asarray(b, np.float32)) for W, b in layers]
+        if self.layers[0][0].ndim != 2:
+            raise ValueError(f"layer 0 needs weights in two dimensions, got {self.layers[0][0].shape}")
         size = self.observation_size
         for n, (W, b) in enumerate(self.layers):
             if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
@@ -75,7 +77,12 @@ class NetworkPolicy:
         self.activation, self.squash = activation, squash
         self.mean = np.zeros(self.observation_size, np.float32) if mean is None else np.asarray(mean, np.float32)
         self.scale = np.ones(self.observation_size, np.float32) if scale is None else np.asarray(scale, np.float32)
-        self.log_std = log_std
+        for what, array in {"mean": self.mean, "scale": self.scale}.items():
+            if array.shape != (self.observation_size,) or not np.isfinite(array).all():
+                raise ValueError(f"{what} must be {self.observation_size} finite numbers, got {array.shape}")
+        if not (self.scale > 0).all():
+            raise ValueError(f"scale must be positive, got {self.scale.min()}")
+        self.log_std = _fitting(log_std, (self.action_size, self.layers[-1][0].shape[1]))
         self.trained_in = dict(trained_in or {})
         self.np_random = np.random.default_rng(seed)
         self._low, self._high = np.full(self.action_size, -1.0, np.float32), np.ones(self.action_size, np.float32)
@@ -155,8 +162,20 @@ class NetworkPolicy:
             header, mean, scale = saved.header, saved.arrays["mean"], saved.arrays["scale"]
             how = header["activation"], header["squash"]
             return cls(layers, *how, mean=mean, scale=scale, trained_in=header["trained_in"])
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def _fitting(log_std: tuple[Array, Array] | None, shape: tuple[int, int]) -> tuple[Array, Array] | None:
+    """The noise, where there is one. Raises ValueError unless its weights are of this shape, and its biases fit."""
+    if log_std is None:
+        return None
+    slope, offset = log_std
+    if slope.shape != shape or offset.shape != shape[:1]:
+        raise ValueError(f"log_std needs weights {shape} and biases {shape[:1]}, got {slope.shape} and {offset.shape}")
+    if not (np.isfinite(slope).all() and np.isfinite(offset).all()):
+        raise ValueError("log_std must be finite")
+    return slope, offset
 
 
 def describe(env: gym.Env[Any, Any]) -> dict[str, Any]:

@@ -13,7 +13,9 @@ import binascii
 import io
 import json
 import pickletools
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -60,6 +62,13 @@ POLICIES = {
 """Where a policy class is from: the algorithms that use it, by the first of them, and its activation by default."""
 
 
+DAMAGE = (
+    *(zipfile.BadZipFile, zlib.error, struct.error, binascii.Error, EOFError, RuntimeError),
+    *(LookupError, TypeError, AttributeError, ValueError),
+)
+"""What reading an archive may raise whose members are not what they should be."""
+
+
 def read_archive(path: Path, seed: int | None = None) -> NetworkPolicy:
     """The agent that ``model.save`` wrote, of SAC, TD3, DDPG, PPO or A2C with an ``MlpPolicy``.
 
@@ -84,8 +93,9 @@ def read_archive(path: Path, seed: int | None = None) -> NetworkPolicy:
                     f"its pickled data would import {', '.join(refused)}, which stable-baselines3 does not"
                 )
             return _from_data(data, _tensors(archive.read("policy.pth")), seed)
-    except (zipfile.BadZipFile, KeyError, TypeError, ValueError, EOFError, binascii.Error, RuntimeError) as error:
-        raise ValueError(f"{path} is not an agent that can be read: {error}") from error
+    except DAMAGE as error:
+        why = str(error) or type(error).__name__
+        raise ValueError(f"{path} is not an agent that can be read: {why}") from error
 
 
 def _pickles(data: Any) -> Iterator[bytes]:

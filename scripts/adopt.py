@@ -24,6 +24,7 @@ from asm_gym.evaluation.report import Table
 from asm_gym.monitors import MONITORS
 from asm_gym.scripts.judge import opinion_of, sights_of
 from asm_gym.scripts.progress import stage
+from asm_gym.scripts.refused import REFUSED
 from asm_gym.scripts.repertoire import recorded
 from asm_gym.scripts.tables import console_table, markdown
 
@@ -129,7 +130,7 @@ def main(argv: list[str] | None = None) -> int:
         args = tyro.cli(Args, args=argv, prog="asm-gym adopt", description=__doc__)
         with stage("fitting and judging", console, {}):
             found = scores(args)
-    except ValueError as error:
+    except REFUSED as error:
         print(f"asm-gym adopt: {error}", file=sys.stderr)
         return 2
     made = table(found, args)

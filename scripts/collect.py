@@ -17,12 +17,13 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from asm_gym.datasets import load_episode, save_episode, write_dataset
+from asm_gym.datasets import load_episode, require_minari, save_episode, write_dataset
 from asm_gym.episodes import Episode
 from asm_gym.policies import make_policy, rollout
 from asm_gym.scripts.claims import claim_folder, versions
 from asm_gym.scripts.dispatch import Crew, Progress, dispatch, environment
 from asm_gym.scripts.progress import stage
+from asm_gym.scripts.refused import REFUSED
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import StreamRecorder
 
@@ -61,6 +62,7 @@ class Args:
             raise ValueError(f"episodes must be at least 1, got {self.episodes}")
         if self.task not in gym.registry:
             task_spec(self.task)
+        Crew(self.workers, self.backend, self.address)  # refuses what makes no sense
 
     @property
     def env_id(self) -> str:
@@ -167,13 +169,14 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = tyro.cli(Args, args=argv, prog="asm-gym collect", description=__doc__)
         args = replace(args, episodes=4) if args.quick else args
+        require_minari()
         check(args)
         claim = {"env_id": args.env_id, "policy": args.policy, "settings": dict(args.settings), "seed": args.seed}
         claim_folder(args.out, "collect.json", claim)
         with stage("recording", console, seconds) as progress:
             files = record_all(args, progress)
         folder, kept = assemble(args, files)
-    except (ValueError, TypeError, FileNotFoundError, ImportError, ConnectionError, gym.error.Error) as error:
+    except REFUSED as error:
         print(f"asm-gym collect: {error}", file=sys.stderr)
         return 2
     steps = sum(map(len, kept))

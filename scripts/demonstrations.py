@@ -20,6 +20,7 @@ from asm_gym.episodes import Episode
 from asm_gym.scripts.claims import versions
 from asm_gym.scripts.dispatch import Progress
 from asm_gym.scripts.progress import stage
+from asm_gym.scripts.refused import REFUSED
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ def main(argv: list[str] | None = None) -> int:
         args = tyro.cli(Args, args=argv, prog="asm-gym import", description=__doc__)
         with stage("replaying", console, {}) as progress:
             folder, episodes = convert(args, progress)
-    except (ValueError, FileNotFoundError, ImportError) as error:
+    except REFUSED as error:
         print(f"asm-gym import: {error}", file=sys.stderr)
         return 2
     console.print(f"{len(episodes)} episodes, {sum(e.success for e in episodes)} successful: {folder}")

@@ -32,6 +32,7 @@ from asm_gym.scripts.judge import Judgement, calibrated, judge
 from asm_gym.scripts.progress import stage
 from asm_gym.scripts.publish import brief_tables, publish
 from asm_gym.scripts.record import EXECUTIONS, Course, draw_onset, episode_seeds, record
+from asm_gym.scripts.refused import REFUSED
 from asm_gym.scripts.tables import console_table
 from asm_gym.tasks import task as task_spec
 
@@ -242,7 +243,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = tyro.cli(Args, args=argv, prog="asm-gym evaluate", description=__doc__).scaled()
         judgement = evaluate(args, console)
-    except (ValueError, OSError) as error:
+    except REFUSED as error:
         print(f"asm-gym evaluate: {error}", file=sys.stderr)
         return 2
     for table in brief_tables(judgement):

@@ -22,6 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.progress import stage
+from asm_gym.scripts.refused import REFUSED
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import NeuralASMSafety
 
@@ -139,7 +140,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = tyro.cli(Args, args=argv, prog="asm-gym lagrangian", description=__doc__)
         multiplier = train(args, console)
-    except (ValueError, FileNotFoundError, RuntimeError) as error:
+    except (*REFUSED, RuntimeError) as error:
         print(f"asm-gym lagrangian: {error}", file=sys.stderr)
         return 2
     console.print(f"multiplier {multiplier.value:.3g} after {args.steps} steps: {args.out / 'multiplier.json'}")

@@ -31,6 +31,7 @@ from asm_gym.scripts.dispatch import Crew, Progress, dispatch
 from asm_gym.scripts.judge import fitted
 from asm_gym.scripts.progress import stage
 from asm_gym.scripts.record import Course, episode_seeds, record
+from asm_gym.scripts.refused import REFUSED
 from asm_gym.scripts.tables import console_table, markdown
 from asm_gym.wrappers.safety import ON_ALARM
 
@@ -215,7 +216,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = tyro.cli(Args, args=argv, prog="asm-gym react", description=__doc__)
         made = react(args, console)
-    except ValueError as error:
+    except REFUSED as error:
         print(f"asm-gym react: {error}", file=sys.stderr)
         return 2
     console.print(console_table(made, left=2))

@@ -31,6 +31,7 @@ from asm_gym.monitors import MONITORS, NeuralASM
 from asm_gym.scripts.dispatch import dispatch
 from asm_gym.scripts.judge import fitted, opinion_of, sights_of, sorted_by_role
 from asm_gym.scripts.progress import stage
+from asm_gym.scripts.refused import REFUSED
 from asm_gym.scripts.switching import NAMES, Switch, record_switch
 from asm_gym.scripts.tables import console_table, markdown
 
@@ -283,7 +284,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = tyro.cli(Args, args=argv, prog="asm-gym repertoire", description=__doc__)
         made = repertoire(args, console)
-    except ValueError as error:
+    except REFUSED as error:
         print(f"asm-gym repertoire: {error}", file=sys.stderr)
         return 2
     for table in made:

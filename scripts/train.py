@@ -27,6 +27,7 @@ from asm_gym.scripts.claims import claim_folder
 from asm_gym.scripts.collect import episode_seeds
 from asm_gym.scripts.dispatch import Progress
 from asm_gym.scripts.progress import stage
+from asm_gym.scripts.refused import REFUSED
 from asm_gym.scripts.training.learners import ALGORITHMS
 from asm_gym.scripts.training.run import BEST, CLONE, Plan, Run, success_rate
 from asm_gym.tasks import task as task_spec
@@ -99,6 +100,18 @@ class Args:
         return self.task if self.task in gym.registry else task_spec(self.task).id
 
     @property
+    def shown(self) -> collect.Args:
+        """How the expert's episodes are recorded."""
+        return collect.Args(
+            task=self.task,
+            robot=self.robot,
+            episodes=self.demonstrations,
+            workers=self.workers,
+            seed=self.seed,
+            out=self.out / "demonstrations",
+        )
+
+    @property
     def plan(self) -> Plan:
         settings = {} if self.robot is None else {"robot": self.robot}
         each = (
@@ -113,6 +126,15 @@ class Args:
         return Plan(self.env_id, settings, **{name: getattr(self, name) for name in each})
 
 
+def check(args: Args) -> None:
+    """Raises what the environment, the dataset or the expert refuse, before the folder is claimed."""
+    gym.make(args.env_id, **args.plan.settings).close()
+    if args.dataset is not None:
+        read_dataset(args.dataset, env_id=args.env_id)
+    elif args.demonstrations:
+        collect.check(args.shown)
+
+
 def demonstrate(args: Args, tick: Progress) -> list[Episode]:
     """Successful episodes to begin with, recorded or read."""
     if args.dataset is not None:
@@ -120,16 +142,7 @@ def demonstrate(args: Args, tick: Progress) -> list[Episode]:
     elif not args.demonstrations:
         return []
     else:
-        how = collect.Args(
-            task=args.task,
-            robot=args.robot,
-            episodes=args.demonstrations,
-            workers=args.workers,
-            seed=args.seed,
-            out=args.out / "demonstrations",
-        )
-        collect.check(how)
-        episodes = [load_episode(file) for file in collect.record_all(how, tick)]
+        episodes = [load_episode(file) for file in collect.record_all(args.shown, tick)]
     kept = [e for e in episodes if e.success]
     if not kept:
         raise ValueError(f"none of {len(episodes)} demonstrations succeeded")
@@ -179,10 +192,11 @@ def main(argv: list[str] | None = None) -> int:
     console = Console()
     try:
         args = tyro.cli(Args, args=argv, prog="asm-gym train", description=__doc__).scaled()
+        check(args)
         keys = ("env_id", "algorithm", "robot", "demonstrations", "dataset", "cloning_updates", "seed")
         claim_folder(args.out, "train.json", {key: getattr(args, key) for key in keys})
         result = train(args, console)
-    except (ValueError, TypeError, FileNotFoundError, ImportError, gym.error.Error) as error:
+    except REFUSED as error:
         print(f"asm-gym train: {error}", file=sys.stderr)
         return 2
     console.print(f"success {result['success']:.0%} of {args.final_episodes} episodes: {args.out / 'agent.npz'}")

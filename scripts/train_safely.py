@@ -32,6 +32,7 @@ from asm_gym.scripts.claims import claim_folder
 from asm_gym.scripts.collect import episode_seeds, record_to
 from asm_gym.scripts.dispatch import Progress, dispatch
 from asm_gym.scripts.progress import stage
+from asm_gym.scripts.refused import REFUSED
 from asm_gym.scripts.tables import console_table, markdown
 from asm_gym.scripts.training.exploration import Gentle, explore, harmless
 from asm_gym.scripts.training.safe_run import ALONE, CONDITIONS, Setting, run
@@ -248,7 +249,7 @@ def main(argv: list[str] | None = None) -> int:
         free = ("seeds", "conditions", "workers", "out")
         claim_folder(args.out, "train_safely.json", {k: v for k, v in vars(args).items() if k not in free})
         tables = train_safely(args, console)
-    except ValueError as error:
+    except REFUSED as error:
         print(f"asm-gym train-safely: {error}", file=sys.stderr)
         return 2
     for table in tables:

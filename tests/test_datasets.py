@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium as gym
 import h5py
@@ -75,7 +76,9 @@ def test_collecting_touches_nothing_outside_its_folder(tmp_path, monkeypatch):
     monkeypatch.delenv("MINARI_DATASETS_PATH", raising=False)
     before = dict(os.environ)
     episodes = sine_episodes(2)
-    write_dataset(tmp_path / "out", "asm_gym/sines-v0", _observed(episodes), _Sines(), {})
+    monkeypatch.chdir(tmp_path)
+    write_dataset(Path("out"), "asm_gym/sines-v0", _observed(episodes), _Sines(), {})
+    assert len(read_dataset("out")) == 2
     assert dict(os.environ) == before
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 

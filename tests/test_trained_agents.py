@@ -1,6 +1,7 @@
 """Trained agents as files: read without running what they bring, and refused where they do not fit."""
 
 import base64
+import io
 import itertools
 import json
 import os
@@ -134,6 +135,47 @@ def test_what_a_custom_policy_would_compute_is_not_guessed(archive):
         read_archive(archive(data=lambda _: b"{"))
 
 
+def saved(content):
+    """As torch writes it."""
+    file = io.BytesIO()
+    torch.save(content, file)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    "members",
+    [
+        {"data": edit_data(policy_class="MlpPolicy")},
+        {"data": edit_data(policy_kwargs=["net_arch"])},
+        {"data": lambda _: b"[1, 2]"},
+        {"policy_pth": lambda _: saved(torch.zeros(3))},
+        {"policy_pth": lambda _: saved({"action_net.weight": "many"})},
+        {"policy_pth": lambda _: saved({1: torch.zeros(3)})},
+        {"policy_pth": lambda _: saved({"action_net.weight": torch.zeros(3), "action_net.bias": torch.zeros(3)})},
+        {"policy_pth": lambda _: saved({})},
+        {"policy_pth": lambda _: b""},
+        {"policy_pth": lambda content: content[:40]},
+        {"policy_pth": lambda _: b"nonsense"},
+    ],
+)
+def test_members_that_are_not_what_they_should_be_are_refused_with_a_reason(members, archive):
+    with pytest.raises(ValueError, match=r"edited\.zip is not an agent that can be read: .+"):
+        read_archive(archive(**members))
+
+
+def test_an_archive_that_cannot_be_unpacked_is_refused(archive):
+    path = archive()
+    content = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as good:
+        entry = good.getinfo("data")
+    # Said to be deflated, in the local header and in the directory, though it is not.
+    content[entry.header_offset + 8] = 8
+    content[content.rindex(b"PK\x01\x02", 0, content.rindex(b"data")) + 10] = 8
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"edited\.zip is not an agent"):
+        read_archive(path)
+
+
 def test_an_agent_that_does_not_fit_is_refused_before_it_acts(tmp_path, lift):
     PPO("MlpPolicy", FakeEnv()).save(tmp_path / "fake.zip")
     with pytest.raises(ValueError, match=r"observations of 2 numbers.*\(37,\)"):
@@ -182,11 +224,28 @@ def test_an_agent_is_the_same_after_saving(tmp_path):
         ([(np.zeros((3, 2)), np.zeros(3)), (np.zeros((1, 4)), np.zeros(1))], "layer 1 takes 3"),
         ([(np.zeros((3, 2)), np.zeros(2))], "layer 0"),
         ([(np.full((3, 2), np.nan), np.zeros(3))], "finite"),
+        ([(np.zeros(3), np.zeros(3))], r"two dimensions, got \(3,\)"),
+        ([(np.zeros(()), np.zeros(3))], "two dimensions"),
     ],
 )
 def test_networks_that_do_not_hang_together_are_refused(layers, message):
     with pytest.raises(ValueError, match=message):
         NetworkPolicy(layers, "relu", "tanh")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"mean": np.zeros(5)}, r"mean must be 2 finite numbers, got \(5,\)"),
+        ({"mean": np.array([0, np.nan])}, "mean must be 2 finite"),
+        ({"scale": np.zeros(2)}, "scale must be positive"),
+        ({"log_std": (np.zeros((3, 1)), np.zeros(3))}, r"log_std needs weights \(3, 2\)"),
+        ({"log_std": (np.zeros((3, 2)), np.full(3, np.inf))}, "log_std must be finite"),
+    ],
+)
+def test_what_a_network_reads_and_draws_by_must_fit_it(fields, message):
+    with pytest.raises(ValueError, match=message):
+        NetworkPolicy([(np.zeros((3, 2)), np.zeros(3))], "relu", "tanh", **fields)
 
 
 def test_unknown_policies_are_refused_with_the_shipped_ones_named(lift):

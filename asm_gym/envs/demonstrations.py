@@ -159,7 +159,7 @@ def _open(path: Path) -> Iterator[Any]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except (OSError, KeyError, json.JSONDecodeError) as error:
+    except (OSError, LookupError, TypeError, AttributeError, json.JSONDecodeError) as error:
         raise ValueError(
             f"{path} is damaged, or no file of robosuite's or robomimic's demonstrations: {error}"
         ) from error
