@@ -25,14 +25,16 @@ from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.trace import POLICY_ALONE
 from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import NeuralASM
+from asm_gym.policies import make_policy
 from asm_gym.scripts.bout import NOMINAL, PASSING, Bout, run_bout
 from asm_gym.scripts.claims import claim_folder
-from asm_gym.scripts.dispatch import Crew, Progress, dispatch
+from asm_gym.scripts.dispatch import Crew, Progress, dispatch, environment
 from asm_gym.scripts.judge import fitted
 from asm_gym.scripts.progress import stage
 from asm_gym.scripts.record import Course, episode_seeds, record
 from asm_gym.scripts.refused import REFUSED
 from asm_gym.scripts.tables import console_table, markdown
+from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers.safety import ON_ALARM
 
 FAULTS = (NOMINAL, PASSING, "collision", "held_by_person", "stuck_joint", "encoder_bias")
@@ -74,6 +76,8 @@ class Args:
     """Folder of the results."""
 
     def __post_init__(self) -> None:
+        for task in self.tasks:
+            task_spec(task)
         for name in self.reflexes:
             check_choice("reflex", name, ON_ALARM)
         for name in self.faults:
@@ -183,6 +187,9 @@ def _percent(e: Estimate) -> str:
 def react(args: Args, console: Console) -> Table:
     """Fits, runs, compares and writes."""
     seconds: dict[str, float] = {}
+    for task in args.tasks:
+        env = environment(f"asm_gym/{task}-v0", args.course.settings())
+        make_policy(args.policy, env, seed=0)  # what does not fit is refused before anything runs
     args.out.mkdir(parents=True, exist_ok=True)
     if args.monitor_freq is not None:
         settings = {"robot": args.robot, "policy": args.policy, "seed": args.seed, "monitor_freq": args.monitor_freq}

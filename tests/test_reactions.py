@@ -75,6 +75,9 @@ def test_every_reflex_has_the_twin_of_the_policy_alone():
         (["--episodes", "0"], "episodes"),
         (["--max-override-s", "0"], "max_override_s"),
         (["--tasks", "Lift"], "run asm-gym evaluate first"),
+        (["--tasks", "Juggle"], "Juggle.*Lift"),
+        (["--tasks", "Lift", "--policy", "missing.zip"], "missing.zip"),
+        (["--tasks", "Lift", "--policy", "missing.zip", "--monitor-freq", "100"], "missing.zip"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, message, tmp_path, capsys):

@@ -9,6 +9,7 @@ while it runs is one physics substep (2 ms) older than its joints; here both are
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -63,7 +64,7 @@ def recorded_in(path: Path) -> Recorded:
             name, kwargs = about["env_name"], about["env_kwargs"]
         else:
             name, kwargs = str(attributes["env"]), json.loads(attributes["env_info"])
-        demos = sorted((n for n in file["data"] if n.startswith("demo")), key=lambda n: int(n.rsplit("_", 1)[-1]))
+        demos = sorted((n for n in file["data"] if re.fullmatch(r"demo_\d+", n)), key=lambda n: int(n[5:]))
     if not demos:
         raise ValueError(f"{path} holds no demonstration")
     robots = kwargs.get("robots", "Panda")
