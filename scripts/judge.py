@@ -150,7 +150,7 @@ def _opinions(
 def opinion_of(name: str, folder: Path, by_role: Mapping[str, Sequence[Recording]], rate: float, seed: int) -> Opinion:
     monitor = fitted(folder, name, by_role["fit"], seed)
     maxima = np.array([s.value.max() for s in _scores(monitor, by_role["calibration"])])
-    rates = sorted({r for r in (*RATES, rate) if len(maxima) >= conformal_episodes(r)})
+    rates = sorted({rate, *(r for r in RATES if len(maxima) >= conformal_episodes(r))})
     thresholds = {r: conformal_threshold(maxima, r) for r in rates}
     tested = [*by_role["nominal"], *by_role.get("faulty", [])]
     verdicts = _verdicts(name, monitor, tested, thresholds[rate])

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from asm_gym.choices import check_choice
+from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode
 from asm_gym.evaluation import comparison, plots
 from asm_gym.evaluation.archive import Recording, read
@@ -71,8 +72,12 @@ class Args:
             check_choice("monitor", name, MONITORS)
         if not self.monitors:
             raise ValueError("there must be at least one monitor")
-        if self.seeds < 1:
-            raise ValueError(f"seeds must be at least 1, got {self.seeds}")
+        for name in ("seeds", "workers"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
+        if not self.window > 0:
+            raise ValueError(f"window must be > 0, got {self.window}")
         if not 0 <= self.alone_seeds <= self.seeds:
             raise ValueError(f"alone_seeds must be in [0, {self.seeds}], got {self.alone_seeds}")
         for name in ("switches", "experience"):
@@ -110,8 +115,21 @@ class Naming(NamedTuple):
 
 
 def jobs(args: Args) -> list[Job]:
-    """All tasks together for each monitor and seed, and each task alone for the first monitor and seeds."""
-    seeds, tasks = range(args.seed, args.seed + args.seeds), args.tasks
+    """All tasks together for each monitor and seed, and each task alone for the first monitor and seeds.
+
+    Raises:
+        ValueError: a task has too few episodes to set its own threshold by.
+    """
+    seeds, tasks, needed = (
+        range(args.seed, args.seed + args.seeds),
+        args.tasks,
+        conformal_episodes(args.false_alarm_rate),
+    )
+    for task in tasks if args.alone_seeds else []:
+        count = len(list((args.run / "episodes" / task / "calibration").glob("*.npz")))
+        if count < needed:
+            raise ValueError(f"{task} alone has {count} calibration episodes, and a rate of {args.false_alarm_rate} "
+                             f"needs {needed}: record more, or set alone_seeds to 0")  # fmt: skip
     together = [Job(m, s, tuple(tasks)) for m in args.monitors for s in seeds]
     return together + [Job(args.monitors[0], s, (t,)) for s in seeds[: args.alone_seeds] for t in tasks]
 
@@ -128,10 +146,12 @@ def score(job: Job, run: Path, rate: float, window_s: float) -> dict[str, Score]
     """The job's monitor on each of its tasks, and on all of them under ``""``."""
     recordings, twins = recorded(run, job.tasks)
     said = opinion_of(job.monitor, run, recordings, rate, job.seed)
-    visible = comparison.visible_kinds(sights_of(twins, recordings["faulty"], window_s))
+    sights = sights_of(twins, recordings["faulty"], window_s)
 
     def of(task: str) -> Score:
         own = [v for v in said.verdicts if task in ("", v.task)]
+        # By task, so that one learned alone is asked about the same kinds.
+        visible = comparison.visible_kinds([s for s in sights if task in ("", s.task)])
         return comparison.score(job.monitor, own, said.thresholds, rate, window_s, visible)
 
     return {task: of(task) for task in ("", *job.tasks)}
@@ -230,6 +250,7 @@ def _delays(scores: Sequence[Score]) -> str:
 def repertoire(args: Args, console: Console) -> list[Table]:
     """Fits, asks, compares and writes."""
     seconds: dict[str, float] = {}
+    wanted_jobs = jobs(args)
     possible = set(NAMES.values()) <= set(args.tasks)
     args.out.mkdir(parents=True, exist_ok=True)
     with stage("changing skills", console, seconds) as progress:
@@ -239,7 +260,6 @@ def repertoire(args: Args, console: Console) -> list[Table]:
         switches, experience = paths[: args.switches], paths[args.switches :]
     with stage("fitting and judging", console, seconds) as progress:
         ask = partial(score, run=args.run.resolve(), rate=args.false_alarm_rate, window_s=args.window)
-        wanted_jobs = jobs(args)
         found = list(zip(wanted_jobs, dispatch(ask, wanted_jobs, args.workers, progress), strict=True))
     tables = [seeds_table(found, args)]
     if args.alone_seeds:

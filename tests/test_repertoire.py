@@ -22,13 +22,16 @@ def test_a_share_is_taken_of_what_was_named_so_many_steps_after_the_beginning():
 
 def test_a_spread_is_mean_and_sample_deviation():
     assert Spread.of([1.0, 2.0, 3.0]) == (2.0, 1.0)
-    assert Spread.of([0.5]).text(100, 1) == "50.0 ± 0.0"
+    assert Spread.of([0.5]).text(100, 1) == "50.0"
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"seeds": 0}, "seeds must be at least 1, got 0"),
+        ({"workers": 0}, "workers must be at least 1, got 0"),
+        ({"false_alarm_rate": 1.5}, "must be in"),
+        ({"window": 0.0}, "window must be > 0"),
         ({"alone_seeds": 4}, r"alone_seeds must be in \[0, 3\], got 4"),
         ({"switches": -1}, "switches must be at least 0, got -1"),
         ({"experience": -3}, "experience must be at least 0, got -3"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -21,11 +22,13 @@ class Spread(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
-        """Of one value a seed; the deviation of a single one is 0."""
-        return cls(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else 0.0)
+        """Of one value a seed; a single one has no deviation, NaN."""
+        return cls(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else math.nan)
 
     def text(self, scale: float = 1.0, digits: int = 3) -> str:
-        """``mean ± sd``, each times ``scale``."""
+        """``mean ± sd``, each times ``scale``; the mean alone where there is no deviation."""
+        if math.isnan(self.sd):
+            return f"{scale * self.mean:.{digits}f}"
         return f"{scale * self.mean:.{digits}f} ± {scale * self.sd:.{digits}f}"
 
 
