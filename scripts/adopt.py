@@ -24,8 +24,8 @@ from asm_gym.evaluation.report import Table
 from asm_gym.monitors import MONITORS
 from asm_gym.scripts.judge import opinion_of, sights_of
 from asm_gym.scripts.progress import stage
+from asm_gym.scripts.recordings import recorded
 from asm_gym.scripts.refused import REFUSED
-from asm_gym.scripts.repertoire import recorded
 from asm_gym.scripts.tables import console_table, markdown
 
 Roles = Mapping[str, Sequence[Recording]]

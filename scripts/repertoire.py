@@ -7,33 +7,30 @@ is repeated over seeds of the monitors; the table gives means and standard devia
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import numpy as np
 import tyro
-from numpy.typing import NDArray
 from rich.console import Console
 
 from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
-from asm_gym.episodes import Episode
 from asm_gym.evaluation import comparison, plots
-from asm_gym.evaluation.archive import Recording, read
 from asm_gym.evaluation.comparison import Score
-from asm_gym.evaluation.repertoire import Alarms, Spread, alarms_table, naming_figure, share_right
+from asm_gym.evaluation.repertoire import Spread, alarms_table, naming_figure, share_right
 from asm_gym.evaluation.report import Table
-from asm_gym.monitors import MONITORS, NeuralASM
+from asm_gym.monitors import MONITORS
 from asm_gym.scripts.dispatch import dispatch
-from asm_gym.scripts.judge import fitted, opinion_of, sights_of, sorted_by_role
+from asm_gym.scripts.judge import opinion_of, sights_of
+from asm_gym.scripts.naming import Naming, experienced, name_skills
 from asm_gym.scripts.progress import stage
+from asm_gym.scripts.recordings import recorded
 from asm_gym.scripts.refused import REFUSED
-from asm_gym.scripts.switching import NAMES, Switch, record_switch
+from asm_gym.scripts.switching import NAMES, record_switch
 from asm_gym.scripts.tables import console_table, markdown
 
 AFTER_S = (0.5, 1.0, 2.0, 5.0)
@@ -106,14 +103,6 @@ class Job(NamedTuple):
     tasks: tuple[str, ...]
 
 
-class Naming(NamedTuple):
-    """How one memory named what runs: a (T,) array of right or wrong for each episode."""
-
-    nominal: list[NDArray[np.bool_]]
-    switched: list[NDArray[np.bool_]]  # from the change of skill on
-    alarms: Alarms
-
-
 def jobs(args: Args) -> list[Job]:
     """All tasks together for each monitor and seed, and each task alone for the first monitor and seeds.
 
@@ -134,14 +123,6 @@ def jobs(args: Args) -> list[Job]:
     return together + [Job(args.monitors[0], s, (t,)) for s in seeds[: args.alone_seeds] for t in tasks]
 
 
-@lru_cache(maxsize=1)
-def recorded(run: Path, tasks: tuple[str, ...]) -> tuple[dict[str, list[Recording]], list[Recording]]:
-    """Recordings by role, and the twins of faulty ones."""
-    folders = [run / "episodes" / t / role for t in tasks for role in ("fit", "calibration", "nominal", "faulty")]
-    found, _, twins = sorted_by_role([read(p) for folder in folders for p in sorted(folder.glob("*.npz"))])
-    return found, twins
-
-
 def score(job: Job, run: Path, rate: float, window_s: float) -> dict[str, Score]:
     """The job's monitor on each of its tasks, and on all of them under ``""``."""
     recordings, twins = recorded(run, job.tasks)
@@ -155,40 +136,6 @@ def score(job: Job, run: Path, rate: float, window_s: float) -> dict[str, Score]
         return comparison.score(job.monitor, own, said.thresholds, rate, window_s, visible)
 
     return {task: of(task) for task in ("", *job.tasks)}
-
-
-def name_skills(seed: int, args: Args, switches: Sequence[Path]) -> Naming:
-    """What the memory of ``seed`` calls the skills of nominal test episodes, and of those that change skill."""
-    recordings, _ = recorded(args.run, tuple(args.tasks))
-    memory = fitted(args.run, "neural_asm", recordings["fit"], seed)
-    assert isinstance(memory, NeuralASM)
-    memory.calibrate([r.episode for r in recordings["calibration"]], args.false_alarm_rate)
-    memory.name_skills([r.episode for r in recordings["fit"]])
-    nominal = [memory.skills(r.episode.stream) == r.label.task for r in recordings["nominal"]]
-    changes = [Switch.read(path, memory.spec) for path in switches]
-    switched = [(memory.skills(s.episode.stream) == s.skills)[s.changed :] for s in changes]
-    return Naming(nominal, switched, alarms_of(memory, recordings["nominal"], changes))
-
-
-def alarms_of(memory: NeuralASM, nominal: Sequence[Recording], changes: Sequence[Switch]) -> Alarms:
-    """What a calibrated memory makes of them."""
-
-    def share(episodes: Sequence[Episode]) -> float:
-        alarms = [s.value.max() > memory.threshold for s in memory.score_episodes(episodes)]
-        return float(np.mean(alarms)) if alarms else math.nan
-
-    return Alarms(share([r.episode for r in nominal]), share([s.episode for s in changes]))
-
-
-def experienced(seed: int, args: Args, switches: Sequence[Path], experience: Sequence[Path]) -> Alarms:
-    """What a memory makes of a change of skill that has seen others, unlabelled among its episodes."""
-    recordings, _ = recorded(args.run, tuple(args.tasks))
-    spec = recordings["fit"][0].episode.spec
-    changes = [Switch.read(path, spec).episode for path in experience]
-    calibration = changes[: len(changes) // 3]
-    memory = NeuralASM(spec, seed=seed).fit([*(r.episode for r in recordings["fit"]), *changes[len(calibration) :]])
-    memory.calibrate([*(r.episode for r in recordings["calibration"]), *calibration], args.false_alarm_rate)
-    return alarms_of(memory, recordings["nominal"], [Switch.read(path, spec) for path in switches])
 
 
 def seeds_table(found: Sequence[tuple[Job, dict[str, Score]]], args: Args) -> Table:
@@ -265,15 +212,17 @@ def repertoire(args: Args, console: Console) -> list[Table]:
     if args.alone_seeds:
         tables.append(alone_table(found, args))
     if "neural_asm" in args.monitors:
+        what: dict[str, Any] = {"run": args.run, "tasks": tuple(args.tasks), "rate": args.false_alarm_rate}
+        what["switches"] = switches
         with stage("naming skills", console, seconds) as progress:
-            name = partial(name_skills, args=args, switches=switches)
+            name = partial(name_skills, **what)
             named = dispatch(name, range(args.seed, args.seed + args.seeds), args.workers, progress)
         dt = recorded(args.run, tuple(args.tasks))[0]["nominal"][0].episode.spec.dt
         tables.append(naming_table(named, args, dt))
         if switches:
             alarms = {"of single skills": [n.alarms for n in named]}
             if experience:
-                learn = partial(experienced, args=args, switches=switches, experience=experience)
+                learn = partial(experienced, **what, experience=experience)
                 with stage("learning changes of skill too", console, seconds) as progress:
                     seeds = range(args.seed, args.seed + args.seeds)
                     alarms[f"that has seen {len(experience)} changes"] = dispatch(learn, seeds, args.workers, progress)
