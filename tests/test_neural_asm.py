@@ -281,10 +281,16 @@ def test_bad_episodes_are_refused_by_fit_and_calibrate(asm):
     other = StreamSpec((Channel("joint_position", 11, "rad", group="joint"), Channel("wrench", 3, "N")), dt=0.05)
     nan = good[1].stream.copy()
     nan[7, 4] = np.nan
+    wild = good[1].stream.copy()
+    wild[7, 4] = 1e25
     cases = [
         ([], "at least one episode"),
         ([good[0], replace(good[1], stream=good[1].stream[:1])], "episode 1 must be at least 2 steps long, got 1"),
         ([good[0], replace(good[1], stream=nan)], r"episode 1, step 7, joint_position\[4\] must be finite, got nan"),
+        (
+            [good[0], replace(good[1], stream=wild)],
+            r"episode 1, step 7, joint_position\[4\] is 1e\+25, where 98 % of all",
+        ),
         ([*good, Episode.from_stream(np.zeros((5, 14)), other)], "(?s)episode 3 does not fit.*command.*wrench"),
     ]
     for episodes, message in cases:

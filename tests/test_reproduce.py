@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from asm_gym.episodes import Episode
 from asm_gym.memory.inference import Weights
 from asm_gym.memory.learning import Batch
 from asm_gym.memory.network import initial_weights
@@ -21,6 +22,7 @@ from asm_gym.scripts.reproduce import (
     express_skills,
     fault_detection,
     memorise_and_recall,
+    robot_recall,
     speed_accuracy,
 )
 from asm_gym.scripts.reproduce.apprentices import DISTURBANCE, demonstrate, stream_of
@@ -50,6 +52,7 @@ from asm_gym.scripts.reproduce.handwriting import (
 )
 from asm_gym.scripts.reproduce.laws import LAWS, fit
 from asm_gym.scripts.reproduce.trials import written_trial
+from asm_gym.stream import MOTOR, Channel, StreamSpec
 
 STROKE = Stroke(length=4.0, direction=0.3, turn=1.5, rise=0.0, onset=-0.05, sigma=0.3)
 
@@ -236,7 +239,7 @@ def test_the_state_tells_a_pair_apart_only_once_it_has_parted():
 
 
 def test_a_library_told_a_wrong_skill_is_always_in_alarm_and_the_memory_needs_none():
-    args = fault_detection.Args(letters=3, writings=8, hidden=32)
+    args = fault_detection.Args(letters=3, writings=8, hidden=32, robot_episodes=0)
     records, _ = fault_detection.judged(0, written_trial(0, 3, 8), args)
     alarms = {way: over_seeds(records, "alarm", way=way)[0] for way in fault_detection.WAYS}
     assert alarms["wrong"] == 1.0
@@ -304,6 +307,11 @@ def test_spread_is_over_seeds_and_not_over_measurements():
         ("express_skills", ["--tasks", "Lift", "Juggle"], "unknown skill 'Juggle'; there is an expert.*Lift, Stack"),
         ("express_skills", ["--units", "10"], "at least the number of channels, 75, got 10"),
         ("express_skills", ["--trials", "0"], "trials must be at least 1, got 0"),
+        ("express_skills", ["--tasks", "Lift", "Lift"], "named twice: Lift, Lift"),
+        ("memorise_and_recall", ["--robot-episodes", "-1"], "robot_episodes must be at least 0, got 1"),
+        ("fault_detection", ["--writings", "0"], "writings must be at least 1, got 0"),
+        ("fault_detection", ["--tasks", "Lift", "Stack", "Lift"], "named twice"),
+        ("fault_detection", ["--hidden", "20"], r"hidden \(robosuite's 75.*at least 38, got 20"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_words(study, arguments, message, capsys, tmp_path):
@@ -334,6 +342,41 @@ def test_arguments_that_all_studies_share_are_checked():
         Common(seed=-1)
     with pytest.raises(ValueError, match="cue must be shorter"):
         memorise_and_recall.Args(cues=(10, STEPS))
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_the_study(tmp_path, capsys, monkeypatch):
+    (tmp_path / "file").write_text("taken")
+    monkeypatch.setattr(memorise_and_recall, "study", None)
+    assert cli(["reproduce", "memorise_and_recall", "--out", str(tmp_path / "file")]) == 2
+    assert "file" in capsys.readouterr().err
+
+
+def robot_episodes(spec: StreamSpec, steps: int, each: int = 3) -> list[Episode]:
+    """Hands that go somewhere, for each skill that is recalled."""
+    rng = np.random.default_rng(0)
+    streams = rng.normal(size=(len(robot_recall.RECALLED), each, steps, spec.size)).cumsum(axis=2)
+    return [
+        Episode.from_stream(stream, spec, info={"skill": task})
+        for task, own in zip(robot_recall.RECALLED, streams, strict=True)
+        for stream in own
+    ]
+
+
+def test_the_mean_demonstration_is_as_far_off_as_it_is():
+    spec = StreamSpec((Channel("hand_position", 3, "m"), Channel("action", 2, group=MOTOR)), 0.05)
+    train = robot_episodes(spec, 165)
+    records = robot_recall.stored(train, train, {"seed": 7, "hidden": 3})
+    found = {(r["domain"], r["model"]): r["error_cm"] for r in records}
+    assert {model for _, model in found} == {"hopfield", "library", "mean"}
+    for task, steps in robot_recall.RECALLED.items():
+        cue = robot_recall.ROBOT_CUE
+        hands = np.stack([e.stream[cue : cue + steps, :3] for e in train if e.info["skill"] == task])
+        off = 100 * np.linalg.norm(hands - hands.mean(axis=0), axis=2).mean()
+        assert found[task, "mean"] == pytest.approx(off, rel=1e-5)
+        assert found[task, "hopfield"] < found[task, "mean"]  # it has stored these very episodes
+    assert all(r["seed"] == 7 and not r["online"] for r in records)
+    with pytest.raises(ValueError, match="no successful episode of PickPlaceCan is 160 steps long"):
+        robot_recall.stored(robot_episodes(spec, 140), train, {})
 
 
 @pytest.mark.slow

@@ -20,6 +20,9 @@ from asm_gym.stream import StreamSpec
 Progress = Callable[[int, int], object]
 """Called as ``progress(done, total)``."""
 
+WILD = 1e6
+"""How many times the range of its channel a number may be away from the median."""
+
 SCORED_AT_ONCE = 64
 """Episodes scored side by side; with more the arrays no longer fit the cache."""
 
@@ -211,6 +214,25 @@ class CalibratedMonitor(ABC):
                 step, column = bad[0]
                 label, value = self.spec.labels[column], episode.stream[step, column]
                 raise ValueError(f"episode {n}, step {step}, {label} must be finite, got {value}")
+        refuse_wild(episodes)
+
+
+def refuse_wild(episodes: Sequence[Episode]) -> None:
+    """Raises ValueError for a number out of all proportion, which would hide whatever its channel does otherwise."""
+    if max(float(np.abs(e.stream).max()) for e in episodes) <= WILD / 2:
+        return
+    rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)
+    low, middle, high = np.quantile(rows, (0.01, 0.5, 0.99), axis=0)
+    reach = WILD * np.maximum(np.maximum(high - low, np.abs(middle)), 1.0)
+    for n, episode in enumerate(episodes):
+        wild = np.argwhere(np.abs(episode.stream - middle) > reach)
+        if len(wild):
+            step, column = wild[0]
+            label, value = episode.spec.labels[column], episode.stream[step, column]
+            raise ValueError(
+                f"episode {n}, step {step}, {label} is {value:g}, where 98 % of all lie between {low[column]:g} and "
+                f"{high[column]:g}: leave the episode out"
+            )
 
 
 def side_by_side(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import platform
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -34,6 +35,9 @@ Record = dict[str, Any]
 
 SKILLS = ("Lift", "Stack", "PickPlaceCan")
 """The robosuite skills of one memory."""
+
+SENSED = 75
+"""Numbers that their streams hold beside the action."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,11 @@ def reproduce(name: str, study: Study[Args], kind: type[Args], description: str 
     """Runs a study and publishes what it found. Raises SystemExit(2) where the arguments make no sense."""
     args = tyro.cli(kind, args=argv, prog=f"asm-gym reproduce {name}", description=description)
     console, seconds = Console(), dict[str, float]()
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:  # before the study, not after it
+        print(f"asm-gym reproduce {name}: {error}", file=sys.stderr)
+        return 2
     with threadpool_limits(1):  # products this small are slowed down by several threads
         found = study(args, console, seconds)
     publish(name, found, args, seconds)
@@ -149,10 +158,15 @@ def demonstrations(
     return [e for e in recorded(args, nominal_labels(tasks, role, episodes), console, seconds) if e.success]
 
 
+def at_least(least: int, name: str, number: int) -> None:
+    """Raises ValueError unless it is."""
+    if number < least:
+        raise ValueError(f"{name} must be at least {least}, got {number}")
+
+
 def at_least_one(name: str, number: int) -> None:
     """Raises ValueError unless it is."""
-    if number < 1:
-        raise ValueError(f"{name} must be at least 1, got {number}")
+    at_least(1, name, number)
 
 
 def wide_enough(hidden: int, channels: int) -> None:

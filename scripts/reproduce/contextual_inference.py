@@ -30,6 +30,7 @@ from asm_gym.scripts.reproduce.common import (
     Common,
     Findings,
     Record,
+    at_least,
     at_least_one,
     demonstrations,
     reproduce,
@@ -74,6 +75,7 @@ class Args(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        at_least(0, "robot_episodes", self.robot_episodes)
         if not 2 <= self.repertoire <= len(NAMES):
             raise ValueError(f"a repertoire has 2 to {len(NAMES)} skills here, got {self.repertoire}")
         for name in self.skills:

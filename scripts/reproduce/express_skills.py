@@ -68,6 +68,8 @@ class Args(Common):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least_one("the number of tasks", len(self.tasks))
+        if len(set(self.tasks)) < len(self.tasks):
+            raise ValueError(f"a task was named twice: {', '.join(self.tasks)}")
         for task in self.tasks:
             if task not in EXPERTS or task.startswith("TwoArm"):
                 known = ", ".join(t for t in EXPERTS if not t.startswith("TwoArm"))

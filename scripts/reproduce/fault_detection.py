@@ -30,10 +30,12 @@ from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.scripts.dispatch import dispatch
 from asm_gym.scripts.progress import stage
 from asm_gym.scripts.reproduce.common import (
+    SENSED,
     SKILLS,
     Common,
     Findings,
     Record,
+    at_least,
     at_least_one,
     over_seeds,
     reproduce,
@@ -96,7 +98,12 @@ class Args(Common):
         for what, count in (("letters", self.letters * self.writings), ("tasks", self.robot_episodes)):
             if 0 < (count if what == "letters" else len(self.tasks) * (count // 2)) < needed or count < 0:
                 raise ValueError(f"a false-alarm rate of {RATE} needs {needed} calibration episodes of {what}")
+        at_least_one("writings", self.writings)
+        if len(set(self.tasks)) < len(self.tasks):
+            raise ValueError(f"a task was named twice: {', '.join(self.tasks)}")
         wide_enough(self.hidden, 4)
+        if self.robot_episodes:
+            at_least(-(-SENSED // 2), f"hidden (robosuite's {SENSED} channels take twice as many)", self.hidden)
 
     def scaled(self) -> Args:
         """With ``quick``, letters only, and few of them."""

@@ -24,10 +24,12 @@ from asm_gym.scripts.dispatch import dispatch
 from asm_gym.scripts.progress import stage
 from asm_gym.scripts.reproduce import robot_recall
 from asm_gym.scripts.reproduce.common import (
+    SENSED,
     SKILLS,
     Common,
     Findings,
     Record,
+    at_least,
     at_least_one,
     demonstrations,
     over_seeds,
@@ -90,12 +92,13 @@ class Args(Common):
             at_least_one(f"the number of {name}", len(getattr(self, name)))
         for hidden in (*self.widths, self.hidden):
             wide_enough(hidden, 2 * 3)
-        wide_enough(self.robot_hidden, 75)
+        wide_enough(self.robot_hidden, SENSED)
         for cue in self.cues:
             if not 1 <= cue < STEPS:
                 raise ValueError(f"a cue must be shorter than the letter, 1 to {STEPS - 1} steps, got {cue}")
         for name in ("writings", "steps", "updates"):
             at_least_one(name, getattr(self, name))
+        at_least(0, "robot_episodes", self.robot_episodes)
 
     def scaled(self) -> Args:
         """With ``quick``, little of everything."""
@@ -178,7 +181,7 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
 
 
 def drawn(records: Sequence[Record], args: Args) -> Figure:
-    """Error by repertoire, width and cue; examples; robosuite."""
+    """Error by repertoire, width and cue; robosuite."""
     middle = 8 if 8 in args.repertoires else max(args.repertoires)
     longest = max(args.cues)
     base = {"domain": "letters", "dims": 2, "skills": middle, "hidden": args.hidden, "cue": longest}

@@ -50,7 +50,7 @@ def stored(train: Sequence[Episode], tests: Sequence[Episode], where: Record) ->
         return _hand(Library.learned(train, [task] * streams.shape[1]), hand, task, streams)
 
     def mean(task: str, streams: Rows) -> Rows:
-        shown_ones = [e.stream[: len(streams), hand] for e in train if e.info["skill"] == task]
+        shown_ones = [e.stream[: len(streams), hand] for e in long_enough(train, task)]
         return np.asarray(np.mean(shown_ones, axis=0)[:, None])
 
     expressed: dict[str, Express] = {
@@ -70,7 +70,7 @@ def errors(expressed: Mapping[str, Express], tests: Sequence[Episode], where: Re
     """
     records = []
     for task, steps in RECALLED.items():
-        own = [e for e in tests if e.info["skill"] == task]
+        own = long_enough(tests, task)
         streams = np.stack([e.stream[: ROBOT_CUE + steps] for e in own], axis=1).astype(np.float64)
         true = streams[:, :, own[0].spec.slices["hand_position"]]
         for name, hand in expressed.items():
@@ -78,6 +78,15 @@ def errors(expressed: Mapping[str, Express], tests: Sequence[Episode], where: Re
             fields = {"domain": task, "model": name, **where, "skills": len(RECALLED), "cue": ROBOT_CUE}
             records.append({**fields, "online": False, "error_cm": error})
     return records
+
+
+def long_enough(episodes: Sequence[Episode], task: str) -> list[Episode]:
+    """Those of a task that go on for as long as is recalled. Raises ValueError where there is none."""
+    steps = ROBOT_CUE + RECALLED[task]
+    own = [e for e in episodes if e.info["skill"] == task and len(e) >= steps]
+    if not own:
+        raise ValueError(f"no successful episode of {task} is {steps} steps long: record more of them")
+    return own
 
 
 def _hand(model: Expresser, hand: slice, task: str, streams: Rows) -> Rows:
