@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+import asm_gym
 from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.evaluation import comparison
 from asm_gym.evaluation.archive import Label, Recording, read
@@ -185,12 +186,14 @@ def fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) 
     """The monitor fitted on these episodes; kept in the folder for the next time, under the name of what it learned."""
     spec = recordings[0].episode.spec
     model = name.removesuffix(EVIDENCE)
-    digest = hashlib.sha256(json.dumps([model, seed, sorted(str(r.label.path) for r in recordings)]).encode())
+    made: Any = make_monitor(name, spec, seed=seed)
+    learned = model, asm_gym.__version__, made.get_params(), sorted(str(r.label.path) for r in recordings)
+    digest = hashlib.sha256(json.dumps(learned, default=str).encode())
     path = folder / "monitors" / f"{model}-{digest.hexdigest()[:12]}.asm"
     if path.is_file():
         loaded: Monitor = monitor_class(name).load(path)
         return loaded
-    monitor = make_monitor(name, spec, seed=seed).fit([r.episode for r in recordings])
+    monitor: Monitor = made.fit([r.episode for r in recordings])
     path.parent.mkdir(parents=True, exist_ok=True)
     monitor.save(path)
     return monitor

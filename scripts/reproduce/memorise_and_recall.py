@@ -226,7 +226,7 @@ def _robot(ax: Any, records: Sequence[Record]) -> None:
         colour = look(i)[0] if model != "mean" else "#999999"
         x = np.arange(len(RECALLED)) + 0.14 * (i - 2.5)
         ax.bar(x, mean, 0.13, yerr=spread, color=colour, error_kw={"linewidth": 1})
-    ax.set_xticks(range(len(RECALLED)), list(RECALLED))
+    ax.set_xticks(range(len(RECALLED)), [task.replace("Place", "Place\n") for task in RECALLED])
     ax.set(ylabel="offline hand error [cm]", title="robosuite; grey: the mean")
 
 
