@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from asm_gym.memory.association import (
-    Association,
     association_change,
-    association_shapes,
     complete,
     hidden_units,
     learn_association,
@@ -17,13 +15,7 @@ from asm_gym.memory.association import (
 from asm_gym.memory.network import Network, initial_weights
 from asm_gym.memory.precision import LARGEST, SMALLEST, learn_precision, log_variance
 from asm_gym.memory.senses import Reading
-
-CHANGES = slice(5, 10)
-
-
-def some_association(rng: np.random.Generator, inputs: int, units: int, changes: int) -> Association:
-    shapes = association_shapes(inputs, units, changes).values()
-    return Association(*(rng.normal(scale=0.3, size=s).astype(np.float32) for s in shapes))
+from tests.problems import CHANGES, some_association
 
 
 def test_precision_recovers_noise_that_depends_on_context():

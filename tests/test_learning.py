@@ -5,10 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asm_gym.memory.association import (
-    Association,
-    association_shapes,
-)
 from asm_gym.memory.energy import energy
 from asm_gym.memory.learning import (
     Learner,
@@ -23,17 +19,7 @@ from asm_gym.memory.learning import (
     side_by_side,
 )
 from asm_gym.memory.network import Network, initial_weights, train
-
-
-def problem(seed: int, batch: int = 3, hidden: int = 8, sensory: int = 5, scale: float = 1.0, dtype=np.float32):
-    """Random (z, mu, x, W_F, b_F, pi_z, pi_x) of an energy."""
-    rng = np.random.default_rng(seed)
-    arrays = [
-        rng.normal(size=s) * scale
-        for s in ((batch, hidden), (batch, hidden), (batch, sensory), (sensory, hidden), (sensory,))
-    ]
-    pi_x = rng.uniform(0.0, 3.0, size=(batch, sensory))
-    return *(a.astype(dtype) for a in arrays), 1.5, pi_x.astype(dtype)
+from tests.problems import CHANGES, problem, some_association
 
 
 def schedule(**changes) -> Schedule:
@@ -68,16 +54,8 @@ def trajectory(senses: np.ndarray, commands: np.ndarray) -> Trajectory:
     return Trajectory(senses, commands, np.hstack([before, senses - before, commands]))
 
 
-CHANGES = slice(5, 10)
-
-
 def trained_on(episodes: list[Trajectory], hidden: int, how: Schedule, rng: np.random.Generator):
     return train(episodes, np.arange(5), CHANGES, hidden, 20, how, rng)
-
-
-def some_association(rng: np.random.Generator, inputs: int, units: int, changes: int) -> Association:
-    shapes = association_shapes(inputs, units, changes).values()
-    return Association(*(rng.normal(scale=0.3, size=s).astype(np.float32) for s in shapes))
 
 
 def test_weight_changes_are_the_outer_products_of_what_is_local():

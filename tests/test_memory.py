@@ -10,17 +10,7 @@ from hypothesis import strategies as st
 from asm_gym.memory.energy import activate, energy, energy_gradient, feedback, outward
 from asm_gym.memory.inference import STRIDE, expect, infer, sense
 from asm_gym.memory.network import initial_weights
-
-
-def problem(seed: int, batch: int = 3, hidden: int = 8, sensory: int = 5, scale: float = 1.0, dtype=np.float32):
-    """Random (z, mu, x, W_F, b_F, pi_z, pi_x) of an energy."""
-    rng = np.random.default_rng(seed)
-    arrays = [
-        rng.normal(size=s) * scale
-        for s in ((batch, hidden), (batch, hidden), (batch, sensory), (sensory, hidden), (sensory,))
-    ]
-    pi_x = rng.uniform(0.0, 3.0, size=(batch, sensory))
-    return *(a.astype(dtype) for a in arrays), 1.5, pi_x.astype(dtype)
+from tests.problems import problem
 
 
 def test_activation_is_tanh():
