@@ -176,3 +176,8 @@ def move(
         step *= speed / norm
     turn = 0.5 * np.cross(hand, target_rotation, axis=0).sum(axis=1) / _RADIANS
     return np.concatenate([step, np.clip(turn, -0.5, 0.5)])
+
+
+def turn_left(hand: Vector, target: Vector) -> float:
+    """The angle between two orientations [rad]."""
+    return float(np.arccos(np.clip((np.trace(hand.T @ target) - 1) / 2, -1.0, 1.0)))

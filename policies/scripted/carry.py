@@ -20,6 +20,7 @@ from asm_gym.policies.scripted.base import (
     matrix,
     move,
     rotation,
+    turn_left,
 )
 
 REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT = range(8)
@@ -123,7 +124,7 @@ class CarryExpert(Expert, ABC):
         off = hand_at - grip
         lost = np.linalg.norm(off) > 0.05
         if phase == REACH:
-            aligned = _turn_left(hand, self._grasp(errand, hand, turned)) < 0.15
+            aligned = turn_left(hand, self._grasp(errand, hand, turned)) < 0.15
             above = np.linalg.norm(off[:2] - state.spread[:2] * 0.3) < 0.02 and abs(off[2] - errand.clearance) < 0.03
             return to(DESCEND) if above and aligned else state
         if phase == DESCEND:
@@ -214,8 +215,3 @@ def _to_fit(headings: tuple[float, ...], turned: Vector) -> float:
     heading = float(np.arctan2(turned[1, 0], turned[0, 0]))
     left = [(h - heading + np.pi) % (2 * np.pi) - np.pi for h in headings]
     return float(min(left, key=abs, default=0.0))
-
-
-def _turn_left(hand: Vector, target: Vector) -> float:
-    """The angle between two orientations [rad]."""
-    return float(np.arccos(np.clip((np.trace(hand.T @ target) - 1) / 2, -1.0, 1.0)))

@@ -14,7 +14,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, Vector, grasping, has_settled, matrix, move, rotation
+from asm_gym.policies.scripted.base import (
+    CLOSE,
+    OPEN,
+    Expert,
+    Vector,
+    grasping,
+    has_settled,
+    matrix,
+    move,
+    rotation,
+    turn_left,
+)
 
 REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, TURN, RELEASE, RETREAT = range(9)
 FRAME, TOOL = range(2)
@@ -184,8 +195,7 @@ def _placed(state: ToolHangState, scene: Scene, settled: bool) -> int:
 def _left(state: ToolHangState, scene: Scene) -> tuple[float, float]:
     """How far the hand is from its goal: [m], [rad]."""
     goal = _goal(state, scene).hand
-    angle = np.arccos(np.clip((np.trace(scene.hand.turned.T @ goal.turned) - 1) / 2, -1.0, 1.0))
-    return float(np.linalg.norm(goal.at - scene.hand.at)), float(angle)
+    return float(np.linalg.norm(goal.at - scene.hand.at)), turn_left(scene.hand.turned, goal.turned)
 
 
 def _goal(state: ToolHangState, scene: Scene) -> Goal:
