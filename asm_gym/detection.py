@@ -4,16 +4,19 @@
     bounded    ẽ_i = e_i / √(1 + e_i²/ν²)                               |ẽ_i| < ν, however large e_i
     evidence   w_t = (1 - a) w_{t-1} + a ẽ_t,   w_0 = 0
                v_i = w_i² (2 - a) / (a (1 - (1 - a)^{2t}))              nominal mean 1 for white errors, for every t
-    pooled     s_t = (Σ_i (v_i/q_i)^p)^(1/p)                            q_i: what v_i stays below in 99 % of episodes
+    ratio      r_i = (v_i/q_i)^κ_i                                      q_i: what v_i stays below in 90 % of episodes
+    pooled     s_t = (Σ_i r_i^p)^(1/p)                                  κ_i = min(1, ξ_0/ξ_i), ξ_i: the tail of v_i
     value      s_t / ŝ(c_t)                                             ŝ: what s seldom exceeds in a context like this
     alarm      value > the ⌈(n + 1)(1 - rate)⌉-th smallest of the maxima of n nominal episodes
 
 Each number is measured against what it does in nominal episodes at its worst, so that a wrist that is often surprised
-by contact does not drown an encoder that never is; p lets the most surprising one count, and several add up.
+by contact does not drown an encoder that never is; p lets the most surprising one count, and several add up. Beyond q
+the maxima of episodes fall off as v^(-1/ξ): a ratio of 10 happens to a wrist now and then, to an encoder never. The
+exponent κ makes the same ratio as rare for the one as for the other.
 
 Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted as under a t distribution); Lowry et al.
-1992 (multivariate EWMA chart, its exact variance at start-up); Vovk et al. 2005 and Angelopoulos and Bates 2023 (split
-conformal prediction).
+1992 (multivariate EWMA chart, its exact variance at start-up); Hill 1975 (the index ξ of a tail); Vovk et al. 2005 and
+Angelopoulos and Bates 2023 (split conformal prediction).
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.memory.habituation import habituate
+from asm_gym.memory.repetition import LIGHT
 
 Array = NDArray[np.floating[Any]]
 
@@ -37,8 +41,8 @@ POWER = 8
 LATELY = 0.2
 """Weight of the newest step in the running mean of the context."""
 
-WORST = 0.99
-"""Share of nominal episodes whose maximum of v stays below q."""
+WORST = 0.9
+"""Share of nominal episodes whose maximum of v stays below q; those above tell how far it goes."""
 
 TINY = float(np.finfo(np.float64).tiny)
 
@@ -107,6 +111,14 @@ def pool(ratios: Array, power: float = POWER) -> tuple[NDArray[np.float64], NDAr
     return pooled[:, 0], pooled * (powers / np.maximum(total, np.finfo(float).tiny))
 
 
+def worst_case(maxima: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """q and κ, of the shape of one episode's maxima, from those of N nominal episodes (N, …)."""
+    ceiling = np.maximum(np.quantile(maxima, WORST, axis=0), FAINTEST)
+    beyond = np.log(np.maximum(maxima / ceiling, 1.0))
+    index = beyond.sum(axis=0) / np.maximum((beyond > 0).sum(axis=0), 1)  # Hill's estimate of ξ
+    return ceiling, LIGHT / np.maximum(index, LIGHT)
+
+
 @compiled
 def _step(
     vector: Any,
@@ -116,6 +128,7 @@ def _step(
     context: Any,
     whitening: Any,
     ceiling: Any,
+    tail: Any,
     habit: Any,
     gains: Any,
     bound: float,
@@ -134,7 +147,7 @@ def _step(
             for i in range(X):
                 w = vector[n, g, i] + a * (whitened[n, i] - vector[n, g, i])
                 new[n, g, i] = w
-                ratios[g, i] = w * w / variance / ceiling[g, i]
+                ratios[g, i] = (w * w / variance / ceiling[g, i]) ** tail[g, i]
                 greatest = max(greatest, ratios[g, i])
         total = 0.0
         for g in range(G):
@@ -166,6 +179,7 @@ class Detector:
     Args:
         whitening: (X, X) M.
         ceiling: (G, X) q.
+        tail: (G, X) κ, in (0, 1].
         habit: (2 C + 1,) weights of ŝ, on the context now and lately, and its bias.
         gains: (G,) a, each in (0, 1].
         bound: ν > 0.
@@ -173,6 +187,7 @@ class Detector:
 
     whitening: NDArray[np.float64]
     ceiling: NDArray[np.float64]
+    tail: NDArray[np.float64]
     habit: NDArray[np.float64]
     gains: NDArray[np.float64]
     bound: float
@@ -193,16 +208,17 @@ class Detector:
         """
         matrix = whitening(bounded(np.concatenate([r.errors for r in learned]), bound), shrinkage)
         a = np.asarray(gains, np.float64)
-        plain = cls(matrix, np.ones((len(a), len(matrix))), np.zeros(1), a, bound)
-        worst = [plain._strengths(r)[0].max(axis=0) for r in (*learned, *held_out)]
-        ceiling = np.maximum(np.quantile(worst, WORST, axis=0), FAINTEST)
+        ones = np.ones((len(a), len(matrix)))
+        plain = cls(matrix, ones, ones, np.zeros(1), a, bound)
+        ceiling, tail = worst_case(np.array([plain._strengths(r)[0].max(axis=0) for r in (*learned, *held_out)]))
         contexts, levels = [], []
         for r in held_out or learned:
             strengths, lately = plain._strengths(r)
             contexts.append(np.hstack([r.contexts, lately]).astype(np.float32))
-            levels.append(np.log(np.maximum(pool((strengths / ceiling).reshape(len(lately), -1))[0], FAINTEST)))
+            ratios = ((strengths / ceiling) ** tail).reshape(len(lately), -1)
+            levels.append(np.log(np.maximum(pool(ratios)[0], FAINTEST)))
         habit = habituate(np.concatenate(contexts), np.concatenate(levels), rng)
-        return cls(matrix, ceiling, habit.astype(np.float64), a, bound)
+        return cls(matrix, ceiling, tail, habit.astype(np.float64), a, bound)
 
     def start(self, batch: int) -> Evidence:
         """No evidence yet."""
@@ -224,6 +240,7 @@ class Detector:
             np.asarray(context, np.float64),
             self.whitening,
             self.ceiling,
+            self.tail,
             self.habit,
             self.gains,
             self.bound,

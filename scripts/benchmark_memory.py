@@ -42,7 +42,8 @@ class PlainTorch:
         self.pi_z, self.pi_x = asm.prior_precision, asm.sensory_precision
         self.curvature, self.iterations = float(asm.network_.curvature), asm.iterations
         d, s = asm.detector_, asm.senses_
-        self.M, self.q, self.gains = (torch.tensor(x, dtype=torch.float32) for x in (d.whitening, d.ceiling, d.gains))
+        found = d.whitening, d.ceiling, d.tail, d.gains
+        self.M, self.q, self.kappa, self.gains = (torch.tensor(x, dtype=torch.float32) for x in found)
         self.habit, self.bound = torch.tensor(d.habit, dtype=torch.float32), d.bound
         self.mean, self.spread, self.change = (torch.tensor(x) for x in (s.mean, s.spread, s.change))
         self.sensory, self.motor, self.slow = (torch.tensor(i) for i in (asm.spec.sensory, asm.spec.motor, s.slow))
@@ -79,7 +80,8 @@ class PlainTorch:
         whitened = self.M @ (error / torch.sqrt(1 + (error / self.bound) ** 2))
         self.evidence = self.evidence + self.gains[:, None] * (whitened - self.evidence)
         variance = self.gains / (2 - self.gains) * (1 - (1 - self.gains) ** (2 * self.t))
-        pooled = ((self.evidence**2 / variance[:, None] / self.q) ** POWER).sum() ** (1 / POWER)
+        ratios = (self.evidence**2 / variance[:, None] / self.q) ** self.kappa
+        pooled = (ratios**POWER).sum() ** (1 / POWER)
         context = torch.tanh(mu)
         self.lately = self.lately + LATELY * (context - self.lately)
         usual = torch.exp(self.habit[:-1] @ torch.cat([context, self.lately]) + self.habit[-1])

@@ -18,8 +18,10 @@ from asm_gym.detection import (
     pool,
     strength,
     whitening,
+    worst_case,
 )
 from asm_gym.memory.habituation import USUAL, habituate
+from asm_gym.memory.repetition import LIGHT
 
 
 def correlated(rng: np.random.Generator, n: int = 4000, size: int = 5) -> np.ndarray:
@@ -109,6 +111,25 @@ def test_pooling_is_the_hand_computed_norm_and_its_parts_add_up():
     huge, parts = pool(np.array([[1e200, 1e-200]]))
     assert huge[0] == pytest.approx(1e200)
     assert parts.sum() == pytest.approx(1e200)
+
+
+def test_the_tail_of_the_maxima_is_that_of_the_distribution_they_come_from():
+    rng, index = np.random.default_rng(3), np.array([0.1, 0.6, 1.2])
+    maxima = 5.0 * (1.0 - rng.random((100_000, 3))) ** -index  # Pareto: P(v > q) = (q/5)^(-1/ξ)
+    ceiling, tail = worst_case(maxima)
+    np.testing.assert_allclose(ceiling, 5.0 * 0.1**-index, rtol=0.03)
+    np.testing.assert_allclose(tail, np.minimum(1.0, LIGHT / index), rtol=0.03)
+    # What is equally rare becomes the same ratio, in tails as heavy as LIGHT or heavier.
+    rare = np.quantile((maxima / ceiling) ** tail, 0.999, axis=0)
+    assert rare[1] == pytest.approx(rare[2], rel=0.1)
+    assert rare[0] < rare[1]
+
+
+def test_constant_maxima_have_no_tail():
+    ceiling, tail = worst_case(np.zeros((1, 2, 3)))
+    assert ceiling.shape == tail.shape == (2, 3)
+    assert (ceiling > 0).all()
+    assert (tail == 1.0).all()
 
 
 def test_habituation_finds_the_quantile_of_each_context():
@@ -208,7 +229,8 @@ def test_the_compiled_step_is_the_same_equations_put_together():
         errors, context = 4.0 * rng.normal(size=(2, 3)), rng.random((2, 2))
         evidence, value, parts = detector.step(evidence, errors, context)
         plain = accumulate(plain, bounded(errors, 5.0) @ detector.whitening, context, gains)
-        pooled, _ = pool((strength(plain, gains) / detector.ceiling).reshape(2, -1))
+        ratios = (strength(plain, gains) / detector.ceiling) ** detector.tail
+        pooled, _ = pool(ratios.reshape(2, -1))
         usual = np.exp(np.hstack([context, plain.context]) @ detector.habit[:-1] + detector.habit[-1])
         np.testing.assert_allclose(value, pooled / usual, rtol=1e-9)
         np.testing.assert_allclose(parts.sum(axis=1), value, rtol=1e-9)

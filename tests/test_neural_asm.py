@@ -12,6 +12,7 @@ import pytest
 
 from asm_gym.episodes import Episode
 from asm_gym.monitors import Monitor, NeuralASM, make_monitor
+from asm_gym.monitors.predictive import FOUND
 from asm_gym.stream import Channel, StreamSpec
 from tests.streams import frozen, sine_episodes, sine_spec
 
@@ -25,9 +26,10 @@ def asm() -> NeuralASM:
 
 def learned_bytes(asm: NeuralASM) -> list[bytes]:
     senses = asm.senses_
-    detector = asm.detector_.whitening, asm.detector_.ceiling, asm.detector_.habit
+    detector = [getattr(asm.detector_, name) for name in FOUND]
     network = *asm.network_.weights, *asm.network_.association
-    return [a.tobytes() for a in (*network, senses.mean, senses.spread, senses.change, *detector, asm.energy_)]
+    counted = asm.energy_, asm.learned_["repetition"]
+    return [a.tobytes() for a in (*network, senses.mean, senses.spread, senses.change, *detector, *counted)]
 
 
 def test_a_frozen_sense_is_detected_and_attributed_to_its_channel(asm):

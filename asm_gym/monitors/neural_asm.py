@@ -145,6 +145,8 @@ class NeuralASM(PredictiveMonitor):
         reading = self.senses_.read(rows, before, earlier)
         hidden, expected = carry_on(self.network_, state, reading)
         error, units = self.network_.associate(reading)
+        if state.steps.min() < self._lag:
+            error[state.steps < self._lag] = 0.0  # nothing came before, so that no change is known
         skill = state.skill
         if self.skills_:
             skill = add_up(skill, units, self.learned_["W_K"], self.learned_["b_K"])

@@ -10,13 +10,17 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection import Detector, Evidence, Run
+from asm_gym.detection import TINY, Detector, Evidence, Run, pool
+from asm_gym.memory.repetition import Repetition, count_repetitions, improbability, repeated, unrepeated
 from asm_gym.monitors.base import State
 from asm_gym.monitors.calibrated import CalibratedMonitor, Progress, require, side_by_side
 from asm_gym.stream import StreamSpec
 
 GAINS = (0.8, 0.2, 0.05)
 BOUND = 20.0
+
+FOUND = ("whitening", "ceiling", "tail", "habit")
+"""What the detector has learned."""
 
 HELD_OUT = 5
 """One in so many training episodes is not learned by the model, but shows how surprised it usually is."""
@@ -27,6 +31,7 @@ class PredictiveState(NamedTuple):
 
     model: State
     evidence: Evidence
+    repetition: Repetition
 
 
 class PredictiveMonitor(CalibratedMonitor):
@@ -99,30 +104,42 @@ class PredictiveMonitor(CalibratedMonitor):
         certain = [Run(r.errors, r.contexts[:, :0]) for r in self._runs(learned)]
         runs = self._runs(held_out or learned)
         detector = Detector.fit(certain, runs, self.gains, self.bound, self.shrinkage, rng)
-        found = {"whitening": detector.whitening, "ceiling": detector.ceiling, "habit": detector.habit}
-        return {**self.learned_, **found}
+        senses = self.spec.sensory
+        repetition = count_repetitions([s[:, senses] for s in streams], self.spec.noise[senses] > 0)
+        return {**self.learned_, **{name: getattr(detector, name) for name in FOUND}, "repetition": repetition}
 
     def build(self) -> None:
         self.build_model()
-        whitening, ceiling, habit = (self.learned_[name] for name in ("whitening", "ceiling", "habit"))
-        self.detector_ = Detector(whitening, ceiling, habit, np.array(self.gains), self.bound)
+        found = {name: self.learned_[name] for name in FOUND}
+        self.detector_ = Detector(**found, gains=np.array(self.gains), bound=self.bound)
         self._places = np.zeros((len(self.judged), self.spec.size))
         self._places[np.arange(len(self.judged)), self.judged] = 1.0
 
     def start(self, batch: int) -> PredictiveState:
         assert self.detector_ is not None
-        return PredictiveState(self.start_model(batch), self.detector_.start(batch))
+        none = unrepeated(batch, len(self.spec.sensory))
+        return PredictiveState(self.start_model(batch), self.detector_.start(batch), none)
 
     def shares(self, state: PredictiveState, rows: NDArray[np.float64]) -> tuple[PredictiveState, NDArray[np.float64]]:
         assert self.detector_ is not None
         model, errors, context = self.predict(state.model, rows)
         evidence, _, parts = self.detector_.step(state.evidence, errors, context)
-        return PredictiveState(model, evidence), self.attribute(parts)
+        senses = self.spec.sensory
+        repetition = Repetition(*repeated(*state.repetition, rows[:, senses], self.learned_["repetition"]))
+        found = self.attribute(parts)
+        if repetition.unlikely.any():
+            ratios = np.zeros_like(found)
+            ratios[:, senses] = improbability(repetition)
+            found = _joined(found, ratios)
+        return PredictiveState(model, evidence, repetition), found
 
     def resynchronise(self, state: PredictiveState) -> PredictiveState:
         """The state with the evidence so far forgotten, after an alarm that was acted on; the model goes on."""
-        evidence = state.evidence
-        return PredictiveState(state.model, evidence._replace(vector=np.zeros_like(evidence.vector)))
+        evidence, repetition = state.evidence, state.repetition
+        return state._replace(
+            evidence=evidence._replace(vector=np.zeros_like(evidence.vector)),
+            repetition=repetition._replace(unlikely=np.zeros_like(repetition.unlikely)),
+        )
 
     def attribute(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
         """(B, D) each number's share, from each error's (B, X)."""
@@ -141,3 +158,11 @@ class PredictiveMonitor(CalibratedMonitor):
                 mine = steps[: len(streams[i])]
                 runs[i] = Run(np.array([s.errors[n] for s in mine]), np.array([s.contexts[n] for s in mine]))
         return [runs[i] for i in range(len(streams))]
+
+
+def _joined(found: NDArray[np.float64], ratios: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Each number's share (B, D) of what was found and of further ratios, pooled as those are that made it."""
+    value = found.sum(axis=1, keepdims=True)
+    _, parts = pool(np.hstack([value, ratios]))
+    shared: NDArray[np.float64] = found * (parts[:, :1] / np.maximum(value, TINY)) + parts[:, 1:]
+    return shared

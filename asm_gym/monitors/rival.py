@@ -36,7 +36,7 @@ class Rival(PredictiveMonitor):
             return super().shares(state, rows)
         model, errors, _ = self.predict(state.model, rows)
         parts = self.published(model, np.asarray(errors, np.float64))
-        return PredictiveState(model, state.evidence), self.attribute(parts)
+        return state._replace(model=model), self.attribute(parts)
 
     def learn_score(self, runs: Sequence[Run]) -> dict[str, NDArray[Any]]:
         """What ``published`` needs to know of the errors in nominal episodes."""
