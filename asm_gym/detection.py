@@ -44,6 +44,9 @@ LATELY = 0.2
 WORST = 0.9
 """Share of nominal episodes whose maximum of v stays below q; those above tell how far it goes."""
 
+DOUBT = 10
+"""How many maxima beyond q a tail must show of its own to count as much as what is common among all."""
+
 TINY = float(np.finfo(np.float64).tiny)
 
 FAINTEST = 1e-9
@@ -115,7 +118,9 @@ def worst_case(maxima: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]
     """q and κ, of the shape of one episode's maxima, from those of N nominal episodes (N, …)."""
     ceiling = np.maximum(np.quantile(maxima, WORST, axis=0), FAINTEST)
     beyond = np.log(np.maximum(maxima / ceiling, 1.0))
-    index = beyond.sum(axis=0) / np.maximum((beyond > 0).sum(axis=0), 1)  # Hill's estimate of ξ
+    total, count = beyond.sum(axis=0), (beyond > 0).sum(axis=0)
+    common = np.median(total / np.maximum(count, 1))  # Hill's estimate of ξ is total / count
+    index = (total + DOUBT * common) / (count + DOUBT)
     return ceiling, LIGHT / np.maximum(index, LIGHT)
 
 
