@@ -35,7 +35,7 @@ class PredictiveState(NamedTuple):
 
 
 class PredictiveMonitor(CalibratedMonitor):
-    """A model of the stream, and the detector of ``asm_gym.detection`` on its errors.
+    """A model of the stream, the detector of ``asm_gym.detection`` on its errors, and an eye for stuck senses.
 
     Args:
         spec: the stream it watches.
