@@ -17,6 +17,7 @@ from torch import Tensor
 from asm_gym.detection import LATELY, POWER
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.report import Table
+from asm_gym.memory.repetition import FADING, LIGHT, SURE
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.collect import collect
 from asm_gym.scripts.tables import console_table
@@ -50,6 +51,8 @@ class PlainTorch:
         self.z = torch.zeros(asm.hidden_size)
         self.evidence = torch.zeros(len(self.gains), len(self.sensory))
         self.lately = torch.zeros(asm.hidden_size)
+        self.counted = torch.tensor(asm.learned_["repetition"], dtype=torch.float32)
+        self.again, self.unlikely = torch.zeros(len(self.sensory), dtype=torch.bool), torch.zeros(len(self.sensory))
         self.before: Tensor | None = None
         self.earlier: Tensor | None = None
         self.t = 0
@@ -76,6 +79,11 @@ class PlainTorch:
         units = torch.tanh(a["V"] @ inputs)
         error = delta - a["U"] @ units - a["D"] @ inputs
         error = error * torch.exp(-0.5 * (a["W_S"] @ units + a["b_S"]).clamp(-12.0, 8.0))
+        again = x[self.sensory] == before[self.sensory]
+        if self.before is None:
+            error, again = torch.zeros_like(error), torch.zeros_like(again)
+        rare = torch.where(self.again, self.counted[1], self.counted[0])
+        self.unlikely, self.again = (1 - FADING) * self.unlikely + again * rare, again
         self.t += 1
         whitened = self.M @ (error / torch.sqrt(1 + (error / self.bound) ** 2))
         self.evidence = self.evidence + self.gains[:, None] * (whitened - self.evidence)
@@ -86,7 +94,8 @@ class PlainTorch:
         self.lately = self.lately + LATELY * (context - self.lately)
         usual = torch.exp(self.habit[:-1] @ torch.cat([context, self.lately]) + self.habit[-1])
         self.z, self.before, self.earlier = z, x, before
-        return float(pooled / usual)
+        repeated = (self.unlikely > 0) * torch.exp(LIGHT * (self.unlikely - SURE))
+        return float(((pooled / usual) ** POWER + (repeated**POWER).sum()) ** (1 / POWER))
 
 
 def synthetic(channels: int, episodes: int, skills: int = 1, seed: int = 0) -> list[Episode]:

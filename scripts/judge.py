@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -22,7 +23,6 @@ from asm_gym.evaluation.ideal import earliest, noise_floor, separation
 from asm_gym.evaluation.metrics import Share, window_steps
 from asm_gym.evaluation.scoring import Verdict, coverage
 from asm_gym.evaluation.trace import POLICY_ALONE, Trace
-from asm_gym.memory.checkpoint import VERSION
 from asm_gym.monitors import EVIDENCE, Monitor, make_monitor, monitor_class
 from asm_gym.scripts.dispatch import Crew, Progress, dispatch
 
@@ -188,10 +188,11 @@ def fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) 
     spec = recordings[0].episode.spec
     model = name.removesuffix(EVIDENCE)
     made: Any = make_monitor(name, spec, seed=seed)
-    learned = model, asm_gym.__version__, VERSION, made.get_params(), sorted(str(r.label.path) for r in recordings)
+    learned = model, asm_gym.__version__, made.get_params(), sorted(str(r.label.path) for r in recordings)
     digest = hashlib.sha256(json.dumps(learned, default=str).encode())
     path = folder / "monitors" / f"{model}-{digest.hexdigest()[:12]}.asm"
-    if path.is_file():
+    # One that cannot be read, for it is damaged or of an older asm-gym, is made anew.
+    with suppress(FileNotFoundError, ValueError):
         loaded: Monitor = monitor_class(name).load(path)
         return loaded
     monitor: Monitor = made.fit([r.episode for r in recordings])

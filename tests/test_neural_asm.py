@@ -71,6 +71,15 @@ def test_the_action_as_commanded_is_used_to_predict(asm):
     assert reversed_action.value[20:].mean() > 3 * asm.score(episode).value[20:].mean()
 
 
+def test_a_checkpoint_without_what_the_detector_needs_is_refused_as_old(asm, tmp_path):
+    asm.save(tmp_path / "m.asm")
+    older = NeuralASM.load(tmp_path / "m.asm")
+    del older.learned_["tail"]
+    older.save(tmp_path / "m.asm")
+    with pytest.raises(ValueError, match="has no tail: an older asm-gym wrote it"):
+        NeuralASM.load(tmp_path / "m.asm")
+
+
 def test_observing_changes_neither_weights_nor_state_nor_row(asm):
     before = learned_bytes(asm)
     rows = np.stack([e.stream[0] for e in sine_episodes(3, seed=7)])

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FORMAT = "asm-gym"
-VERSION = 2
+VERSION = 1
 HEADER = "header.json"
 
 
@@ -68,7 +68,7 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: the file is damaged, foreign, of another kind, or of another format.
+        ValueError: the file is damaged, foreign, of another kind, or of a newer format.
     """
     try:
         with zipfile.ZipFile(path) as file:
@@ -80,11 +80,11 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
         raise ValueError(f"{path} is damaged or not a checkpoint of asm-gym: {error}") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ValueError(f"{path} is not a checkpoint of asm-gym")
-    version = header.get("version")
-    if version != VERSION:
-        older = isinstance(version, int) and version < VERSION
-        hint = "an older asm-gym wrote it: fit it anew" if older else "a newer asm-gym may have written it"
-        raise ValueError(f"{path} has checkpoint format {version!r}, this asm-gym reads {VERSION}; {hint}")
+    if header.get("version") != VERSION:
+        raise ValueError(
+            f"{path} has checkpoint format {header.get('version')!r}, this asm-gym reads {VERSION}; "
+            "a newer asm-gym may have written it"
+        )
     if header.get("kind") != kind:
         raise ValueError(f"{path} is a checkpoint of {header.get('kind')!r}, not of {kind!r}")
     return Checkpoint(header, arrays)

@@ -109,6 +109,9 @@ class PredictiveMonitor(CalibratedMonitor):
         return {**self.learned_, **{name: getattr(detector, name) for name in FOUND}, "repetition": repetition}
 
     def build(self) -> None:
+        missing = [name for name in (*FOUND, "repetition") if name not in self.learned_]
+        if missing:
+            raise ValueError(f"the checkpoint has no {', '.join(missing)}: an older asm-gym wrote it, so fit it anew")
         self.build_model()
         found = {name: self.learned_[name] for name in FOUND}
         self.detector_ = Detector(**found, gains=np.array(self.gains), bound=self.bound)
