@@ -18,8 +18,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.episodes import Episode
-from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.stream import StreamSpec, control_period
 from asm_gym.tasks import TASKS
 

@@ -17,8 +17,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.choices import check_choice
-from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
 
 Array = NDArray[np.float32]
 

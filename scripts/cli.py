@@ -19,16 +19,26 @@ class Command(NamedTuple):
 COMMANDS: dict[str, Command] = {
     "demo": Command("asm_gym.scripts.demo", "a robot that notices when something is wrong, in a few minutes"),
     "collect": Command("asm_gym.scripts.collect", "episodes of a policy, as a Minari dataset"),
-    "import": Command("asm_gym.scripts.demonstrations", "robosuite's or robomimic's HDF5 demonstrations, likewise"),
+    "import": Command(
+        "asm_gym.scripts.import_demonstrations", "robosuite's or robomimic's HDF5 demonstrations, likewise"
+    ),
     "train": Command("asm_gym.scripts.train", "an agent: cloned from an expert, improved by SAC, TD3 or PPO"),
     "train-safely": Command(
-        "asm_gym.scripts.train_safely", "the same agent trained alone and under the safety wrapper"
+        "asm_gym.scripts.reproduce.safe_training", "the same agent trained alone and under the safety wrapper"
     ),
-    "lagrangian": Command("asm_gym.scripts.lagrangian", "an example: PPO with a Lagrange multiplier on alarms"),
+    "lagrangian": Command(
+        "asm_gym.scripts.examples.lagrangian", "an example: PPO with a Lagrange multiplier on alarms"
+    ),
     "evaluate": Command("asm_gym.scripts.evaluate", "tasks x monitors x faults: who notices what, with a report"),
-    "adopt": Command("asm_gym.scripts.adopt", "one policy's memory on another: as it is, re-calibrated, fitted anew"),
-    "repertoire": Command("asm_gym.scripts.repertoire", "one memory of all skills against one for each, over seeds"),
-    "react": Command("asm_gym.scripts.react", "reflexes x faults: what acting on alarms is worth, paired by seed"),
+    "adopt": Command(
+        "asm_gym.scripts.reproduce.transfer", "one policy's memory on another: as it is, re-calibrated, fitted anew"
+    ),
+    "repertoire": Command(
+        "asm_gym.scripts.reproduce.repertoire", "one memory of all skills against one for each, over seeds"
+    ),
+    "react": Command(
+        "asm_gym.scripts.reproduce.reflexes", "reflexes x faults: what acting on alarms is worth, paired by seed"
+    ),
     "reproduce": Command("asm_gym.scripts.reproduce", "the method's claims: figures, tables, and where they fail"),
     "benchmark": Command("asm_gym.scripts.benchmark", "speeds, as ratios against rivals in the same run, and experts"),
     "doctor": Command("asm_gym.scripts.doctor", "what this machine lacks, and the command that installs it"),

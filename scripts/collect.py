@@ -20,10 +20,10 @@ from rich.console import Console
 from asm_gym.datasets import load_episode, require_minari, save_episode, write_dataset
 from asm_gym.episodes import Episode
 from asm_gym.policies import make_policy, rollout
-from asm_gym.scripts.claims import claim_folder, versions
-from asm_gym.scripts.dispatch import Crew, Progress, dispatch, environment
-from asm_gym.scripts.progress import stage
-from asm_gym.scripts.refused import REFUSED
+from asm_gym.rollouts.folder import claim_folder, versions
+from asm_gym.rollouts.parallel import ParallelConfig, Progress, environment, parallel_map
+from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.command import USAGE_ERRORS
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import StreamRecorder
 
@@ -62,7 +62,7 @@ class Args:
             raise ValueError(f"episodes must be at least 1, got {self.episodes}")
         if self.task not in gym.registry:
             task_spec(self.task)
-        Crew(self.workers, self.backend, self.address)  # refuses what makes no sense
+        ParallelConfig(self.workers, self.backend, self.address)  # refuses what makes no sense
 
     @property
     def env_id(self) -> str:
@@ -122,7 +122,7 @@ def collect(
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     seeds = episode_seeds(seed, episodes, stage)
     task = partial(record, env_id=env_id, policy=policy, settings=tuple(sorted(env_kwargs.items())))
-    return dispatch(task, seeds, workers, progress)
+    return parallel_map(task, seeds, workers, progress)
 
 
 def record_to(seed: int, env_id: str, policy: str, settings: Settings, folder: Path) -> Path:
@@ -138,8 +138,8 @@ def record_all(args: Args, progress: Progress) -> list[Path]:
     done = len(seeds) - len(missing)
     progress(done, len(seeds))
     task = partial(record_to, env_id=args.env_id, policy=args.policy, settings=args.settings, folder=folder)
-    crew = Crew(args.workers, args.backend, args.address)
-    dispatch(task, missing, crew, lambda k, _: progress(done + k, len(seeds)))
+    crew = ParallelConfig(args.workers, args.backend, args.address)
+    parallel_map(task, missing, crew, lambda k, _: progress(done + k, len(seeds)))
     return [_place(folder, s) for s in seeds]
 
 
@@ -176,7 +176,7 @@ def main(argv: list[str] | None = None) -> int:
         with stage("recording", console, seconds) as progress:
             files = record_all(args, progress)
         folder, kept = assemble(args, files)
-    except REFUSED as error:
+    except USAGE_ERRORS as error:
         print(f"asm-gym collect: {error}", file=sys.stderr)
         return 2
     steps = sum(map(len, kept))

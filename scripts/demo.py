@@ -24,18 +24,18 @@ import tyro
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from asm_gym.detection import conformal_episodes
+from asm_gym.detection.detector import conformal_episodes
 from asm_gym.evaluation import plots
 from asm_gym.evaluation.metrics import Row, Share, binomial_interval, summarise
 from asm_gym.evaluation.report import detection_table, headline, outcome_table, write_report
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
 from asm_gym.faults import Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
+from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.video import Scene, film, prepare_film
+from asm_gym.rollouts.watch import Trial, watch_pair
 from asm_gym.scripts.collect import collect, episode_seeds
-from asm_gym.scripts.dispatch import dispatch
-from asm_gym.scripts.film import Scene, film, prepare_film
-from asm_gym.scripts.progress import stage
-from asm_gym.scripts.watch import Trial, watch_pair
 from asm_gym.tasks import task
 
 WINDOW_S = 1.0
@@ -269,7 +269,7 @@ def run(args: Args, console: Console) -> list[Row]:
     todo = trials(args)
     with timed("testing, policy alone and wrapped") as progress:
         work = partial(watch_pair, env_id=args.task, policy="scripted", memory=folder / "lift.asm")
-        traces = [trace for pair in dispatch(work, todo, args.workers, progress) for trace in pair]
+        traces = [trace for pair in parallel_map(work, todo, args.workers, progress) for trace in pair]
     rows = summarise(traces, WINDOW_S)
     latency = observe_latency_us(memory)
     show(console, rows, args.on_alarm)

@@ -20,20 +20,20 @@ import tyro
 from rich.console import Console
 
 from asm_gym.choices import check_choice
-from asm_gym.detection import conformal_episodes
+from asm_gym.detection.detector import conformal_episodes
 from asm_gym.evaluation.archive import Label
+from asm_gym.evaluation.publish import brief_tables, publish
+from asm_gym.evaluation.text_tables import console_table
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, possible, suite_fault
 from asm_gym.monitors import MONITORS
 from asm_gym.policies import make_policy
-from asm_gym.scripts.claims import claim_folder
-from asm_gym.scripts.dispatch import Crew, Progress, dispatch
-from asm_gym.scripts.film import Scene, film, prepare_film
-from asm_gym.scripts.judge import Judgement, calibrated, judge
-from asm_gym.scripts.progress import stage
-from asm_gym.scripts.publish import brief_tables, publish
-from asm_gym.scripts.record import EXECUTIONS, Course, draw_onset, episode_seeds, record
-from asm_gym.scripts.refused import REFUSED
-from asm_gym.scripts.tables import console_table
+from asm_gym.rollouts.benchmark import Judgement, calibrated, judge
+from asm_gym.rollouts.folder import claim_folder
+from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
+from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.record import EXECUTIONS, Course, draw_onset, episode_seeds, record
+from asm_gym.rollouts.video import Scene, film, prepare_film
+from asm_gym.scripts.command import USAGE_ERRORS
 from asm_gym.tasks import task as task_spec
 
 _HARMLESS = (*HARMLESS, *EXECUTIONS)
@@ -139,8 +139,8 @@ class Args:
         )
 
     @property
-    def crew(self) -> Crew:
-        return Crew(self.workers, self.backend, self.address)
+    def crew(self) -> ParallelConfig:
+        return ParallelConfig(self.workers, self.backend, self.address)
 
 
 def labels(args: Args) -> list[Label]:
@@ -170,14 +170,14 @@ def labels(args: Args) -> list[Label]:
     return made
 
 
-def record_all(args: Args, wanted: Sequence[Label], crew: Crew, progress: Progress) -> None:
+def record_all(args: Args, wanted: Sequence[Label], crew: ParallelConfig, progress: Progress) -> None:
     """Records the episodes that are not there yet."""
     missing = [label for label in wanted if not (args.out / label.path).is_file()]
     done = len(wanted) - len(missing)
     progress(done, len(wanted))
     course = Course(args.robot, args.policy)
     task = partial(record, course=course, folder=args.out.resolve())
-    dispatch(task, missing, crew, lambda k, _: progress(done + k, len(wanted)))
+    parallel_map(task, missing, crew, lambda k, _: progress(done + k, len(wanted)))
 
 
 def claim(args: Args) -> None:
@@ -243,7 +243,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = tyro.cli(Args, args=argv, prog="asm-gym evaluate", description=__doc__).scaled()
         judgement = evaluate(args, console)
-    except REFUSED as error:
+    except USAGE_ERRORS as error:
         print(f"asm-gym evaluate: {error}", file=sys.stderr)
         return 2
     for table in brief_tables(judgement):

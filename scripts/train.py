@@ -22,14 +22,14 @@ from asm_gym.choices import check_choice
 from asm_gym.datasets import load_episode, read_dataset
 from asm_gym.episodes import Episode
 from asm_gym.policies.network import NetworkPolicy
+from asm_gym.rollouts.folder import claim_folder
+from asm_gym.rollouts.parallel import Progress
+from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.training.learners import ALGORITHMS
+from asm_gym.rollouts.training.run import BEST, CLONE, Plan, Run, success_rate
 from asm_gym.scripts import collect
-from asm_gym.scripts.claims import claim_folder
 from asm_gym.scripts.collect import episode_seeds
-from asm_gym.scripts.dispatch import Progress
-from asm_gym.scripts.progress import stage
-from asm_gym.scripts.refused import REFUSED
-from asm_gym.scripts.training.learners import ALGORITHMS
-from asm_gym.scripts.training.run import BEST, CLONE, Plan, Run, success_rate
+from asm_gym.scripts.command import USAGE_ERRORS
 from asm_gym.tasks import task as task_spec
 
 
@@ -196,7 +196,7 @@ def main(argv: list[str] | None = None) -> int:
         keys = ("env_id", "algorithm", "robot", "demonstrations", "dataset", "cloning_updates", "seed")
         claim_folder(args.out, "train.json", {key: getattr(args, key) for key in keys})
         result = train(args, console)
-    except REFUSED as error:
+    except USAGE_ERRORS as error:
         print(f"asm-gym train: {error}", file=sys.stderr)
         return 2
     console.print(f"success {result['success']:.0%} of {args.final_episodes} episodes: {args.out / 'agent.npz'}")

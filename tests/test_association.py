@@ -14,7 +14,7 @@ from asm_gym.memory.association import (
 )
 from asm_gym.memory.network import Network, initial_weights
 from asm_gym.memory.precision import LARGEST, SMALLEST, learn_precision, log_variance
-from asm_gym.memory.senses import Reading
+from asm_gym.scaling import ScaledRows
 from tests.problems import CHANGES, some_association
 
 
@@ -45,7 +45,7 @@ def test_network_reports_the_errors_of_association_in_the_spread_that_is_expecte
     seen = np.ones_like(x)
     seen[1, 3] = 0
     whole = seen.min(axis=1, keepdims=True)
-    found, units = network.associate(Reading(x, seen, u, inputs, inputs[:, CHANGES], whole, np.ones((2, 7), bool)))
+    found, units = network.associate(ScaledRows(x, seen, u, inputs, inputs[:, CHANGES], whole, np.ones((2, 7), bool)))
     expected, _ = network.follow(z, u, x, seen)
     np.testing.assert_allclose(expected, np.tanh(z) @ w.W_H.T + u @ w.W_U.T, atol=1e-5)
     V, U, D, W_S, b_S = association

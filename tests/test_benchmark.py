@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.gru import GRU
+from asm_gym.monitors.baselines.gru import GRU
 from asm_gym.scripts.benchmark import main
-from asm_gym.scripts.benchmark_experts import Attempt, _row, attempt
-from asm_gym.scripts.benchmark_fit import errors
-from asm_gym.scripts.benchmark_memory import PlainTorch, synthetic
+from asm_gym.scripts.benchmark.experts import Attempt, _row, attempt
+from asm_gym.scripts.benchmark.fit import errors
+from asm_gym.scripts.benchmark.memory import PlainTorch, synthetic
 
 
 @pytest.mark.parametrize("channels", [5, 23])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asm_gym.memory.checkpoint import read_checkpoint, write_checkpoint
+from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 
 
 def test_checkpoint_keeps_every_bit(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asm_gym.detection import (
+from asm_gym.detection.detector import (
     Detector,
     Run,
     accumulate,
@@ -20,8 +20,8 @@ from asm_gym.detection import (
     whitening,
     worst_case,
 )
-from asm_gym.memory.habituation import USUAL, habituate
-from asm_gym.memory.repetition import LIGHT
+from asm_gym.detection.habituation import USUAL, habituate
+from asm_gym.detection.repetition import LIGHT
 
 
 def correlated(rng: np.random.Generator, n: int = 4000, size: int = 5) -> np.ndarray:

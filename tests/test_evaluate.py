@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from asm_gym.evaluation.archive import Label, read
-from asm_gym.scripts.dispatch import Crew, dispatch
+from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
+from asm_gym.rollouts.record import Course, draw_onset, record
 from asm_gym.scripts.evaluate import Args, labels, main
-from asm_gym.scripts.record import Course, draw_onset, record
 
 MONITORS = ("neural_asm", "kalman+evidence", "autoregression", "force_limit")
 SMALL = [
@@ -141,9 +141,9 @@ def test_a_cluster_that_loses_a_worker_makes_the_same_recordings(tmp_path):
                 workers[0].kill()
 
         job = _Recorder(there)
-        dispatch(job, wanted, Crew(2, "dask", address), kill_one)
+        parallel_map(job, wanted, ParallelConfig(2, "dask", address), kill_one)
         assert workers[0].wait(10) != 0
-        dispatch(_Recorder(here), wanted, 1)
+        parallel_map(_Recorder(here), wanted, 1)
         for label in wanted:
             a, b = read(here / label.path), read(there / label.path)
             np.testing.assert_array_equal(a.episode.stream, b.episode.stream)

@@ -13,9 +13,9 @@ from asm_gym.policies.scripted.base import ObservationReader, Style, grasping, g
 from asm_gym.policies.scripted.door import _about
 from asm_gym.policies.scripted.handover import Hammer, Meeting
 from asm_gym.policies.scripted.two_arms import Hand, move_arm
-from asm_gym.scripts.benchmark_experts import attempt
+from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.scripts.benchmark.experts import attempt
 from asm_gym.scripts.collect import collect, episode_seeds
-from asm_gym.scripts.dispatch import dispatch
 
 QUICK = [
     "Stack",
@@ -63,7 +63,7 @@ def test_other_arms_solve_it_too(task, robot):
 def test_other_arms_succeed_on_most_of_100_seeds(task, robot):
     # The IIWA, whose bin is at the end of its reach, solves 92 of 100: its bar leaves room for other seeds.
     least = 85 if (task, robot) == ("PickPlaceCan", "IIWA") else 95
-    made = dispatch(partial(attempt, task=task, robot=robot), episode_seeds(99, 100), 2)
+    made = parallel_map(partial(attempt, task=task, robot=robot), episode_seeds(99, 100), 2)
     assert sum(m.solved for m in made) >= least
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.memory.senses import Senses
 from asm_gym.monitors import NeuralASM
+from asm_gym.scaling import StreamScaler
 from tests.streams import sine_episodes, sine_spec
 
 LAG = 3
@@ -73,7 +73,7 @@ def test_a_whole_episode_is_read_as_its_rows_are(fast):
 def test_changes_are_standardised_over_as_many_rows():
     streams = [e.stream for e in sine_episodes(5)]
     by_hand = np.concatenate([s[LAG:].astype(np.float64) - s[:-LAG] for s in streams]).std(axis=0)
-    np.testing.assert_allclose(Senses.fit(FAST, streams, LAG).change, by_hand)
+    np.testing.assert_allclose(StreamScaler.fit(FAST, streams, LAG).change, by_hand)
 
 
 def test_side_by_side_is_as_one_by_one_whenever_each_began(fast):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from asm_gym import faults
-from asm_gym.envs.ledger import Ledger
+from asm_gym.envs.edits import SimulatorEdits
 from asm_gym.faults import Bias, FrozenEncoder, GripperOpens, Push, StuckJoint, WeakJoint, make_fault
 from asm_gym.faults.base import SHAPES
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, harmless_variation, possible, suite_fault
@@ -114,7 +114,7 @@ def test_severities_grow(stack, course):
 
 
 def test_edits_of_one_number_compose_and_end_in_any_order():
-    ledger, array = Ledger(), np.array([0.3, 5.0])
+    ledger, array = SimulatorEdits(), np.array([0.3, 5.0])
     nominal = array.copy()
     double, add = ledger.hold(array, 0), ledger.hold(array, 0)
     double.change(lambda v: 2 * v)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from asm_gym.evaluation.archive import Label, Recording
-from asm_gym.scripts.judge import fitted
+from asm_gym.rollouts.benchmark import fitted
 from tests.streams import sine_episodes
 
 

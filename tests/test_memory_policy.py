@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from asm_gym.episodes import Episode
 from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, situation
-from asm_gym.memory.senses import Senses
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.grip import ENOUGH, FORGETS, Readout
 from asm_gym.policies.memory_policy import StreamReader, common_spec
+from asm_gym.scaling import StreamScaler
 from asm_gym.stream import Channel, StreamSpec
 
 SMALL: dict[str, Any] = {"hidden_size": 8, "association_size": 8, "epochs": 1}
@@ -109,7 +109,7 @@ def scene() -> StreamSpec:
 def test_rates_and_commands_are_not_read_and_distances_finely():
     spec = scene()
     assert fineness(spec).tolist() == [PLACED, PLACED, 0, 0, 1, 1, FINE, FINE, 0, 0]
-    senses = Senses(spec, np.full(10, 1.0), np.full(10, 2.0), np.ones(10))
+    senses = StreamScaler(spec, np.full(10, 1.0), np.full(10, 2.0), np.ones(10))
     row = np.arange(10.0)[None]
     expected = [PLACED * (0 - 1) / 2, 0.0, 3 / 2, 4 / 2, FINE * 5 / 2, FINE * 6 / 2, 1.0]
     np.testing.assert_allclose(situation(senses, row)[0], expected)
@@ -119,7 +119,7 @@ def test_rates_and_commands_are_not_read_and_distances_finely():
 
 def test_a_situation_is_paired_with_what_was_intended_next():
     spec = scene()
-    senses = Senses(spec, np.zeros(10), np.ones(10), np.ones(10))
+    senses = StreamScaler(spec, np.zeros(10), np.ones(10), np.ones(10))
     stream = np.arange(40.0).reshape(4, 10)
     done = Episode.from_stream(stream, spec)
     intended = replace(done, actions=np.full((4, 2), 7.0, np.float32))

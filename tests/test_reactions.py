@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pytest
 
-from asm_gym.evaluation.reactions import Reaction, bootstrap, compare, gain, reduction
+from asm_gym.evaluation.intervention import Reaction, bootstrap, compare, gain, reduction
 from asm_gym.evaluation.trace import POLICY_ALONE
-from asm_gym.scripts.bout import NOMINAL, PASSING, Bout
+from asm_gym.rollouts.bout import NOMINAL, PASSING, Bout
 from asm_gym.scripts.evaluate import main as evaluate
-from asm_gym.scripts.react import Args, bouts, main
+from asm_gym.scripts.reproduce.reflexes import Args, bouts, main
 
 
 def reaction(seed: int, acting: str, **changes) -> Reaction:

@@ -13,7 +13,7 @@ from asm_gym.memory.inference import motor_prediction
 from asm_gym.memory.learning import Learner, Schedule, Trajectory
 from asm_gym.memory.network import Network, initial_weights
 from asm_gym.memory.recall import at_rest, follow, run_on, to_rows
-from asm_gym.memory.rehearsal import LONGEST_CUE, Rehearsal, one_after_another
+from asm_gym.memory.scheduled_sampling import LONGEST_CUE, Rehearsal, one_after_another
 from asm_gym.monitors import NeuralASM
 from tests.streams import sine_episodes, sine_spec
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from asm_gym.evaluation.repertoire import Spread, naming_figure, share_right
-from asm_gym.scripts import evaluate, repertoire
-from asm_gym.scripts.switching import NAMES, Switch, record_switch
+from asm_gym.scripts import evaluate
+from asm_gym.scripts.reproduce import repertoire
+from asm_gym.scripts.reproduce.skill_switch import NAMES, Switch, record_switch
 from tests.streams import sine_spec
 
 RIGHT = [np.array([False, True, True]), np.array([False, False, True, False])]

@@ -1,4 +1,4 @@
-"""Senses that say the same twice: counted in nominal streams, and held against how rare that was."""
+"""StreamScaler that say the same twice: counted in nominal streams, and held against how rare that was."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.memory.repetition import (
+from asm_gym.detection.repetition import (
     FADING,
     LIGHT,
     SURE,

@@ -5,8 +5,8 @@ import pytest
 
 from asm_gym.episodes import Episode
 from asm_gym.monitors import MONITORS, make_monitor
-from asm_gym.monitors.autoregression import Autoregression
-from asm_gym.monitors.limits import ExternalTorqueLimit, ForceLimit
+from asm_gym.monitors.baselines.autoregression import Autoregression
+from asm_gym.monitors.baselines.limits import ExternalTorqueLimit, ForceLimit
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from tests.streams import sine_episodes, sine_spec
 

@@ -11,11 +11,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.safe_training import COUNTED, Outcome, count, counts_table, learning_figure, worth, worth_table
+from asm_gym.rollouts.training.exploration import Explorer, Gentle, until_contact
+from asm_gym.rollouts.training.learners import NOVICE_LOG_STD, make_learner, make_novice
+from asm_gym.rollouts.training.safe_run import AT_LIMIT, read_outcome
+from asm_gym.rollouts.training.violations import TorqueWatch
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.training.exploration import Explorer, Gentle, until_contact
-from asm_gym.scripts.training.learners import NOVICE_LOG_STD, make_learner, make_novice
-from asm_gym.scripts.training.safe_run import AT_LIMIT, read_outcome
-from asm_gym.scripts.training.violations import TorqueWatch
 from asm_gym.stream import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from tests.fakes import CueMonitor, FakeEnv

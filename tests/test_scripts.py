@@ -8,11 +8,11 @@ import pytest
 from asm_gym.evaluation.metrics import Share
 from asm_gym.evaluation.trace import POLICY_ALONE
 from asm_gym.faults import FrozenEncoder, Push
+from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.watch import Trial, watch
 from asm_gym.scripts import demo
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.collect import collect, episode_seeds
-from asm_gym.scripts.dispatch import dispatch
-from asm_gym.scripts.watch import Trial, watch
 from asm_gym.wrappers import StreamRecorder
 from tests.fakes import FakeEnv
 
@@ -42,18 +42,18 @@ def test_bad_counts_are_refused():
     with pytest.raises(ValueError, match=r"episodes.*0"):
         collect("asm_gym/Lift-v0", episodes=0)
     with pytest.raises(ValueError, match=r"workers.*0"):
-        dispatch(abs, [1], 0)
+        parallel_map(abs, [1], 0)
 
 
 def test_dispatch_keeps_the_order_and_reports_progress():
     seen = []
-    assert dispatch(abs, [-3, 1, -2], 2, lambda done, total: seen.append((done, total))) == [3, 1, 2]
+    assert parallel_map(abs, [-3, 1, -2], 2, lambda done, total: seen.append((done, total))) == [3, 1, 2]
     assert seen == [(1, 3), (2, 3), (3, 3)]
 
 
 def test_what_a_task_raises_is_raised_here():
     with pytest.raises(TypeError):
-        dispatch(abs, ["a"], 2)
+        parallel_map(abs, ["a"], 2)
 
 
 def test_the_recorder_keeps_whole_and_cut_short_episodes():

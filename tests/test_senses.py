@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from asm_gym.memory.senses import FARTHEST, Senses
+from asm_gym.scaling import FARTHEST, StreamScaler
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("slow", 1), Channel("fast", 2), Channel("action", 1, group=MOTOR)), dt=0.05)
@@ -20,7 +20,7 @@ def streams():
 
 
 def test_of_slow_channels_the_change_is_sensed_too_and_of_all_it_is_judged(streams):
-    senses = Senses.fit(SPEC, streams)
+    senses = StreamScaler.fit(SPEC, streams)
     assert senses.slow.tolist() == [0]
     assert senses.size == 4
     assert senses.changes == slice(4, 7)
@@ -28,12 +28,12 @@ def test_of_slow_channels_the_change_is_sensed_too_and_of_all_it_is_judged(strea
 
 def test_groups_are_those_of_the_spec_or_where_it_has_one_only_every_number_its_own(streams):
     channels = Channel("a", 2, group="joint"), Channel("b", 1, group="hand"), Channel("action", 1, group=MOTOR)
-    assert Senses.fit(StreamSpec(channels, dt=0.1), streams).groups.tolist() == [1, 1, 0]
-    assert Senses.fit(SPEC, streams).groups.tolist() == [0, 1, 2]
+    assert StreamScaler.fit(StreamSpec(channels, dt=0.1), streams).groups.tolist() == [1, 1, 0]
+    assert StreamScaler.fit(SPEC, streams).groups.tolist() == [0, 1, 2]
 
 
 def test_values_and_changes_are_standardised_by_hand(streams):
-    senses = Senses.fit(SPEC, streams)
+    senses = StreamScaler.fit(SPEC, streams)
     row, before, earlier = np.array([[1.0, 2.0, 3.0, 0.5], [0.9, 0.0, 0.0, 0.0], [0.7, 9.0, 9.0, 9.0]])[:, None]
     reading = senses.read(row, before, earlier)
     rows = np.concatenate(streams).astype(np.float64)
@@ -50,7 +50,7 @@ def test_values_and_changes_are_standardised_by_hand(streams):
 
 
 def test_a_gap_hides_the_value_and_the_changes_on_both_its_sides(streams):
-    senses = Senses.fit(SPEC, streams)
+    senses = StreamScaler.fit(SPEC, streams)
     good, gap = np.ones((1, 4)), np.array([[np.nan, 1.0, 1.0, 1.0]])
     assert senses.read(gap, good, good).seen[0].tolist() == [0, 1, 1, 0]
     assert senses.read(good, gap, good).seen[0].tolist() == [1, 1, 1, 0]
@@ -61,7 +61,7 @@ def test_a_gap_hides_the_value_and_the_changes_on_both_its_sides(streams):
 
 
 def test_huge_numbers_are_cut_off_and_stay_finite(streams):
-    senses = Senses.fit(SPEC, streams)
+    senses = StreamScaler.fit(SPEC, streams)
     reading = senses.read(np.full((1, 4), 1.7e308), np.full((1, 4), -1.7e308), np.zeros((1, 4)))
     assert (reading.senses == FARTHEST).all()
     assert (reading.changes == FARTHEST).all()

@@ -14,7 +14,7 @@ from PIL import ImageColor
 
 from asm_gym.evaluation import overlay
 from asm_gym.evaluation.overlay import StripChart, compose
-from asm_gym.wrappers.surprise_overlay import SurpriseOverlay
+from asm_gym.wrappers.overlay import SurpriseOverlay
 
 RED, ORANGE, CURVE = (np.array(ImageColor.getrgb(c)) for c in (overlay._ALARM, overlay._FAULT, overlay._CURVE))
 GREY = np.full((120, 200, 3), 128, np.uint8)

@@ -17,11 +17,11 @@ from stable_baselines3.common.logger import configure
 from asm_gym.datasets import write_dataset
 from asm_gym.episodes import Episode
 from asm_gym.policies.network import NetworkPolicy
+from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
+from asm_gym.rollouts.training.learners import ALGORITHMS, RECIPES, export, make_learner, warm_critic
+from asm_gym.rollouts.training.run import Plan, Run, Standard
+from asm_gym.rollouts.training.state import Progressed, newest, resume, save
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
-from asm_gym.scripts.training.learners import ALGORITHMS, RECIPES, export, make_learner, warm_critic
-from asm_gym.scripts.training.run import Plan, Run, Standard
-from asm_gym.scripts.training.state import Progressed, newest, resume, save
 from asm_gym.stream import StreamSpec
 
 PENDULUM = ["train", "Pendulum-v1", "--demonstrations", "0", "--evaluation-episodes", "1", "--final-episodes", "1"]

@@ -1,9 +1,9 @@
 """Gymnasium wrappers: safety, faults, streams and pictures."""
 
-from asm_gym.wrappers.fault_injection import FaultInjection
+from asm_gym.wrappers.faults import FaultInjection
+from asm_gym.wrappers.overlay import SurpriseOverlay
+from asm_gym.wrappers.recording import StreamRecorder
 from asm_gym.wrappers.safety import NeuralASMSafety
-from asm_gym.wrappers.stream_recorder import StreamRecorder
-from asm_gym.wrappers.surprise_overlay import SurpriseOverlay
-from asm_gym.wrappers.vector_safety import VectorNeuralASMSafety
+from asm_gym.wrappers.vector import VectorNeuralASMSafety
 
 __all__ = ["FaultInjection", "NeuralASMSafety", "StreamRecorder", "SurpriseOverlay", "VectorNeuralASMSafety"]

@@ -19,7 +19,7 @@ from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract
 from asm_gym.stream import control_period
 from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Patience, Verdict
-from asm_gym.wrappers.stream_recorder import StreamSource
+from asm_gym.wrappers.recording import StreamSource
 
 REFLEXES: dict[str, Callable[[gym.Env[Any, Any]], Policy]] = {
     "hold": Hold,

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from asm_gym.choices import check_choice
 from asm_gym.envs import backend
+from asm_gym.envs.cameras import RENDER_MODES, Pictures
+from asm_gym.envs.edits import SimulatorEdits
 from asm_gym.envs.layout import Layout
-from asm_gym.envs.ledger import Ledger
-from asm_gym.envs.pictures import RENDER_MODES, Pictures
 from asm_gym.envs.rewards import Rewards, RewardTerms
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS
 from asm_gym.envs.simulation import Simulation
@@ -112,7 +112,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """Sensor faults: each edits the measured row (channels of ``measured_spec``) in place, after the noise."""
         self.deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]] = []
         """Action faults: each makes of the action that was sent the one that arrives."""
-        self.edits = Ledger()
+        self.edits = SimulatorEdits()
         """Changes of the simulator's numbers that are to be undone."""
         self.substep_hooks: list[Callable[[int], None]] = []
         """Called after every physics substep with its number in the control step; ``measure()`` says what the sensors

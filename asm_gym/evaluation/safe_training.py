@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from asm_gym.evaluation.intervention import Estimate, bootstrap, gain, reduction
 from asm_gym.evaluation.plots import figure, look
-from asm_gym.evaluation.reactions import Estimate, bootstrap, gain, reduction
 from asm_gym.evaluation.repertoire import Spread
 from asm_gym.evaluation.report import Table
 

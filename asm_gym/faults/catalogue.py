@@ -7,7 +7,7 @@ import re
 from typing import Any
 
 from asm_gym.choices import check_choice
-from asm_gym.faults import action, actuator, body, harmless, sensor, thing
+from asm_gym.faults import action, actuator, body, harmless, object, sensor
 from asm_gym.faults.base import Fault
 
 _EVERY: tuple[type[Fault], ...] = (
@@ -38,11 +38,11 @@ _EVERY: tuple[type[Fault], ...] = (
     action.SignFlip,
     action.ActionNoise,
     action.Adversary,
-    thing.Slip,
-    thing.Snatch,
-    thing.Teleport,
-    thing.Missing,
-    thing.Heavy,
+    object.Slip,
+    object.Snatch,
+    object.Teleport,
+    object.Missing,
+    object.Heavy,
     harmless.Touch,
     harmless.ObjectMass,
     harmless.ObjectFriction,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults.base import Apply, Fault, held, listed, model_of
 from asm_gym.faults.body import Push
-from asm_gym.faults.thing import ObjectFault
+from asm_gym.faults.object import ObjectFault
 
 
 @dataclass(frozen=True, kw_only=True)

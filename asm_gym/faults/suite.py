@@ -12,7 +12,7 @@ import numpy as np
 
 from asm_gym.choices import check_choice
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults import action, actuator, body, harmless, sensor, thing
+from asm_gym.faults import action, actuator, body, harmless, object, sensor
 from asm_gym.faults.base import Fault
 
 SEVERITIES = ("mild", "medium", "strong")
@@ -94,11 +94,13 @@ KINDS: dict[str, Kind] = {
     "action_noise": lambda d, s: action.ActionNoise(share=_at(s, 0.15, 0.4, 1.0), **d.when),
     "adversary": lambda d, s: action.Adversary(size=_at(s, 0.05, 0.15, 0.4), **d.when),
     # object
-    "slip": lambda d, s: thing.Slip(friction=_at(s, 0.4, 0.15, 0.03), **d.when),
-    "snatch": lambda d, s: thing.Snatch(newtons=_at(s, 3, 10, 30), direction=d.direction, duration=10, **d.when),
-    "teleport": lambda d, s: thing.Teleport(offset=(_at(s, 0.01, 0.03, 0.08), _at(s, 0.01, 0.03, 0.08), 0.0), **d.when),
-    "heavy_object": lambda d, s: thing.Heavy(kilograms=_at(s, 0.1, 0.4, 1.5), **d.when),
-    "missing_object": lambda d, _: thing.Missing(**d.when),
+    "slip": lambda d, s: object.Slip(friction=_at(s, 0.4, 0.15, 0.03), **d.when),
+    "snatch": lambda d, s: object.Snatch(newtons=_at(s, 3, 10, 30), direction=d.direction, duration=10, **d.when),
+    "teleport": lambda d, s: object.Teleport(
+        offset=(_at(s, 0.01, 0.03, 0.08), _at(s, 0.01, 0.03, 0.08), 0.0), **d.when
+    ),
+    "heavy_object": lambda d, s: object.Heavy(kilograms=_at(s, 0.1, 0.4, 1.5), **d.when),
+    "missing_object": lambda d, _: object.Missing(**d.when),
 }
 """A fault of each kind for an episode, at severity 0 to 2."""
 

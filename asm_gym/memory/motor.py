@@ -29,7 +29,7 @@ from asm_gym.episodes import Episode
 from asm_gym.memory.association import association_change, complete, hidden_units
 from asm_gym.memory.energy import Array
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
-from asm_gym.memory.senses import Senses
+from asm_gym.scaling import StreamScaler
 from asm_gym.stream import MOTOR, StreamSpec
 
 UPDATES, PASSES = 12_000, 100
@@ -64,7 +64,7 @@ def fineness(spec: StreamSpec) -> NDArray[np.float64]:
     return np.array([of(c.name, c.unit, c.group) for c in spec.channels for _ in range(c.size)])
 
 
-def situation(senses: Senses, rows: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+def situation(senses: StreamScaler, rows: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
     """m (B, I) of rows (B, D); 0 where a number is not finite."""
     kappa = fineness(senses.spec)
     read = np.flatnonzero(kappa)
@@ -87,13 +87,13 @@ class Motor(NamedTuple):
         expected = complete(hidden_units(m, self.V), m, self.U, self.D)
         return (self.mean + self.spread * expected).astype(np.float32)
 
-    def named(self, senses: Senses) -> dict[str, NDArray[Any]]:
+    def named(self, senses: StreamScaler) -> dict[str, NDArray[Any]]:
         """As a checkpoint keeps them, and κ, without which they mean something else."""
         arrays = {**self._asdict(), "kappa": fineness(senses.spec)}
         return {f"motor_{name}": array for name, array in arrays.items()}
 
     @classmethod
-    def found(cls, learned: Mapping[str, NDArray[Any]], senses: Senses) -> Self | None:
+    def found(cls, learned: Mapping[str, NDArray[Any]], senses: StreamScaler) -> Self | None:
         """What ``named`` put there; None where it is not. Raises ValueError where it does not fit the senses."""
         if "motor_U" not in learned:
             return None
@@ -114,7 +114,7 @@ class Motor(NamedTuple):
         return cls(**{name: learned[f"motor_{name}"] for name in shapes})
 
 
-def lessons(senses: Senses, episodes: Sequence[Episode]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def lessons(senses: StreamScaler, episodes: Sequence[Episode]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Situations (N, I), and what was to be commanded next in each (N, A).
 
     That is what ``episode.actions`` says, which may differ from what was executed, where somebody disturbed it (DART:

@@ -17,8 +17,8 @@ from asm_gym.memory.energy import Array
 from asm_gym.memory.inference import Weights, expect, infer, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory, learn, passes
 from asm_gym.memory.precision import PRECISION_EPOCHS
-from asm_gym.memory.rehearsal import rehearse
-from asm_gym.memory.senses import Reading
+from asm_gym.memory.scheduled_sampling import rehearse
+from asm_gym.scaling import ScaledRows
 
 
 def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> Weights:
@@ -60,7 +60,7 @@ class Network:
     def hidden_size(self) -> int:
         return self.weights.W_H.shape[0]
 
-    def associate(self, reading: Reading) -> tuple[Array, Array]:
+    def associate(self, reading: ScaledRows) -> tuple[Array, Array]:
         """(Δ_t - Δ̂_t)/σ_t (B, X), 0 where a row was not whole; and f(h_t) (B, M) of association."""
         error, units = normalised_errors(reading.inputs, reading.changes, reading.whole, *self.association)
         return error, units

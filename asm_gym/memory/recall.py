@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from asm_gym.memory.energy import Array, outward
 from asm_gym.memory.inference import motor_prediction, sense
 from asm_gym.memory.network import Network
-from asm_gym.memory.senses import Senses
+from asm_gym.scaling import StreamScaler
 
 
 class Recalled(NamedTuple):
@@ -42,7 +42,7 @@ def follow(network: Network, z: Array, senses: Array, commands: Array) -> Recall
 
     Args:
         z: (B, H) the state before the first row.
-        senses: (T, B, S) as a ``Reading`` has them; not a number where unseen.
+        senses: (T, B, S) as a ``ScaledRows`` has them; not a number where unseen.
         commands: (T, B, A + 1), the last one a constant 1.
     """
     w, steps = network.weights, []
@@ -64,7 +64,7 @@ def run_on(network: Network, z: Array, steps: int) -> Recalled:
     return _stacked(made)
 
 
-def to_rows(reader: Senses, recalled: Recalled) -> NDArray[np.float64]:
+def to_rows(reader: StreamScaler, recalled: Recalled) -> NDArray[np.float64]:
     """What was expected, (T, B, D) in the units of the stream."""
     T, B, _ = recalled.senses.shape
     sensory, motor = reader.spec.sensory, reader.spec.motor
@@ -75,7 +75,9 @@ def to_rows(reader: Senses, recalled: Recalled) -> NDArray[np.float64]:
     return rows
 
 
-def continued(network: Network, reader: Senses, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
+def continued(
+    network: Network, reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int
+) -> NDArray[np.float64]:
     """(steps, D) rows that come after a cue (T, D), in the units of the stream. Raises as ``check_cue`` does."""
     rows, lag = check_cue(reader, cue, steps), reader.lag
     # Every l-th row follows from those l apart: as many threads of rows, recalled side by side.
@@ -86,7 +88,7 @@ def continued(network: Network, reader: Senses, cue: NDArray[np.floating[Any]], 
     return recalled.reshape(-1, reader.spec.size)[:steps]
 
 
-def check_cue(reader: Senses, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
+def check_cue(reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
     """The cue (T, D) to recall ``steps`` rows from. Raises ValueError unless it can be recalled from."""
     rows, least = np.asarray(cue, np.float64), 2 * reader.lag
     if rows.ndim != 2:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from asm_gym.memory.energy import activate
 from asm_gym.memory.network import Network
-from asm_gym.memory.senses import Reading
+from asm_gym.scaling import ScaledRows
 
 Rows = NDArray[np.float64]
 
@@ -44,7 +44,9 @@ def past(state: MemoryState, rows: Rows) -> tuple[Rows, Rows]:
     return before, earlier
 
 
-def carry_on(network: Network, state: MemoryState, reading: Reading) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def carry_on(
+    network: Network, state: MemoryState, reading: ScaledRows
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """z and f(μ) (B, H) after a row, which are as they were in streams whose turn it is not."""
     due = state.steps % state.before.shape[1] == 0
     if not due.any():

@@ -7,8 +7,8 @@ from typing import Any
 
 from asm_gym.choices import check_choice
 from asm_gym.monitors.base import Monitor, Surprise
+from asm_gym.monitors.baselines.base import EVIDENCE, Baseline, with_evidence
 from asm_gym.monitors.neural_asm import NeuralASM
-from asm_gym.monitors.rival import EVIDENCE, Rival, with_evidence
 from asm_gym.stream import StreamSpec
 
 __all__ = ["EVIDENCE", "MONITORS", "Monitor", "NeuralASM", "Surprise", "make_monitor", "monitor_class"]
@@ -40,8 +40,8 @@ def monitor_class(name: str) -> type[Any]:
     if name == "neural_asm":
         return NeuralASM
     module, _, attribute = (_RIVALS | _LIMITS)[name.removesuffix(EVIDENCE)].partition(":")
-    found: type[Any] = getattr(importlib.import_module(f"asm_gym.monitors.{module}"), attribute)
-    return with_evidence(found) if name.endswith(EVIDENCE) and issubclass(found, Rival) else found
+    found: type[Any] = getattr(importlib.import_module(f"asm_gym.monitors.baselines.{module}"), attribute)
+    return with_evidence(found) if name.endswith(EVIDENCE) and issubclass(found, Baseline) else found
 
 
 def make_monitor(name: str, spec: StreamSpec, **kwargs: Any) -> Monitor:

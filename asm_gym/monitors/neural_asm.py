@@ -14,19 +14,19 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.episodes import Episode
+from asm_gym.memory.adaptation import followed
 from asm_gym.memory.association import Association, association_shapes, hidden_units, synapses
 from asm_gym.memory.inference import Weights, motor_prediction, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
 from asm_gym.memory.network import Network, train
-from asm_gym.memory.online import followed
 from asm_gym.memory.readout import add_up, learn_readout, running
 from asm_gym.memory.recall import continued
-from asm_gym.memory.senses import Senses, rows_apart
 from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past
 from asm_gym.monitors.base import Surprise
-from asm_gym.monitors.calibrated import Progress, require
+from asm_gym.monitors.monitor import Progress, require
 from asm_gym.monitors.predictive import BOUND, GAINS, PredictiveMonitor, PredictiveState
+from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.stream import StreamSpec
 
 
@@ -104,7 +104,7 @@ class NeuralASM(PredictiveMonitor):
     def learn_model(
         self, streams: Sequence[NDArray[np.float32]], rng: np.random.Generator, progress: Progress
     ) -> dict[str, NDArray[Any]]:
-        senses = Senses.fit(self.spec, streams, self._lag)
+        senses = StreamScaler.fit(self.spec, streams, self._lag)
         readings = [senses.read_episode(s) for s in streams]
         lag = self._lag
         trajectories = [Trajectory(r.senses[::lag], r.commands[::lag], r.inputs) for r in readings]
@@ -118,7 +118,7 @@ class NeuralASM(PredictiveMonitor):
     def build_model(self) -> None:
         found = self.learned_
         self.energy_ = found["energy"]
-        self.senses_ = senses = Senses(self.spec, found["mean"], found["spread"], found["change"], self._lag)
+        self.senses_ = senses = StreamScaler(self.spec, found["mean"], found["spread"], found["change"], self._lag)
         X, A = len(self.spec.sensory), len(self.spec.motor)
         units = self._units_each(senses) * (int(senses.groups.max()) + 1)
         shapes = weight_shapes(self.hidden_size, senses.size, A) | association_shapes(senses.inputs, units, X)
@@ -291,6 +291,6 @@ class NeuralASM(PredictiveMonitor):
         """l."""
         return rows_apart(self.spec.dt)
 
-    def _units_each(self, senses: Senses) -> int:
+    def _units_each(self, senses: StreamScaler) -> int:
         """Hidden units of association for each group."""
         return max(1, self.association_size // (int(senses.groups.max()) + 1))

@@ -10,10 +10,10 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection import TINY, Detector, Evidence, Run, pool
-from asm_gym.memory.repetition import Repetition, count_repetitions, improbability, repeated, unrepeated
+from asm_gym.detection.detector import TINY, Detector, Evidence, Run, pool
+from asm_gym.detection.repetition import Repetition, count_repetitions, improbability, repeated, unrepeated
 from asm_gym.monitors.base import State
-from asm_gym.monitors.calibrated import CalibratedMonitor, Progress, require, side_by_side
+from asm_gym.monitors.monitor import CalibratedMonitor, Progress, require, side_by_side
 from asm_gym.stream import StreamSpec
 
 GAINS = (0.8, 0.2, 0.05)

@@ -21,13 +21,13 @@ from torch import Tensor, nn
 
 from asm_gym.episodes import Episode
 from asm_gym.memory.motor import fineness, lessons, situation
-from asm_gym.memory.senses import Senses
-from asm_gym.monitors.torch_model import adam, descend, padded
+from asm_gym.monitors.baselines.torch_model import adam, descend, padded
 from asm_gym.policies import make_policy
 from asm_gym.policies.grip import Grip, Readout
 from asm_gym.policies.memory_policy import StreamReader, common_spec, require_motor
 from asm_gym.policies.scripted.base import Style
-from asm_gym.scripts.dispatch import environment
+from asm_gym.rollouts.parallel import environment
+from asm_gym.scaling import StreamScaler
 from asm_gym.stream import StreamSpec
 
 GROUPS = ("hand", "gripper", "object", "action")
@@ -108,7 +108,9 @@ class CloneState(NamedTuple):
 class Clone:
     """A GRU that was trained to do as the expert does; ``bound`` to an environment it is a policy."""
 
-    def __init__(self, senses: Senses, module: Cloned, mean: NDArray[np.float32], spread: NDArray[np.float32]) -> None:
+    def __init__(
+        self, senses: StreamScaler, module: Cloned, mean: NDArray[np.float32], spread: NDArray[np.float32]
+    ) -> None:
         self.senses, self.module, self.mean, self.spread = senses, module, mean, spread
 
     @classmethod
@@ -117,7 +119,7 @@ class Clone:
     ) -> Clone:
         """By backpropagation through whole episodes, 16 at a time."""
         torch.set_num_threads(1)
-        senses = Senses.fit(episodes[0].spec, [e.stream for e in episodes])
+        senses = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
         taught = [lessons(senses, [e]) for e in episodes]
         every = np.concatenate([a for _, a in taught])
         mean, spread = every.mean(axis=0), every.std(axis=0)

@@ -25,10 +25,10 @@ from asm_gym.evaluation.archive import Label, read
 from asm_gym.evaluation.plots import save
 from asm_gym.evaluation.repertoire import Spread
 from asm_gym.evaluation.report import Table
-from asm_gym.scripts.dispatch import dispatch
-from asm_gym.scripts.progress import stage
-from asm_gym.scripts.record import Course, episode_seeds, record
-from asm_gym.scripts.tables import console_table, markdown
+from asm_gym.evaluation.text_tables import console_table, markdown
+from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.record import Course, episode_seeds, record
 
 Record = dict[str, Any]
 """One measurement: what was varied, the seed, and what came out."""
@@ -142,7 +142,7 @@ def recorded(args: Common, labels: Sequence[Label], console: Console, seconds: d
     missing = [label for label in labels if not (args.out / label.path).is_file()]
     if missing:
         with stage("recording robosuite episodes", console, seconds) as progress:
-            dispatch(partial(record, course=Course(), folder=args.out.resolve()), missing, args.workers, progress)
+            parallel_map(partial(record, course=Course(), folder=args.out.resolve()), missing, args.workers, progress)
     return [read(args.out / label.path).episode for label in labels]
 
 

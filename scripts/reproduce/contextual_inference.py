@@ -23,8 +23,8 @@ from scipy.optimize import linear_sum_assignment
 from asm_gym.choices import check_choice
 from asm_gym.episodes import Episode
 from asm_gym.memory.readout import certainty, learn_readout
-from asm_gym.scripts.dispatch import dispatch
-from asm_gym.scripts.progress import stage
+from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.reproduce.common import (
     SKILLS,
     Common,
@@ -265,14 +265,14 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     """Letters for every seed, then robosuite."""
     args = args.scaled()
     with stage("learning letters", console, seconds) as progress:
-        found = dispatch(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
+        found = parallel_map(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
     records = [r for own, _ in found for r in own]
     if args.robot_episodes:
         train = demonstrations(args, SKILLS, "fit", args.robot_episodes, console, seconds)
         tests = demonstrations(args, SKILLS, "nominal", 15, console, seconds)
         with stage("learning robosuite skills", console, seconds) as progress:
             one = partial(robot, train=train, tests=tests, args=args)
-            for own in dispatch(one, list(args.repetitions), args.workers, progress):
+            for own in parallel_map(one, list(args.repetitions), args.workers, progress):
                 records += own
     return Findings(
         records, tables(records, len(set(args.skills))), drawn(records, found[0][1]), {"letter_steps": STEPS}

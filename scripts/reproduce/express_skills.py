@@ -26,9 +26,9 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.base import Policy
 from asm_gym.policies.registry import EXPERTS
-from asm_gym.scripts.dispatch import dispatch, environment
-from asm_gym.scripts.progress import stage
-from asm_gym.scripts.record import episode_seeds
+from asm_gym.rollouts.parallel import environment, parallel_map
+from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.record import episode_seeds
 from asm_gym.scripts.reproduce.apprentices import CONSISTENT, SETTINGS, Clone, demonstrate, stream_of
 from asm_gym.scripts.reproduce.common import (
     Common,
@@ -200,15 +200,15 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     spec = stream_of(args.tasks)
     plan = [(t, s) for t in args.tasks for s in episode_seeds(0, t, "demonstrate", args.demonstrations)]
     with stage("demonstrating", console, seconds) as progress:
-        shown_ones = dispatch(partial(demonstrate, spec=spec), plan, args.workers, progress)
+        shown_ones = parallel_map(partial(demonstrate, spec=spec), plan, args.workers, progress)
     episodes = [e for e in shown_ones if e is not None]
     # Those who take longest first, so that nobody waits for the last of them.
     pupils = [(m, s) for m in ("gru", "memory") for s in args.repetitions]
     with stage("learning", console, seconds) as progress:
-        learned = dispatch(partial(learn, episodes=episodes, args=args), pupils, args.workers, progress)
+        learned = parallel_map(partial(learn, episodes=episodes, args=args), pupils, args.workers, progress)
     brains = {(p.model, p.seed): p.brain for p in learned}
     with stage("acting", console, seconds) as progress:
-        found = dispatch(partial(attempt, brains=brains), trials(args), args.workers, progress)
+        found = parallel_map(partial(attempt, brains=brains), trials(args), args.workers, progress)
     records = [r for each in found for r in each]
     facts = {
         "demonstrations": {t: sum(e.info["skill"] == t for e in episodes) for t in args.tasks},

@@ -18,9 +18,9 @@ from asm_gym.memory.association import Association, association_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, initial_weights
 from asm_gym.memory.recall import Recalled, at_rest, follow, run_on, to_rows
-from asm_gym.memory.rehearsal import rehearse
-from asm_gym.memory.senses import Senses
-from asm_gym.monitors.skill_library import SkillLibrary
+from asm_gym.memory.scheduled_sampling import rehearse
+from asm_gym.monitors.baselines.skill_library import SkillLibrary
+from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import recurrent
 
 Rows = NDArray[np.float64]
@@ -34,13 +34,13 @@ class Expresser(Protocol):
         ...
 
 
-def read(reader: Senses, streams: Rows) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Senses (T, B, S) and commands (T, B, A + 1) of streams (T, B, D)."""
+def read(reader: StreamScaler, streams: Rows) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """StreamScaler (T, B, S) and commands (T, B, A + 1) of streams (T, B, D)."""
     readings = [reader.read_episode(streams[:, n]) for n in range(streams.shape[1])]
     return np.stack([r.senses for r in readings], axis=1), np.stack([r.commands for r in readings], axis=1)
 
 
-def trajectories(reader: Senses, episodes: Sequence[Episode]) -> list[Trajectory]:
+def trajectories(reader: StreamScaler, episodes: Sequence[Episode]) -> list[Trajectory]:
     """Episodes as a network reads them."""
     readings = [reader.read_episode(e.stream) for e in episodes]
     return [Trajectory(r.senses, r.commands, r.inputs) for r in readings]
@@ -50,7 +50,7 @@ def trajectories(reader: Senses, episodes: Sequence[Episode]) -> list[Trajectory
 class Memory:
     """The temporal predictive coding network alone: nothing is judged here, so there is no association."""
 
-    reader: Senses
+    reader: StreamScaler
     network: Network
 
     @classmethod
@@ -70,7 +70,7 @@ class Memory:
             steps: in which its synapses change, with 32 episodes side by side.
             carry_prior, iterations, rate: as in ``NeuralASM``.
         """
-        reader = Senses.fit(episodes[0].spec, [e.stream for e in episodes])
+        reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
         learned = trajectories(reader, episodes)
         weights = initial_weights(hidden, reader.size, len(reader.spec.motor), rng)
         size = 32
@@ -100,7 +100,7 @@ def unassociated() -> Association:
 class Backpropagated:
     """A recurrent network trained by backpropagation through time."""
 
-    reader: Senses
+    reader: StreamScaler
     network: Any
 
     @classmethod
@@ -115,7 +115,7 @@ class Backpropagated:
         rate: float = 1e-2,
     ) -> Backpropagated:
         """From whole episodes; the other arguments are those of ``recurrent.train``."""
-        reader = Senses.fit(episodes[0].spec, [e.stream for e in episodes])
+        reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
         learned = trajectories(reader, episodes)
         return cls(reader, recurrent.train(learned, cell, hidden, updates, rng, noise, rate))
 
@@ -133,7 +133,7 @@ class Hopfield:
     The distance is the scaled dot product for keys whose lengths differ. Source: Ramsauer et al. 2021 (ICLR).
     """
 
-    reader: Senses
+    reader: StreamScaler
     keys: NDArray[np.float64]  # (N, window · D)
     values: NDArray[np.float64]  # (N, D)
     window: int
@@ -142,7 +142,7 @@ class Hopfield:
     @classmethod
     def learned(cls, episodes: Sequence[Episode], window: int = 5, beta: float = 100.0) -> Hopfield:
         """Every window of ``window`` rows, with what followed it; the first windows reach back before the episode."""
-        reader = Senses.fit(episodes[0].spec, [e.stream for e in episodes])
+        reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
         keys, values = [], []
         for e in episodes:
             rows = (e.stream - reader.mean) / reader.spread

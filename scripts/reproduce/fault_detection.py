@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from asm_gym.choices import check_choice
-from asm_gym.detection import conformal_episodes, conformal_threshold
+from asm_gym.detection.detector import conformal_episodes, conformal_threshold
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.metrics import auroc
 from asm_gym.evaluation.plots import figure, look
 from asm_gym.evaluation.report import Table
 from asm_gym.faults.suite import KINDS, SEVERITIES
 from asm_gym.monitors import NeuralASM, make_monitor
-from asm_gym.scripts.dispatch import dispatch
-from asm_gym.scripts.progress import stage
+from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.reproduce.common import (
     SENSED,
     SKILLS,
@@ -246,13 +246,13 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     """Letters for every seed, then robosuite."""
     args = args.scaled()
     with stage("letters", console, seconds) as progress:
-        found = dispatch(partial(_letters, args=args), list(args.repetitions), args.workers, progress)
+        found = parallel_map(partial(_letters, args=args), list(args.repetitions), args.workers, progress)
     if args.robot_episodes:
         faults = args.faults, args.severity, args.faulty_episodes
         trial = robot_trial(args, args.tasks, args.robot_episodes, *faults, console, seconds)
         with stage("robosuite", console, seconds) as progress:
             one = partial(judged, trial=trial, args=args)
-            found += dispatch(one, list(args.repetitions), args.workers, progress)
+            found += parallel_map(one, list(args.repetitions), args.workers, progress)
     records = [r for own, _ in found for r in own]
     example = found[-1][1]
     facts = {"false_alarm_rate": RATE, "example": {k: np.asarray(v).tolist() for k, v in example.items()}}

@@ -26,9 +26,9 @@ from asm_gym.evaluation.report import Table
 from asm_gym.memory.inference import Weights
 from asm_gym.memory.learning import Batch, Learner, Schedule, Trajectory, batches, cosine_decay, side_by_side
 from asm_gym.memory.network import initial_weights
-from asm_gym.memory.senses import Senses
-from asm_gym.scripts.dispatch import dispatch
-from asm_gym.scripts.progress import stage
+from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.progress import stage
+from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce.common import (
     Common,
     Findings,
@@ -98,7 +98,7 @@ def one_seed(seed: int, args: Args) -> list[Record]:
     rng = np.random.default_rng(seed)
     letters = repertoire(args.skills, 2, rng)
     train, tests = copybook(letters, args.writings, 2, rng), copybook(letters, 2, 2, rng)
-    reader = Senses.fit(train[0].spec, [e.stream for e in train])
+    reader = StreamScaler.fit(train[0].spec, [e.stream for e in train])
     learned, judged = trajectories(reader, train), side_by_side(trajectories(reader, tests))
     weights = initial_weights(args.hidden, reader.size, 2, rng)
     probe, start = side_by_side(learned[:: max(1, len(learned) // 16)]), Weights(*(w.copy() for w in weights))
@@ -259,7 +259,7 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     """Every seed, then the costs."""
     args = args.scaled()
     with stage("learning both ways", console, seconds) as progress:
-        found = dispatch(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
+        found = parallel_map(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
     with stage("measuring costs", console, seconds):
         records = [r for own in found for r in own] + costs(args)
     return Findings(records, tables(records, args), drawn(records, args), {"rates": RATES})

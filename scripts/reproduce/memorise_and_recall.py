@@ -20,8 +20,8 @@ from rich.console import Console
 
 from asm_gym.evaluation.plots import figure, look
 from asm_gym.evaluation.report import Table
-from asm_gym.scripts.dispatch import dispatch
-from asm_gym.scripts.progress import stage
+from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.reproduce import robot_recall
 from asm_gym.scripts.reproduce.common import (
     SENSED,
@@ -243,7 +243,7 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     # The longest first, so that no process is left with one of them at the end.
     jobs += [partial(letters, condition, args) for condition in conditions(args)]
     with stage("learning", console, seconds) as progress:
-        records = [r for found in dispatch(_done, jobs, args.workers, progress) for r in found]
+        records = [r for found in parallel_map(_done, jobs, args.workers, progress) for r in found]
     return Findings(records, tables(records, args), drawn(records, args), {})
 
 

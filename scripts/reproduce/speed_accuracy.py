@@ -30,8 +30,8 @@ from asm_gym.evaluation.plots import figure, look
 from asm_gym.evaluation.report import Table
 from asm_gym.memory.network import Network
 from asm_gym.memory.recall import at_rest, follow
-from asm_gym.scripts.dispatch import dispatch
-from asm_gym.scripts.progress import stage
+from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.reproduce.common import (
     Common,
     Findings,
@@ -268,7 +268,7 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     """Every seed."""
     args = args.scaled()
     with stage("learning letters", console, seconds) as progress:
-        found = dispatch(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
+        found = parallel_map(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
     records = [r for own in found for r in own]
     laws = {f"{value}, {law}": one._asdict() for (value, law), one in fits(records).items()}
     return Findings(records, tables(records, args), drawn(records, args), {"laws": laws, "letter_steps": STEPS})

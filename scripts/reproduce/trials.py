@@ -11,7 +11,7 @@ from rich.console import Console
 
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.archive import Label
-from asm_gym.scripts.record import draw_onset, episode_seeds
+from asm_gym.rollouts.record import draw_onset, episode_seeds
 from asm_gym.scripts.reproduce.common import Common, demonstrations, recorded
 from asm_gym.scripts.reproduce.handwriting import copybook, repertoire
 from asm_gym.scripts.reproduce.speed_accuracy import slips

@@ -1,0 +1,1 @@
+"""From prediction errors to evidence, and from evidence to an alarm."""

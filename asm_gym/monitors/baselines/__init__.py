@@ -1,0 +1,1 @@
+"""Every rival of the Neural ASM."""

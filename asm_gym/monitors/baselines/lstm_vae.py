@@ -1,0 +1,144 @@
+"""LSTM-VAE: a variational autoencoder over time, and a threshold that depends on its latent state.
+
+Source: Park, Hoshi and Kemp 2018 (IEEE RA-L 3(3)), “A multimodal anomaly detector for robot-assisted feeding using an
+LSTM-based variational autoencoder”: denoising, a prior that moves on with the episode's progress, the negative log
+likelihood as score, and its expected value, which a support vector regression takes from the latent state, deducted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.svm import SVR
+from torch import Tensor, nn
+
+from asm_gym.detection.detector import Run
+from asm_gym.monitors.base import State
+from asm_gym.monitors.baselines.base import Rows, no_rows, read
+from asm_gym.monitors.baselines.torch_model import TorchModel, adam, descend, padded
+from asm_gym.monitors.monitor import Progress
+from asm_gym.scaling import ScaledRows
+
+HIDDEN, LATENT = 128, 16
+UPDATES, EPOCHS, BATCH = 1500, 60, 16
+CORRUPTION = 0.1
+"""Standard deviation of the noise that the encoder's inputs are corrupted with."""
+REGRESSED = 3000
+"""Steps that the threshold is learned from; a support vector regression takes the square of their number in time."""
+
+
+class _Cell(NamedTuple):
+    hidden: NDArray[np.float32]  # (B, H)
+    cell: NDArray[np.float32]  # (B, H)
+
+
+class _Memory(NamedTuple):
+    encoder: _Cell
+    decoder: _Cell
+    latent: NDArray[np.float32]  # (B, Z) mean of z_t
+    seen: Rows
+
+
+class _Module(nn.Module):
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.encoder = nn.LSTM(size, HIDDEN, batch_first=True)
+        self.to_latent = nn.Linear(HIDDEN, 2 * LATENT)
+        self.decoder = nn.LSTM(LATENT, HIDDEN, batch_first=True)
+        self.out = nn.Linear(HIDDEN, 2 * size)
+
+    def encode(self, x: Tensor, state: Any = None) -> tuple[Tensor, Tensor, Any]:
+        hidden, state = self.encoder(x, state)
+        mean, log_variance = self.to_latent(hidden).chunk(2, dim=-1)
+        return mean, log_variance.clamp(-8.0, 4.0), state
+
+    def decode(self, z: Tensor, state: Any = None) -> tuple[Tensor, Tensor, Any]:
+        hidden, state = self.decoder(z, state)
+        mean, log_variance = self.out(hidden).chunk(2, dim=-1)
+        return mean, log_variance.clamp(-8.0, 4.0), state
+
+
+class LSTMVAE(TorchModel):
+    """A recurrent variational autoencoder of values and changes; the arguments are those of ``PredictiveMonitor``."""
+
+    kind = "lstm_vae"
+
+    def module(self) -> nn.Module:
+        return _Module(self.senses_.size)
+
+    @property
+    def judged(self) -> NDArray[np.intp]:
+        return np.concatenate([self.spec.sensory, self.senses_.slow])
+
+    def train(
+        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
+    ) -> None:
+        assert isinstance(module, _Module)
+        each = -(-len(readings) // BATCH)
+        epochs = max(1, min(EPOCHS, UPDATES // each))
+        optimiser, schedule = adam(module, epochs * each)
+        longest = max(len(r.senses) for r in readings)
+        # The centre of the prior moves through the latent space as the episode goes on.
+        centre = torch.linspace(-1.0, 1.0, longest)[None, :, None]
+        for epoch in range(epochs):
+            tell(epoch, epochs)
+            order = rng.permutation(len(readings))
+            for start in range(0, len(order), BATCH):
+                x, real = padded([readings[i].senses for i in order[start : start + BATCH]])
+                mean, log_variance, _ = module.encode(x + CORRUPTION * torch.randn_like(x))
+                z = mean + torch.exp(0.5 * log_variance) * torch.randn_like(mean)
+                rebuilt, spread, _ = module.decode(z)
+                likelihood = 0.5 * (spread + (x - rebuilt) ** 2 * torch.exp(-spread)).sum(dim=-1)
+                prior = (mean - centre[:, : x.shape[1]]) ** 2
+                divergence = 0.5 * (log_variance.exp() + prior - 1.0 - log_variance).sum(dim=-1)
+                descend(((likelihood + divergence) * real).sum() / real.sum(), optimiser, schedule)
+
+    def start_model(self, batch: int) -> _Memory:
+        nothing = _Cell(np.zeros((batch, HIDDEN), np.float32), np.zeros((batch, HIDDEN), np.float32))
+        return _Memory(nothing, nothing, np.zeros((batch, LATENT), np.float32), no_rows(batch, self.spec.size))
+
+    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, NDArray[Any], NDArray[Any]]:
+        assert isinstance(self.module_, _Module)
+        r = read(self.senses_, state.seen, rows)
+        z, _, encoder = self.module_.encode(torch.from_numpy(r.senses)[:, None], _torch(state.encoder))
+        mean, log_variance, decoder = self.module_.decode(z, _torch(state.decoder))
+        error = r.seen * (r.senses - mean.numpy()[:, 0]) * np.exp(-0.5 * log_variance.numpy()[:, 0])
+        latent = z.numpy()[:, 0]
+        return _Memory(_numpy(encoder), _numpy(decoder), latent, state.seen.then(rows)), error, latent
+
+    def learn_score(self, runs: Sequence[Run]) -> dict[str, NDArray[Any]]:
+        contexts = np.concatenate([r.contexts for r in runs])
+        scores = 0.5 * (np.concatenate([r.errors for r in runs]) ** 2).sum(axis=1)
+        chosen = np.random.default_rng(self.seed).permutation(len(scores))[:REGRESSED]
+        centre, spread = contexts.mean(axis=0), np.maximum(contexts.std(axis=0), 1e-6)
+        machine = SVR(C=10.0, gamma=1.0 / LATENT, epsilon=0.1)
+        machine.fit((contexts[chosen] - centre) / spread, np.log(scores[chosen] + 1e-6))
+        return {
+            "centre": centre.astype(np.float64),
+            "scale": spread.astype(np.float64),
+            "support": machine.support_vectors_,
+            "pull": machine.dual_coef_[0],
+            "offset": machine.intercept_,
+        }
+
+    def published(self, model: State, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The negative log likelihood over what is expected of it in this latent state."""
+        found = self.learned_
+        z = (model.latent - found["centre"]) / found["scale"]
+        distance = ((z[:, None] - found["support"]) ** 2).sum(axis=-1)  # (B, support vectors)
+        usual = np.exp(np.exp(-distance / LATENT) @ found["pull"] + found["offset"])
+        parts: NDArray[np.float64] = 0.5 * errors**2 / usual[:, None]
+        return parts
+
+
+def _torch(state: _Cell) -> tuple[Tensor, Tensor]:
+    hidden, cell = (torch.from_numpy(np.ascontiguousarray(s))[None] for s in state)
+    return hidden, cell
+
+
+def _numpy(state: tuple[Tensor, Tensor]) -> _Cell:
+    return _Cell(state[0].numpy()[0], state[1].numpy()[0])

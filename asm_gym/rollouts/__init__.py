@@ -1,0 +1,1 @@
+"""Runs episodes: trials, collections, folders of runs, parallel work."""

@@ -1,0 +1,296 @@
+"""Fits every monitor on the nominal recordings, and asks each what it makes of all the others."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import asm_gym
+from asm_gym.detection.detector import conformal_episodes, conformal_threshold
+from asm_gym.evaluation import comparison
+from asm_gym.evaluation.archive import Label, Recording, read
+from asm_gym.evaluation.comparison import IDEAL, RATES, Cell, Score, Sight
+from asm_gym.evaluation.ideal import earliest, noise_floor, separation
+from asm_gym.evaluation.metrics import Share, window_steps
+from asm_gym.evaluation.scoring import Verdict, coverage
+from asm_gym.evaluation.trace import POLICY_ALONE, Trace
+from asm_gym.monitors import EVIDENCE, Monitor, make_monitor, monitor_class
+from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
+
+EXAMPLES = ("push", "collision", "weak_joint", "frozen_encoder", "snatch")
+"""Kinds of which the report shows an episode."""
+
+
+NOMINAL = ("fit", "calibration", "nominal")
+"""Roles of the episodes that nothing is done to."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the monitors said of a run's episodes.
+
+    Args:
+        verdicts: of nominal and faulty episodes, by monitor.
+        harmless: of harmless variations, by monitor.
+        thresholds: by monitor and by the false-alarm rate they were set for.
+        sights: what an ideal observer could see.
+        rate, window_s: the run's own.
+        failed: nominal episodes that did not succeed; they are left out.
+        examples: a typical faulty episode of some kinds, as the first monitor saw it.
+        shown: which those are.
+    """
+
+    verdicts: Mapping[str, Sequence[Verdict]]
+    harmless: Mapping[str, Sequence[Verdict]]
+    thresholds: Mapping[str, Mapping[float, float]]
+    sights: Sequence[Sight]
+    rate: float
+    window_s: float
+    failed: int = 0
+    examples: Sequence[Trace] = ()
+    shown: Sequence[Label] = ()
+
+    @cached_property
+    def visible(self) -> dict[tuple[str, str], bool]:
+        return comparison.visible_kinds(self.sights)
+
+    @cached_property
+    def cells(self) -> dict[str, dict[tuple[str, str], Cell]]:
+        """Each monitor's score on each kind, the ideal observer's first."""
+        kinds = self.visible
+        ideal = {k: comparison.ideal_cell([s for s in self.sights if (s.kind, s.severity) == k]) for k in kinds}
+        return {IDEAL: ideal} | {
+            m: comparison.by_kind(v, self.thresholds[m], self.rate, self.window_s) for m, v in self.verdicts.items()
+        }
+
+    @cached_property
+    def scores(self) -> list[Score]:
+        """A row for each monitor."""
+        return [
+            comparison.score(m, v, self.thresholds[m], self.rate, self.window_s, self.visible)
+            for m, v in self.verdicts.items()
+        ]
+
+    def ideal(self) -> Cell:
+        """The bound, over the kinds that can be seen."""
+        return comparison.ideal_cell([s for s in self.sights if self.visible[(s.kind, s.severity)]])
+
+    def cries(self) -> dict[str, dict[str, Share]]:
+        """Episodes of each harmless variation with an alarm, by monitor."""
+        return {
+            m: {k: coverage([x for x in v if x.kind == k], self.thresholds[m][self.rate]) for k in _kinds(v)}
+            for m, v in self.harmless.items()
+        }
+
+
+class Opinion(NamedTuple):
+    """What one monitor said."""
+
+    verdicts: list[Verdict]
+    harmless: list[Verdict]
+    thresholds: dict[float, float]
+    examples: dict[Label, Trace]
+
+
+def judge(
+    folder: Path,
+    labels: Sequence[Label],
+    monitors: Sequence[str],
+    rate: float,
+    window_s: float,
+    seed: int,
+    crew: ParallelConfig,
+    progress: Progress,
+) -> Judgement:
+    """Reads the recordings, and lets every monitor judge them.
+
+    Args:
+        folder: of the run.
+        labels: its episodes; those of roles fit and calibration are learned from, all others judged.
+        seed: of the monitors.
+        crew: who judges; each monitor is one task.
+    """
+    progress(0, len(monitors))
+    # One that is judged in two ways is fitted once.
+    models: dict[str, list[str]] = {}
+    for name in monitors:
+        models.setdefault(name.removesuffix(EVIDENCE), []).append(name)
+    opine = partial(_opinions, folder=folder.resolve(), labels=tuple(labels), rate=rate, seed=seed)
+    made = parallel_map(
+        opine, list(models.values()), crew, lambda k, n: progress(k * len(monitors) // n, len(monitors))
+    )
+    found = {name: opinion for opinions in made for name, opinion in opinions.items()}
+    opinions = {name: found[name] for name in monitors}
+    by_role, failed, twins = sorted_by_role(recordings_of(folder, labels))
+    return Judgement(
+        {n: o.verdicts for n, o in opinions.items()},
+        {n: o.harmless for n, o in opinions.items()},
+        {n: o.thresholds for n, o in opinions.items()},
+        sights_of(twins, by_role.get("faulty", []), window_s),
+        rate,
+        window_s,
+        failed,
+        list(opinions[monitors[0]].examples.values()),
+        list(opinions[monitors[0]].examples),
+    )
+
+
+def _opinions(
+    names: Sequence[str], folder: Path, labels: Sequence[Label], rate: float, seed: int
+) -> dict[str, Opinion]:
+    by_role, _, _ = sorted_by_role(recordings_of(folder, labels))
+    return {name: opinion_of(name, folder, by_role, rate, seed) for name in names}
+
+
+def opinion_of(name: str, folder: Path, by_role: Mapping[str, Sequence[Recording]], rate: float, seed: int) -> Opinion:
+    monitor = fitted(folder, name, by_role["fit"], seed)
+    maxima = np.array([s.value.max() for s in _scores(monitor, by_role["calibration"])])
+    rates = sorted({rate, *(r for r in RATES if len(maxima) >= conformal_episodes(r))})
+    thresholds = {r: conformal_threshold(maxima, r) for r in rates}
+    tested = [*by_role["nominal"], *by_role.get("faulty", [])]
+    verdicts = _verdicts(name, monitor, tested, thresholds[rate])
+    harmless = _verdicts(name, monitor, by_role.get("harmless", []), thresholds[rate])
+    return Opinion(verdicts, harmless, thresholds, _examples(monitor, verdicts, tested, thresholds[rate]))
+
+
+def recordings_of(folder: Path, labels: Sequence[Label]) -> list[Recording]:
+    """Read from the folder of a run."""
+    return [read(folder / label.path) for label in labels]
+
+
+def sorted_by_role(recordings: Sequence[Recording]) -> tuple[dict[str, list[Recording]], int, list[Recording]]:
+    """Recordings by role, how many nominal ones failed and are not among them, and all twins of faulty ones."""
+    by_role: dict[str, list[Recording]] = {}
+    failed = 0
+    for recording in recordings:
+        role = recording.label.role
+        # A nominal episode that fails is no example of what should feel normal, nor an alarm in it a false one.
+        if role in NOMINAL and not recording.episode.success:
+            failed += 1
+        else:
+            by_role.setdefault(role, []).append(recording)
+    for role in NOMINAL:
+        if not by_role.get(role):
+            raise ValueError(f"none of the {role} episodes succeeded: there is nothing normal to learn or to test on")
+    twins = [r for r in recordings if r.label.role == "nominal"]
+    return by_role, failed, twins
+
+
+def fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) -> Monitor:
+    """The monitor fitted on these episodes; kept in the folder for the next time, under the name of what it learned."""
+    spec = recordings[0].episode.spec
+    model = name.removesuffix(EVIDENCE)
+    made: Any = make_monitor(name, spec, seed=seed)
+    learned = model, asm_gym.__version__, made.get_params(), sorted(str(r.label.path) for r in recordings)
+    digest = hashlib.sha256(json.dumps(learned, default=str).encode())
+    path = folder / "monitors" / f"{model}-{digest.hexdigest()[:12]}.asm"
+    # One that cannot be read, for it is damaged or of an older asm-gym, is made anew.
+    with suppress(FileNotFoundError, ValueError):
+        loaded: Monitor = monitor_class(name).load(path)
+        return loaded
+    monitor: Monitor = made.fit([r.episode for r in recordings])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    monitor.save(path)
+    return monitor
+
+
+def calibrated(folder: Path, name: str, labels: Sequence[Label], seed: int, threshold: float) -> Any:
+    """The monitor as it judged the run, with the threshold it judged by."""
+    by_role, _, _ = sorted_by_role(recordings_of(folder, [label for label in labels if label.role in NOMINAL]))
+    monitor: Any = fitted(folder, name, by_role["fit"], seed)
+    monitor.threshold_ = threshold
+    return monitor
+
+
+def _scores(monitor: Any, recordings: Sequence[Recording]) -> list[Any]:
+    return list(monitor.score_episodes([r.episode for r in recordings])) if recordings else []
+
+
+def _verdicts(name: str, monitor: Monitor, recordings: Sequence[Recording], threshold: float) -> list[Verdict]:
+    made = []
+    for recording, surprise in zip(recordings, _scores(monitor, recordings), strict=True):
+        label, episode = recording.label, recording.episode
+        faulty = label.role == "faulty"
+        verdict = Verdict(
+            task=label.task,
+            monitor=name,
+            kind=label.kind or "nominal",
+            severity=label.severity,
+            seed=label.seed,
+            dt=episode.spec.dt,
+            surprise=surprise.value,
+            onset=label.onset if faulty else None,
+            guilty=recording.guilty,
+        )
+        after = verdict.detected_after(threshold)
+        if after is not None and label.onset is not None:
+            blamed = int(np.argmax(surprise.attribution[label.onset + after]))
+            verdict = Verdict(**{**verdict.__dict__, "blamed": episode.spec.labels[blamed]})
+        made.append(verdict)
+    return made
+
+
+def _examples(
+    monitor: Any, verdicts: Sequence[Verdict], recordings: Sequence[Recording], threshold: float
+) -> dict[Label, Trace]:
+    """Of each of a few kinds, at its strongest, the episode with the median delay."""
+    chosen = []
+    for kind in EXAMPLES:
+        own = [i for i, v in enumerate(verdicts) if v.kind == kind]
+        own = [i for i in own if verdicts[i].severity == verdicts[own[-1]].severity]
+        if own:
+            late = sorted((math.inf if (a := verdicts[i].detected_after(threshold)) is None else a, i) for i in own)
+            chosen.append(late[(len(late) - 1) // 2][1])
+    twins = {(r.label.task, r.label.seed): r.episode.stream for r in recordings if r.label.role == "nominal"}
+    traces = {}
+    for i in chosen:
+        label, episode = recordings[i].label, recordings[i].episode
+        surprise = monitor.score(episode)
+        traces[label] = Trace(
+            condition=" ".join([label.severity, label.kind.replace("_", " "), "in", label.task]),
+            acting=POLICY_ALONE,
+            seed=label.seed,
+            dt=episode.spec.dt,
+            threshold=threshold,
+            surprise=surprise.value,
+            alarm=surprise.value > threshold,
+            fault=episode.faults,
+            contact_force=recordings[i].contact_force,
+            attribution=surprise.attribution,
+            labels=episode.spec.labels,
+            success=episode.success,
+            stream=episode.stream,
+            twin=twins.get((label.task, label.seed)),
+        )
+    return traces
+
+
+def sights_of(nominal: Sequence[Recording], faulty: Sequence[Recording], window_s: float) -> list[Sight]:
+    twins = {(r.label.task, r.label.seed): r.episode.stream for r in nominal}
+    noises: dict[str, Any] = {}
+    sights = []
+    for recording in faulty:
+        label, episode = recording.label, recording.episode
+        if label.task not in noises:
+            own = [r.episode.stream for r in nominal if r.label.task == label.task]
+            noises[label.task] = noise_floor(episode.spec.noise, own)
+        summed = separation(episode.stream, twins[label.task, label.seed], noises[label.task], label.onset or 0)
+        window = summed[: window_steps(window_s, episode.spec.dt)]
+        seen = float(window[-1]) if len(window) else 0.0
+        sights.append(
+            Sight(label.task, label.kind, label.severity, label.seed, seen, earliest(window), episode.spec.dt)
+        )
+    return sights
+
+
+def _kinds(verdicts: Sequence[Verdict]) -> list[str]:
+    return list(dict.fromkeys(v.kind for v in verdicts))

@@ -1,0 +1,200 @@
+r"""What of a stream row the memory reads: values and their changes.
+
+Of a channel that moves little in a step the best prediction is its last value, plus a little. The temporal network
+senses both the value, which says where in a skill the robot is, and the change, which says what is happening now
+(generalised coordinates of motion: Friston 2008, PLOS Comput Biol 4(11)). Association judges the change of every
+channel, given all values before and all other changes.
+
+    s_t = [v_t, Δ_t,slow]      v_t = (x_t - m) / σ      Δ_t = (x_t - x_{t-l}) / σ_Δ      slow:  σ_Δ < 0.3 σ
+    a_t = [v_{t-l}, Δ_t, Δ_{t-l},slow, u_t, 1]
+
+l is 1 at a robot's control rate. Where rows come faster, what moves between two of them drowns in the sensors' noise,
+and the change is taken over the l rows of a twentieth of a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.compilation import compiled
+from asm_gym.stream import StreamSpec
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+SLOW = 0.3
+"""A channel is slow where a step's change is under this share of its spread."""
+
+LAPSE = 0.05
+"""Over how long a change is taken, where rows come faster [s]."""
+
+FARTHEST = 1e3
+"""Where standardised numbers are cut off, so that no finite row can overflow.
+
+A number that far out is judged, but nothing is expected from it: one broken sense should not make all look wrong.
+"""
+
+
+class ScaledRows(NamedTuple):
+    """Rows of B streams, as the memory reads them; S numbers are sensed, X changes judged."""
+
+    senses: NDArray[np.float32]  # (B, S) standardised; 0 where unseen
+    seen: NDArray[np.float32]  # (B, S) 1 where there was something to read, else 0
+    commands: NDArray[np.float32]  # (B, A + 1) standardised, then a constant 1
+    inputs: NDArray[np.float32]  # (B, I) of association; 0 where unseen or cut off
+    changes: NDArray[np.float32]  # (B, X) what is judged; 0 where unseen
+    whole: NDArray[np.float32]  # (B, 1) 1 where nothing was unseen in any of the three rows, else 0
+    finite: NDArray[np.bool_]  # (B, D)
+
+
+@dataclass(frozen=True, eq=False)
+class StreamScaler:
+    """Standardises rows of a stream.
+
+    Args:
+        spec: of the stream.
+        mean: (D,) of the training rows [unit of each channel].
+        spread: (D,) their standard deviation.
+        change: (D,) standard deviation of the change over ``lag`` rows.
+        lag: l, how many rows later the change of a row is taken.
+    """
+
+    spec: StreamSpec
+    mean: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    change: NDArray[np.float64]
+    lag: int = 1
+
+    @classmethod
+    def fit(cls, spec: StreamSpec, streams: Sequence[NDArray[np.float32]], lag: int = 1) -> Self:
+        """From training episodes (T, D) each, of more than ``lag`` rows."""
+        rows = np.concatenate(streams).astype(np.float64)  # (N, D)
+        steps = np.concatenate([s[lag:].astype(np.float64) - s[:-lag] for s in streams])
+        mean = rows.mean(axis=0)
+        spread = _spread(rows, mean, spec.noise)
+        change = steps.std(axis=0)
+        return cls(spec, mean, spread, np.where(change > 0, change, spread), lag)
+
+    @cached_property
+    def slow(self) -> NDArray[np.intp]:
+        """(S - X,) columns of the stream whose change is sensed too."""
+        slow = self.change < SLOW * self.spread
+        slow[self.spec.motor] = False
+        return np.flatnonzero(slow)
+
+    @cached_property
+    def size(self) -> int:
+        """S."""
+        return len(self.spec.sensory) + len(self.slow)
+
+    @cached_property
+    def changes(self) -> slice:
+        """Where the X changes stand among the inputs."""
+        return slice(self.spec.size, self.spec.size + len(self.spec.sensory))
+
+    @cached_property
+    def groups(self) -> NDArray[np.intp]:
+        """(X,) the group of each change, by number; where all are of one group, every number is its own."""
+        names = [c.group for c in self.spec.channels for _ in range(c.size)]
+        found = np.unique([names[i] for i in self.spec.sensory], return_inverse=True)[1].astype(np.intp)
+        return found if found.any() else np.arange(len(found))
+
+    @cached_property
+    def inputs(self) -> int:
+        """I."""
+        return self.spec.size + len(self.spec.sensory) + len(self.slow) + len(self.spec.motor) + 1
+
+    def read_episode(self, stream: NDArray[np.floating[Any]]) -> ScaledRows:
+        """All rows of an episode (T, D); nothing has moved before the first ``lag``."""
+        before = np.concatenate([stream[: self.lag], stream[: -self.lag]])
+        return self.read(stream, before, np.concatenate([before[: self.lag], before[: -self.lag]]))
+
+    def read(
+        self,
+        rows: NDArray[np.floating[Any]],
+        before: NDArray[np.floating[Any]],
+        earlier: NDArray[np.floating[Any]],
+    ) -> ScaledRows:
+        """Rows (B, D), those ``lag`` rows before, and as long before those; what is not finite is unseen."""
+        x, y, z = (np.ascontiguousarray(r, np.float64) for r in (rows, before, earlier))
+        sensory, motor = self.spec.sensory, self.spec.motor
+        return ScaledRows(*_read(x, y, z, self.mean, self.spread, self.change, sensory, motor, self.slow))
+
+
+@compiled
+def _bounded(number: float) -> float:
+    """Cut off at ``FARTHEST``; what overflowed on both sides of a difference is there already."""
+    return 0.0 if number != number else min(max(number, -FARTHEST), FARTHEST)
+
+
+@compiled
+def _believed(number: float) -> float:
+    """0 where the number would be cut off."""
+    return number if abs(number) < FARTHEST else 0.0
+
+
+@compiled
+def _read(
+    rows: Floats,
+    before: Floats,
+    earlier: Floats,
+    mean: Floats,
+    spread: Floats,
+    change: Floats,
+    sensory: Ints,
+    motor: Ints,
+    slow: Ints,
+) -> tuple[Any, ...]:
+    """The fields of a ``ScaledRows``, in order."""
+    B, D = rows.shape
+    X, A, L = len(sensory), len(motor), len(slow)
+    senses, seen = np.zeros((B, X + L), np.float32), np.zeros((B, X + L), np.float32)
+    commands = np.ones((B, A + 1), np.float32)
+    inputs, changes = np.zeros((B, D + X + L + A + 1), np.float32), np.zeros((B, X), np.float32)
+    whole, finite = np.ones((B, 1), np.float32), np.zeros((B, D), np.bool_)
+    for n in range(B):
+        for i in range(D):
+            finite[n, i] = np.isfinite(rows[n, i])
+            known = np.isfinite(before[n, i])
+            if not (finite[n, i] and known and np.isfinite(earlier[n, i])):
+                whole[n, 0] = 0.0
+            if known:
+                inputs[n, i] = _believed((before[n, i] - mean[i]) / spread[i])
+        for j in range(X):
+            i = sensory[j]
+            if finite[n, i]:
+                senses[n, j], seen[n, j] = _bounded((rows[n, i] - mean[i]) / spread[i]), 1.0
+                if np.isfinite(before[n, i]):
+                    changes[n, j] = _bounded((rows[n, i] - before[n, i]) / change[i])
+                    inputs[n, D + j] = _believed((rows[n, i] - before[n, i]) / change[i])
+        for j in range(L):
+            i = slow[j]
+            if finite[n, i] and np.isfinite(before[n, i]):
+                senses[n, X + j], seen[n, X + j] = _bounded((rows[n, i] - before[n, i]) / change[i]), 1.0
+            if np.isfinite(before[n, i]) and np.isfinite(earlier[n, i]):
+                inputs[n, D + X + j] = _believed((before[n, i] - earlier[n, i]) / change[i])
+        for j in range(A):
+            i = motor[j]
+            commands[n, j] = _bounded((rows[n, i] - mean[i]) / spread[i]) if finite[n, i] else 0.0
+            inputs[n, D + X + L + j] = commands[n, j] if abs(commands[n, j]) < FARTHEST else 0.0
+        inputs[n, D + X + L + A] = 1.0
+    return senses, seen, commands, inputs, changes, whole, finite
+
+
+def rows_apart(dt: float) -> int:
+    """l for rows that come every ``dt`` seconds."""
+    return max(1, round(LAPSE / dt))
+
+
+def _spread(rows: NDArray[np.float64], mean: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(D,) standard deviation of each column; of one that never changes its sensor noise, or 1 where that is 0."""
+    spread = rows.std(axis=0)
+    constant = spread <= 1e-6 * np.abs(mean)  # the rounding of float32 is not a signal
+    fallback: NDArray[np.float64] = np.where(noise > 0, noise, 1.0)
+    return np.where(constant, fallback, spread)

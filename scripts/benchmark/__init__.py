@@ -1,0 +1,216 @@
+"""``python -m asm_gym.scripts.benchmark <what>``: speeds as ratios against a rival in the same run, and experts.
+
+Machines differ and are noisy: rivals take turns, step by step, and the medians of their turns are compared.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import track
+
+import asm_gym  # noqa: F401  (registers the environments)
+from asm_gym.envs.backend import import_robosuite
+from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.text_tables import console_table
+from asm_gym.scripts.benchmark.experts import Experts
+from asm_gym.scripts.benchmark.fit import Fit
+from asm_gym.scripts.benchmark.memory import Memory, Safety
+from asm_gym.tasks import task as task_spec
+
+
+@dataclass
+class Env:
+    """An environment's steps and resets, against robosuite's own and against MuJoCo alone."""
+
+    task: str = "Lift"
+    """a task's name"""
+    robot: str = "Panda"
+    """the arm, and its twin where the task takes two"""
+    controller: str = "OSC_POSE"
+    """the arm's controller"""
+    steps: int = 400
+    """control steps of each rival"""
+    resets: int = 10
+    """resets of each rival"""
+    seed: int = 0
+    """of the actions"""
+
+    def run(self, console: Console) -> int:
+        """Prints the table."""
+        steps = _take_turns(self._rivals(), self.steps, console)
+        physics, theirs = steps["mj_step only"], steps["robosuite"]
+        table = Table(
+            f"{self.task}, {self.robot}, {self.controller}, 20 Hz: median of {self.steps} control steps",
+            ("", "ms", "steps/s", "against robosuite", "against mj_step"),
+            [
+                (name, f"{1e3 * s:.2f}", f"{1 / s:.0f}", f"{theirs / s:.2f}×", f"{s / physics:.2f}×")
+                for name, s in steps.items()
+            ],
+        )
+        console.print(console_table(table))
+        resets = _take_turns(self._resets(), self.resets, console)
+        default = resets["robosuite, hard (its default)"]
+        rows = [(name, f"{1e3 * s:.1f}", f"{default / s:.1f}×") for name, s in resets.items()]
+        console.print(console_table(Table(f"median of {self.resets} resets", ("", "ms", "against robosuite"), rows)))
+        return 0
+
+    def _make(self, **kwargs: Any) -> Any:
+        kwargs |= {"robot": self.robot, "controller": self.controller, "horizon": 10**9}
+        env = gym.make(f"asm_gym/{self.task}-v0", disable_env_checker=True, **kwargs).unwrapped
+        env.reset(seed=self.seed)
+        return env
+
+    def _robosuite(self, **kwargs: Any) -> Any:
+        robosuite = import_robosuite()
+        configuration = robosuite.load_composite_controller_config(robot=self.robot)
+        if self.controller != "OSC_POSE":
+            part = robosuite.load_part_controller_config(default_controller=self.controller)
+            configuration["body_parts"]["arms"] = {"right": part | {"gripper": {"type": "GRIP"}}}
+        arms = task_spec(self.task).arms
+        env = robosuite.make(
+            self.task,
+            robots=[self.robot] * arms,
+            controller_configs=[configuration] * arms,
+            has_renderer=False,
+            has_offscreen_renderer=False,
+            use_camera_obs=False,
+            reward_shaping=True,
+            ignore_done=True,
+            **kwargs,
+        )
+        env.reset()
+        return env
+
+    def _rivals(self) -> dict[str, Callable[[], Any]]:
+        ours, bare = self._make(), self._make(stream=(), sensor_noise=0.0)
+        theirs, wrapped = self._robosuite(), self._wrapped()
+        rng = np.random.default_rng(self.seed)
+        size = ours.action_space.shape[0]
+
+        def drive(step: Callable[[Any], Any]) -> Callable[[], Any]:
+            # Held for a while, as a policy's actions are: noise alone would keep the arm in place.
+            actions = np.repeat(rng.uniform(-0.3, 0.3, (2 + self.steps // 20, size)), 20, axis=0).astype(np.float32)
+            turns = iter(actions)
+            return lambda: step(next(turns))
+
+        floor = self._make()
+
+        def physics() -> None:
+            mujoco.mj_step(floor.simulation.model, floor.simulation.data, floor.substeps)
+
+        return {
+            "asm_gym": drive(ours.step),
+            "asm_gym, no stream": drive(bare.step),
+            "robosuite": drive(theirs.step),
+            "robosuite GymWrapper": drive(wrapped.step),
+            "mj_step only": physics,
+        }
+
+    def _wrapped(self) -> Any:
+        from robosuite.wrappers import GymWrapper
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it makes its spaces with the wrong dtype, and Gymnasium says so
+            wrapped = GymWrapper(self._robosuite())
+        wrapped.reset()
+        return wrapped
+
+    def _resets(self) -> dict[str, Callable[[], Any]]:
+        ours, seeds = self._make(), iter(range(10**6))
+        return {
+            "asm_gym, unseeded": ours.reset,
+            "asm_gym, seeded": lambda: ours.reset(seed=next(seeds)),
+            "robosuite, hard (its default)": self._robosuite().reset,
+            "robosuite, hard_reset=False": self._robosuite(hard_reset=False).reset,
+        }
+
+
+@dataclass
+class Leaks:
+    """Whether the process grows over an environment's steps and resets."""
+
+    task: str = "Lift"
+    """a task's name"""
+    steps: int = 100_000
+    """control steps in all"""
+    resets: int = 500
+    """spread evenly over them; every tenth is seeded, which loads the model anew for some tasks"""
+
+    def run(self, console: Console) -> int:
+        """Prints the resident memory after each tenth; 1 where the last is more than 5 % above the second."""
+        env: Any = gym.make(f"asm_gym/{self.task}-v0", horizon=10**9)
+        rng, length = np.random.default_rng(0), self.steps // self.resets
+        sizes: list[float] = []
+        for i in track(range(self.resets), "stepping", console=console, transient=True):
+            env.reset(seed=i if i % 10 == 0 else None)
+            for _ in range(length):
+                env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
+            if (i + 1) % max(1, self.resets // 10) == 0:
+                sizes.append(_resident())
+        console.print(
+            f"{self.task}: {length * self.resets} steps, {self.resets} resets; resident memory [MB] by tenths"
+        )
+        console.print("  " + " ".join(f"{size:.0f}" for size in sizes))
+        growth = sizes[-1] / sizes[min(1, len(sizes) - 1)] - 1
+        console.print(f"  growth since the second: {100 * growth:+.1f} %")
+        return int(growth > 0.05)
+
+
+def _resident() -> float:
+    """Resident memory of this process [MB]."""
+    with open("/proc/self/statm") as file:
+        pages = int(file.read().split()[1])
+    return pages * 4096 / 1e6
+
+
+def _take_turns(rivals: dict[str, Callable[[], Any]], turns: int, console: Console) -> dict[str, float]:
+    """Median seconds of a call of each rival; the first calls, which warm up, do not count."""
+    for call in rivals.values():
+        call()
+    seconds: dict[str, list[float]] = {name: [] for name in rivals}
+    order, rng = list(rivals), np.random.default_rng(0)
+    for _ in track(range(turns), "measuring", console=console, transient=True):
+        rng.shuffle(order)  # whoever comes after another finds the caches as that one left them
+        for name in order:
+            call = rivals[name]
+            start = time.perf_counter()
+            call()
+            seconds[name].append(time.perf_counter() - start)
+    return {name: float(np.median(times)) for name, times in seconds.items()}
+
+
+@dataclass
+class Args:
+    """Speeds as ratios, each against a named rival in the same run."""
+
+    what: Annotated[
+        Annotated[Env, tyro.conf.subcommand("env")]
+        | Annotated[Leaks, tyro.conf.subcommand("leaks")]
+        | Annotated[Experts, tyro.conf.subcommand("experts")]
+        | Annotated[Memory, tyro.conf.subcommand("memory")]
+        | Annotated[Fit, tyro.conf.subcommand("fit")]
+        | Annotated[Safety, tyro.conf.subcommand("safety")],
+        tyro.conf.arg(name=""),
+    ] = field(default_factory=Env)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one benchmark, and returns its exit code."""
+    args = tyro.cli(Args, args=argv, prog="asm-gym benchmark", description=__doc__)
+    console = Console()
+    return args.what.run(console, _take_turns) if isinstance(args.what, (Memory, Safety)) else args.what.run(console)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,101 @@
+"""How often the scripted experts succeed, by task and robot: ``asm-gym benchmark experts``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+
+from asm_gym.choices import check_choice
+from asm_gym.evaluation.metrics import Share
+from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.text_tables import console_table
+from asm_gym.policies import make_policy, rollout
+from asm_gym.policies.registry import EXPERTS
+from asm_gym.rollouts.parallel import environment, parallel_map
+from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.collect import episode_seeds
+from asm_gym.tasks import ROBOTS
+
+_QUICK = 5
+
+
+class Attempt(NamedTuple):
+    """What became of one episode."""
+
+    solved: bool  # at some step
+    held: bool  # at the last step, too
+    steps: int  # until it was solved, or all of them
+    force: float  # the largest contact force on an arm [N]
+
+
+def attempt(seed: int, task: str, robot: str) -> Attempt:
+    """The scripted expert's episode of ``seed``, which also is the expert's own seed."""
+    env = environment(f"asm_gym/{task}-v0", (("robot", robot), ("stream", ())))
+    success: list[bool] = []
+    force: list[float] = []
+
+    def note(info: dict[str, Any]) -> None:
+        success.append(bool(info["success"]))
+        force.append(float(info["contact_force"]))
+
+    solved = rollout(env, make_policy("scripted", env, seed=seed), seed, note)
+    steps = success.index(True) + 1 if solved else len(success)
+    return Attempt(solved, success[-1], steps, float(np.nanmax(force)))
+
+
+@dataclass
+class Experts:
+    """How often each scripted expert succeeds, whether it leaves the task solved, and how long it takes."""
+
+    tasks: tuple[str, ...] = tuple(EXPERTS)
+    """names of tasks"""
+    robots: tuple[str, ...] = ("Panda",)
+    """the arms; two of one kind where the task takes two"""
+    episodes: int = 100
+    """of each task and robot"""
+    workers: int = 2
+    """processes"""
+    seed: int = 0
+    """of the episodes"""
+    quick: bool = False
+    """five episodes each"""
+
+    def __post_init__(self) -> None:
+        for name in self.tasks:
+            check_choice("task", name, tuple(EXPERTS))
+        for robot in self.robots:
+            check_choice("robot", robot, ROBOTS)
+        for count in ("episodes", "workers"):
+            if getattr(self, count) < 1:
+                raise ValueError(f"{count} must be at least 1, got {getattr(self, count)}")
+
+    def run(self, console: Console) -> int:
+        """Prints a row for each task and robot."""
+        seeds = episode_seeds(self.seed, min(self.episodes, _QUICK) if self.quick else self.episodes)
+        rows = []
+        for name in self.tasks:
+            for robot in self.robots:
+                with stage(f"{name}, {robot}", console, {}) as progress:
+                    attempts = parallel_map(partial(attempt, task=name, robot=robot), seeds, self.workers, progress)
+                rows.append((name, robot, *_row(attempts)))
+        headings = ("task", "robot", "solved", "95 %", "held", "steps", "force")
+        console.print(console_table(Table(f"scripted experts, seeds of {self.seed}", headings, rows), left=2))
+        console.print("held: also at the last step; steps: mean until solved; force: median largest [N]")
+        return 0
+
+
+def _row(attempts: list[Attempt]) -> tuple[str, ...]:
+    share = Share.of([a.solved for a in attempts])
+    low, high = share.interval
+    steps = [a.steps for a in attempts if a.solved]
+    return (
+        f"{share.k} of {share.n}",
+        f"{100 * low:.0f} to {100 * high:.0f} %",
+        str(sum(a.held for a in attempts)),
+        f"{np.mean(steps):.0f}" if steps else "",
+        f"{np.median([a.force for a in attempts]):.0f}",
+    )

@@ -1,0 +1,247 @@
+"""What watching costs: ``asm-gym benchmark memory``, against plain torch, and ``asm-gym benchmark safety``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from torch import Tensor
+
+from asm_gym.detection.detector import LATELY, POWER
+from asm_gym.detection.repetition import FADING, LIGHT, SURE
+from asm_gym.episodes import Episode
+from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.text_tables import console_table
+from asm_gym.monitors import NeuralASM
+from asm_gym.scripts.collect import collect
+from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.wrappers import NeuralASMSafety
+
+ACTIONS = 7
+STEPS = 60
+
+
+class PlainTorch:
+    """One stream watched by the equations of the memory and of its detection, a line of torch each, as one would write.
+
+    Args:
+        asm: whose weights it takes.
+    """
+
+    def __init__(self, asm: NeuralASM) -> None:
+        assert asm.network_ is not None
+        assert asm.detector_ is not None
+        self.w = {n: torch.tensor(W) for n, W in asm.network_.weights._asdict().items()}
+        self.a = {n: torch.tensor(W) for n, W in asm.network_.association._asdict().items()}
+        self.pi_z, self.pi_x = asm.prior_precision, asm.sensory_precision
+        self.curvature, self.iterations = float(asm.network_.curvature), asm.iterations
+        d, s = asm.detector_, asm.senses_
+        found = d.whitening, d.ceiling, d.tail, d.gains
+        self.M, self.q, self.kappa, self.gains = (torch.tensor(x, dtype=torch.float32) for x in found)
+        self.habit, self.bound = torch.tensor(d.habit, dtype=torch.float32), d.bound
+        self.mean, self.spread, self.change = (torch.tensor(x) for x in (s.mean, s.spread, s.change))
+        self.sensory, self.motor, self.slow = (torch.tensor(i) for i in (asm.spec.sensory, asm.spec.motor, s.slow))
+        self.z = torch.zeros(asm.hidden_size)
+        self.evidence = torch.zeros(len(self.gains), len(self.sensory))
+        self.lately = torch.zeros(asm.hidden_size)
+        self.counted = torch.tensor(asm.learned_["repetition"], dtype=torch.float32)
+        self.again, self.unlikely = torch.zeros(len(self.sensory), dtype=torch.bool), torch.zeros(len(self.sensory))
+        self.before: Tensor | None = None
+        self.earlier: Tensor | None = None
+        self.t = 0
+
+    def observe(self, row: NDArray[np.float64]) -> float:
+        """The surprise of the next row (D,)."""
+        x = torch.from_numpy(row)
+        before = x if self.before is None else self.before
+        earlier = before if self.earlier is None else self.earlier
+        value, step = (x - self.mean) / self.spread, (x - before) / self.change
+        last, past = (before - self.mean) / self.spread, ((before - earlier) / self.change)[self.slow]
+        u = torch.cat([value[self.motor], torch.ones(1, dtype=x.dtype)]).float()
+        delta = step[self.sensory].float()
+        senses = torch.cat([value[self.sensory], step[self.slow]]).float()
+        inputs = torch.cat([last.float(), delta, past.float(), u])
+        w, a = self.w, self.a
+        mu = w["W_H"] @ torch.tanh(self.z) + w["W_U"] @ u
+        z = mu.clone()
+        for _ in range(self.iterations):
+            f = torch.tanh(z)
+            feedback = w["W_F"].T @ (self.pi_x * (senses - w["W_F"] @ f - w["b_F"]))
+            gradient = self.pi_z * (z - mu) - (1 - f * f) * feedback
+            z = z - 1.5 / (self.curvature + 0.77 * feedback.abs().max()) * gradient
+        units = torch.tanh(a["V"] @ inputs)
+        error = delta - a["U"] @ units - a["D"] @ inputs
+        error = error * torch.exp(-0.5 * (a["W_S"] @ units + a["b_S"]).clamp(-12.0, 8.0))
+        again = x[self.sensory] == before[self.sensory]
+        if self.before is None:
+            error, again = torch.zeros_like(error), torch.zeros_like(again)
+        rare = torch.where(self.again, self.counted[1], self.counted[0])
+        self.unlikely, self.again = (1 - FADING) * self.unlikely + again * rare, again
+        self.t += 1
+        whitened = self.M @ (error / torch.sqrt(1 + (error / self.bound) ** 2))
+        self.evidence = self.evidence + self.gains[:, None] * (whitened - self.evidence)
+        variance = self.gains / (2 - self.gains) * (1 - (1 - self.gains) ** (2 * self.t))
+        ratios = (self.evidence**2 / variance[:, None] / self.q) ** self.kappa
+        pooled = (ratios**POWER).sum() ** (1 / POWER)
+        context = torch.tanh(mu)
+        self.lately = self.lately + LATELY * (context - self.lately)
+        usual = torch.exp(self.habit[:-1] @ torch.cat([context, self.lately]) + self.habit[-1])
+        self.z, self.before, self.earlier = z, x, before
+        repeated = (self.unlikely > 0) * torch.exp(LIGHT * (self.unlikely - SURE))
+        return float(((pooled / usual) ** POWER + (repeated**POWER).sum()) ** (1 / POWER))
+
+
+def synthetic(channels: int, episodes: int, skills: int = 1, seed: int = 0) -> list[Episode]:
+    """Streams of as many sensory channels in five groups, smooth and noisy, and seven actions."""
+    sizes = [len(part) for part in np.array_split(np.arange(channels), 5)]
+    spec = StreamSpec(
+        (
+            *(Channel(f"sense_{g}", n, noise=0.01, group=f"group_{g}") for g, n in enumerate(sizes)),
+            Channel("action", ACTIONS, group=MOTOR),
+        ),
+        dt=0.05,
+    )
+    rng = np.random.default_rng(seed)
+    mixing = rng.normal(size=(skills, 12, channels))
+    made = []
+    for n in range(episodes):
+        time = np.arange(STEPS)[:, None]
+        sources = np.sin(time * rng.uniform(0.05, 0.3, 12) + rng.uniform(0, 6, 12))
+        senses = sources @ mixing[n % skills] + 0.01 * rng.normal(size=(STEPS, channels))
+        made.append(Episode.from_stream(np.hstack([senses, np.tanh(rng.normal(size=(STEPS, ACTIONS)))]), spec))
+    return made
+
+
+def watching(asm: NeuralASM, episode: Episode, batch: int) -> Callable[[], Any]:
+    """Observes the rows of an episode, over and over, in ``batch`` streams at once."""
+    rows = [np.repeat(row[None].astype(np.float64), batch, axis=0) for row in episode.stream]
+    state, n = asm.initial_state(batch), 0
+
+    def call() -> None:
+        nonlocal state, n
+        state, _ = asm.observe(state, rows[n % len(rows)])
+        n += 1
+
+    return call
+
+
+def watching_plainly(asm: NeuralASM, episode: Episode) -> Callable[[], Any]:
+    """The same in torch, one stream."""
+    plain, rows, n = PlainTorch(asm), [row.astype(np.float64) for row in episode.stream], 0
+
+    def call() -> None:
+        nonlocal n
+        with torch.no_grad():
+            plain.observe(rows[n % len(rows)])
+        n += 1
+
+    return call
+
+
+def _fitted(hidden: int, channels: int, skills: int = 1) -> tuple[NeuralASM, Episode]:
+    """A memory that has learned little: the cost is the same. It names skills where there are several."""
+    episodes = synthetic(channels, max(10, skills + 2), skills)
+    asm = NeuralASM(episodes[0].spec, hidden_size=hidden, epochs=1).fit(episodes[:-2])
+    if skills > 1:
+        asm.name_skills([replace(e, info={"skill": str(n % skills)}) for n, e in enumerate(episodes[:-2])])
+    return asm, episodes[-1]
+
+
+@dataclass
+class Memory:
+    """What one call of observe() costs, against the same equations written plainly in torch."""
+
+    hidden: int = 256
+    """hidden units"""
+    channels: int = 60
+    """sensory channels"""
+    steps: int = 2000
+    """calls of each rival"""
+    sweep: bool = True
+    """also print the cost against hidden units, channels and named skills"""
+
+    def run(self, console: Console, take_turns: Callable[..., dict[str, float]]) -> int:
+        """Prints the tables."""
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            asm, episode = _fitted(self.hidden, self.channels)
+            rivals = {
+                "asm_gym, one stream": watching(asm, episode, 1),
+                "asm_gym, 64 streams": watching(asm, episode, 64),
+                "plain torch, one stream": watching_plainly(asm, episode),
+            }
+            seconds = take_turns(rivals, self.steps, console)
+        finally:
+            torch.set_num_threads(threads)
+        seconds["asm_gym, 64 streams"] /= 64
+        title = f"{self.hidden} hidden units, {self.channels} channels, {asm.iterations} iterations: a stream's row"
+        plain = seconds["plain torch, one stream"]
+        rows = [(name, f"{1e6 * s:.0f}", f"{plain / s:.1f}×") for name, s in seconds.items()]
+        console.print(console_table(Table(title, ("", "µs", "against torch"), rows)))
+        if self.sweep:
+            self._sweep(console, take_turns)
+        return 0
+
+    def _sweep(self, console: Console, take_turns: Callable[..., dict[str, float]]) -> None:
+        makers: dict[str, tuple[Callable[[int], tuple[NeuralASM, Episode]], tuple[int, ...]]] = {
+            "hidden units": (lambda n: _fitted(n, self.channels), (64, 256, 1024, 2048)),
+            "channels": (lambda n: _fitted(self.hidden, n), (15, 30, 60, 120)),
+            "skills": (lambda n: _fitted(self.hidden, self.channels, n), (2, 8, 32, 128)),
+        }
+        for what, (make, sizes) in makers.items():
+            rivals = {str(size): watching(*make(size), 1) for size in sizes}
+            seconds = take_turns(rivals, max(1, self.steps // 4), console)
+            least = seconds[str(sizes[0])]
+            rows = [(name, f"{1e6 * s:.0f}", f"{s / least:.1f}×") for name, s in seconds.items()]
+            console.print(console_table(Table(f"one stream, by {what}", (what, "µs", f"against {sizes[0]}"), rows)))
+
+
+@dataclass
+class Safety:
+    """What the safety wrapper adds to a control step, at the control rate and within control steps."""
+
+    task: str = "Lift"
+    """a task's name"""
+    hidden: int = 256
+    """hidden units of the memory"""
+    steps: int = 400
+    """control steps of each rival"""
+    monitor_freq: int = 100
+    """rows watched a second, where it watches within control steps [Hz]"""
+
+    def run(self, console: Console, take_turns: Callable[..., dict[str, float]]) -> int:
+        """Prints the table."""
+        plain = self._make(None)
+        envs = {"step": plain, "step under the wrapper": NeuralASMSafety(self._make(None), self._memory(None))}
+        rate = self.monitor_freq
+        watched = NeuralASMSafety(self._make(rate), self._memory(rate), monitor_freq=rate)
+        envs |= {f"step, stream at {rate} Hz": self._make(rate), f"step under the wrapper at {rate} Hz": watched}
+        action = np.zeros(plain.action_space.shape or (), np.float32)
+        for env in envs.values():
+            env.reset(seed=0)
+        rivals = {name: partial(env.step, action) for name, env in envs.items()}
+        seconds = take_turns(rivals, self.steps, console)
+        caption = f"{self.task}, 20 Hz, {self.hidden} hidden units: a control step"
+        rows = [(name, f"{1e3 * s:.2f}", f"{s / seconds['step']:.2f}×") for name, s in seconds.items()]
+        console.print(console_table(Table(caption, ("", "ms", "against step"), rows)))
+        return 0
+
+    def _make(self, rate: int | None) -> gym.Env[Any, Any]:
+        env_id = f"asm_gym/{self.task}-v0"
+        return gym.make(env_id, horizon=10**9, stream_freq=rate, disable_env_checker=True)
+
+    def _memory(self, rate: int | None) -> NeuralASM:
+        """One that has learned little, and whose threshold is out of reach: the cost is the same."""
+        env_id = f"asm_gym/{self.task}-v0"
+        episodes = collect(env_id, episodes=4, workers=1, horizon=40, stream_freq=rate)
+        asm = NeuralASM(episodes[0].spec, hidden_size=self.hidden, epochs=1).fit(episodes)
+        asm.threshold_ = np.inf
+        return asm

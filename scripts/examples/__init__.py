@@ -1,0 +1,1 @@
+"""Examples: short programs that use the package as a user would."""

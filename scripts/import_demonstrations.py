@@ -1,0 +1,71 @@
+"""Reads robosuite's or robomimic's HDF5 demonstrations into a Minari dataset, their states replayed in the simulator.
+
+The stream has the groups ``joint``, ``hand`` and ``action``: what motors and contacts did within a step is in no such
+file. A memory of it watches ``gym.make(..., stream=("joint", "hand", "action"))``.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from asm_gym.datasets import write_dataset
+from asm_gym.envs.demonstrations import recorded_in, replay
+from asm_gym.episodes import Episode
+from asm_gym.rollouts.folder import versions
+from asm_gym.rollouts.parallel import Progress
+from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.command import USAGE_ERRORS
+
+
+@dataclass(frozen=True)
+class Args:
+    """Demonstrations as a Minari dataset."""
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.hdf5")]
+    """What robosuite's collect_human_demonstrations or robomimic wrote."""
+    sensor_noise: float = 1.0
+    """Scales the noise of the sensors; 0 for exact readings."""
+    seed: int = 0
+    """Of the noise."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/import")
+    """Folder of the dataset."""
+
+
+def convert(args: Args, progress: Progress) -> tuple[Path, list[Episode]]:
+    """The dataset, and what is in it."""
+    recorded = recorded_in(args.file)
+    env = recorded.make(args.sensor_noise)
+    try:
+        episodes = []
+        for episode in replay(args.file, recorded, env, args.seed):
+            episodes.append(episode)
+            progress(len(episodes), len(recorded.demos))
+        details = {"algorithm_name": "demonstrations", "versions": versions(), "file": args.file.name}
+        name = f"asm_gym/{recorded.task.lower()}-demonstrations-v0"
+        return write_dataset(args.out, name, episodes, env, details), episodes
+    finally:
+        env.close()
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Converts; 2 where the file makes no sense."""
+    console = Console()
+    try:
+        args = tyro.cli(Args, args=argv, prog="asm-gym import", description=__doc__)
+        with stage("replaying", console, {}) as progress:
+            folder, episodes = convert(args, progress)
+    except USAGE_ERRORS as error:
+        print(f"asm-gym import: {error}", file=sys.stderr)
+        return 2
+    console.print(f"{len(episodes)} episodes, {sum(e.success for e in episodes)} successful: {folder}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

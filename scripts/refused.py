@@ -1,8 +1,0 @@
-"""What every command answers with a line and exit code 2, rather than a traceback."""
-
-from __future__ import annotations
-
-import gymnasium as gym
-
-REFUSED = (ValueError, TypeError, OSError, ImportError, gym.error.Error)
-"""Raised where arguments, files or what is installed make no sense; no cluster at an address is an OSError too."""

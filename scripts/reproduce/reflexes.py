@@ -1,0 +1,235 @@
+"""Lets reflexes act on the alarms of a memory that an evaluation has fitted: what is gained, what it costs.
+
+Every faulty episode is run with the policy alone and with each reflex, paired by seed, on the real simulator. Reads the
+folder of ``asm-gym evaluate`` for nominal episodes to learn from and to calibrate on.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from asm_gym.choices import check_choice
+from asm_gym.evaluation.archive import Label, Recording, read
+from asm_gym.evaluation.intervention import Comparison, Estimate, Reaction, compare
+from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.text_tables import console_table, markdown
+from asm_gym.evaluation.trace import POLICY_ALONE
+from asm_gym.faults.suite import KINDS
+from asm_gym.monitors import NeuralASM
+from asm_gym.policies import make_policy
+from asm_gym.rollouts.benchmark import fitted
+from asm_gym.rollouts.bout import NOMINAL, PASSING, Bout, run_bout
+from asm_gym.rollouts.folder import claim_folder
+from asm_gym.rollouts.parallel import ParallelConfig, Progress, environment, parallel_map
+from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.record import Course, episode_seeds, record
+from asm_gym.scripts.command import USAGE_ERRORS
+from asm_gym.tasks import task as task_spec
+from asm_gym.wrappers.safety import ON_ALARM
+
+FAULTS = (NOMINAL, PASSING, "collision", "held_by_person", "stuck_joint", "encoder_bias")
+
+
+@dataclass(frozen=True)
+class Args:
+    """Reflexes x faults: success, force, and time in alarm, against the policy alone."""
+
+    run: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
+    """Folder of an evaluation, whose nominal episodes the memory learns from at the control rate."""
+    tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan", "Door")
+    """Names of tasks; at the control rate the evaluation must have recorded them."""
+    robot: str = "Panda"
+    """The arm."""
+    policy: str = "scripted"
+    """What acts: scripted, or the path of an agent."""
+    reflexes: tuple[str, ...] = ("hold", "retract", "comply", "recall", "graded", "terminate")
+    """What ``on_alarm`` takes."""
+    faults: tuple[str, ...] = FAULTS
+    """nominal, passing_push (20 N for 0.3 s), or kinds of the suite, which are strong."""
+    episodes: int = 12
+    """Of each task, fault and reflex."""
+    monitor_freq: int | None = None
+    """Rows watched a second [Hz], for reflexes within control steps; nominal episodes are then recorded here."""
+    fit_episodes: int = 60
+    """Nominal episodes of each task to learn from, with a monitor_freq."""
+    calibration_episodes: int = 60
+    """Others of each task, to calibrate on."""
+    max_override_s: float = 3.0
+    """How long a reflex may act at a stretch before the episode is ended [s]."""
+    false_alarm_rate: float = 0.01
+    """Share of nominal episodes that may raise an alarm."""
+    workers: int = 2
+    """Processes."""
+    seed: int = 0
+    """Of the evaluation, of the memory and of the episodes."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/react")
+    """Folder of the results."""
+
+    def __post_init__(self) -> None:
+        for task in self.tasks:
+            task_spec(task)
+        for name in self.reflexes:
+            check_choice("reflex", name, ON_ALARM)
+        for name in self.faults:
+            check_choice("fault", name, (NOMINAL, PASSING, *KINDS))
+        for name in ("episodes", "fit_episodes", "calibration_episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not self.max_override_s > 0:
+            raise ValueError(f"max_override_s must be > 0, got {self.max_override_s}")
+
+    @property
+    def course(self) -> Course:
+        return Course(self.robot, self.policy, stream_freq=self.monitor_freq)
+
+
+def learned_from(args: Args) -> NeuralASM:
+    """The memory, fitted and calibrated on what the evaluation recorded of these tasks.
+
+    Raises:
+        ValueError: it recorded too little.
+    """
+
+    folder = args.run if args.monitor_freq is None else args.out
+
+    def role(name: str) -> list[Recording]:
+        paths = [p for task in args.tasks for p in sorted((folder / "episodes" / task / name).glob("*.npz"))]
+        return [r for r in map(read, paths) if r.episode.success]
+
+    fit = role("fit")
+    if not fit:
+        raise ValueError(f"{args.run} has no recordings of {', '.join(args.tasks)}: run asm-gym evaluate first")
+    memory = fitted(args.out, "neural_asm", fit, args.seed)
+    assert isinstance(memory, NeuralASM)
+    return memory.calibrate([r.episode for r in role("calibration")], args.false_alarm_rate)
+
+
+def record_nominal(args: Args, progress: Progress) -> None:
+    """Records nominal episodes at ``monitor_freq``, those that are not there yet."""
+    roles = {"fit": args.fit_episodes, "calibration": args.calibration_episodes}
+    wanted = [
+        Label(task, role, seed=s)
+        for task in args.tasks
+        for role, n in roles.items()
+        for s in episode_seeds(args.seed, task, role, n)
+    ]
+    missing = [label for label in wanted if not (args.out / label.path).is_file()]
+    make = partial(record, course=args.course, folder=args.out.resolve())
+    parallel_map(make, missing, ParallelConfig(args.workers), lambda k, n: progress(len(wanted) - n + k, len(wanted)))
+
+
+def bouts(args: Args) -> list[Bout]:
+    """Every episode, those that share a task and a fault side by side."""
+    return [
+        Bout(task, fault, acting, seed)
+        for task in args.tasks
+        for fault in args.faults
+        for seed in episode_seeds(args.seed, task, "react", args.episodes)
+        for acting in (POLICY_ALONE, *args.reflexes)
+    ]
+
+
+def comparisons(reactions: Sequence[Reaction], args: Args) -> list[Comparison]:
+    """Each reflex under each fault, over all tasks."""
+
+    def of(fault: str, acting: str) -> list[Reaction]:
+        return [r for r in reactions if (r.fault, r.acting) == (fault, acting)]
+
+    return [compare(of(f, POLICY_ALONE), of(f, r), args.seed) for f in args.faults for r in args.reflexes]
+
+
+def table(found: Sequence[Comparison], args: Args) -> Table:
+    """A row for each fault and reflex."""
+    headings = (
+        *("Fault", "Reflex", "Success", "alone", "gained", "Peak force less by", "Impulse less by"),
+        *("In alarm [s]", "Ended", "Median delay [ms]"),
+    )
+    rows = [
+        (
+            c.fault.replace("_", " "),
+            c.acting,
+            f"{100 * c.success.value:.0f} %",
+            f"{100 * c.alone.value:.0f} %",
+            _percent(c.gained),
+            _percent(c.peak) if c.fault != NOMINAL else "",
+            _percent(c.impulse) if c.fault != NOMINAL else "",
+            f"{c.alarm_s:.2f}",
+            f"{c.ended.k} of {c.ended.n}",
+            "" if c.fault == NOMINAL else f"{c.median_delay_ms:.0f}" if math.isfinite(c.median_delay_ms) else "missed",
+        )
+        for c in found
+    ]
+    return Table(
+        f"Reflexes against the policy alone, paired by seed, {args.episodes} episodes of each of "
+        f"{', '.join(args.tasks)}; force on the arm from outside since the onset; in brackets 95 % bootstrap "
+        "intervals.",
+        headings,
+        rows,
+    )
+
+
+def _percent(e: Estimate) -> str:
+    if math.isnan(e.value):
+        return ""
+    return f"{100 * e.value:.0f} % ({100 * e.low:.0f} to {100 * e.high:.0f})"
+
+
+def react(args: Args, console: Console) -> Table:
+    """Fits, runs, compares and writes."""
+    seconds: dict[str, float] = {}
+    for task in args.tasks:
+        env = environment(f"asm_gym/{task}-v0", args.course.settings())
+        make_policy(args.policy, env, seed=0)  # what does not fit is refused before anything runs
+    args.out.mkdir(parents=True, exist_ok=True)
+    if args.monitor_freq is not None:
+        settings = {"robot": args.robot, "policy": args.policy, "seed": args.seed, "monitor_freq": args.monitor_freq}
+        claim_folder(args.out, "recordings.json", settings)
+        with stage("recording", console, seconds) as progress:
+            record_nominal(args, progress)
+    with stage("fitting and calibrating", console, seconds):
+        memory = args.out / "memory.asm"
+        learned_from(args).save(memory)
+    with stage("acting", console, seconds) as progress:
+        run: Callable[[Bout], Reaction] = partial(
+            run_bout, course=args.course, max_override_s=args.max_override_s, memory=memory.resolve()
+        )
+        reactions = parallel_map(run, bouts(args), ParallelConfig(args.workers), progress)
+    found = comparisons(reactions, args)
+    made = table(found, args)
+    (args.out / "reactions.md").write_text(markdown(made) + "\n", encoding="utf-8")
+    settings = {f.name: getattr(args, f.name) for f in fields(args)}
+    content = {
+        "settings": json.loads(json.dumps(settings, default=str)),
+        "seconds": seconds,
+        "episodes": [{k: None if v == math.inf else v for k, v in asdict(r).items()} for r in reactions],
+    }
+    (args.out / "reactions.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the comparison; 2 where the arguments make no sense."""
+    console = Console()
+    try:
+        args = tyro.cli(Args, args=argv, prog="asm-gym react", description=__doc__)
+        made = react(args, console)
+    except USAGE_ERRORS as error:
+        print(f"asm-gym react: {error}", file=sys.stderr)
+        return 2
+    console.print(console_table(made, left=2))
+    console.print(f"Wrote {args.out / 'reactions.md'} and {args.out / 'reactions.json'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

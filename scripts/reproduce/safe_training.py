@@ -1,0 +1,262 @@
+"""Trains the same agent alone and under the safety wrapper: fewer violations on the way, as much success in the end?
+
+An untrained actor learns by SAC with demonstrations in its replay buffer: alone; where an alarm costs reward and ends
+the episode; and where the robot holds on an alarm. The memory knows harmless exploration, in which none of the runs
+takes part. A run can be killed at any time: what has been recorded, fitted or trained is not made again.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from asm_gym.choices import check_choice
+from asm_gym.datasets import load_episode
+from asm_gym.detection.detector import conformal_episodes
+from asm_gym.episodes import Episode
+from asm_gym.evaluation import plots
+from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.safe_training import COUNTED, Outcome, counts_table, learning_figure, worth_table
+from asm_gym.evaluation.text_tables import console_table, markdown
+from asm_gym.monitors import NeuralASM
+from asm_gym.rollouts.folder import claim_folder
+from asm_gym.rollouts.parallel import Progress, parallel_map
+from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.training.exploration import Gentle, explore, harmless
+from asm_gym.rollouts.training.safe_run import ALONE, CONDITIONS, Setting, run
+from asm_gym.scripts.collect import episode_seeds, record_to
+from asm_gym.scripts.command import USAGE_ERRORS
+from asm_gym.tasks import task as task_spec
+
+DEMONSTRATIONS, FITTING, TESTING = 11, 12, 13
+"""Stages of the seeds of episodes that are recorded."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Training alone against training under the wrapper, paired by seed."""
+
+    task: str = "Lift"
+    """Name of a task with a scripted expert, whose contacts are gentle."""
+    conditions: tuple[str, ...] = tuple(CONDITIONS)
+    """Of alone, terminate and hold; alone must be among them."""
+    seeds: int = 5
+    """Runs of each condition."""
+    steps: int = 2_500
+    """Control steps of each run."""
+    demonstrations: int = 50
+    """Episodes of the expert in the replay buffer, and as many others for a memory of the expert."""
+    fit_episodes: int = 120
+    """Episodes of exploration that the memory learns from."""
+    calibration_episodes: int = 60
+    """Others that its threshold is set on."""
+    test_episodes: int = 40
+    """Others that its false alarms are counted in."""
+    false_alarm_rate: float = 0.05
+    """Share of harmless episodes of exploration that may raise an alarm."""
+    harmless_force: float = 20.0
+    """External force above which exploration is no longer harmless [N]."""
+    harmless_torque: float = 10.0
+    """The same of the external torque on a joint [N m]: arms that hit themselves, joints at their stops."""
+    force_limit: float = 40.0
+    """External force above which a contact is a violation [N]."""
+    cost: float = 1.0
+    """What an alarm takes off the reward where it ends the episode."""
+    evaluate_every: int = 500
+    """Control steps between evaluations."""
+    evaluation_episodes: int = 10
+    """Of each evaluation."""
+    final_episodes: int = 100
+    """Of the last one."""
+    workers: int = 1
+    """Processes."""
+    seed: int = 0
+    """The first of the runs' seeds, and the seed of all that is recorded."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/train_safely")
+    """Folder of the comparison."""
+    quick: bool = False
+    """Two seeds and little of everything: to see that everything runs."""
+
+    def __post_init__(self) -> None:
+        task_spec(self.task)
+        for name in self.conditions:
+            check_choice("condition", name, CONDITIONS)
+        if ALONE not in self.conditions:
+            raise ValueError(f"conditions must hold {ALONE}, which the others are compared with")
+        for name in ("seeds", "steps", "evaluate_every", *(n for n in vars(self) if n.endswith("episodes"))):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("harmless_force", "harmless_torque", "force_limit"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
+        needed = conformal_episodes(self.false_alarm_rate)
+        if min(self.calibration_episodes, self.demonstrations) < needed:
+            raise ValueError(
+                f"a false-alarm rate of {self.false_alarm_rate:g} needs {needed} calibration_episodes and as many "
+                f"demonstrations, got {self.calibration_episodes} and {self.demonstrations}"
+            )
+
+    def scaled(self) -> Args:
+        """With ``quick``, little of everything."""
+        if not self.quick:
+            return self
+        return replace(
+            self,
+            false_alarm_rate=0.2,
+            fit_episodes=10,
+            calibration_episodes=9,
+            test_episodes=3,
+            demonstrations=9,
+            seeds=min(2, self.seeds),
+            steps=600,
+            evaluate_every=300,
+            evaluation_episodes=1,
+            final_episodes=2,
+        )
+
+    @property
+    def env_id(self) -> str:
+        return task_spec(self.task).id
+
+    @property
+    def gentle(self) -> Gentle:
+        return Gentle(self.harmless_force, self.harmless_torque)
+
+    @property
+    def setting(self) -> Setting:
+        names = ("env_id", "steps", "evaluate_every", "evaluation_episodes", "final_episodes", "force_limit", "cost")
+        return Setting(**{name: getattr(self, name) for name in names})
+
+
+class Recorded(NamedTuple):
+    """Files of episodes."""
+
+    expert: list[Path]  # twice the demonstrations: those of the buffer, and others
+    exploration: list[Path]  # to fit on and to calibrate on
+    testing: list[Path]
+
+
+def record(args: Args, progress: Progress) -> Recorded:
+    """Records what is not there yet."""
+    folder = args.out.resolve() / "episodes"
+    shown = episode_seeds(args.seed, 2 * args.demonstrations, DEMONSTRATIONS)
+    missing = [s for s in shown if not (folder / "expert" / f"{s}.npz").is_file()]
+    show = partial(record_to, env_id=args.env_id, policy="scripted", settings=(), folder=folder / "expert")
+    parallel_map(show, missing, args.workers, progress)
+    seek = partial(explore, env_id=args.env_id, gentle=args.gentle, folder=folder / "exploration")
+    counts = {FITTING: args.fit_episodes + args.calibration_episodes, TESTING: args.test_episodes}
+    found = {s: parallel_map(seek, episode_seeds(args.seed, n, s), args.workers, progress) for s, n in counts.items()}
+    return Recorded([folder / "expert" / f"{s}.npz" for s in shown], found[FITTING], found[TESTING])
+
+
+def memories(args: Args, recorded: Recorded) -> dict[str, Path]:
+    """One memory of exploration, which watches, and one of the expert, to compare; fitted where they are not yet."""
+    expert = [load_episode(f) for f in recorded.expert]
+    n, k = args.fit_episodes, args.demonstrations
+    learned: dict[str, tuple[list[Episode], list[Episode]]] = {
+        "exploration": (harmless(recorded.exploration[:n]), harmless(recorded.exploration[n:])),
+        "expert": (expert[:k], expert[k:]),
+    }
+    paths = {}
+    for name, (fit, calibration) in learned.items():
+        paths[name] = args.out.resolve() / f"{name}.asm"
+        if not paths[name].is_file():
+            if not fit:
+                raise ValueError(f"no episode stays harmless for long enough: is {args.task} done gently?")
+            memory = NeuralASM(fit[0].spec, seed=args.seed, epochs=5 if args.quick else 40).fit(fit)
+            memory.calibrate(calibration, args.false_alarm_rate).save(paths[name])
+    return paths
+
+
+def surprise_table(args: Args, memory: Mapping[str, Path], recorded: Recorded) -> Table:
+    """How much each memory finds wrong where nothing is."""
+    kinds = {
+        "harmless exploration": harmless(recorded.testing),
+        "the expert": [load_episode(f) for f in recorded.expert[: args.test_episodes]],
+    }
+    rows = []
+    for name, path in memory.items():
+        watching = NeuralASM.load(path)
+        cells = [f"a memory of {name}"]
+        for episodes in kinds.values():
+            alarms = [s.value > watching.threshold for s in watching.score_episodes(episodes)]
+            cells.append(f"{100 * np.concatenate(alarms).mean():.1f} %")
+            cells.append(f"{sum(a.any() for a in alarms)} of {len(alarms)}")
+        rows.append(tuple(cells))
+    headings = [f"{kind}: {what}" for kind in kinds for what in ("steps in alarm", "episodes with one")]
+    return Table(
+        f"False alarms where nothing presses with more than {args.harmless_force:g} N or {args.harmless_torque:g} N m; "
+        "the thresholds are for "
+        f"{100 * args.false_alarm_rate:g} % of the episodes that each memory knows. The memory of the expert has "
+        "learned from these episodes of the expert.",
+        ("", *headings),
+        rows,
+    )
+
+
+def train_safely(args: Args, console: Console) -> list[Table]:
+    """Records, fits, trains, compares and writes."""
+    seconds: dict[str, float] = {}
+    with stage("recording", console, seconds) as progress:
+        recorded = record(args, progress)
+    with stage("fitting", console, seconds):
+        memory = memories(args, recorded)
+        surprises = surprise_table(args, memory, recorded)
+    jobs = [(c, args.seed + n) for n in range(args.seeds) for c in args.conditions]
+    with stage("training", console, seconds) as progress:
+        each = partial(
+            run,
+            setting=args.setting,
+            memory=memory["exploration"],
+            demonstrations=recorded.expert[: args.demonstrations],
+            folder=args.out.resolve() / "outcomes",
+        )
+        made = parallel_map(each, jobs, args.workers, progress)
+    outcomes = {c: [o for o in made if o.condition == c] for c in args.conditions}
+    tables = [counts_table(outcomes, args.force_limit), worth_table(outcomes, ALONE, args.force_limit), surprises]
+    _write(args, outcomes, tables, seconds)
+    return tables
+
+
+def _write(
+    args: Args, outcomes: Mapping[str, Sequence[Outcome]], tables: Sequence[Table], seconds: Mapping[str, float]
+) -> None:
+    (args.out / "training.md").write_text("\n\n".join(map(markdown, tables)) + "\n", encoding="utf-8")
+    every = [o for runs in outcomes.values() for o in runs]
+    rows = [(o.condition, o.seed, o.steps, *(sum(getattr(o, n)) for n in COUNTED), o.success) for o in every]
+    with (args.out / "training.csv").open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([("condition", "seed", "steps", *COUNTED, "success"), *rows])
+    content = {"settings": asdict(args), "seconds": seconds, "runs": [asdict(o) for o in every]}
+    (args.out / "training.json").write_text(json.dumps(content, indent=1, default=str) + "\n", encoding="utf-8")
+    plots.save(learning_figure(outcomes, args.force_limit), args.out / "training.png")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the comparison; 2 where the arguments make no sense."""
+    console = Console()
+    try:
+        args = tyro.cli(Args, args=argv, prog="asm-gym train-safely", description=__doc__).scaled()
+        free = ("seeds", "conditions", "workers", "out")
+        claim_folder(args.out, "train_safely.json", {k: v for k, v in vars(args).items() if k not in free})
+        tables = train_safely(args, console)
+    except USAGE_ERRORS as error:
+        print(f"asm-gym train-safely: {error}", file=sys.stderr)
+        return 2
+    for table in tables:
+        console.print(console_table(table))
+    console.print(f"Wrote {args.out / 'training.md'}, training.csv, training.json and training.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,147 @@
+"""A memory of one policy watches another: as it is, re-calibrated, or fitted anew on the other's own episodes?
+
+Reads the folders of two runs of ``asm-gym evaluate`` with the same tasks: one of the policy that the memory knows, one
+of the policy that it is to watch.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import tyro
+from rich.console import Console
+
+from asm_gym.choices import check_choice
+from asm_gym.evaluation import comparison
+from asm_gym.evaluation.archive import Recording
+from asm_gym.evaluation.comparison import Score
+from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.text_tables import console_table, markdown
+from asm_gym.monitors import MONITORS
+from asm_gym.rollouts.benchmark import opinion_of, sights_of
+from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.recordings import recorded
+from asm_gym.scripts.command import USAGE_ERRORS
+
+Roles = Mapping[str, Sequence[Recording]]
+
+
+@dataclass(frozen=True)
+class Args:
+    """One policy's memory on another policy's episodes."""
+
+    known: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="KNOWN")]
+    """Folder of an evaluation of the policy that the memory knows."""
+    watched: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="WATCHED")]
+    """Folder of one of the policy that it is to watch."""
+    monitor: str = "neural_asm"
+    """Name of the monitor."""
+    false_alarm_rate: float = 0.05
+    """Share of nominal episodes that may raise an alarm."""
+    window: float = 1.0
+    """How soon after its onset a fault must be noticed [s]."""
+    seed: int = 0
+    """Of the monitor."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/adopt")
+    """Folder of the results."""
+
+    def __post_init__(self) -> None:
+        check_choice("monitor", self.monitor, MONITORS)
+
+
+class Side(NamedTuple):
+    """What was recorded of one policy."""
+
+    folder: Path
+    roles: Roles
+    visible: dict[tuple[str, str], bool]  # kinds and severities that an ideal observer could see
+
+
+def read_side(folder: Path, window_s: float) -> Side:
+    """The recordings of an evaluation.
+
+    Raises:
+        ValueError: there are none.
+    """
+    tasks = tuple(sorted(p.name for p in (folder / "episodes").glob("*") if p.is_dir()))
+    if not tasks:
+        raise ValueError(f"{folder} holds no recordings: run asm-gym evaluate first")
+    roles, twins = recorded(folder.resolve(), tasks)
+    return Side(folder, roles, comparison.visible_kinds(sights_of(twins, roles.get("faulty", []), window_s)))
+
+
+def scores(args: Args) -> dict[str, Score]:
+    """By what was done, on the kinds of fault that can be seen under both policies."""
+    known, watched = (read_side(folder, args.window) for folder in (args.known, args.watched))
+    both = {k: seen and watched.visible.get(k, False) for k, seen in known.visible.items()}
+    ways = {
+        "known policy, its own memory": (known, known, known),
+        "watched policy, that memory as it is": (known, known, watched),
+        "re-calibrated on the watched": (known, watched, watched),
+        "fitted anew on the watched": (watched, watched, watched),
+    }
+    found = {}
+    for name, (fit, calibration, tested) in ways.items():
+        roles = {
+            "fit": fit.roles["fit"],
+            "calibration": calibration.roles["calibration"],
+            "nominal": tested.roles["nominal"],
+            "faulty": tested.roles.get("faulty", []),
+        }
+        said = opinion_of(args.monitor, fit.folder, roles, args.false_alarm_rate, args.seed)
+        found[name] = comparison.score(
+            args.monitor, said.verdicts, said.thresholds, args.false_alarm_rate, args.window, both
+        )
+    return found
+
+
+def table(found: Mapping[str, Score], args: Args) -> Table:
+    """A row for each way."""
+    rows = []
+    for name, score in found.items():
+        found_share, false = score.cell.found[args.false_alarm_rate], score.false_alarms
+        low, high = found_share.interval
+        rows.append(
+            (
+                name,
+                f"{score.cell.auroc:.3f}",
+                f"{100 * found_share.value:.0f} % ({100 * low:.0f} to {100 * high:.0f})",
+                f"{false.k} of {false.n}",
+            )
+        )
+    return Table(
+        f"{args.monitor}, faults found within {args.window:g} s and nominal episodes with an alarm, at a "
+        f"threshold for {100 * args.false_alarm_rate:g} % of them; mean AUROC over kinds of fault; in brackets 95 % "
+        "Wilson intervals.",
+        ("", "AUROC", "Found", "False alarms"),
+        rows,
+    )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Compares; 2 where the arguments make no sense."""
+    console = Console()
+    try:
+        args = tyro.cli(Args, args=argv, prog="asm-gym adopt", description=__doc__)
+        with stage("fitting and judging", console, {}):
+            found = scores(args)
+    except USAGE_ERRORS as error:
+        print(f"asm-gym adopt: {error}", file=sys.stderr)
+        return 2
+    made = table(found, args)
+    args.out.mkdir(parents=True, exist_ok=True)
+    (args.out / "adopt.md").write_text(markdown(made) + "\n", encoding="utf-8")
+    content = {"settings": asdict(args), "headings": made.headings, "rows": made.rows}
+    (args.out / "adopt.json").write_text(json.dumps(content, indent=1, default=str) + "\n", encoding="utf-8")
+    console.print(console_table(made))
+    console.print(f"Wrote {args.out / 'adopt.md'} and {args.out / 'adopt.json'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
