@@ -1,0 +1,149 @@
+"""Refusing at the edge what is no number, or none that will do: NaN and booleans do not pass for numbers."""
+
+from __future__ import annotations
+
+import math
+from numbers import Integral, Real
+from typing import Any, Literal, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+SHOWN = 80
+"""How many characters of a refused value a message shows."""
+
+
+@overload
+def check_number(
+    name: str,
+    value: object,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+    whole: Literal[True],
+    infinite: bool = False,
+) -> int: ...
+
+
+@overload
+def check_number(
+    name: str,
+    value: object,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+    whole: Literal[False] = False,
+    infinite: bool = False,
+) -> float: ...
+
+
+def check_number(
+    name: str,
+    value: object,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+    whole: bool = False,
+    infinite: bool = False,
+) -> float:
+    """``value`` as a Python number, once it is one and within its bounds.
+
+    Args:
+        name: the argument's, for the message.
+        low, high: the least and the greatest that will do.
+        above, below: what it must stay strictly between.
+        whole: only integers will do, and an int comes back.
+        infinite: infinity will do, where the bounds allow it.
+
+    Raises:
+        ValueError: naming the argument, what it must be, and what it was.
+    """
+    wanted = _described("whole number" if whole else "number", low, high, above, below)
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral if whole else Real):
+        raise ValueError(f"{name} must be a {wanted}, got {shown(value)}")
+    number: float = int(value) if isinstance(value, Integral) else float(value)
+    # NaN alone differs from itself.
+    if number != number or not _within(number, low, high, above, below):
+        raise ValueError(f"{name} must be a {wanted}, got {shown(value)}")
+    if not infinite and abs(number) > np.finfo(np.float64).max:
+        raise ValueError(f"{name} must be finite, got {shown(value)}")
+    return number
+
+
+def check_numbers(
+    name: str,
+    values: ArrayLike,
+    *shape: int,
+    low: float | None = None,
+    high: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+) -> NDArray[np.float64]:
+    """``values`` as a float64 array of this shape, once all of them are finite and within their bounds.
+
+    Raises:
+        ValueError: naming the argument, what it must be, and what it was.
+    """
+    wanted = f"{_described('finite numbers', low, high, above, below)} in the shape {shape}"
+    try:
+        given: NDArray[Any] = np.asarray(values)
+    except ValueError:  # rows of several lengths
+        given = np.array(None)
+    if given.dtype.kind not in "iuf" or given.shape != shape:
+        raise ValueError(f"{name} must be {wanted}, got {shown(values)}")
+    array = given.astype(np.float64)
+    bad = [v for v in array.ravel().tolist() if not math.isfinite(v) or not _within(v, low, high, above, below)]
+    if bad:
+        raise ValueError(f"{name} must be {wanted}, got {shown(bad[0])} among them")
+    return array
+
+
+def check_text(name: str, value: object) -> str:
+    """``value``, once it is a string that is not empty. Raises ValueError."""
+    if not isinstance(value, str) or not value:
+        raise ValueError(f"{name} must be a name, got {shown(value)}")
+    return value
+
+
+def check_flag(name: str, value: object) -> bool:
+    """``value``, once it is True or False. Raises ValueError."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name} must be True or False, got {shown(value)}")
+    return bool(value)
+
+
+def shown(value: object) -> str:
+    """``value`` as a message shows it: in full where it is short."""
+    try:
+        text = repr(value.item() if isinstance(value, np.generic) else value)
+    except ValueError:  # more digits than Python converts
+        text = "a number of thousands of digits"
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 1]}…"
+
+
+def _within(number: float, low: float | None, high: float | None, above: float | None, below: float | None) -> bool:
+    return (
+        (low is None or number >= low)
+        and (high is None or number <= high)
+        and (above is None or number > above)
+        and (below is None or number < below)
+    )
+
+
+def _described(what: str, low: float | None, high: float | None, above: float | None, below: float | None) -> str:
+    """For example ``whole number of at least 1``, or ``number in (0, 1]``."""
+    least, greatest = low if above is None else above, high if below is None else below
+    if least is not None and greatest is not None:
+        brackets = ("[" if above is None else "(", "]" if below is None else ")")
+        return f"{what} in {brackets[0]}{least:g}, {greatest:g}{brackets[1]}"
+    if least is not None:
+        return f"{what} of at least {least:g}" if above is None else f"{what} above {least:g}"
+    if greatest is not None:
+        return f"{what} of at most {greatest:g}" if below is None else f"{what} below {greatest:g}"
+    return what
