@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import mujoco
 import numba
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -42,7 +42,15 @@ def _cache_of(dispatcher: Any) -> Any:
 @lru_cache
 def _digest(folder: Path) -> str:
     """Of every source file in a folder, and of what its code is compiled by and linked to."""
-    digest = hashlib.sha256(f"{numba.__version__} {mujoco.__version__}".encode())
+    digest = hashlib.sha256(f"{numba.__version__} {_installed('mujoco')}".encode())
     for path in sorted(folder.glob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def _installed(package: str) -> str:
+    """The version of a package, which a light install may be without."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "none"

@@ -6,12 +6,31 @@ import importlib
 from typing import Any
 
 from asm_gym.choices import check_choice
-from asm_gym.monitors.base import Monitor, Surprise
+from asm_gym.monitors.base import (
+    ExpectsActions,
+    ForgetsEvidence,
+    LearnsOnTheJob,
+    Monitor,
+    NamesSkills,
+    Surprise,
+)
 from asm_gym.monitors.baselines.base import EVIDENCE, Baseline, with_evidence
 from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.stream import StreamSpec
 
-__all__ = ["EVIDENCE", "MONITORS", "Monitor", "NeuralASM", "Surprise", "make_monitor", "monitor_class"]
+__all__ = [
+    "EVIDENCE",
+    "MONITORS",
+    "ExpectsActions",
+    "ForgetsEvidence",
+    "LearnsOnTheJob",
+    "Monitor",
+    "NamesSkills",
+    "NeuralASM",
+    "Surprise",
+    "make_monitor",
+    "monitor_class",
+]
 
 _RIVALS = {
     "skill_library": "skill_library:SkillLibrary",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,3 +49,50 @@ class Monitor(Protocol):
     def observe(self, state: State, stream: NDArray[np.floating[Any]]) -> tuple[State, Surprise]: ...
 
     def save(self, path: str | Path) -> None: ...
+
+
+@runtime_checkable
+class ForgetsEvidence(Protocol):
+    """A monitor that adds up evidence, and can be told to start anew after an alarm that was acted on."""
+
+    def reset_evidence(self, state: State) -> State:
+        """The state with the evidence so far forgotten; the model goes on."""
+        ...
+
+
+@runtime_checkable
+class ExpectsActions(Protocol):
+    """A monitor that knows what is likely to be commanded next."""
+
+    def expected_action(self, state: State) -> NDArray[np.float32]:
+        """(B, A) in the units of the action, of the state as ``observe`` handed it back."""
+        ...
+
+
+@runtime_checkable
+class LearnsOnTheJob(Protocol):
+    """A monitor that can learn from rows it has just observed, where they did not surprise it."""
+
+    def adapt(
+        self,
+        before: State,
+        stream: NDArray[np.floating[Any]],
+        surprise: Surprise,
+        rate: float = ...,
+        below: float = ...,
+    ) -> NDArray[np.bool_]:
+        """(B,) which of the rows (B, D) were learned from; ``before`` is the state that ``observe`` was given."""
+        ...
+
+
+@runtime_checkable
+class NamesSkills(Protocol):
+    """A monitor that can be taught the names of skills, and says which one runs."""
+
+    def name_skills(self, episodes: Sequence[Episode]) -> Self:
+        """Learns the names from episodes whose ``info["skill"]`` says them."""
+        ...
+
+    def skills(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.str_]:
+        """(T,) the skill that seems to run in each step of a stream (T, D)."""
+        ...

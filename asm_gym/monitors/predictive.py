@@ -136,13 +136,15 @@ class PredictiveMonitor(CalibratedMonitor):
             found = _joined(found, ratios)
         return PredictiveState(model, evidence, repetition), found
 
-    def resynchronise(self, state: PredictiveState) -> PredictiveState:
+    def reset_evidence(self, state: PredictiveState) -> PredictiveState:
         """The state with the evidence so far forgotten, after an alarm that was acted on; the model goes on."""
         evidence, repetition = state.evidence, state.repetition
         return state._replace(
             evidence=evidence._replace(vector=np.zeros_like(evidence.vector)),
             repetition=repetition._replace(unlikely=np.zeros_like(repetition.unlikely)),
         )
+
+    resynchronise = reset_evidence  # what it was called before; goes once the wrappers ask for the new name
 
     def attribute(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
         """(B, D) each number's share, from each error's (B, X)."""
