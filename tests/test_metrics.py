@@ -21,33 +21,23 @@ from asm_gym.evaluation.metrics import (
     placements,
     summarise,
     time_matched_auroc,
-    top_label,
     wilson_interval,
-    window_steps,
 )
-from asm_gym.evaluation.trace import Trace, spans
+from asm_gym.evaluation.trace import InterventionOutcome, Trace, TraceDetail, spans, window_steps
 
 
 def a_trace(
-    surprise: Any, fault: Any = (), condition: str | None = None, acting: str = "policy alone", **fields: Any
+    surprise: Any, onset: int | None = None, kind: str | None = None, contact_force: float = 0.0, **fields: Any
 ) -> Trace:
-    """A trace of 0.1 s steps and the threshold 10, in alarm wherever surprise is above it."""
-    surprise = np.asarray(surprise, np.float64)
-    active = np.zeros(len(surprise), np.bool_)
-    active[list(fault)] = True
-    attribution = np.column_stack([np.zeros(len(surprise)), surprise])
-    values: dict[str, Any] = {
-        "dt": 0.1,
-        "threshold": 10.0,
-        "alarm": surprise > 10.0,
-        "contact_force": np.zeros(len(surprise)),
-        "attribution": attribution,
-        "labels": ("calm", "loud"),
-        "success": True,
-        "ended_by_alarm": False,
-    }
-    condition = condition or ("push" if active.any() else "nominal")
-    return Trace(condition, acting, seed=0, surprise=surprise, fault=active, **{**values, **fields})
+    """A trace of 0.1 s steps and the threshold 10."""
+    kind = kind or ("nominal" if onset is None else "push")
+    values: dict[str, Any] = {"dt": 0.1, "threshold": 10.0, "seed": 0, "onset": onset, **fields}
+    outcome = InterventionOutcome(values.pop("success", True), values.pop("ended_by_alarm", False), contact_force)
+    return Trace(kind=kind, surprise=np.asarray(surprise, np.float64), outcome=outcome, **values)
+
+
+def detail(fault: Any) -> TraceDetail:
+    return TraceDetail(np.zeros((len(fault), 2)), ("calm", "loud"), fault)
 
 
 def test_spans_are_the_runs_of_true():
@@ -57,26 +47,26 @@ def test_spans_are_the_runs_of_true():
 
 
 def test_detection_counts_steps_from_the_onset_to_the_alarm():
-    trace = a_trace([1, 1, 1, 1, 20, 20], fault=[2, 3])
+    trace = a_trace([1, 1, 1, 1, 20, 20], onset=2)
     assert trace.onset == 2
     assert trace.detected_after == 2
     assert trace.delay == pytest.approx(0.3)  # the fault begins at 0.2 s, step 4 ends at 0.5 s
 
 
 def test_an_alarm_before_the_onset_is_false_and_no_detection():
-    trace = a_trace([1, 20, 1, 1, 1], fault=[3, 4])
+    trace = a_trace([1, 20, 1, 1, 1], onset=3)
     assert trace.false_alarms == (1,)
     assert trace.detected_after is None
     assert trace.delay is None
 
 
 def test_an_alarm_that_was_up_before_the_onset_is_no_detection_until_it_is_raised_again():
-    assert a_trace([20, 20, 20, 20], fault=[2]).detected_after is None
-    assert a_trace([20, 20, 20, 1, 20], fault=[2]).detected_after == 2
+    assert a_trace([20, 20, 20, 20], onset=2).detected_after is None
+    assert a_trace([20, 20, 20, 1, 20], onset=2).detected_after == 2
 
 
 def test_an_alarm_in_the_very_step_of_the_onset_is_detection_and_not_false():
-    trace = a_trace([1, 1, 20, 1], fault=[2])
+    trace = a_trace([1, 1, 20, 1], onset=2)
     assert trace.false_alarms == ()
     assert trace.detected_after == 0
 
@@ -91,9 +81,15 @@ def test_a_trace_without_a_fault_has_no_onset_and_only_false_alarms():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"alarm": np.zeros(2, bool)}, r"alarm must have the shape \(3,\), got \(2,\)"),
-        ({"attribution": np.zeros((3, 5))}, r"attribution must have the shape \(3, 2\)"),
-        ({"alarm": np.zeros(3, int)}, "alarm must be bool, got int64"),
+        ({"surprise": np.zeros((3, 2))}, r"surprise must have the shape \(T,\) with T > 0, got \(3, 2\)"),
+        ({"surprise": []}, r"surprise must have the shape \(T,\) with T > 0, got \(0,\)"),
+        ({"onset": -1}, "onset must be >= 0, got -1"),
+        ({"detail": detail(np.zeros(2, bool))}, "detail must be of 3 rows, got 2"),
+        ({"detail": detail(np.ones(3, bool))}, "a fault is active where none should be"),
+        (
+            {"detail": detail(np.ones(3, bool)), "onset": 1},
+            "a fault is active where none should be, before the onset 1",
+        ),
         ({"dt": 0.0}, "dt must be > 0, got 0.0"),
         ({"surprise": np.array([1.0, np.nan, 1.0])}, "surprise must not be NaN"),
     ],
@@ -101,12 +97,38 @@ def test_a_trace_without_a_fault_has_no_onset_and_only_false_alarms():
 def test_a_trace_refuses_what_it_cannot_mean(fields: dict[str, Any], message: str):
     surprise = fields.pop("surprise", [1, 1, 1])
     with pytest.raises(ValueError, match=message):
-        a_trace(surprise, **{"alarm": np.zeros(3, bool), **fields})
+        a_trace(surprise, **fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"attribution": np.zeros((3, 5))}, r"attribution must have the shape \(T, 2\), got \(3, 5\)"),
+        ({"fault": np.zeros(2, bool)}, r"fault must have the shape \(3,\), got \(2,\)"),
+        ({"fault": np.zeros(3, int)}, "fault must be bool, got int64"),
+    ],
+)
+def test_what_is_drawn_has_a_row_for_every_step(fields: dict[str, Any], message: str):
+    with pytest.raises(ValueError, match=message):
+        TraceDetail(**{"attribution": np.zeros((3, 2)), "channels": ("a", "b"), "fault": np.zeros(3, bool), **fields})
 
 
 def test_a_nominal_trace_holds_no_fault():
     with pytest.raises(ValueError, match="nominal trace must not hold a fault"):
-        a_trace([1, 1], fault=[1], condition="nominal")
+        a_trace([1, 1], onset=1, kind="nominal")
+
+
+def test_another_threshold_changes_the_alarms_and_nothing_else():
+    trace = a_trace([1, 20, 30], onset=1).attributed(np.eye(3), ("a", "b", "c"))
+    other = trace.at(25.0)
+    assert (trace.alarms, trace.top_channel) == ((1,), "b")
+    assert (other.alarms, other.detected_after, other.top_channel) == ((2,), 1, "")
+    np.testing.assert_array_equal(other.surprise, trace.surprise)
+
+
+def test_a_condition_is_the_kind_in_words():
+    trace = a_trace([1, 1], onset=1, kind="weak_joint", severity="mild", task="Lift")
+    assert (trace.condition, trace.title) == ("mild weak joint", "mild weak joint in Lift")
 
 
 @pytest.mark.parametrize(
@@ -177,7 +199,7 @@ def test_a_window_holds_whole_steps_whatever_the_rounding():
 
 def test_time_matching_compares_each_fault_with_the_same_steps_of_nominal_episodes():
     # Every episode is surprised at step 0, the nominal ones at step 3 too: only steps 1 and 2 may count.
-    faulty = a_trace([99, 5, 7, 1], fault=[1])
+    faulty = a_trace([99, 5, 7, 1], onset=1)
     nominal = [a_trace([90, 6, 1, 90]), a_trace([90, 1, 8, 90]), a_trace([90, 7, 1, 90]), a_trace([90, 1, 1, 90])]
     assert placements([faulty], nominal, window_s=0.2) == pytest.approx([(1 + 0.5) / 4])  # 8 above, 7 tied
     assert time_matched_auroc([faulty], nominal, window_s=0.2) == pytest.approx(1 - 1.5 / 4)
@@ -185,27 +207,27 @@ def test_time_matching_compares_each_fault_with_the_same_steps_of_nominal_episod
 
 def test_time_matching_of_one_common_window_is_the_plain_auroc():
     rng = np.random.default_rng(0)
-    faulty = [a_trace(rng.random(8) + 0.2, fault=range(3, 8)) for _ in range(9)]
+    faulty = [a_trace(rng.random(8) + 0.2, onset=3) for _ in range(9)]
     nominal = [a_trace(rng.random(8)) for _ in range(7)]
     plain = auroc([t.surprise[3:7].max() for t in faulty], [t.surprise[3:7].max() for t in nominal])
     assert time_matched_auroc(faulty, nominal, window_s=0.4) == pytest.approx(plain)
 
 
 def test_time_matching_leaves_out_nominal_episodes_that_ended_before_the_onset():
-    faulty = a_trace([1, 1, 5], fault=[2])
+    faulty = a_trace([1, 1, 5], onset=2)
     assert time_matched_auroc([faulty], [a_trace([99, 99])], window_s=1.0) is None
     assert time_matched_auroc([faulty], [a_trace([99, 99]), a_trace([1, 1, 1])], window_s=1.0) == 1.0
 
 
 def test_a_delay_is_at_least_one_step_and_a_late_alarm_is_a_miss():
-    at_once, late = a_trace([1, 20, 1, 1, 1], fault=[1]), a_trace([1, 1, 1, 20, 1], fault=[1])
-    never, nominal = a_trace([1, 1, 1, 1, 1], fault=[1]), a_trace([20, 20])
+    at_once, late = a_trace([1, 20, 1, 1, 1], onset=1), a_trace([1, 1, 1, 20, 1], onset=1)
+    never, nominal = a_trace([1, 1, 1, 1, 1], onset=1), a_trace([20, 20])
     assert delays_ms([late, at_once, never, nominal], window_s=0.3) == pytest.approx([100, 300, math.inf])
     assert delays_ms([late], window_s=0.2) == pytest.approx([math.inf])
 
 
 def test_quantiles_of_the_delay_count_misses_as_infinitely_late():
-    traces = [a_trace([1] * k + [20] + [1] * 30, fault=[0]) for k in range(20)]  # 100, 200, … 2000 ms
+    traces = [a_trace([1] * k + [20] + [1] * 30, onset=0) for k in range(20)]  # 100, 200, … 2000 ms
     assert delay_summary(traces, window_s=5.0) == pytest.approx(Delays(1000.0, 1900.0, 20, 0))
     assert delay_summary(traces, window_s=1.5) == pytest.approx(Delays(1000.0, math.inf, 15, 5))
     assert delay_summary([a_trace([1, 1])], window_s=1.0) is None
@@ -217,30 +239,25 @@ def test_false_alarms_per_hour_count_only_the_time_before_the_fault():
     faulty[[5, 6, 20, 50, 60]] = 20  # two alarms before step 40
     nominal = np.ones(60)
     nominal[3] = 20
-    assert false_alarms_per_hour([a_trace(faulty, fault=range(40, 70)), a_trace(nominal)]) == pytest.approx(1080.0)
-    assert math.isnan(false_alarms_per_hour([a_trace([1, 1], fault=[0])]))
+    assert false_alarms_per_hour([a_trace(faulty, onset=40), a_trace(nominal)]) == pytest.approx(1080.0)
+    assert math.isnan(false_alarms_per_hour([a_trace([1, 1], onset=0)]))
 
 
-def test_the_top_label_is_read_at_the_first_alarm_since_the_onset():
+def test_the_top_channel_is_read_at_the_first_alarm_since_the_onset():
     attribution = np.array([[0, 0], [20, 0], [0, 0], [0, 20]])
-    trace = a_trace([1, 20, 1, 20], fault=[2, 3], attribution=attribution)
-    assert top_label(trace) == "loud"
-    assert top_label(a_trace([1, 20, 1, 20], attribution=attribution)) == "calm"
-    with pytest.raises(ValueError, match="no alarm"):
-        top_label(a_trace([1, 1]))
+    for onset, top in ((2, "loud"), (None, "calm")):
+        assert a_trace([1, 20, 1, 20], onset).attributed(attribution, ("calm", "loud")).top_channel == top
+    assert a_trace([1, 1]).attributed(attribution, ("calm", "loud")).top_channel == ""
 
 
 def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_acting():
-    def force(*newtons: float) -> dict[str, Any]:
-        return {"contact_force": np.array(newtons)}
-
     traces = [
-        a_trace([1, 1, 20, 1], fault=[1, 2], success=False, **force(1, 50, 2, 0)),
-        a_trace([1, 1, 1, 1], fault=[1, 2], success=False, **force(1, 70, 2, 0)),
-        a_trace([20, 1, 1, 20], fault=[1, 2], success=True, **force(1, 90, 2, 0)),
+        a_trace([1, 1, 20, 1], onset=1, success=False, top_channel="loud", contact_force=50.0),
+        a_trace([1, 1, 1, 1], onset=1, success=False, contact_force=70.0),
+        a_trace([20, 1, 1, 20], onset=1, success=True, top_channel="loud", contact_force=90.0),
         # The wrapped episodes see an alarm at once, which must not touch the figures of detection.
-        a_trace([1, 20, 1, 1], fault=[1, 2], acting="hold", **force(1, 10, 0, 0)),
-        a_trace([1, 20, 1, 1], fault=[1, 2], acting="hold", ended_by_alarm=True, **force(1, 20, 0, 0)),
+        a_trace([1, 20, 1, 1], onset=1, acting="hold", contact_force=10.0),
+        a_trace([1, 20, 1, 1], onset=1, acting="hold", ended_by_alarm=True, contact_force=20.0),
         a_trace([1, 2, 3, 4]),
         a_trace([1, 2, 30, 4]),
     ]

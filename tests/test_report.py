@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from asm_gym.evaluation import plots
 from asm_gym.evaluation.metrics import summarise, time_matched_auroc
 from asm_gym.evaluation.report import Table, detection_table, headline, outcome_table, write_report
-from asm_gym.evaluation.trace import Trace
+from asm_gym.evaluation.trace import InterventionOutcome, Trace, TraceDetail
 from asm_gym.evaluation.video import write_video
 
 
@@ -32,10 +32,11 @@ def a_trace(condition: str, seed: int, acting: str = "policy alone") -> Trace:
         fault[20:40] = True
         surprise[20 + rng.integers(8) : 40] += 30 * rng.random()
     attribution = rng.dirichlet(np.ones(20), 60) * surprise[:, None]
+    channels = tuple(f"joint_position[{i}]" for i in range(20))
     return Trace(
-        condition, acting, seed, 0.05, 20.0, surprise, surprise > 20.0, fault, 10 * rng.random(60), attribution,
-        tuple(f"joint_position[{i}]" for i in range(20)), True, False,
-    )  # fmt: skip
+        condition, seed, 0.05, 20.0, surprise, 20 if fault.any() else None, acting=acting,
+        outcome=InterventionOutcome(True, False, 10 * rng.random()), detail=TraceDetail(attribution, channels, fault),
+    ).attributed(attribution, channels)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -102,10 +103,10 @@ def test_infinite_and_zero_surprise_can_be_drawn(traces: list[Trace], tmp_path: 
     good = next(t for t in traces if t.delay is not None)
     surprise = good.surprise.copy()
     surprise[:5], surprise[30:] = 0.0, np.inf
-    attribution = good.attribution.copy()
+    attribution = good.detail.attribution.copy()
     attribution[30:] = np.inf
-    fields = {**vars(good), "surprise": surprise, "alarm": surprise > 20.0, "attribution": attribution}
-    broken = Trace(**{k: v for k, v in fields.items() if k in Trace.__dataclass_fields__})
+    detail = dataclasses.replace(good.detail, attribution=attribution)
+    broken = dataclasses.replace(good, surprise=surprise, detail=detail)
     for name, figure in figures_of([broken, *(t for t in traces if t.condition == "nominal")]).items():
         assert plots.save(figure, tmp_path / f"{name}.png").stat().st_size > 5000
 
@@ -113,23 +114,27 @@ def test_infinite_and_zero_surprise_can_be_drawn(traces: list[Trace], tmp_path: 
 def test_attribution_shows_the_channels_with_the_greatest_share_first(traces: list[Trace]):
     trace = next(t for t in traces if t.delay is not None)
     labels = [text.get_text() for text in plots.attribution_figure(trace, top=3).axes[0].get_yticklabels()]
-    peaks = trace.attribution[20:].max(axis=0)
-    assert labels == [trace.labels[i] for i in np.argsort(-peaks)[:3]]
+    peaks = trace.detail.attribution[20:].max(axis=0)
+    assert labels == [trace.detail.channels[i] for i in np.argsort(-peaks)[:3]]
 
 
 def test_the_stream_is_shown_beside_its_twin_and_the_most_surprising_channel_first(traces: list[Trace]):
     trace = next(t for t in traces if t.delay is not None)
     rng = np.random.default_rng(0)
-    stream, twin = rng.normal(size=(2, len(trace), len(trace.labels)))
-    axes = plots.stream_figure(dataclasses.replace(trace, stream=stream, twin=twin), top=2).axes
-    peaks = trace.attribution[trace.onset :].max(axis=0)
+    stream, twin = rng.normal(size=(2, len(trace), len(trace.detail.channels)))
+    axes = plots.stream_figure(
+        dataclasses.replace(trace, detail=dataclasses.replace(trace.detail, stream=stream, twin=twin)), top=2
+    ).axes
+    peaks = trace.detail.attribution[trace.onset :].max(axis=0)
     order = np.argsort(-peaks)[:2]
-    assert [ax.get_title(loc="left") for ax in axes] == [trace.labels[i] for i in order]
+    assert [ax.get_title(loc="left") for ax in axes] == [trace.detail.channels[i] for i in order]
     healthy, sensed = (line.get_ydata() for line in axes[0].lines[:2])
     np.testing.assert_array_equal(healthy, twin[:, order[0]])
     np.testing.assert_array_equal(sensed, stream[:, order[0]])
     with pytest.raises(ValueError, match="without its stream"):
         plots.stream_figure(trace)
+    with pytest.raises(ValueError, match="without the detail"):
+        plots.stream_figure(dataclasses.replace(trace, detail=None))
 
 
 def test_nothing_to_draw_is_an_error(traces: list[Trace]):

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
+from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace, window_steps
 
 
 def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -138,13 +138,6 @@ class Delays(NamedTuple):
     missed: int
 
 
-def window_steps(window_s: float, dt: float) -> int:
-    """How many control steps a window holds, at least one."""
-    if not window_s > 0:
-        raise ValueError(f"window_s must be > 0, got {window_s}")
-    return max(1, math.floor(window_s / dt + 1e-6))  # 0.3 / 0.1 is a hair below 3
-
-
 def delays_ms(traces: Sequence[Trace], window_s: float) -> NDArray[np.float64]:
     """(F,) sorted times from the fault to its alarm [ms], ``inf`` where that took longer than the window.
 
@@ -245,36 +238,19 @@ def _row(condition: str, traces: Sequence[Trace], nominal: Sequence[Trace], wind
         detected=Share(delays.detected, delays.detected + delays.missed) if delays else Share(0, 0),
         delays=delays,
         auroc=time_matched_auroc(watched, nominal, window_s),
-        top_labels=tuple(Counter(top_label(t) for t in watched if _blamed_step(t) is not None).most_common(3)),
+        top_labels=tuple(Counter(t.top_channel for t in watched if t.top_channel).most_common(3)),
         outcomes=tuple(_outcome(a, [t for t in traces if t.acting == a]) for a in actings),
     )
 
 
 def _outcome(acting: str, traces: Sequence[Trace]) -> Outcome:
-    peaks = [float(t.contact_force.max()) for t in traces]
+    peaks = [t.outcome.contact_force for t in traces]
     return Outcome(
         acting=acting,
-        success=Share.of([t.success for t in traces]),
-        ended_by_alarm=Share.of([t.ended_by_alarm for t in traces]),
+        success=Share.of([t.outcome.success for t in traces]),
+        ended_by_alarm=Share.of([t.outcome.ended_by_alarm for t in traces]),
         peak_force=float(np.median(peaks)),
     )
-
-
-def _blamed_step(trace: Trace) -> int | None:
-    """The step of the first alarm since the onset, or of the first alarm where there is no fault."""
-    return next((t for t in trace.alarms if t >= (trace.onset or 0)), None)
-
-
-def top_label(trace: Trace) -> str:
-    """The channel with the greatest share when the first alarm was raised (since the onset, where there is one).
-
-    Raises:
-        ValueError: there was no such alarm.
-    """
-    step = _blamed_step(trace)
-    if step is None:
-        raise ValueError("no alarm was raised in this trace")
-    return trace.labels[int(np.argmax(trace.attribution[step]))]
 
 
 def _check_confidence(confidence: Any) -> float:

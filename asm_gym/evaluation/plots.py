@@ -20,8 +20,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from asm_gym.evaluation.metrics import delays_ms, placements, wilson_interval, window_steps
-from asm_gym.evaluation.trace import NOMINAL, Trace, spans
+from asm_gym.evaluation.metrics import delays_ms, placements, wilson_interval
+from asm_gym.evaluation.trace import NOMINAL, Trace, TraceDetail, spans
 
 BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK = (
     "#0072B2",
@@ -99,7 +99,7 @@ def _surprise_panel(ax: Axes, trace: Trace) -> None:
     time = (np.arange(len(trace)) + 1) * trace.dt  # (T,) a row is known at the end of its step
     ax.plot(time, np.clip(trace.surprise, floor, ceiling), color=BLUE, linewidth=1.5)
     ax.axhline(trace.threshold, color=BLACK, linewidth=1, linestyle=(0, (4, 2)))
-    for start, stop in spans(trace.fault):
+    for start, stop in spans(trace.detail.fault) if trace.detail else []:
         ax.axvspan(start * trace.dt, stop * trace.dt, color=ORANGE, alpha=0.3, linewidth=0)
     if trace.onset is not None:
         ax.axvline(trace.onset * trace.dt, color=ORANGE, linewidth=1.5)
@@ -110,7 +110,7 @@ def _surprise_panel(ax: Axes, trace: Trace) -> None:
         ax.plot(ends[0], 0.86, "v", color=VERMILLION, markersize=7, transform=rug)
     late = "" if trace.delay is None else f": alarm {1e3 * trace.delay:.0f} ms after the onset"
     missed = ": missed" if trace.onset is not None and trace.delay is None else ""
-    ax.set_title(f"{trace.condition}{late}{missed}")
+    ax.set_title(f"{trace.title}{late}{missed}")
     ax.grid(axis="y", color="#dddddd", linewidth=0.6)
 
 
@@ -165,7 +165,8 @@ def roc_figure(traces: Sequence[Trace], window_s: float) -> Figure:
 
 def attribution_figure(trace: Trace, top: int = 12) -> Figure:
     """Where the surprise came from: the shares of the ``top`` channels over time, in units of the threshold."""
-    share = trace.attribution / trace.threshold  # (T, D)
+    detail = _detail(trace)
+    share = detail.attribution / trace.threshold  # (T, D)
     # An infinite share takes the brightest finite colour, or it would leave all others dark.
     brightest = float(share[np.isfinite(share)].max(initial=1.0))
     share = np.nan_to_num(share, nan=0.0, posinf=brightest, neginf=0.0)
@@ -179,7 +180,7 @@ def attribution_figure(trace: Trace, top: int = 12) -> Figure:
             np.clip(share[:, rows].T, norm.vmin, None), norm=norm, cmap="cividis", aspect="auto", extent=ends,
             interpolation="nearest",
         )  # fmt: skip
-        ax.set_yticks(range(len(rows)), [trace.labels[r] for r in rows])
+        ax.set_yticks(range(len(rows)), [detail.channels[r] for r in rows])
         ax.set_xlabel("time [s]")
         ax.spines[:].set_visible(False)
         marks = [(trace.onset * trace.dt, "fault")] if trace.onset is not None else []
@@ -189,7 +190,7 @@ def attribution_figure(trace: Trace, top: int = 12) -> Figure:
             ax.axvline(at, color="white", linewidth=1.5, linestyle=("-", (0, (3, 2)))[i])
             side = "right" if i == 0 and len(marks) == 2 else "left"
             ax.annotate(text, (at, -0.5), (0, 4), textcoords="offset points", ha=side, weight="bold")
-        ax.set_title(trace.condition, pad=18)
+        ax.set_title(trace.title, pad=18)
         fig.colorbar(image, ax=ax, label="share of surprise / threshold", pad=0.02)
     return fig
 
@@ -200,26 +201,27 @@ def stream_figure(trace: Trace, top: int = 4) -> Figure:
     Raises:
         ValueError: the trace has no stream.
     """
-    if trace.stream is None:
+    detail = _detail(trace)
+    if detail.stream is None:
         raise ValueError("this trace was kept without its stream")
-    share = np.nan_to_num(trace.attribution[trace.onset or 0 :], posinf=1e30)
+    share = np.nan_to_num(detail.attribution[trace.onset or 0 :], posinf=1e30)
     rows = np.argsort(-share.max(axis=0), kind="stable")[:top]
     time = (np.arange(len(trace)) + 1) * trace.dt
     with figure(height=1.0 + 1.15 * len(rows)) as fig:
         axes = fig.subplots(len(rows), sharex=True, squeeze=False)[:, 0]
         for i, (ax, row) in enumerate(zip(axes, rows, strict=True)):
-            for start, stop in spans(trace.fault):
+            for start, stop in spans(detail.fault):
                 label = "fault" if i == 0 else None
                 ax.axvspan(start * trace.dt, stop * trace.dt, color="#f3d9a4", linewidth=0, label=label)
-            if trace.twin is not None:
-                healthy = trace.twin[: len(trace), row]
+            if detail.twin is not None:
+                healthy = detail.twin[: len(trace), row]
                 label = "without the fault" if i == 0 else None
                 ax.plot(time[: len(healthy)], healthy, color="#666666", linestyle=(0, (4, 2)), label=label)
-            ax.plot(time, trace.stream[:, row], color=BLUE, label="sensed" if i == 0 else None)
+            ax.plot(time, detail.stream[:, row], color=BLUE, label="sensed" if i == 0 else None)
             if trace.delay is not None and trace.onset is not None:
                 at = trace.onset * trace.dt + trace.delay
                 ax.axvline(at, color=BLACK, linewidth=1, label="alarm" if i == 0 else None)
-            ax.set_title(trace.labels[row], loc="left", fontsize=10)
+            ax.set_title(detail.channels[row], loc="left", fontsize=10)
         axes[-1].set_xlabel("time [s]")
         fig.legend(loc="outside upper right", ncols=4, frameon=False)
     return fig
@@ -256,9 +258,7 @@ def maxima_figure(traces: Sequence[Trace], window_s: float) -> Figure:
 
 
 def _peak(trace: Trace, window_s: float) -> float:
-    start = trace.onset or 0
-    stop = len(trace) if trace.onset is None else start + window_steps(window_s, trace.dt)
-    return float(np.clip(trace.surprise[start:stop].max(), *_limits([trace])))
+    return float(np.clip(trace.surprise[trace.window(window_s)].max(), *_limits([trace])))
 
 
 def _swarm(values: NDArray[np.float64], size: float) -> NDArray[np.float64]:
@@ -293,6 +293,12 @@ def look(i: int) -> tuple[str, Any, str]:
     """Colour, line style and marker of the i-th curve."""
     n = len(_COLOURS)
     return _COLOURS[i % n], _LINES[(i + i // n) % n], _MARKERS[(i + i // n) % n]
+
+
+def _detail(trace: Trace) -> TraceDetail:
+    if trace.detail is None:
+        raise ValueError("this trace was kept without the detail that the figure needs")
+    return trace.detail
 
 
 def _require(traces: Sequence[Trace]) -> None:

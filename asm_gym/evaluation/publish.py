@@ -12,11 +12,12 @@ import numpy as np
 
 from asm_gym.evaluation import comparison_plots as plots
 from asm_gym.evaluation.comparison import IDEAL, Cell, Score, Sight
-from asm_gym.evaluation.metrics import Share, window_steps
+from asm_gym.evaluation.metrics import Share
 from asm_gym.evaluation.plots import attribution_figure, stream_figure, surprise_figure
 from asm_gym.evaluation.report import Table, write_report
 from asm_gym.evaluation.scoring import Verdict
 from asm_gym.evaluation.text_tables import markdown
+from asm_gym.evaluation.trace import window_steps
 from asm_gym.rollouts.benchmark import Judgement
 
 _HEADINGS = ("Monitor", "AUROC", "AP", "Found at 0.5 %", "at 1 %", "at 5 %", "Median delay [ms]", "p95 [ms]")
@@ -110,8 +111,8 @@ def publish(folder: Path, judgement: Judgement, details: Mapping[str, Any], vide
             surprise_figure(judgement.examples)
         )
     for trace in judgement.examples:
-        figures[f"{trace.condition}: the channels that surprised most."] = stream_figure(trace)
-        figures[f"{trace.condition}: where the surprise came from."] = attribution_figure(trace)
+        figures[f"{trace.title}: the channels that surprised most."] = stream_figure(trace)
+        figures[f"{trace.title}: where the surprise came from."] = attribution_figure(trace)
     write_report(
         folder / "report.html",
         "Who notices what",

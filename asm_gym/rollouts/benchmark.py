@@ -20,9 +20,9 @@ from asm_gym.evaluation import comparison
 from asm_gym.evaluation.archive import Label, Recording, read
 from asm_gym.evaluation.comparison import IDEAL, RATES, Cell, Score, Sight
 from asm_gym.evaluation.ideal import earliest, noise_floor, separation
-from asm_gym.evaluation.metrics import Share, window_steps
+from asm_gym.evaluation.metrics import Share
 from asm_gym.evaluation.scoring import Verdict, coverage
-from asm_gym.evaluation.trace import POLICY_ALONE, Trace
+from asm_gym.evaluation.trace import InterventionOutcome, Trace, TraceDetail, window_steps
 from asm_gym.monitors import EVIDENCE, Monitor, make_monitor, monitor_class
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 
@@ -256,20 +256,22 @@ def _examples(
         label, episode = recordings[i].label, recordings[i].episode
         surprise = monitor.score(episode)
         traces[label] = Trace(
-            condition=" ".join([label.severity, label.kind.replace("_", " "), "in", label.task]),
-            acting=POLICY_ALONE,
+            kind=label.kind,
+            severity=label.severity,
+            task=label.task,
             seed=label.seed,
             dt=episode.spec.dt,
             threshold=threshold,
             surprise=surprise.value,
-            alarm=surprise.value > threshold,
-            fault=episode.faults,
-            contact_force=recordings[i].contact_force,
-            attribution=surprise.attribution,
-            labels=episode.spec.labels,
-            success=episode.success,
-            stream=episode.stream,
-            twin=twins.get((label.task, label.seed)),
+            onset=label.onset,
+            outcome=InterventionOutcome(episode.success),
+            detail=TraceDetail(
+                surprise.attribution,
+                episode.spec.labels,
+                episode.faults,
+                episode.stream,
+                twins.get((label.task, label.seed)),
+            ),
         )
     return traces
 

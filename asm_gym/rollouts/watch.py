@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from asm_gym.evaluation.trace import POLICY_ALONE, Trace
+from asm_gym.evaluation.trace import POLICY_ALONE, InterventionOutcome, Trace, TraceDetail
 from asm_gym.faults import Fault
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy, rollout
@@ -72,18 +72,21 @@ def watch(trial: Trial, env_id: str, policy: str, memory: Path) -> Trace:
     finally:
         env.get_wrapper_attr("undo_faults")()  # the next trial has wrappers of its own around the same environment
     asm = [info["asm"] for info in infos]
-    return Trace(
-        condition=trial.condition,
+    fault = np.array([bool(info["fault"]) for info in infos])
+    attribution = np.array([list(a["attribution"].values()) for a in asm])
+    trace = Trace(
+        kind=trial.condition,
         acting=trial.acting,
         seed=trial.seed,
         dt=monitor.spec.dt,
         threshold=monitor.threshold,
         surprise=np.array([a["surprise"] for a in asm]),
-        alarm=np.array([a["alarm"] for a in asm]),
-        fault=np.array([bool(info["fault"]) for info in infos]),
-        contact_force=np.array([info["contact_force"] for info in infos]),
-        attribution=np.array([list(a["attribution"].values()) for a in asm]),
-        labels=monitor.spec.labels,
-        success=success,
-        ended_by_alarm=trial.acting == "terminate" and bool(asm[-1]["alarm"]),
+        onset=int(np.argmax(fault)) if fault.any() else None,
+        outcome=InterventionOutcome(
+            success,
+            ended_by_alarm=trial.acting == "terminate" and bool(asm[-1]["alarm"]),
+            contact_force=float(np.max([info["contact_force"] for info in infos])),
+        ),
+        detail=TraceDetail(attribution, monitor.spec.labels, fault),
     )
+    return trace.attributed(attribution, monitor.spec.labels)
