@@ -26,8 +26,9 @@ from rich.table import Table as RichTable
 
 from asm_gym.detection.detector import conformal_episodes
 from asm_gym.evaluation import plots
-from asm_gym.evaluation.metrics import Row, Share, binomial_interval, summarise
+from asm_gym.evaluation.metrics import Row, summarise
 from asm_gym.evaluation.report import detection_table, headline, outcome_table, write_report
+from asm_gym.evaluation.statistics import Share, binomial_interval
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
 from asm_gym.faults import Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asm_gym.evaluation.ideal import auroc_bound, earliest, noise_floor, power_bound, separation
-from asm_gym.evaluation.metrics import auroc
+from asm_gym.evaluation.statistics import auroc
 
 
 def test_the_bounds_are_what_the_likelihood_ratio_reaches():

@@ -12,17 +12,14 @@ from scipy import stats
 
 from asm_gym.evaluation.metrics import (
     Delays,
-    Share,
-    auroc,
-    binomial_interval,
     delay_summary,
     delays_ms,
     false_alarms_per_hour,
     placements,
     summarise,
     time_matched_auroc,
-    wilson_interval,
 )
+from asm_gym.evaluation.statistics import Share, auroc, binomial_interval, wilson_interval
 from asm_gym.evaluation.trace import InterventionOutcome, Trace, TraceDetail, spans, window_steps
 
 

@@ -7,18 +7,20 @@ import re
 import numpy as np
 import pytest
 
-from asm_gym.evaluation.intervention import Reaction, bootstrap, compare, gain, reduction
-from asm_gym.evaluation.trace import POLICY_ALONE
-from asm_gym.rollouts.bout import NOMINAL, PASSING, Bout
+from asm_gym.evaluation.intervention import compare
+from asm_gym.evaluation.statistics import bootstrap, gain, reduction
+from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, InterventionOutcome, Trace
+from asm_gym.rollouts.bout import PASSING, Bout
 from asm_gym.scripts.evaluate import main as evaluate
 from asm_gym.scripts.reproduce.reflexes import Args, bouts, main
 
 
-def reaction(seed: int, acting: str, **changes) -> Reaction:
-    what = {"success": True, "peak_force": 40.0, "impulse": 8.0, "alarm_s": 0.5, "acted_s": 0.5, "delay_ms": 100.0}
-    return Reaction(
-        **{"task": "Lift", "fault": "push", "acting": acting, "seed": seed, "ended": False, **what, **changes}
-    )
+def trace(seed: int, acting: str, delay: int = 2, ended: bool = False, **changes) -> Trace:
+    """Ten steps of 50 ms, the alarm ``delay`` steps after the onset."""
+    surprise = np.where(np.arange(10) == 1 + delay, 2.0, 0.0)
+    what = {"success": True, "external_force": 40.0, "impulse": 8.0, "acted_s": 0.5, **changes}
+    outcome = InterventionOutcome(ended_by_alarm=ended, **what)
+    return Trace("push", seed, 0.05, 1.0, surprise, 2, task="Lift", acting=acting, outcome=outcome)
 
 
 def test_gain_and_reduction_are_the_hand_computed_ones():
@@ -39,19 +41,20 @@ def test_the_bootstrap_interval_of_a_mean_is_about_the_normal_one():
 
 
 def test_pairs_are_matched_by_seed_whatever_their_order():
-    alone = [reaction(n, POLICY_ALONE, peak_force=10.0 * (n + 1), success=n < 3) for n in range(4)]
-    held = [reaction(n, "hold", peak_force=5.0 * (n + 1), delay_ms=50.0 * (n + 1), ended=n == 0) for n in (2, 0, 3, 1)]
+    alone = [trace(n, POLICY_ALONE, external_force=10.0 * (n + 1), success=n < 3) for n in range(4)]
+    held = [trace(n, "hold", external_force=5.0 * (n + 1), delay=n + 1, ended=n == 0) for n in (2, 0, 3, 1)]
     c = compare(alone, held)
     assert c.peak == (0.5, 0.5, 0.5)
     assert c.impulse.value == 0.0
     assert (c.success.k, c.alone.k, c.gained.value) == (4, 3, 0.25)
     assert c.median_delay_ms == 100.0
     assert (c.ended.k, c.ended.n) == (1, 4)
+    assert c.alarm_s == pytest.approx(0.05)
 
 
 def test_what_is_no_pair_is_refused():
     with pytest.raises(ValueError, match="twin"):
-        compare([reaction(0, POLICY_ALONE)], [reaction(1, "hold")])
+        compare([trace(0, POLICY_ALONE)], [trace(1, "hold")])
     with pytest.raises(ValueError, match="twin"):
         compare([], [])
 

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from asm_gym.evaluation.repertoire import Spread, naming_figure, share_right
+from asm_gym.evaluation.repertoire import naming_figure, share_right
+from asm_gym.evaluation.statistics import Spread
 from asm_gym.scripts import evaluate
 from asm_gym.scripts.reproduce import repertoire
 from asm_gym.scripts.reproduce.skill_switch import NAMES, Switch, record_switch

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from asm_gym.evaluation.metrics import Share
+from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.trace import POLICY_ALONE
 from asm_gym.faults import FrozenEncoder, Push
 from asm_gym.rollouts.parallel import parallel_map

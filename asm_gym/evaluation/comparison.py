@@ -10,8 +10,8 @@ import numpy as np
 
 from asm_gym.evaluation import scoring
 from asm_gym.evaluation.ideal import auroc_bound, power_bound
-from asm_gym.evaluation.metrics import Share
 from asm_gym.evaluation.scoring import Verdict
+from asm_gym.evaluation.statistics import Share
 
 IDEAL = "ideal observer"
 

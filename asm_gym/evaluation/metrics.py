@@ -10,66 +10,13 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from asm_gym.evaluation.statistics import Share, auroc
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace, window_steps
-
-
-def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """The score interval of a proportion of ``k`` in ``n`` (Wilson 1927); (0, 1) where ``n`` is 0.
-
-    ``(p + z²/2n ± z √(p(1-p)/n + z²/4n²)) / (1 + z²/n)``
-    """
-    if not 0 <= k <= n:
-        raise ValueError(f"k must be in [0, n], got {k} of {n}")
-    if n == 0:
-        return 0.0, 1.0
-    z = NormalDist().inv_cdf(0.5 + _check_confidence(confidence) / 2)
-    p, shrink = k / n, 1 + z * z / n
-    centre = (p + z * z / (2 * n)) / shrink
-    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / shrink
-    # At the ends the bound is exact; rounding would leave 1e-17.
-    return (0.0 if k == 0 else centre - half), (1.0 if k == n else centre + half)
-
-
-def binomial_interval(n: int, p: float, confidence: float = 0.95) -> tuple[int, int]:
-    """Counts (lo, hi) that ``n`` trials of probability ``p`` stay within, equal tails: P(k < lo), P(k > hi) <= (1-c)/2.
-
-    For checking a calibration: alarms in n nominal episodes at the false-alarm rate p.
-    """
-    if not 0 <= p <= 1:
-        raise ValueError(f"p must be in [0, 1], got {p}")
-    if n < 0:
-        raise ValueError(f"n must be >= 0, got {n}")
-    tail = (1 - _check_confidence(confidence)) / 2
-    if p in (0.0, 1.0):
-        return round(n * p), round(n * p)
-    log_mass = [
-        math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) + k * math.log(p) + (n - k) * math.log1p(-p)
-        for k in range(n + 1)
-    ]
-    mass = np.exp(log_mass)  # (n + 1,)
-    below, above = np.cumsum(mass), np.cumsum(mass[::-1])[::-1]  # P(K <= k), P(K >= k)
-    return int(np.argmax(below > tail)), int(n - np.argmax(above[::-1] > tail))
-
-
-def auroc(scores_pos: ArrayLike, scores_neg: ArrayLike) -> float:
-    """The probability that a positive scores higher than a negative, ties counted half (Mann-Whitney).
-
-    Takes infinite scores, refuses NaN.
-    """
-    pos, neg = np.asarray(scores_pos, np.float64), np.asarray(scores_neg, np.float64)
-    if not pos.size or not neg.size:
-        raise ValueError(f"auroc needs scores of both kinds, got {pos.size} positive and {neg.size} negative")
-    if np.isnan(pos).any() or np.isnan(neg).any():
-        raise ValueError("scores must not be NaN")
-    neg = np.sort(neg)
-    lower, not_higher = np.searchsorted(neg, pos, "left"), np.searchsorted(neg, pos, "right")  # (P,)
-    return float((lower + not_higher).sum() / (2 * pos.size * neg.size))
 
 
 def placements(faulty: Sequence[Trace], nominal: Sequence[Trace], window_s: float) -> NDArray[np.float64]:
@@ -100,26 +47,6 @@ def time_matched_auroc(faulty: Sequence[Trace], nominal: Sequence[Trace], window
     """
     values = placements(faulty, nominal, window_s)
     return float(1.0 - values.mean()) if values.size else None
-
-
-class Share(NamedTuple):
-    """``k`` of ``n``."""
-
-    k: int
-    n: int
-
-    @property
-    def value(self) -> float:
-        return self.k / self.n if self.n else math.nan
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % Wilson interval."""
-        return wilson_interval(self.k, self.n)
-
-    @classmethod
-    def of(cls, outcomes: Sequence[bool]) -> Share:
-        return cls(sum(map(bool, outcomes)), len(outcomes))
 
 
 class Delays(NamedTuple):
@@ -251,9 +178,3 @@ def _outcome(acting: str, traces: Sequence[Trace]) -> Outcome:
         ended_by_alarm=Share.of([t.outcome.ended_by_alarm for t in traces]),
         peak_force=float(np.median(peaks)),
     )
-
-
-def _check_confidence(confidence: Any) -> float:
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence must be in (0, 1), got {confidence}")
-    return float(confidence)

@@ -20,7 +20,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from asm_gym.evaluation.metrics import delays_ms, placements, wilson_interval
+from asm_gym.evaluation.metrics import delays_ms, placements
+from asm_gym.evaluation.statistics import wilson_interval
 from asm_gym.evaluation.trace import NOMINAL, Trace, TraceDetail, spans
 
 BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK = (

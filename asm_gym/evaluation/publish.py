@@ -12,10 +12,10 @@ import numpy as np
 
 from asm_gym.evaluation import comparison_plots as plots
 from asm_gym.evaluation.comparison import IDEAL, Cell, Score, Sight
-from asm_gym.evaluation.metrics import Share
 from asm_gym.evaluation.plots import attribution_figure, stream_figure, surprise_figure
 from asm_gym.evaluation.report import Table, write_report
 from asm_gym.evaluation.scoring import Verdict
+from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.text_tables import markdown
 from asm_gym.evaluation.trace import window_steps
 from asm_gym.rollouts.benchmark import Judgement

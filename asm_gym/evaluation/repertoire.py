@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -12,24 +11,7 @@ from numpy.typing import NDArray
 
 from asm_gym.evaluation.plots import figure, look
 from asm_gym.evaluation.report import Table
-
-
-class Spread(NamedTuple):
-    """Mean and standard deviation over seeds."""
-
-    mean: float
-    sd: float
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> Spread:
-        """Of one value a seed; a single one has no deviation, NaN."""
-        return cls(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else math.nan)
-
-    def text(self, scale: float = 1.0, digits: int = 3) -> str:
-        """``mean ± sd``, each times ``scale``; the mean alone where there is no deviation."""
-        if math.isnan(self.sd):
-            return f"{scale * self.mean:.{digits}f}"
-        return f"{scale * self.mean:.{digits}f} ± {scale * self.sd:.{digits}f}"
+from asm_gym.evaluation.statistics import Spread
 
 
 class Alarms(NamedTuple):

@@ -13,7 +13,8 @@ from string import Template
 
 from matplotlib.figure import Figure
 
-from asm_gym.evaluation.metrics import Row, Share
+from asm_gym.evaluation.metrics import Row
+from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE
 
 _PAGE = Template("""<!doctype html>

@@ -11,10 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from asm_gym.evaluation.intervention import Estimate, bootstrap, gain, reduction
 from asm_gym.evaluation.plots import figure, look
-from asm_gym.evaluation.repertoire import Spread
 from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.statistics import Estimate, Spread, bootstrap, gain, reduction
 
 COUNTED = ("over", "contacts", "limited", "touched", "alarms", "acted", "noticed")
 """Names of what ``Outcome`` counts."""
@@ -164,19 +163,13 @@ def worth_table(outcomes: Mapping[str, Sequence[Outcome]], alone: str, limit: fl
         limit: of the force [N].
     """
     found = [worth(outcomes[alone], runs) for name, runs in outcomes.items() if name != alone]
-    rows = [(w.condition, *map(_percent, (w.over, w.contacts, w.limited, w.gained))) for w in found]
+    rows = [(w.condition, *(e.percent("none alone") for e in (w.over, w.contacts, w.limited, w.gained))) for w in found]
     return Table(
         "Against training alone, paired by seed; in brackets 95 % bootstrap intervals over seeds, which for so few of "
         "them are too narrow rather than too wide.",
         ("", f"Steps above {limit:g} N less by", "Contacts less by", "At torque limit less by", "Success gained"),
         rows,
     )
-
-
-def _percent(e: Estimate) -> str:
-    if math.isnan(e.value):
-        return "none alone"
-    return f"{100 * e.value:.0f} % ({100 * e.low:.0f} to {100 * e.high:.0f})"
 
 
 def learning_figure(outcomes: Mapping[str, Sequence[Outcome]], limit: float) -> Figure:

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.evaluation.metrics import Delays, Share, auroc
+from asm_gym.evaluation.metrics import Delays
+from asm_gym.evaluation.statistics import Share, auroc
 from asm_gym.evaluation.trace import spans, window_steps
 
 Floats = NDArray[np.floating[Any]]

@@ -20,8 +20,8 @@ from asm_gym.evaluation import comparison
 from asm_gym.evaluation.archive import Label, Recording, read
 from asm_gym.evaluation.comparison import IDEAL, RATES, Cell, Score, Sight
 from asm_gym.evaluation.ideal import earliest, noise_floor, separation
-from asm_gym.evaluation.metrics import Share
 from asm_gym.evaluation.scoring import Verdict, coverage
+from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.trace import InterventionOutcome, Trace, TraceDetail, window_steps
 from asm_gym.monitors import EVIDENCE, Monitor, make_monitor, monitor_class
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map

@@ -1,8 +1,7 @@
-"""Runs one episode in which a reflex acts on the alarms, and sums up what it was worth."""
+"""Runs one episode in which a reflex acts on the alarms, and keeps its trace."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.evaluation.intervention import Reaction
-from asm_gym.evaluation.trace import POLICY_ALONE
+from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, InterventionOutcome, Trace
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.suite import draw, suite_fault
 from asm_gym.monitors import NeuralASM
@@ -22,8 +20,8 @@ from asm_gym.rollouts.record import Course, draw_onset
 from asm_gym.stream import control_period
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety
 
-NOMINAL, PASSING = "nominal", "passing_push"
-"""Conditions beside the kinds of fault."""
+PASSING = "passing_push"
+"""A condition beside nominal and the kinds of fault."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ def _fault(kind: str, env: RobosuiteEnv, onset: int, seed: int) -> tuple[Fault, 
     return (suite_fault(kind, env, "strong", onset, seed),)
 
 
-def run_bout(one: Bout, course: Course, max_override_s: float, memory: Path) -> Reaction:
+def run_bout(one: Bout, course: Course, max_override_s: float, memory: Path) -> Trace:
     """Runs one episode in this process's environment.
 
     Args:
@@ -78,20 +76,21 @@ def run_bout(one: Bout, course: Course, max_override_s: float, memory: Path) -> 
     finally:
         env.get_wrapper_attr("undo_faults")()
     since = infos[onset:]
-    rows = np.concatenate([info["asm"]["surprises"] for info in infos]) > monitor.threshold
-    began = onset * len(infos[0]["asm"]["surprises"])
-    raised = np.flatnonzero(rows[began:] & ~np.concatenate([[False], rows])[began:-1])
     last = infos[-1]["asm"]
-    return Reaction(
-        task=one.task,
-        fault=one.fault,
-        acting=one.acting,
+    return Trace(
+        kind=one.fault,
         seed=one.seed,
-        success=success,
-        peak_force=float(np.nanmax([info["external_force"] for info in since], initial=0.0)),
-        impulse=float(np.nansum([info["external_impulse"] for info in since])),
-        alarm_s=float(rows.sum() * monitor.spec.dt),
-        acted_s=sum(info["asm"]["intervened"] for info in infos) * dt,
-        delay_ms=1e3 * (raised[0] + 1) * monitor.spec.dt if len(raised) and one.fault != NOMINAL else math.inf,
-        ended=bool(last["gave_up"] or (one.acting == "terminate" and last["alarm"])),
+        dt=monitor.spec.dt,
+        threshold=monitor.threshold,
+        surprise=np.concatenate([info["asm"]["surprises"] for info in infos]),
+        onset=None if one.fault == NOMINAL else onset * len(infos[0]["asm"]["surprises"]),
+        task=one.task,
+        acting=one.acting,
+        outcome=InterventionOutcome(
+            success,
+            ended_by_alarm=bool(last["gave_up"] or (one.acting == "terminate" and last["alarm"])),
+            external_force=float(np.nanmax([info["external_force"] for info in since], initial=0.0)),
+            impulse=float(np.nansum([info["external_impulse"] for info in since])),
+            acted_s=sum(info["asm"]["intervened"] for info in infos) * dt,
+        ),
     )

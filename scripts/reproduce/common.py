@@ -23,8 +23,8 @@ import asm_gym
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.archive import Label, read
 from asm_gym.evaluation.plots import save
-from asm_gym.evaluation.repertoire import Spread
 from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.text_tables import console_table, markdown
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage

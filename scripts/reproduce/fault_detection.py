@@ -22,9 +22,9 @@ from rich.console import Console
 from asm_gym.choices import check_choice
 from asm_gym.detection.detector import conformal_episodes, conformal_threshold
 from asm_gym.episodes import Episode
-from asm_gym.evaluation.metrics import auroc
 from asm_gym.evaluation.plots import figure, look
 from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.statistics import auroc
 from asm_gym.faults.suite import KINDS, SEVERITIES
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.rollouts.parallel import parallel_map

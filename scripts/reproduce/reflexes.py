@@ -10,25 +10,25 @@ import json
 import math
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 
 from asm_gym.choices import check_choice
 from asm_gym.evaluation.archive import Label, Recording, read
-from asm_gym.evaluation.intervention import Comparison, Estimate, Reaction, compare
+from asm_gym.evaluation.intervention import Comparison, compare
 from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.text_tables import console_table, markdown
-from asm_gym.evaluation.trace import POLICY_ALONE
+from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
 from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy
 from asm_gym.rollouts.benchmark import fitted
-from asm_gym.rollouts.bout import NOMINAL, PASSING, Bout, run_bout
+from asm_gym.rollouts.bout import PASSING, Bout, run_bout
 from asm_gym.rollouts.folder import claim_folder
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, environment, parallel_map
 from asm_gym.rollouts.progress import stage
@@ -139,11 +139,11 @@ def bouts(args: Args) -> list[Bout]:
     ]
 
 
-def comparisons(reactions: Sequence[Reaction], args: Args) -> list[Comparison]:
+def comparisons(traces: Sequence[Trace], args: Args) -> list[Comparison]:
     """Each reflex under each fault, over all tasks."""
 
-    def of(fault: str, acting: str) -> list[Reaction]:
-        return [r for r in reactions if (r.fault, r.acting) == (fault, acting)]
+    def of(fault: str, acting: str) -> list[Trace]:
+        return [t for t in traces if (t.kind, t.acting) == (fault, acting)]
 
     return [compare(of(f, POLICY_ALONE), of(f, r), args.seed) for f in args.faults for r in args.reflexes]
 
@@ -156,16 +156,16 @@ def table(found: Sequence[Comparison], args: Args) -> Table:
     )
     rows = [
         (
-            c.fault.replace("_", " "),
+            c.kind.replace("_", " "),
             c.acting,
             f"{100 * c.success.value:.0f} %",
             f"{100 * c.alone.value:.0f} %",
-            _percent(c.gained),
-            _percent(c.peak) if c.fault != NOMINAL else "",
-            _percent(c.impulse) if c.fault != NOMINAL else "",
+            c.gained.percent(),
+            c.peak.percent() if c.kind != NOMINAL else "",
+            c.impulse.percent() if c.kind != NOMINAL else "",
             f"{c.alarm_s:.2f}",
             f"{c.ended.k} of {c.ended.n}",
-            "" if c.fault == NOMINAL else f"{c.median_delay_ms:.0f}" if math.isfinite(c.median_delay_ms) else "missed",
+            "" if c.kind == NOMINAL else f"{c.median_delay_ms:.0f}" if math.isfinite(c.median_delay_ms) else "missed",
         )
         for c in found
     ]
@@ -178,10 +178,21 @@ def table(found: Sequence[Comparison], args: Args) -> Table:
     )
 
 
-def _percent(e: Estimate) -> str:
-    if math.isnan(e.value):
-        return ""
-    return f"{100 * e.value:.0f} % ({100 * e.low:.0f} to {100 * e.high:.0f})"
+def _row(trace: Trace) -> dict[str, Any]:
+    """An episode as it is written down."""
+    return {
+        "task": trace.task,
+        "fault": trace.kind,
+        "acting": trace.acting,
+        "seed": trace.seed,
+        "success": trace.outcome.success,
+        "peak_force": trace.outcome.external_force,
+        "impulse": trace.outcome.impulse,
+        "alarm_s": float(trace.alarm.sum() * trace.dt),
+        "acted_s": trace.outcome.acted_s,
+        "delay_ms": None if trace.delay is None else 1e3 * trace.delay,
+        "ended": trace.outcome.ended_by_alarm,
+    }
 
 
 def react(args: Args, console: Console) -> Table:
@@ -200,18 +211,18 @@ def react(args: Args, console: Console) -> Table:
         memory = args.out / "memory.asm"
         learned_from(args).save(memory)
     with stage("acting", console, seconds) as progress:
-        run: Callable[[Bout], Reaction] = partial(
+        run: Callable[[Bout], Trace] = partial(
             run_bout, course=args.course, max_override_s=args.max_override_s, memory=memory.resolve()
         )
-        reactions = parallel_map(run, bouts(args), ParallelConfig(args.workers), progress)
-    found = comparisons(reactions, args)
+        traces = parallel_map(run, bouts(args), ParallelConfig(args.workers), progress)
+    found = comparisons(traces, args)
     made = table(found, args)
     (args.out / "reactions.md").write_text(markdown(made) + "\n", encoding="utf-8")
     settings = {f.name: getattr(args, f.name) for f in fields(args)}
     content = {
         "settings": json.loads(json.dumps(settings, default=str)),
         "seconds": seconds,
-        "episodes": [{k: None if v == math.inf else v for k, v in asdict(r).items()} for r in reactions],
+        "episodes": [_row(trace) for trace in traces],
     }
     (args.out / "reactions.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     return made

@@ -21,8 +21,9 @@ from asm_gym.choices import check_choice
 from asm_gym.detection.detector import conformal_episodes
 from asm_gym.evaluation import comparison, plots
 from asm_gym.evaluation.comparison import Score
-from asm_gym.evaluation.repertoire import Spread, alarms_table, naming_figure, share_right
+from asm_gym.evaluation.repertoire import alarms_table, naming_figure, share_right
 from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.text_tables import console_table, markdown
 from asm_gym.monitors import MONITORS
 from asm_gym.rollouts.benchmark import opinion_of, sights_of

@@ -1,0 +1,155 @@
+"""Statistics of proportions, ranks and resampled means: pure functions of numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.floating[Any]]
+
+RESAMPLES = 2000
+"""Of a bootstrap."""
+
+
+class Share(NamedTuple):
+    """``k`` of ``n``."""
+
+    k: int
+    n: int
+
+    @property
+    def value(self) -> float:
+        return self.k / self.n if self.n else math.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % Wilson interval."""
+        return wilson_interval(self.k, self.n)
+
+    @classmethod
+    def of(cls, outcomes: Sequence[bool]) -> Share:
+        return cls(sum(map(bool, outcomes)), len(outcomes))
+
+
+class Estimate(NamedTuple):
+    """A number and its 95 % bootstrap interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def percent(self, undefined: str = "") -> str:
+        """``value % (low to high)``; ``undefined`` where there is no value."""
+        if math.isnan(self.value):
+            return undefined
+        return f"{100 * self.value:.0f} % ({100 * self.low:.0f} to {100 * self.high:.0f})"
+
+
+class Spread(NamedTuple):
+    """Mean and standard deviation over seeds."""
+
+    mean: float
+    sd: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        """Of one value a seed; a single one has no deviation, NaN."""
+        return cls(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else math.nan)
+
+    def text(self, scale: float = 1.0, digits: int = 3) -> str:
+        """``mean ± sd``, each times ``scale``; the mean alone where there is no deviation."""
+        if math.isnan(self.sd):
+            return f"{scale * self.mean:.{digits}f}"
+        return f"{scale * self.mean:.{digits}f} ± {scale * self.sd:.{digits}f}"
+
+
+def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
+    """The score interval of a proportion of ``k`` in ``n`` (Wilson 1927); (0, 1) where ``n`` is 0.
+
+    ``(p + z²/2n ± z √(p(1-p)/n + z²/4n²)) / (1 + z²/n)``
+    """
+    if not 0 <= k <= n:
+        raise ValueError(f"k must be in [0, n], got {k} of {n}")
+    if n == 0:
+        return 0.0, 1.0
+    z = NormalDist().inv_cdf(0.5 + _check_confidence(confidence) / 2)
+    p, shrink = k / n, 1 + z * z / n
+    centre = (p + z * z / (2 * n)) / shrink
+    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / shrink
+    # At the ends the bound is exact; rounding would leave 1e-17.
+    return (0.0 if k == 0 else centre - half), (1.0 if k == n else centre + half)
+
+
+def binomial_interval(n: int, p: float, confidence: float = 0.95) -> tuple[int, int]:
+    """Counts (lo, hi) that ``n`` trials of probability ``p`` stay within, equal tails: P(k < lo), P(k > hi) <= (1-c)/2.
+
+    For checking a calibration: alarms in n nominal episodes at the false-alarm rate p.
+    """
+    if not 0 <= p <= 1:
+        raise ValueError(f"p must be in [0, 1], got {p}")
+    if n < 0:
+        raise ValueError(f"n must be >= 0, got {n}")
+    tail = (1 - _check_confidence(confidence)) / 2
+    if p in (0.0, 1.0):
+        return round(n * p), round(n * p)
+    log_mass = [
+        math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) + k * math.log(p) + (n - k) * math.log1p(-p)
+        for k in range(n + 1)
+    ]
+    mass = np.exp(log_mass)  # (n + 1,)
+    below, above = np.cumsum(mass), np.cumsum(mass[::-1])[::-1]  # P(K <= k), P(K >= k)
+    return int(np.argmax(below > tail)), int(n - np.argmax(above[::-1] > tail))
+
+
+def auroc(scores_pos: ArrayLike, scores_neg: ArrayLike) -> float:
+    """The probability that a positive scores higher than a negative, ties counted half (Mann-Whitney).
+
+    Takes infinite scores, refuses NaN.
+    """
+    pos, neg = np.asarray(scores_pos, np.float64), np.asarray(scores_neg, np.float64)
+    if not pos.size or not neg.size:
+        raise ValueError(f"auroc needs scores of both kinds, got {pos.size} positive and {neg.size} negative")
+    if np.isnan(pos).any() or np.isnan(neg).any():
+        raise ValueError("scores must not be NaN")
+    neg = np.sort(neg)
+    lower, not_higher = np.searchsorted(neg, pos, "left"), np.searchsorted(neg, pos, "right")  # (P,)
+    return float((lower + not_higher).sum() / (2 * pos.size * neg.size))
+
+
+def bootstrap(
+    statistic: Callable[[Floats], Floats], pairs: Floats, rng: np.random.Generator, resamples: int = RESAMPLES
+) -> Estimate:
+    """Percentile interval over resampled episodes (Efron and Tibshirani 1993, ch. 13).
+
+    Args:
+        statistic: from (…, n, 2) to (…).
+        pairs: (n, 2) what was measured with the policy alone, and with the reflex.
+    """
+    drawn = statistic(pairs[rng.integers(len(pairs), size=(resamples, len(pairs)))])
+    low, high = np.nanquantile(drawn, [0.025, 0.975])
+    return Estimate(float(statistic(pairs)), float(low), float(high))
+
+
+def gain(pairs: Floats) -> Floats:
+    """Mean difference, reflex less policy alone."""
+    difference: Floats = pairs[..., 1].mean(axis=-1) - pairs[..., 0].mean(axis=-1)
+    return difference
+
+
+def reduction(pairs: Floats) -> Floats:
+    """1 - the mean with the reflex over the mean with the policy alone; NaN where that is 0."""
+    alone = pairs[..., 0].mean(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share: Floats = np.where(alone > 0, 1.0 - pairs[..., 1].mean(axis=-1) / alone, math.nan)
+    return share
+
+
+def _check_confidence(confidence: Any) -> float:
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must be in (0, 1), got {confidence}")
+    return float(confidence)
