@@ -90,6 +90,17 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
     return Checkpoint(header, arrays)
 
 
+def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
+    """Every array of an ``.npz``, by name. Raises FileNotFoundError, or ValueError where it is damaged."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            return {n.removesuffix(".npy"): _read(file, n) for n in file.namelist()}
+    except FileNotFoundError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, RuntimeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
 def _write(file: IO[bytes], header: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr(HEADER, header)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import shutil
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,37 +19,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checkpoint import read_checkpoint, write_checkpoint
+from asm_gym import episodes as single
 from asm_gym.episodes import Episode
 from asm_gym.stream import StreamSpec, control_period
 from asm_gym.tasks import TASKS
 
 METADATA = "metadata.json"
-ARRAYS = ("stream", "actions", "observations", "rewards", "faults")
-
-
-def save_episode(path: Path, episode: Episode) -> Path:
-    """Writes one episode to a file of its own, which appears only when it is complete."""
-    header = {
-        "spec": episode.spec.to_json(),
-        "success": bool(episode.success),
-        "seed": episode.seed,
-        "info": episode.info,
-    }
-    write_checkpoint(path, "episode", header, {name: getattr(episode, name) for name in ARRAYS})
-    return path
-
-
-def load_episode(path: Path) -> Episode:
-    """What ``save_episode`` wrote. Raises ValueError where the file is damaged or something else."""
-    saved = read_checkpoint(path, "episode")
-    try:
-        spec = StreamSpec.from_json(saved.header["spec"])
-        kept: dict[str, Any] = {name: saved.header[name] for name in ("success", "seed", "info")}
-        kept |= {name: saved.arrays[name] for name in ARRAYS}
-        return Episode(spec=spec, **kept)
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
 
 
 def write_dataset(
@@ -229,3 +205,11 @@ def _minari(name: str) -> Any:
     require_minari()
     module, attribute = name.rsplit(".", 1)
     return getattr(importlib.import_module(module), attribute)
+
+
+def __getattr__(name: str) -> Any:
+    """Single episodes moved to ``asm_gym.episodes``."""
+    if name not in ("save_episode", "load_episode"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    warnings.warn(f"asm_gym.datasets.{name} is now asm_gym.episodes.{name}", DeprecationWarning, stacklevel=2)
+    return getattr(single, name)

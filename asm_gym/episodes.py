@@ -1,18 +1,60 @@
-"""Episodes: what happened between a reset and its end, as arrays of one length."""
+"""Episodes: what happened between a reset and its end, in arrays; and the one file format of a single one.
+
+A file is a checkpoint: arrays and JSON, never pickle, written whole or not at all.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+import zipfile
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.checkpoint import read_arrays, read_checkpoint, write_checkpoint
 from asm_gym.stream import StreamSpec
+
+KIND = "episode"
+
+ARRAYS = {"stream": "f", "actions": "f", "observations": "fiub", "rewards": "f", "faults": "b", "contact_force": "f"}
+"""What a file holds, and the kinds of numbers that each may have."""
 
 
 def _empty() -> NDArray[np.float32]:
     return np.zeros((0, 0), np.float32)
+
+
+@dataclass(frozen=True)
+class EpisodeLabel:
+    """What an episode was recorded as.
+
+    Args:
+        task: a task's name.
+        role: ``"fit"``, ``"calibration"``, ``"nominal"``, ``"faulty"`` or ``"harmless"``.
+        kind: of the fault or the harmless variation; empty for the others.
+        severity: of the fault; empty for the others.
+        seed: of the environment and of the policy. Episodes that share it are twins.
+        onset: the first step with the fault or variation; None without one.
+        affected_channels: in which an attentive observer would see the fault first. Found out while recording, so two
+            labels that differ in nothing else are equal.
+    """
+
+    task: str
+    role: str
+    kind: str = ""
+    severity: str = ""
+    seed: int = 0
+    onset: int | None = None
+    affected_channels: frozenset[str] = field(default=frozenset(), compare=False)
+
+    @property
+    def path(self) -> Path:
+        """Where in a run's folder the episode lies."""
+        parts = [part for part in (self.kind, self.severity) if part]
+        return Path("episodes") / self.task / self.role / "-".join([*parts, f"{self.seed}.npz"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +71,8 @@ class Episode:
         observations: (T + 1, O) float32, the first one from ``reset``.
         rewards: (T,) float32.
         faults: (T,) bool, a fault was active in that row of the stream (the ground truth).
+        contact_force: (T,) float32, between the robot and everything else [N].
+        label: what it was recorded as; None where nobody said.
         info: whatever else is worth keeping; JSON-serialisable.
     """
 
@@ -40,6 +84,8 @@ class Episode:
     observations: NDArray[np.float32] = field(default_factory=_empty)
     rewards: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     faults: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    contact_force: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    label: EpisodeLabel | None = None
     info: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -50,7 +96,89 @@ class Episode:
     def __len__(self) -> int:
         return len(self.stream)
 
+    @property
+    def labelled(self) -> EpisodeLabel:
+        """The label. Raises ValueError where there is none."""
+        if self.label is None:
+            raise ValueError("this episode has no label: nobody said which task and role it was recorded for")
+        return self.label
+
     @classmethod
     def from_stream(cls, x: NDArray[np.floating[Any]], spec: StreamSpec, **fields: Any) -> Episode:
         """An episode from a stream recorded elsewhere, a real robot's included: ``x`` has the shape (T, D)."""
         return cls(np.ascontiguousarray(x, dtype=np.float32), spec, **fields)
+
+
+def save_episode(path: str | Path, episode: Episode) -> Path:
+    """Writes one episode to a file of its own, which appears only when it is complete; returns where it is."""
+    label = None if episode.label is None else asdict(episode.label)
+    if label is not None:
+        label["affected_channels"] = sorted(label["affected_channels"])
+    header = {
+        "spec": episode.spec.to_json(),
+        "success": bool(episode.success),
+        "seed": episode.seed,
+        "label": label,
+        "info": episode.info,
+    }
+    write_checkpoint(path, KIND, header, {name: getattr(episode, name) for name in ARRAYS})
+    return Path(path)
+
+
+def load_episode(path: str | Path, spec: StreamSpec | None = None) -> Episode:
+    """What ``save_episode`` wrote, or what the three formats before it held.
+
+    Args:
+        spec: of a file that names no channels itself, as one old format did not.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged or something else.
+    """
+    try:
+        kept = _fields(Path(path), spec)
+        for name, kinds in ARRAYS.items():
+            if name in kept and kept[name].dtype.kind not in kinds:
+                raise ValueError(f"{name} cannot be of {kept[name].dtype}")
+        return Episode(**kept)
+    except FileNotFoundError:
+        raise
+    except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} is damaged or no episode that can be read: {error}") from error
+
+
+def _fields(path: Path, spec: StreamSpec | None) -> dict[str, Any]:
+    """The arguments of ``Episode`` in a file of any format."""
+    with zipfile.ZipFile(path) as file:
+        members = file.namelist()
+    if "header.npy" in members:
+        return _recording(read_arrays(path))
+    if "skills.npy" in members:
+        return _switch(read_arrays(path), spec)
+    saved = read_checkpoint(path, KIND)
+    header = saved.header
+    label = header.get("label")  # files of before labels hold none
+    if label is not None:
+        label = EpisodeLabel(**{**label, "affected_channels": frozenset(label["affected_channels"])})
+    about = {name: header[name] for name in ("success", "seed", "info")}
+    return {**saved.arrays, **about, "label": label, "spec": StreamSpec.from_json(header["spec"])}
+
+
+def _recording(arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    """Of an evaluation, as it was written before labels were part of an episode."""
+    header = json.loads(arrays.pop("header").tobytes())
+    if header["format"] != 1:
+        raise ValueError(f"format {header['format']}, this version reads 1")
+    label = EpisodeLabel(**header["label"], affected_channels=frozenset(header["guilty"]))
+    about = {"success": header["success"], "seed": label.seed, "info": {"skill": label.task}}
+    return {**arrays, **about, "label": label, "spec": StreamSpec.from_json(header["spec"])}
+
+
+def _switch(arrays: dict[str, NDArray[Any]], spec: StreamSpec | None) -> dict[str, Any]:
+    """Of one skill after another, as it was written when the skill of each step was an array."""
+    if spec is None:
+        raise ValueError("it names no channels: load it with the spec of its stream")
+    skills = arrays["skills"]
+    changed = int(np.argmax(skills != skills[0]))
+    about = {"success": True, "info": {"skills": [str(skills[0]), str(skills[changed])], "changed": changed}}
+    return {"stream": arrays["stream"], **about, "spec": spec}

@@ -17,8 +17,8 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from asm_gym.datasets import load_episode, require_minari, save_episode, write_dataset
-from asm_gym.episodes import Episode
+from asm_gym.datasets import require_minari, write_dataset
+from asm_gym.episodes import Episode, load_episode, save_episode
 from asm_gym.policies import make_policy, rollout
 from asm_gym.rollouts.folder import claim_folder, versions
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, environment, parallel_map

@@ -21,7 +21,7 @@ from rich.console import Console
 
 from asm_gym.choices import check_choice
 from asm_gym.detection.detector import conformal_episodes
-from asm_gym.evaluation.archive import Label
+from asm_gym.episodes import EpisodeLabel
 from asm_gym.evaluation.publish import brief_tables, publish
 from asm_gym.evaluation.text_tables import console_table
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, possible, suite_fault
@@ -143,9 +143,9 @@ class Args:
         return ParallelConfig(self.workers, self.backend, self.address)
 
 
-def labels(args: Args) -> list[Label]:
+def labels(args: Args) -> list[EpisodeLabel]:
     """Every episode of the run, task by task. Raises ValueError or OSError where the policy cannot act in one."""
-    made: list[Label] = []
+    made: list[EpisodeLabel] = []
     for task in args.tasks:
         made_env = gym.make(f"asm_gym/{task}-v0", robot=args.robot)
         make_policy(args.policy, made_env, seed=0)  # what does not fit is refused before anything is recorded
@@ -156,21 +156,21 @@ def labels(args: Args) -> list[Label]:
         env.close()
         for role in ("fit", "calibration", "nominal"):
             seeds = episode_seeds(args.seed, task, role, getattr(args, f"{role}_episodes"))
-            made += [Label(task, role, seed=s) for s in seeds]
+            made += [EpisodeLabel(task, role, seed=s) for s in seeds]
         twins = episode_seeds(args.seed, task, "nominal", args.nominal_episodes)[: args.faulty_episodes]
         onsets = {s: draw_onset(s, horizon) for s in twins}
         made += [
-            Label(task, "faulty", k, severity, s, onsets[s])
+            EpisodeLabel(task, "faulty", k, severity, s, onsets[s])
             for k in faults
             for severity in args.severities
             for s in twins
         ]
         others = episode_seeds(args.seed, task, "harmless", args.harmless_episodes)
-        made += [Label(task, "harmless", k, "", s, draw_onset(s, horizon)) for k in harmless for s in others]
+        made += [EpisodeLabel(task, "harmless", k, "", s, draw_onset(s, horizon)) for k in harmless for s in others]
     return made
 
 
-def record_all(args: Args, wanted: Sequence[Label], crew: ParallelConfig, progress: Progress) -> None:
+def record_all(args: Args, wanted: Sequence[EpisodeLabel], crew: ParallelConfig, progress: Progress) -> None:
     """Records the episodes that are not there yet."""
     missing = [label for label in wanted if not (args.out / label.path).is_file()]
     done = len(wanted) - len(missing)
@@ -194,7 +194,7 @@ def claim(args: Args) -> None:
     claim_folder(args.out, "recordings.json", ours)
 
 
-def film_examples(args: Args, judgement: Judgement, wanted: Sequence[Label], progress: Progress) -> Path:
+def film_examples(args: Args, judgement: Judgement, wanted: Sequence[EpisodeLabel], progress: Progress) -> Path:
     """The first of the typical episodes, as the first monitor saw them."""
     name = args.monitors[0]
     monitor = calibrated(args.out, name, wanted, args.seed, judgement.thresholds[name][args.false_alarm_rate])

@@ -19,8 +19,8 @@ import tyro
 from rich.console import Console
 
 from asm_gym.choices import check_choice
-from asm_gym.datasets import load_episode, read_dataset
-from asm_gym.episodes import Episode
+from asm_gym.datasets import read_dataset
+from asm_gym.episodes import Episode, load_episode
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.folder import claim_folder
 from asm_gym.rollouts.parallel import Progress

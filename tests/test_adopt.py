@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from asm_gym.episodes import Episode
-from asm_gym.evaluation.archive import Label, Recording, write
+from asm_gym.episodes import Episode, EpisodeLabel, save_episode
 from asm_gym.scripts.cli import main
 from asm_gym.stream import Channel, StreamSpec
 
@@ -21,17 +20,18 @@ def evaluation(folder, spread, seed):
     seeds = iter(range(1000))
 
     def put(label, stream):
-        episode = Episode.from_stream(stream, SPEC, success=True, faults=np.zeros(len(stream), bool))
-        write(folder, Recording(label, episode, np.zeros(len(stream), np.float32)))
+        quiet = {"faults": np.zeros(len(stream), bool), "contact_force": np.zeros(len(stream), np.float32)}
+        episode = Episode.from_stream(stream, SPEC, success=True, label=label, **quiet)
+        save_episode(folder / label.path, episode)
 
     for role, n in COUNTS.items():
         for seed in (next(seeds) for _ in range(n)):
             stream = rng.uniform(-spread, spread, (60, 2))
-            put(Label("Lift", role, seed=seed), stream)
+            put(EpisodeLabel("Lift", role, seed=seed), stream)
             if role == "nominal":
                 struck = stream.copy()
                 struck[ONSET:] += 100.0
-                put(Label("Lift", "faulty", "push", "strong", seed, ONSET), struck)
+                put(EpisodeLabel("Lift", "faulty", "push", "strong", seed, ONSET), struck)
     return str(folder)
 
 

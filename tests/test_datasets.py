@@ -17,8 +17,9 @@ import pytest
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
-from asm_gym.datasets import load_episode, read_dataset, save_episode, write_dataset
+from asm_gym.datasets import read_dataset, write_dataset
 from asm_gym.envs.demonstrations import recorded_in, replay
+from asm_gym.episodes import load_episode, save_episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy, rollout
 from asm_gym.scripts.cli import main

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from asm_gym.evaluation.archive import Label, read
+from asm_gym.episodes import EpisodeLabel, load_episode
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 from asm_gym.rollouts.record import Course, draw_onset, record
 from asm_gym.scripts.evaluate import Args, labels, main
@@ -48,15 +48,15 @@ def test_it_writes_what_it_promises(run):
 
 
 def test_faulty_episodes_are_twins_until_the_onset(run):
-    faulty = [read(p) for p in sorted((run / "episodes/Stack/faulty").glob("*.npz"))]
+    faulty = [load_episode(p) for p in sorted((run / "episodes/Stack/faulty").glob("*.npz"))]
     assert len(faulty) == 12
-    for recording in faulty:
-        label = recording.label
-        twin = read(run / Label("Stack", "nominal", seed=label.seed).path).episode.stream
+    for episode in faulty:
+        label = episode.label
+        twin = load_episode(run / EpisodeLabel("Stack", "nominal", seed=label.seed).path).stream
         onset = label.onset
-        np.testing.assert_array_equal(recording.episode.stream[:onset], twin[:onset])
-        assert recording.episode.faults.argmax() == onset
-        assert len(recording.episode) == onset + 40
+        np.testing.assert_array_equal(episode.stream[:onset], twin[:onset])
+        assert episode.faults.argmax() == onset
+        assert len(episode) == onset + 40
 
 
 def test_it_goes_on_where_it_was_killed_and_gives_the_same_table(run):
@@ -123,7 +123,7 @@ def test_onsets_leave_room_before_and_after():
 
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_makes_the_same_recordings(tmp_path):
-    wanted = [Label("Stack", "fit", seed=s) for s in range(12)]
+    wanted = [EpisodeLabel("Stack", "fit", seed=s) for s in range(12)]
     distributed = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
     file = tmp_path / "scheduler.json"
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
@@ -145,8 +145,8 @@ def test_a_cluster_that_loses_a_worker_makes_the_same_recordings(tmp_path):
         assert workers[0].wait(10) != 0
         parallel_map(_Recorder(here), wanted, 1)
         for label in wanted:
-            a, b = read(here / label.path), read(there / label.path)
-            np.testing.assert_array_equal(a.episode.stream, b.episode.stream)
+            a, b = load_episode(here / label.path), load_episode(there / label.path)
+            np.testing.assert_array_equal(a.stream, b.stream)
     finally:
         for process in (*workers, scheduler):
             process.kill()

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from asm_gym.evaluation.archive import Label, Recording
+from asm_gym.episodes import EpisodeLabel
 from asm_gym.rollouts.benchmark import fitted
 from tests.streams import sine_episodes
 
 
 def test_a_monitor_is_kept_and_one_that_cannot_be_read_is_made_anew(tmp_path):
     recordings = [
-        Recording(Label("Sines", "fit", seed=n), episode, np.zeros(len(episode), np.float32))
-        for n, episode in enumerate(sine_episodes(8))
+        replace(episode, label=EpisodeLabel("Sines", "fit", seed=n)) for n, episode in enumerate(sine_episodes(8))
     ]
     first = fitted(tmp_path, "kalman", recordings, 0)
     (kept,) = (tmp_path / "monitors").glob("*")

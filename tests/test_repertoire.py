@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
+from asm_gym.episodes import load_episode
 from asm_gym.evaluation.repertoire import naming_figure, share_right
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.scripts import evaluate
 from asm_gym.scripts.reproduce import repertoire
 from asm_gym.scripts.reproduce.skill_switch import NAMES, Switch, record_switch
-from tests.streams import sine_spec
 
 RIGHT = [np.array([False, True, True]), np.array([False, False, True, False])]
 
@@ -56,9 +56,7 @@ def test_an_episode_with_a_change_of_skill_is_recorded_once(tmp_path):
     path = record_switch(tmp_path / "0.npz")
     written = path.stat().st_mtime_ns
     assert record_switch(path).stat().st_mtime_ns == written
-    with np.load(path) as arrays:
-        spec = sine_spec(arrays["stream"].shape[1], 0)
-    switch = Switch.read(path, spec)
+    switch = Switch.read(path, load_episode(path).spec)
     assert set(switch.skills[: switch.changed]) | set(switch.skills[switch.changed :]) == set(NAMES.values())
     assert len(set(switch.skills[: switch.changed])) == len(set(switch.skills[switch.changed :])) == 1
     assert len(switch.skills) == len(switch.episode)

@@ -16,8 +16,8 @@ import numpy as np
 
 import asm_gym
 from asm_gym.detection.detector import conformal_episodes, conformal_threshold
+from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation import comparison
-from asm_gym.evaluation.archive import Label, Recording, read
 from asm_gym.evaluation.comparison import IDEAL, RATES, Cell, Score, Sight
 from asm_gym.evaluation.ideal import earliest, noise_floor, separation
 from asm_gym.evaluation.scoring import Verdict, coverage
@@ -57,7 +57,7 @@ class Judgement:
     window_s: float
     failed: int = 0
     examples: Sequence[Trace] = ()
-    shown: Sequence[Label] = ()
+    shown: Sequence[EpisodeLabel] = ()
 
     @cached_property
     def visible(self) -> dict[tuple[str, str], bool]:
@@ -98,12 +98,12 @@ class Opinion(NamedTuple):
     verdicts: list[Verdict]
     harmless: list[Verdict]
     thresholds: dict[float, float]
-    examples: dict[Label, Trace]
+    examples: dict[EpisodeLabel, Trace]
 
 
 def judge(
     folder: Path,
-    labels: Sequence[Label],
+    labels: Sequence[EpisodeLabel],
     monitors: Sequence[str],
     rate: float,
     window_s: float,
@@ -145,13 +145,13 @@ def judge(
 
 
 def _opinions(
-    names: Sequence[str], folder: Path, labels: Sequence[Label], rate: float, seed: int
+    names: Sequence[str], folder: Path, labels: Sequence[EpisodeLabel], rate: float, seed: int
 ) -> dict[str, Opinion]:
     by_role, _, _ = sorted_by_role(recordings_of(folder, labels))
     return {name: opinion_of(name, folder, by_role, rate, seed) for name in names}
 
 
-def opinion_of(name: str, folder: Path, by_role: Mapping[str, Sequence[Recording]], rate: float, seed: int) -> Opinion:
+def opinion_of(name: str, folder: Path, by_role: Mapping[str, Sequence[Episode]], rate: float, seed: int) -> Opinion:
     monitor = fitted(folder, name, by_role["fit"], seed)
     maxima = np.array([s.value.max() for s in _scores(monitor, by_role["calibration"])])
     rates = sorted({rate, *(r for r in RATES if len(maxima) >= conformal_episodes(r))})
@@ -162,48 +162,48 @@ def opinion_of(name: str, folder: Path, by_role: Mapping[str, Sequence[Recording
     return Opinion(verdicts, harmless, thresholds, _examples(monitor, verdicts, tested, thresholds[rate]))
 
 
-def recordings_of(folder: Path, labels: Sequence[Label]) -> list[Recording]:
+def recordings_of(folder: Path, labels: Sequence[EpisodeLabel]) -> list[Episode]:
     """Read from the folder of a run."""
-    return [read(folder / label.path) for label in labels]
+    return [load_episode(folder / label.path) for label in labels]
 
 
-def sorted_by_role(recordings: Sequence[Recording]) -> tuple[dict[str, list[Recording]], int, list[Recording]]:
+def sorted_by_role(recordings: Sequence[Episode]) -> tuple[dict[str, list[Episode]], int, list[Episode]]:
     """Recordings by role, how many nominal ones failed and are not among them, and all twins of faulty ones."""
-    by_role: dict[str, list[Recording]] = {}
+    by_role: dict[str, list[Episode]] = {}
     failed = 0
     for recording in recordings:
-        role = recording.label.role
+        role = recording.labelled.role
         # A nominal episode that fails is no example of what should feel normal, nor an alarm in it a false one.
-        if role in NOMINAL and not recording.episode.success:
+        if role in NOMINAL and not recording.success:
             failed += 1
         else:
             by_role.setdefault(role, []).append(recording)
     for role in NOMINAL:
         if not by_role.get(role):
             raise ValueError(f"none of the {role} episodes succeeded: there is nothing normal to learn or to test on")
-    twins = [r for r in recordings if r.label.role == "nominal"]
+    twins = [r for r in recordings if r.labelled.role == "nominal"]
     return by_role, failed, twins
 
 
-def fitted(folder: Path, name: str, recordings: Sequence[Recording], seed: int) -> Monitor:
+def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) -> Monitor:
     """The monitor fitted on these episodes; kept in the folder for the next time, under the name of what it learned."""
-    spec = recordings[0].episode.spec
+    spec = recordings[0].spec
     model = name.removesuffix(EVIDENCE)
     made: Any = make_monitor(name, spec, seed=seed)
-    learned = model, asm_gym.__version__, made.get_params(), sorted(str(r.label.path) for r in recordings)
+    learned = model, asm_gym.__version__, made.get_params(), sorted(str(r.labelled.path) for r in recordings)
     digest = hashlib.sha256(json.dumps(learned, default=str).encode())
     path = folder / "monitors" / f"{model}-{digest.hexdigest()[:12]}.asm"
     # One that cannot be read, for it is damaged or of an older asm-gym, is made anew.
     with suppress(FileNotFoundError, ValueError):
         loaded: Monitor = monitor_class(name).load(path)
         return loaded
-    monitor: Monitor = made.fit([r.episode for r in recordings])
+    monitor: Monitor = made.fit(recordings)
     path.parent.mkdir(parents=True, exist_ok=True)
     monitor.save(path)
     return monitor
 
 
-def calibrated(folder: Path, name: str, labels: Sequence[Label], seed: int, threshold: float) -> Any:
+def calibrated(folder: Path, name: str, labels: Sequence[EpisodeLabel], seed: int, threshold: float) -> Any:
     """The monitor as it judged the run, with the threshold it judged by."""
     by_role, _, _ = sorted_by_role(recordings_of(folder, [label for label in labels if label.role in NOMINAL]))
     monitor: Any = fitted(folder, name, by_role["fit"], seed)
@@ -211,14 +211,14 @@ def calibrated(folder: Path, name: str, labels: Sequence[Label], seed: int, thre
     return monitor
 
 
-def _scores(monitor: Any, recordings: Sequence[Recording]) -> list[Any]:
-    return list(monitor.score_episodes([r.episode for r in recordings])) if recordings else []
+def _scores(monitor: Any, recordings: Sequence[Episode]) -> list[Any]:
+    return list(monitor.score_episodes(recordings)) if recordings else []
 
 
-def _verdicts(name: str, monitor: Monitor, recordings: Sequence[Recording], threshold: float) -> list[Verdict]:
+def _verdicts(name: str, monitor: Monitor, recordings: Sequence[Episode], threshold: float) -> list[Verdict]:
     made = []
-    for recording, surprise in zip(recordings, _scores(monitor, recordings), strict=True):
-        label, episode = recording.label, recording.episode
+    for episode, surprise in zip(recordings, _scores(monitor, recordings), strict=True):
+        label = episode.labelled
         faulty = label.role == "faulty"
         verdict = Verdict(
             task=label.task,
@@ -229,7 +229,7 @@ def _verdicts(name: str, monitor: Monitor, recordings: Sequence[Recording], thre
             dt=episode.spec.dt,
             surprise=surprise.value,
             onset=label.onset if faulty else None,
-            guilty=recording.guilty,
+            guilty=label.affected_channels,
         )
         after = verdict.detected_after(threshold)
         if after is not None and label.onset is not None:
@@ -240,8 +240,8 @@ def _verdicts(name: str, monitor: Monitor, recordings: Sequence[Recording], thre
 
 
 def _examples(
-    monitor: Any, verdicts: Sequence[Verdict], recordings: Sequence[Recording], threshold: float
-) -> dict[Label, Trace]:
+    monitor: Any, verdicts: Sequence[Verdict], recordings: Sequence[Episode], threshold: float
+) -> dict[EpisodeLabel, Trace]:
     """Of each of a few kinds, at its strongest, the episode with the median delay."""
     chosen = []
     for kind in EXAMPLES:
@@ -250,10 +250,10 @@ def _examples(
         if own:
             late = sorted((math.inf if (a := verdicts[i].detected_after(threshold)) is None else a, i) for i in own)
             chosen.append(late[(len(late) - 1) // 2][1])
-    twins = {(r.label.task, r.label.seed): r.episode.stream for r in recordings if r.label.role == "nominal"}
+    twins = {(r.labelled.task, r.labelled.seed): r.stream for r in recordings if r.labelled.role == "nominal"}
     traces = {}
     for i in chosen:
-        label, episode = recordings[i].label, recordings[i].episode
+        episode, label = recordings[i], recordings[i].labelled
         surprise = monitor.score(episode)
         traces[label] = Trace(
             kind=label.kind,
@@ -276,14 +276,14 @@ def _examples(
     return traces
 
 
-def sights_of(nominal: Sequence[Recording], faulty: Sequence[Recording], window_s: float) -> list[Sight]:
-    twins = {(r.label.task, r.label.seed): r.episode.stream for r in nominal}
+def sights_of(nominal: Sequence[Episode], faulty: Sequence[Episode], window_s: float) -> list[Sight]:
+    twins = {(r.labelled.task, r.labelled.seed): r.stream for r in nominal}
     noises: dict[str, Any] = {}
     sights = []
-    for recording in faulty:
-        label, episode = recording.label, recording.episode
+    for episode in faulty:
+        label = episode.labelled
         if label.task not in noises:
-            own = [r.episode.stream for r in nominal if r.label.task == label.task]
+            own = [r.stream for r in nominal if r.labelled.task == label.task]
             noises[label.task] = noise_floor(episode.spec.noise, own)
         summed = separation(episode.stream, twins[label.task, label.seed], noises[label.task], label.onset or 0)
         window = summed[: window_steps(window_s, episode.spec.dt)]

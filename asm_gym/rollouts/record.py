@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from asm_gym.evaluation.archive import Label, Recording, write
+from asm_gym.episodes import Episode, EpisodeLabel, save_episode
 from asm_gym.faults.suite import harmless_variation, suite_fault
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.scripted.base import Style
@@ -53,7 +53,7 @@ def draw_onset(seed: int, horizon: int) -> int:
     return int(np.random.default_rng([seed, 1]).integers(10, max(11, horizon // 2)))
 
 
-def record(label: Label, course: Course, folder: Path) -> Path:
+def record(label: EpisodeLabel, course: Course, folder: Path) -> Path:
     """Records the episode of ``label``, and writes it to its place under ``folder``."""
     base = environment(f"asm_gym/{label.task}-v0", course.settings())
     inner: Any = base.unwrapped
@@ -74,4 +74,15 @@ def record(label: Label, course: Course, folder: Path) -> Path:
     finally:
         env.get_wrapper_attr("undo_faults")()
     guilty = faults[0].labels(inner) if label.role == "faulty" else frozenset()
-    return write(folder, Recording(label, env.finish(), np.asarray(forces, np.float32), frozenset(guilty)))
+    recorded = env.finish()
+    kept = Episode(  # what monitors look at: actions stand in the stream, and nobody learns to act from these
+        stream=recorded.stream,
+        spec=recorded.spec,
+        success=recorded.success,
+        seed=label.seed,
+        faults=recorded.faults,
+        contact_force=np.asarray(forces, np.float32),
+        label=replace(label, affected_channels=frozenset(guilty)),
+        info={"skill": label.task},
+    )
+    return save_episode(folder / label.path, kept)

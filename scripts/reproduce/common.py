@@ -20,8 +20,7 @@ from rich.console import Console
 from threadpoolctl import threadpool_limits
 
 import asm_gym
-from asm_gym.episodes import Episode
-from asm_gym.evaluation.archive import Label, read
+from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.plots import save
 from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.statistics import Spread
@@ -137,18 +136,20 @@ def shown(records: Sequence[Record], value: str, digits: int = 2, **where: Any) 
     return "" if np.isnan(found.mean) else found.text(digits=digits)
 
 
-def recorded(args: Common, labels: Sequence[Label], console: Console, seconds: dict[str, float]) -> list[Episode]:
+def recorded(
+    args: Common, labels: Sequence[EpisodeLabel], console: Console, seconds: dict[str, float]
+) -> list[Episode]:
     """The episodes of these labels, recorded where they are not there yet; those that failed are among them."""
     missing = [label for label in labels if not (args.out / label.path).is_file()]
     if missing:
         with stage("recording robosuite episodes", console, seconds) as progress:
             parallel_map(partial(record, course=Course(), folder=args.out.resolve()), missing, args.workers, progress)
-    return [read(args.out / label.path).episode for label in labels]
+    return [load_episode(args.out / label.path) for label in labels]
 
 
-def nominal_labels(tasks: Sequence[str], role: str, episodes: int) -> list[Label]:
+def nominal_labels(tasks: Sequence[str], role: str, episodes: int) -> list[EpisodeLabel]:
     """The first so many nominal episodes of each task; the same for every seed of a study."""
-    return [Label(task, role, seed=s) for task in tasks for s in episode_seeds(0, task, role, episodes)]
+    return [EpisodeLabel(task, role, seed=s) for task in tasks for s in episode_seeds(0, task, role, episodes)]
 
 
 def demonstrations(

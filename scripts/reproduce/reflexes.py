@@ -19,7 +19,7 @@ import tyro
 from rich.console import Console
 
 from asm_gym.choices import check_choice
-from asm_gym.evaluation.archive import Label, Recording, read
+from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.intervention import Comparison, compare
 from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.text_tables import console_table, markdown
@@ -102,23 +102,23 @@ def learned_from(args: Args) -> NeuralASM:
 
     folder = args.run if args.monitor_freq is None else args.out
 
-    def role(name: str) -> list[Recording]:
+    def role(name: str) -> list[Episode]:
         paths = [p for task in args.tasks for p in sorted((folder / "episodes" / task / name).glob("*.npz"))]
-        return [r for r in map(read, paths) if r.episode.success]
+        return [e for e in map(load_episode, paths) if e.success]
 
     fit = role("fit")
     if not fit:
         raise ValueError(f"{args.run} has no recordings of {', '.join(args.tasks)}: run asm-gym evaluate first")
     memory = fitted(args.out, "neural_asm", fit, args.seed)
     assert isinstance(memory, NeuralASM)
-    return memory.calibrate([r.episode for r in role("calibration")], args.false_alarm_rate)
+    return memory.calibrate(role("calibration"), args.false_alarm_rate)
 
 
 def record_nominal(args: Args, progress: Progress) -> None:
     """Records nominal episodes at ``monitor_freq``, those that are not there yet."""
     roles = {"fit": args.fit_episodes, "calibration": args.calibration_episodes}
     wanted = [
-        Label(task, role, seed=s)
+        EpisodeLabel(task, role, seed=s)
         for task in args.tasks
         for role, n in roles.items()
         for s in episode_seeds(args.seed, task, role, n)

@@ -218,7 +218,7 @@ def repertoire(args: Args, console: Console) -> list[Table]:
         with stage("naming skills", console, seconds) as progress:
             name = partial(name_skills, **what)
             named = parallel_map(name, range(args.seed, args.seed + args.seeds), args.workers, progress)
-        dt = recorded(args.run, tuple(args.tasks))[0]["nominal"][0].episode.spec.dt
+        dt = recorded(args.run, tuple(args.tasks))[0]["nominal"][0].spec.dt
         tables.append(naming_table(named, args, dt))
         if switches:
             alarms = {"of single skills": [n.alarms for n in named]}

@@ -21,9 +21,8 @@ import tyro
 from rich.console import Console
 
 from asm_gym.choices import check_choice
-from asm_gym.datasets import load_episode
 from asm_gym.detection.detector import conformal_episodes
-from asm_gym.episodes import Episode
+from asm_gym.episodes import Episode, load_episode
 from asm_gym.evaluation import plots
 from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.safe_training import COUNTED, Outcome, counts_table, learning_figure, worth_table

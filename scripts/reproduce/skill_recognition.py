@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.episodes import Episode
-from asm_gym.evaluation.archive import Recording
 from asm_gym.evaluation.repertoire import Alarms
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.benchmark import fitted
@@ -32,22 +31,22 @@ def name_skills(seed: int, run: Path, tasks: tuple[str, ...], rate: float, switc
     recordings, _ = recorded(run, tasks)
     memory = fitted(run, "neural_asm", recordings["fit"], seed)
     assert isinstance(memory, NeuralASM)
-    memory.calibrate([r.episode for r in recordings["calibration"]], rate)
-    memory.name_skills([r.episode for r in recordings["fit"]])
-    nominal = [memory.skills(r.episode.stream) == r.label.task for r in recordings["nominal"]]
+    memory.calibrate(recordings["calibration"], rate)
+    memory.name_skills(recordings["fit"])
+    nominal = [memory.skills(r.stream) == r.labelled.task for r in recordings["nominal"]]
     changes = [Switch.read(path, memory.spec) for path in switches]
     switched = [(memory.skills(s.episode.stream) == s.skills)[s.changed :] for s in changes]
     return Naming(nominal, switched, alarms_of(memory, recordings["nominal"], changes))
 
 
-def alarms_of(memory: NeuralASM, nominal: Sequence[Recording], changes: Sequence[Switch]) -> Alarms:
+def alarms_of(memory: NeuralASM, nominal: Sequence[Episode], changes: Sequence[Switch]) -> Alarms:
     """What a calibrated memory makes of them."""
 
     def share(episodes: Sequence[Episode]) -> float:
         alarms = [s.value.max() > memory.threshold for s in memory.score_episodes(episodes)]
         return float(np.mean(alarms)) if alarms else math.nan
 
-    return Alarms(share([r.episode for r in nominal]), share([s.episode for s in changes]))
+    return Alarms(share(nominal), share([s.episode for s in changes]))
 
 
 def experienced(
@@ -55,9 +54,9 @@ def experienced(
 ) -> Alarms:
     """What a memory makes of a change of skill that has seen others, unlabelled among its episodes."""
     recordings, _ = recorded(run, tasks)
-    spec = recordings["fit"][0].episode.spec
+    spec = recordings["fit"][0].spec
     changes = [Switch.read(path, spec).episode for path in experience]
     calibration = changes[: len(changes) // 3]
-    memory = NeuralASM(spec, seed=seed).fit([*(r.episode for r in recordings["fit"]), *changes[len(calibration) :]])
-    memory.calibrate([*(r.episode for r in recordings["calibration"]), *calibration], rate)
+    memory = NeuralASM(spec, seed=seed).fit([*recordings["fit"], *changes[len(calibration) :]])
+    memory.calibrate([*recordings["calibration"], *calibration], rate)
     return alarms_of(memory, recordings["nominal"], [Switch.read(path, spec) for path in switches])

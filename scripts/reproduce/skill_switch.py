@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episodes import Episode
+from asm_gym.episodes import Episode, load_episode, save_episode
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
 from asm_gym.rollouts.parallel import environment
 from asm_gym.stream import StreamSpec
@@ -41,9 +41,10 @@ class Switch:
     @classmethod
     def read(cls, path: Path, spec: StreamSpec) -> Self:
         """What ``record_switch`` wrote."""
-        with np.load(path, allow_pickle=False) as arrays:
-            skills = arrays["skills"]
-            return cls(Episode.from_stream(arrays["stream"], spec), skills, int(np.argmax(skills != skills[0])))
+        episode = load_episode(path, spec)
+        spec.require(episode.spec, str(path))
+        changed = int(episode.info["changed"])
+        return cls(episode, np.repeat(episode.info["skills"], [changed, len(episode) - changed]), changed)
 
 
 def record_switch(path: Path) -> Path:
@@ -53,18 +54,15 @@ def record_switch(path: Path) -> Path:
         found = _sort_both(seed + 10_000 * attempt)
         if found is None:
             continue
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_name(f".{path.name}.unfinished.npz")
-        np.savez_compressed(unfinished, stream=found[0].stream, skills=found[1])
-        unfinished.replace(path)
+        save_episode(path, found)
         break
     if not path.is_file():
         raise RuntimeError(f"none of 20 attempts sorted both things with seed {seed}")
     return path
 
 
-def _sort_both(seed: int) -> tuple[Episode, NDArray[np.str_]] | None:
-    """The episode of ``seed`` and the skill of each step; None where either thing is not sorted."""
+def _sort_both(seed: int) -> Episode | None:
+    """The episode of ``seed``, with its two skills and the step of the change; None where a thing is not sorted."""
     env = StreamRecorder(environment("asm_gym/PickPlace-v0", (("horizon", HORIZON),)))
     simulator: Any = env.unwrapped.robosuite_env  # type: ignore[attr-defined]
     expert = PickPlaceExpert(env, seed=seed, things=tuple(NAMES))
@@ -88,5 +86,7 @@ def _sort_both(seed: int) -> tuple[Episode, NDArray[np.str_]] | None:
         if rest > round(REST_S / env.stream_spec.dt):
             break
     episode = env.finish()
-    changes = sum(a != b for a, b in pairwise(skills))
-    return (episode, np.array(skills)) if changes == 1 and rest else None
+    changes = [t for t, (a, b) in enumerate(pairwise(skills), 1) if a != b]
+    if len(changes) != 1 or not rest:
+        return None
+    return replace(episode, info={**episode.info, "skills": [skills[0], skills[-1]], "changed": changes[0]})

@@ -17,8 +17,8 @@ import tyro
 from rich.console import Console
 
 from asm_gym.choices import check_choice
+from asm_gym.episodes import Episode
 from asm_gym.evaluation import comparison
-from asm_gym.evaluation.archive import Recording
 from asm_gym.evaluation.comparison import Score
 from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.text_tables import console_table, markdown
@@ -28,7 +28,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.recordings import recorded
 from asm_gym.scripts.command import USAGE_ERRORS
 
-Roles = Mapping[str, Sequence[Recording]]
+Roles = Mapping[str, Sequence[Episode]]
 
 
 @dataclass(frozen=True)

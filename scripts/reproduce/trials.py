@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from rich.console import Console
 
-from asm_gym.episodes import Episode
-from asm_gym.evaluation.archive import Label
+from asm_gym.episodes import Episode, EpisodeLabel
 from asm_gym.rollouts.record import draw_onset, episode_seeds
 from asm_gym.scripts.reproduce.common import Common, demonstrations, recorded
 from asm_gym.scripts.reproduce.handwriting import copybook, repertoire
@@ -55,7 +54,7 @@ def robot_trial(
     ask = partial(demonstrations, args, tasks, console=console, seconds=seconds)
     nominal = max(faulty_episodes, 12)
     labels = [
-        Label(task, "faulty", kind, severity, seed, draw_onset(seed, task_spec(task).horizon))
+        EpisodeLabel(task, "faulty", kind, severity, seed, draw_onset(seed, task_spec(task).horizon))
         for task in tasks
         for kind in kinds
         for seed in episode_seeds(0, task, "nominal", faulty_episodes)

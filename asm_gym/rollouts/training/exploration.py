@@ -16,8 +16,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.datasets import load_episode, save_episode
-from asm_gym.episodes import Episode
+from asm_gym.episodes import Episode, load_episode, save_episode
 from asm_gym.monitors.monitor import columns
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.base import Policy

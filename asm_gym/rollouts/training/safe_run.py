@@ -20,8 +20,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor as EpisodeMonitor
 
-from asm_gym.datasets import load_episode
-from asm_gym.episodes import Episode
+from asm_gym.episodes import Episode, load_episode
 from asm_gym.evaluation.safe_training import Outcome, count
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
