@@ -2,6 +2,7 @@
 
 import gymnasium
 
+from asm_gym.moved import install
 from asm_gym.tasks import TASKS
 
 __version__ = "0.1.0"
@@ -14,3 +15,5 @@ for _task in TASKS.values():
         # The environment truncates itself, so that `horizon` is an argument like any other.
         max_episode_steps=None,
     )
+
+install()

@@ -51,7 +51,7 @@ class Args:
     address: str | None = None
     """Where the cluster is, such as tcp://host:8786."""
     seed: int = 0
-    """Of everything."""
+    """Seed of the environment and of the policy: the same seed gives the same episodes."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/collect")
     """Folder of the episodes and of the dataset."""
     quick: bool = False

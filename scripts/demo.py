@@ -66,7 +66,7 @@ class Args:
     workers: int = os.cpu_count() or 1
     """Processes."""
     seed: int = 0
-    """Of everything: the same seed gives the same table."""
+    """Seed of all that is drawn: the same seed gives the same table."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/demo")
     """Folder to write to."""
     video: bool = True

@@ -1,7 +1,6 @@
-"""What this machine lacks to run asm-gym, and the command that installs it.
+"""What this machine lacks to run asm-gym, and the command that installs it. Exit code 1: it cannot run here."""
 
-Nothing checked here is imported here: the doctor has to work where ``import robosuite`` does not.
-"""
+# Nothing that is checked here is imported here: the doctor has to work where `import robosuite` does not.
 
 from __future__ import annotations
 
@@ -14,12 +13,13 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 
-import tyro
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from asm_gym.scripts.command import run
 
 PACKAGES = ("mujoco", "robosuite", "gymnasium", "stable-baselines3", "numpy", "torch")
 BACKENDS = ("egl", "osmesa")  # EGL first: it uses a GPU where there is one
@@ -65,7 +65,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Args:
-    """Says what this machine lacks to run asm-gym, and how to install it. Exit code 1: it cannot run."""
+    """The doctor takes no options."""
 
 
 def run_checks() -> list[Check]:
@@ -193,11 +193,9 @@ def table(checks: list[Check]) -> Table:
     return rows
 
 
-def main(argv: list[str]) -> int:
+def report(args: Args, console: Console) -> int:
     """Prints the table, and what it comes to."""
-    tyro.cli(Args, args=argv, prog="asm-gym doctor")
     checks = run_checks()
-    console = Console()
     console.print(table(checks))
     wrong = [check for check in checks if not check.ok]
     if exit_code(checks):
@@ -209,5 +207,10 @@ def main(argv: list[str]) -> int:
     return exit_code(checks)
 
 
+def main(argv: list[str] | None = None) -> int:
+    """Looks at this machine; 1 where asm-gym cannot run on it."""
+    return run("doctor", Args, report, argv, __doc__)
+
+
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

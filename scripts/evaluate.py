@@ -83,7 +83,7 @@ class Args:
     address: str | None = None
     """Where the cluster is, such as tcp://host:8786."""
     seed: int = 0
-    """Of everything."""
+    """Seed of all that is drawn: the same seed gives the same table."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
     """Folder of the run."""
     video: bool = True

@@ -20,7 +20,7 @@ from asm_gym.episodes import Episode
 from asm_gym.rollouts.folder import versions
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import USAGE_ERRORS
+from asm_gym.scripts.command import run
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Args:
     sensor_noise: float = 1.0
     """Scales the noise of the sensors; 0 for exact readings."""
     seed: int = 0
-    """Of the noise."""
+    """Seed of that noise."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/import")
     """Folder of the dataset."""
 
@@ -53,18 +53,16 @@ def convert(args: Args, progress: Progress) -> tuple[Path, list[Episode]]:
         env.close()
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Converts; 2 where the file makes no sense."""
-    console = Console()
-    try:
-        args = tyro.cli(Args, args=argv, prog="asm-gym import", description=__doc__)
-        with stage("replaying", console, {}) as progress:
-            folder, episodes = convert(args, progress)
-    except USAGE_ERRORS as error:
-        print(f"asm-gym import: {error}", file=sys.stderr)
-        return 2
+def convert_and_report(args: Args, console: Console) -> None:
+    """Converts, and says what came of it."""
+    with stage("replaying", console, {}) as progress:
+        folder, episodes = convert(args, progress)
     console.print(f"{len(episodes)} episodes, {sum(e.success for e in episodes)} successful: {folder}")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Reads demonstrations, and returns the exit code."""
+    return run("import", Args, convert_and_report, argv, __doc__)
 
 
 if __name__ == "__main__":

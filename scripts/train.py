@@ -50,19 +50,19 @@ class Args:
     dataset: Path | None = None
     """Minari dataset of demonstrations, in place of the scripted expert's."""
     cloning_updates: int = 15_000
-    """Of the actor, before it acts."""
+    """Updates of the actor on demonstrations, before it acts."""
     evaluate_every: int = 5_000
     """Control steps between evaluations."""
     evaluation_episodes: int = 40
-    """Of each evaluation."""
+    """Episodes of each evaluation."""
     final_episodes: int = 100
-    """Of the last one, on other seeds."""
+    """Episodes of the last evaluation, on other seeds."""
     checkpoint_every: int = 2_500
     """Control steps between checkpoints: what a kill loses at most."""
     workers: int = 1
     """Processes that record demonstrations; learning is done by one."""
     seed: int = 0
-    """Of everything."""
+    """Seed of all that is drawn."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/train")
     """Folder of the run."""
     quick: bool = False

@@ -225,9 +225,7 @@ def test_the_doctor_imports_nothing_that_it_checks() -> None:
 
 
 def test_an_unknown_option_is_refused() -> None:
-    with pytest.raises(SystemExit) as refusal:
-        doctor.main(["--no-such-option"])
-    assert refusal.value.code == 2
+    assert doctor.main(["--no-such-option"]) == 2
 
 
 @pytest.mark.parametrize("argv", [[], ["--help"], ["-h"]])

@@ -1,4 +1,4 @@
-"""``python -m asm_gym.scripts.benchmark <what>``: speeds as ratios against a rival in the same run, and experts.
+"""Speeds as ratios against a rival in the same run, and how often experts succeed.
 
 Machines differ and are noisy: rivals take turns, step by step, and the medians of their turns are compared.
 """
@@ -6,7 +6,6 @@ Machines differ and are noisy: rivals take turns, step by step, and the medians 
 from __future__ import annotations
 
 import sys
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -26,6 +25,8 @@ from asm_gym.evaluation.text_tables import console_table
 from asm_gym.scripts.benchmark.experts import Experts
 from asm_gym.scripts.benchmark.fit import Fit
 from asm_gym.scripts.benchmark.memory import Memory, Safety
+from asm_gym.scripts.benchmark.turns import take_turns
+from asm_gym.scripts.command import BAD_NEWS, DONE, run
 from asm_gym.tasks import task as task_spec
 
 
@@ -34,21 +35,21 @@ class Env:
     """An environment's steps and resets, against robosuite's own and against MuJoCo alone."""
 
     task: str = "Lift"
-    """a task's name"""
+    """Name of the task."""
     robot: str = "Panda"
-    """the arm, and its twin where the task takes two"""
+    """The arm, and its twin where the task takes two."""
     controller: str = "OSC_POSE"
-    """the arm's controller"""
+    """The arm's controller."""
     steps: int = 400
-    """control steps of each rival"""
+    """Control steps of each rival."""
     resets: int = 10
-    """resets of each rival"""
+    """Resets of each rival."""
     seed: int = 0
-    """of the actions"""
+    """Seed of the actions."""
 
     def run(self, console: Console) -> int:
         """Prints the table."""
-        steps = _take_turns(self._rivals(), self.steps, console)
+        steps = take_turns(self._rivals(), self.steps, console)
         physics, theirs = steps["mj_step only"], steps["robosuite"]
         table = Table(
             f"{self.task}, {self.robot}, {self.controller}, 20 Hz: median of {self.steps} control steps",
@@ -59,11 +60,11 @@ class Env:
             ],
         )
         console.print(console_table(table))
-        resets = _take_turns(self._resets(), self.resets, console)
+        resets = take_turns(self._resets(), self.resets, console)
         default = resets["robosuite, hard (its default)"]
         rows = [(name, f"{1e3 * s:.1f}", f"{default / s:.1f}×") for name, s in resets.items()]
         console.print(console_table(Table(f"median of {self.resets} resets", ("", "ms", "against robosuite"), rows)))
-        return 0
+        return DONE
 
     def _make(self, **kwargs: Any) -> Any:
         kwargs |= {"robot": self.robot, "controller": self.controller, "horizon": 10**9}
@@ -141,11 +142,11 @@ class Leaks:
     """Whether the process grows over an environment's steps and resets."""
 
     task: str = "Lift"
-    """a task's name"""
+    """Name of the task."""
     steps: int = 100_000
-    """control steps in all"""
+    """Control steps in all."""
     resets: int = 500
-    """spread evenly over them; every tenth is seeded, which loads the model anew for some tasks"""
+    """Resets, spread evenly over the steps; every tenth is seeded, which loads the model anew for some tasks."""
 
     def run(self, console: Console) -> int:
         """Prints the resident memory after each tenth; 1 where the last is more than 5 % above the second."""
@@ -164,7 +165,7 @@ class Leaks:
         console.print("  " + " ".join(f"{size:.0f}" for size in sizes))
         growth = sizes[-1] / sizes[min(1, len(sizes) - 1)] - 1
         console.print(f"  growth since the second: {100 * growth:+.1f} %")
-        return int(growth > 0.05)
+        return BAD_NEWS if growth > 0.05 else DONE
 
 
 def _resident() -> float:
@@ -172,22 +173,6 @@ def _resident() -> float:
     with open("/proc/self/statm") as file:
         pages = int(file.read().split()[1])
     return pages * 4096 / 1e6
-
-
-def _take_turns(rivals: dict[str, Callable[[], Any]], turns: int, console: Console) -> dict[str, float]:
-    """Median seconds of a call of each rival; the first calls, which warm up, do not count."""
-    for call in rivals.values():
-        call()
-    seconds: dict[str, list[float]] = {name: [] for name in rivals}
-    order, rng = list(rivals), np.random.default_rng(0)
-    for _ in track(range(turns), "measuring", console=console, transient=True):
-        rng.shuffle(order)  # whoever comes after another finds the caches as that one left them
-        for name in order:
-            call = rivals[name]
-            start = time.perf_counter()
-            call()
-            seconds[name].append(time.perf_counter() - start)
-    return {name: float(np.median(times)) for name, times in seconds.items()}
 
 
 @dataclass
@@ -205,11 +190,14 @@ class Args:
     ] = field(default_factory=Env)
 
 
+def measure(args: Args, console: Console) -> int:
+    """Runs the one that was asked for."""
+    return args.what.run(console)
+
+
 def main(argv: list[str] | None = None) -> int:
-    """Runs one benchmark, and returns its exit code."""
-    args = tyro.cli(Args, args=argv, prog="asm-gym benchmark", description=__doc__)
-    console = Console()
-    return args.what.run(console, _take_turns) if isinstance(args.what, (Memory, Safety)) else args.what.run(console)
+    """Runs one benchmark, and returns the exit code; 1 where memory leaks."""
+    return run("benchmark", Args, measure, argv, __doc__)
 
 
 if __name__ == "__main__":

@@ -52,17 +52,17 @@ class Experts:
     """How often each scripted expert succeeds, whether it leaves the task solved, and how long it takes."""
 
     tasks: tuple[str, ...] = tuple(EXPERTS)
-    """names of tasks"""
+    """Names of tasks."""
     robots: tuple[str, ...] = ("Panda",)
-    """the arms; two of one kind where the task takes two"""
+    """The arms; two of one kind where the task takes two."""
     episodes: int = 100
-    """of each task and robot"""
+    """Episodes of each task and robot."""
     workers: int = 2
-    """processes"""
+    """Processes."""
     seed: int = 0
-    """of the episodes"""
+    """Seed of the episodes."""
     quick: bool = False
-    """five episodes each"""
+    """Five episodes each."""
 
     def __post_init__(self) -> None:
         for name in self.tasks:

@@ -30,11 +30,11 @@ class Fit:
     """How long a memory takes to learn three skills, and how far off its expectations are, against a GRU."""
 
     tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan")
-    """names of tasks"""
+    """Names of tasks."""
     episodes: int = 60
-    """of each task"""
+    """Episodes of each task."""
     seed: int = 0
-    """of the episodes and of both monitors"""
+    """Seed of the episodes and of both monitors."""
 
     def run(self, console: Console) -> int:
         """Prints the table."""

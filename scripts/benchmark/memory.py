@@ -20,6 +20,7 @@ from asm_gym.episodes import Episode
 from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.text_tables import console_table
 from asm_gym.monitors import NeuralASM
+from asm_gym.scripts.benchmark.turns import take_turns
 from asm_gym.scripts.collect import collect
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
@@ -159,15 +160,15 @@ class Memory:
     """What one call of observe() costs, against the same equations written plainly in torch."""
 
     hidden: int = 256
-    """hidden units"""
+    """Hidden units."""
     channels: int = 60
-    """sensory channels"""
+    """Sensory channels."""
     steps: int = 2000
-    """calls of each rival"""
+    """Calls of each rival."""
     sweep: bool = True
-    """also print the cost against hidden units, channels and named skills"""
+    """Also print the cost against hidden units, channels and named skills."""
 
-    def run(self, console: Console, take_turns: Callable[..., dict[str, float]]) -> int:
+    def run(self, console: Console) -> int:
         """Prints the tables."""
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
@@ -187,10 +188,10 @@ class Memory:
         rows = [(name, f"{1e6 * s:.0f}", f"{plain / s:.1f}×") for name, s in seconds.items()]
         console.print(console_table(Table(title, ("", "µs", "against torch"), rows)))
         if self.sweep:
-            self._sweep(console, take_turns)
+            self._sweep(console)
         return 0
 
-    def _sweep(self, console: Console, take_turns: Callable[..., dict[str, float]]) -> None:
+    def _sweep(self, console: Console) -> None:
         makers: dict[str, tuple[Callable[[int], tuple[NeuralASM, Episode]], tuple[int, ...]]] = {
             "hidden units": (lambda n: _fitted(n, self.channels), (64, 256, 1024, 2048)),
             "channels": (lambda n: _fitted(self.hidden, n), (15, 30, 60, 120)),
@@ -209,15 +210,15 @@ class Safety:
     """What the safety wrapper adds to a control step, at the control rate and within control steps."""
 
     task: str = "Lift"
-    """a task's name"""
+    """Name of the task."""
     hidden: int = 256
-    """hidden units of the memory"""
+    """Hidden units of the memory."""
     steps: int = 400
-    """control steps of each rival"""
+    """Control steps of each rival."""
     monitor_freq: int = 100
-    """rows watched a second, where it watches within control steps [Hz]"""
+    """Rows watched a second, where it watches within control steps [Hz]."""
 
-    def run(self, console: Console, take_turns: Callable[..., dict[str, float]]) -> int:
+    def run(self, console: Console) -> int:
         """Prints the table."""
         plain = self._make(None)
         envs = {"step": plain, "step under the wrapper": NeuralASMSafety(self._make(None), self._memory(None))}
@@ -227,7 +228,7 @@ class Safety:
         action = np.zeros(plain.action_space.shape or (), np.float32)
         for env in envs.values():
             env.reset(seed=0)
-        rivals = {name: partial(env.step, action) for name, env in envs.items()}
+        rivals: dict[str, Callable[[], Any]] = {name: partial(env.step, action) for name, env in envs.items()}
         seconds = take_turns(rivals, self.steps, console)
         caption = f"{self.task}, 20 Hz, {self.hidden} hidden units: a control step"
         rows = [(name, f"{1e3 * s:.2f}", f"{s / seconds['step']:.2f}×") for name, s in seconds.items()]

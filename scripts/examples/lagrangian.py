@@ -22,7 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import USAGE_ERRORS
+from asm_gym.scripts.command import run
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import NeuralASMSafety
 
@@ -97,7 +97,7 @@ class LagrangeMultiplier(BaseCallback):
 
 @dataclass(frozen=True)
 class Args:
-    """PPO that learns to stay out of alarm."""
+    """PPO that learns to stay out of alarm, by a Lagrange multiplier on the reward: an example to copy."""
 
     memory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MEMORY.asm")]
     """A calibrated memory of harmless moving, such as asm-gym train-safely makes: exploration.asm."""
@@ -110,7 +110,7 @@ class Args:
     rate: float = 5.0
     """How fast the multiplier follows."""
     seed: int = 0
-    """Of everything."""
+    """Seed of the agent."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/lagrangian")
     """Folder of the agent and of the multiplier's history."""
 
@@ -134,17 +134,15 @@ def train(args: Args, console: Console) -> LagrangeMultiplier:
     return multiplier
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Trains; 2 where the arguments make no sense."""
-    console = Console()
-    try:
-        args = tyro.cli(Args, args=argv, prog="asm-gym lagrangian", description=__doc__)
-        multiplier = train(args, console)
-    except (*USAGE_ERRORS, RuntimeError) as error:
-        print(f"asm-gym lagrangian: {error}", file=sys.stderr)
-        return 2
+def train_and_report(args: Args, console: Console) -> None:
+    """Trains, and says where the multiplier ended."""
+    multiplier = train(args, console)
     console.print(f"multiplier {multiplier.value:.3g} after {args.steps} steps: {args.out / 'multiplier.json'}")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Trains, and returns the exit code."""
+    return run("lagrangian", Args, train_and_report, argv)
 
 
 if __name__ == "__main__":

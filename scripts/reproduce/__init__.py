@@ -4,36 +4,84 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
+from typing import Any, NamedTuple
+
+from asm_gym.choices import check_choice
+from asm_gym.scripts.command import DONE, REFUSED, exit_code, parse
+
+
+class Study(NamedTuple):
+    """What a study asks, and whether it judges the recordings of another run, which must be there."""
+
+    summary: str
+    needs_a_run: bool = False
+
 
 STUDIES = {
-    "memorise_and_recall": "one network learns a repertoire, and expresses each skill from a cue",
-    "contextual_inference": "the state says which skill is running, and nobody told it",
-    "express_skills": "one memory closes the loop in robosuite: its own motor prediction drives the arm",
-    "local_learning": "local updates against the gradient of backpropagation through time",
-    "speed_accuracy": "more inference, or slower movements, for more accuracy",
-    "fault_detection": "surprise across the repertoire against a library told the right or the wrong skill",
+    "memorise_and_recall": Study("one network learns skills, recalls each from a cue"),
+    "contextual_inference": Study("the state says which skill is running, untold"),
+    "express_skills": Study("one memory's own motor prediction drives the arm"),
+    "local_learning": Study("local updates against backpropagation through time"),
+    "speed_accuracy": Study("more inference, or slower movements, for more accuracy"),
+    "fault_detection": Study("surprise, against a library that is told the skill"),
+    "safe_training": Study("an agent trained alone, and under the safety wrapper"),
+    "reflexes": Study("what acting on alarms is worth, reflex by fault", needs_a_run=True),
+    "transfer": Study("one policy's memory on another policy", needs_a_run=True),
+    "repertoire": Study("one memory of all skills against one for each", needs_a_run=True),
 }
+INDEPENDENT = tuple(name for name, study in STUDIES.items() if not study.needs_a_run)
 
 
 def usage() -> str:
     """The studies, a line each."""
     width = max(map(len, STUDIES))
-    lines = [f"  {name:<{width}}  {summary}" for name, summary in STUDIES.items()]
+
+    def lines(needing: bool) -> list[str]:
+        return [f"  {name:<{width}}  {s.summary}" for name, s in STUDIES.items() if s.needs_a_run is needing]
+
     return "\n".join(
-        ["usage: asm-gym reproduce STUDY|all [OPTIONS]", "", *lines, "", "all runs them one after another."]
+        [
+            *("usage: asm-gym reproduce STUDY [OPTIONS]", "       asm-gym reproduce all [OPTIONS]", ""),
+            *("All of these, one after another, with the options they share:", *lines(False), ""),
+            *("One by one, on what asm-gym evaluate recorded:", *lines(True), ""),
+            "asm-gym reproduce STUDY --help lists the options of one.",
+        ]
     )
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs one study, or all, and returns the exit code: 2 where there is no such study."""
+    """Runs one study, or all that need no other run's folder, and returns the exit code."""
     name, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if name in ("-h", "--help"):
         print(usage())
-        return 0
-    if name != "all" and name not in STUDIES:
-        print(f"asm-gym reproduce: unknown study {name!r}; the studies are all, {', '.join(STUDIES)}", file=sys.stderr)
-        return 2
-    code = 0
-    for study in STUDIES if name == "all" else [name]:
-        code = max(code, import_module(f"asm_gym.scripts.reproduce.{study}").main(rest))
+        return DONE
+
+    def chosen() -> int:
+        check_choice("study", name, ("all", *STUDIES))
+        if name == "all":
+            return everything(rest)
+        code: int = _module(name).main(rest)
+        return code
+
+    return exit_code("reproduce", chosen)
+
+
+def everything(argv: list[str]) -> int:
+    """Runs the independent studies; the options are checked against each of them before the first begins."""
+    from asm_gym.scripts.reproduce.common import Common
+
+    if parse("reproduce all", Common, argv, f"Runs {', '.join(INDEPENDENT)}.") is None:
+        return DONE
+    modules = [_module(name) for name in INDEPENDENT]
+    for name, module in zip(INDEPENDENT, modules, strict=True):
+        parse(f"reproduce {name}", module.Args, argv)
+    code = DONE
+    for module in modules:
+        code = max(code, module.main(argv))
+        if code > REFUSED:  # interrupted
+            break
     return code
+
+
+def _module(study: str) -> Any:
+    return import_module(f"asm_gym.scripts.reproduce.{study}")

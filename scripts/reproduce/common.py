@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import platform
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -28,6 +27,7 @@ from asm_gym.evaluation.text_tables import console_table, markdown
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.record import Course, episode_seeds, record
+from asm_gym.scripts.command import run
 
 Record = dict[str, Any]
 """One measurement: what was varied, the seed, and what came out."""
@@ -44,7 +44,7 @@ class Common:
     """Arguments of every study."""
 
     seed: int = 0
-    """Of everything; a study repeats itself with this seed and those that follow."""
+    """The first seed; a study repeats itself with those that follow."""
     seeds: int = 3
     """How often it repeats itself."""
     workers: int = 2
@@ -81,21 +81,19 @@ Study = Callable[[Args, Console, dict[str, float]], Findings]
 
 
 def reproduce(name: str, study: Study[Args], kind: type[Args], description: str | None, argv: list[str] | None) -> int:
-    """Runs a study and publishes what it found. Raises SystemExit(2) where the arguments make no sense."""
-    args = tyro.cli(kind, args=argv, prog=f"asm-gym reproduce {name}", description=description)
-    console, seconds = Console(), dict[str, float]()
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:  # before the study, not after it
-        print(f"asm-gym reproduce {name}: {error}", file=sys.stderr)
-        return 2
-    with threadpool_limits(1):  # products this small are slowed down by several threads
-        found = study(args, console, seconds)
-    publish(name, found, args, seconds)
-    for table in found.tables:
-        console.print(console_table(table))
-    console.print(f"Wrote {args.out / name}.png, .svg, .csv, .md and .json")
-    return 0
+    """Runs a study, publishes what it found, and returns the exit code."""
+
+    def conduct(args: Args, console: Console) -> None:
+        seconds: dict[str, float] = {}
+        args.out.mkdir(parents=True, exist_ok=True)  # refused before the study, not after it
+        with threadpool_limits(1):  # products this small are slowed down by several threads
+            found = study(args, console, seconds)
+        publish(name, found, args, seconds)
+        for table in found.tables:
+            console.print(console_table(table))
+        console.print(f"Wrote {args.out / name}.png, .svg, .csv, .md and .json")
+
+    return run(f"reproduce {name}", kind, conduct, argv, description)
 
 
 def publish(name: str, found: Findings, args: Common, seconds: dict[str, float]) -> None:

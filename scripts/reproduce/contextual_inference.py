@@ -67,11 +67,11 @@ class Args(Common):
     hidden: int = 128
     """Hidden units."""
     writings: int = 16
-    """Of each letter to learn from; as many others are judged."""
+    """Writings of each letter to learn from; as many others are judged."""
     steps: int = 12000
-    """In which the synapses change."""
+    """Steps in which the synapses change."""
     robot_episodes: int = 20
-    """Of each robosuite skill to learn from; 0 leaves them out."""
+    """Episodes of each robosuite skill to learn from; 0 leaves them out."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -55,13 +55,13 @@ class Args(Common):
     tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan", "Door")
     """Whose skills one memory learns."""
     demonstrations: int = 80
-    """Of each task; those that fail are left out."""
+    """Demonstrations of each task; those that fail are left out."""
     units: int = 512
-    """Of the motor association of the memory."""
+    """Hidden units of the motor association of the memory."""
     hidden: int = 256
     """Units of the GRU, which have several times as many weights."""
     updates: int = 600
-    """Of the GRU, 16 episodes each."""
+    """Updates of the GRU, 16 episodes each."""
     trials: int = 34
     """Scenes of each task, for each seed other ones."""
 

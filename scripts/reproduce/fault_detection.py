@@ -66,21 +66,21 @@ class Args(Common):
     """Surprise without selection against a library that needs it."""
 
     letters: int = 8
-    """In the repertoire of handwriting."""
+    """Letters in the repertoire of handwriting."""
     writings: int = 16
-    """Of each letter to learn from; as many more to calibrate on, and to judge."""
+    """Writings of each letter to learn from; as many more to calibrate on, and to judge."""
     hidden: int = 128
     """Hidden units."""
     tasks: tuple[str, ...] = SKILLS
     """Robosuite skills."""
     robot_episodes: int = 30
-    """Of each robosuite skill to learn from, and half as many to calibrate on; 0 leaves them out."""
+    """Episodes of each robosuite skill to learn from, and half as many to calibrate on; 0 leaves them out."""
     faults: tuple[str, ...] = ("push", "weak_joint", "encoder_bias", "wrist_bias", "action_delay")
     """Kinds of fault."""
     severity: str = "medium"
     """How bad they are."""
     faulty_episodes: int = 4
-    """Of each robosuite skill and kind."""
+    """Faulty episodes of each robosuite skill and kind."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

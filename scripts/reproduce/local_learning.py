@@ -59,7 +59,7 @@ class Args(Common):
     hidden: int = 64
     """Hidden units."""
     writings: int = 8
-    """Of each letter."""
+    """Writings of each letter."""
     epochs: int = 40
     """Passes over them."""
     iterations: tuple[int, ...] = (1, 5, 20, 60)

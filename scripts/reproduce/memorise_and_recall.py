@@ -75,13 +75,13 @@ class Args(Common):
     cues: tuple[int, ...] = (5, 10, 20, 30)
     """Steps that are read before recall begins."""
     writings: int = 8
-    """Of each letter to learn from."""
+    """Writings of each letter to learn from."""
     robot_episodes: int = 40
-    """Of each robosuite skill to learn from; 0 leaves them out."""
+    """Episodes of each robosuite skill to learn from; 0 leaves them out."""
     steps: int = 16000
-    """In which the synapses of the memory change."""
+    """Steps in which the synapses of the memory change."""
     updates: int = 400
-    """Of the networks trained by backpropagation through time, a batch of 16 letters each."""
+    """Updates of the networks trained by backpropagation through time, a batch of 16 letters each."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

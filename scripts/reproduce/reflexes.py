@@ -53,17 +53,17 @@ class Args:
     policy: str = "scripted"
     """What acts: scripted, or the path of an agent."""
     reflexes: tuple[str, ...] = ("hold", "retract", "comply", "recall", "graded", "terminate")
-    """What ``on_alarm`` takes."""
+    """Names of reflexes: what the safety wrapper does on an alarm."""
     faults: tuple[str, ...] = FAULTS
     """nominal, passing_push (20 N for 0.3 s), or kinds of the suite, which are strong."""
     episodes: int = 12
-    """Of each task, fault and reflex."""
+    """Episodes of each task, fault and reflex."""
     monitor_freq: int | None = None
     """Rows watched a second [Hz], for reflexes within control steps; nominal episodes are then recorded here."""
     fit_episodes: int = 60
     """Nominal episodes of each task to learn from, with a monitor_freq."""
     calibration_episodes: int = 60
-    """Others of each task, to calibrate on."""
+    """Other nominal episodes of each task, to calibrate on."""
     max_override_s: float = 3.0
     """How long a reflex may act at a stretch before the episode is ended [s]."""
     false_alarm_rate: float = 0.01
@@ -71,7 +71,7 @@ class Args:
     workers: int = 2
     """Processes."""
     seed: int = 0
-    """Of the evaluation, of the memory and of the episodes."""
+    """Seed of the evaluation, of the memory and of the episodes."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/react")
     """Folder of the results."""
 

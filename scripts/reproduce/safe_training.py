@@ -48,7 +48,7 @@ class Args:
     task: str = "Lift"
     """Name of a task with a scripted expert, whose contacts are gentle."""
     conditions: tuple[str, ...] = tuple(CONDITIONS)
-    """Of alone, terminate and hold; alone must be among them."""
+    """What to compare: alone, terminate, hold; alone must be among them."""
     seeds: int = 5
     """Runs of each condition."""
     steps: int = 2_500
@@ -58,15 +58,15 @@ class Args:
     fit_episodes: int = 120
     """Episodes of exploration that the memory learns from."""
     calibration_episodes: int = 60
-    """Others that its threshold is set on."""
+    """Other episodes of exploration that its threshold is set on."""
     test_episodes: int = 40
-    """Others that its false alarms are counted in."""
+    """Other episodes of exploration that its false alarms are counted in."""
     false_alarm_rate: float = 0.05
     """Share of harmless episodes of exploration that may raise an alarm."""
     harmless_force: float = 20.0
     """External force above which exploration is no longer harmless [N]."""
     harmless_torque: float = 10.0
-    """The same of the external torque on a joint [N m]: arms that hit themselves, joints at their stops."""
+    """External torque on a joint above which it is not harmless [N m]: arms that hit themselves, joints at stops."""
     force_limit: float = 40.0
     """External force above which a contact is a violation [N]."""
     cost: float = 1.0
@@ -74,9 +74,9 @@ class Args:
     evaluate_every: int = 500
     """Control steps between evaluations."""
     evaluation_episodes: int = 10
-    """Of each evaluation."""
+    """Episodes of each evaluation."""
     final_episodes: int = 100
-    """Of the last one."""
+    """Episodes of the last evaluation."""
     workers: int = 1
     """Processes."""
     seed: int = 0

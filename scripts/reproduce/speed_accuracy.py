@@ -67,15 +67,15 @@ class Args(Common):
     iterations: tuple[int, ...] = (1, 2, 3, 5, 8, 12, 20, 35, 60, 100, 200)
     """Steps of inference."""
     speeds: tuple[float, ...] = (0.6, 0.8, 1.0, 1.25, 1.6, 2.0)
-    """Of writing, times the usual one."""
+    """Speeds of writing, as multiples of the usual one."""
     skills: int = 4
     """Letters."""
     hidden: int = 64
     """Hidden units."""
     writings: int = 12
-    """Of each letter."""
+    """Writings of each letter."""
     steps: int = 16000
-    """In which the synapses change."""
+    """Steps in which the synapses change."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -46,7 +46,7 @@ class Args:
     window: float = 1.0
     """How soon after its onset a fault must be noticed [s]."""
     seed: int = 0
-    """Of the monitor."""
+    """Seed of the monitor."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/adopt")
     """Folder of the results."""
 
