@@ -7,11 +7,11 @@ https://minari.farama.org.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import shutil
 import warnings
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from asm_gym import episodes as single
 from asm_gym.episodes import Episode
+from asm_gym.extras import require
 from asm_gym.stream import StreamSpec, control_period
 from asm_gym.tasks import TASKS
 
@@ -196,15 +197,15 @@ def _without_reset(rows: NDArray[Any], T: int) -> NDArray[Any]:
 
 def require_minari() -> None:
     """Raises ImportError that says how to get what datasets need, where it is missing."""
-    if importlib.util.find_spec("minari") is None or importlib.util.find_spec("h5py") is None:
-        raise ImportError("datasets need the packages minari and h5py: pip install 'asm-gym[data]'")
+    for package in ("h5py", "minari"):
+        require(package, what="a dataset")
 
 
 def _minari(name: str) -> Any:
     """Something of Minari's, which is an extra."""
     require_minari()
     module, attribute = name.rsplit(".", 1)
-    return getattr(importlib.import_module(module), attribute)
+    return getattr(import_module(module), attribute)
 
 
 def __getattr__(name: str) -> Any:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from asm_gym import __version__
 from asm_gym.choices import check_choice
+from asm_gym.extras import needed_for
 from asm_gym.scripts.command import DONE, exit_code
 
 
@@ -62,7 +63,9 @@ def main(argv: list[str] | None = None) -> int:
 
     def chosen() -> int:
         check_choice("command", name, COMMANDS)
-        code: int = import_module(COMMANDS[name].module).main(rest)
+        with needed_for("it"):
+            main_of = import_module(COMMANDS[name].module).main
+        code: int = main_of(rest)
         return code
 
     return exit_code(name if name in COMMANDS else "", chosen)

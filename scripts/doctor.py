@@ -19,9 +19,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from asm_gym.extras import BROUGHT_BY
 from asm_gym.scripts.command import run
 
-PACKAGES = ("mujoco", "robosuite", "gymnasium", "stable-baselines3", "numpy", "torch")
+PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "mujoco", "robosuite", "stable-baselines3", "torch")
 BACKENDS = ("egl", "osmesa")  # EGL first: it uses a GPU where there is one
 REINSTALL = "make clean, then make doctor (or: python -m pip install -c constraints.txt -e .)"
 COMPILER = "apt-get install gcc libc6-dev linux-libc-dev python3-dev"
@@ -97,9 +98,11 @@ def package(name: str) -> Check:
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
-        # robosuite brings evdev, which is compiled.
-        remedy = f"{COMPILER}, then {REINSTALL}" if name == "robosuite" else REINSTALL
-        return Check(name, False, True, "not installed", remedy)
+        extra = BROUGHT_BY.get(name.replace("-", "_"))
+        remedy = f"python -m pip install 'asm-gym[{extra}]'" if extra else REINSTALL
+        if name == "robosuite":  # it brings evdev, which is compiled
+            remedy = f"{COMPILER}, then {remedy}"
+        return Check(name, False, not extra, "not installed", remedy)
     ok = wanted.contains(version, prereleases=True)
     return Check(name, ok, True, version if ok else f"{version}, but needs {wanted}", "" if ok else REINSTALL)
 
@@ -112,9 +115,15 @@ def wanted_versions(name: str) -> SpecifierSet:
         except metadata.PackageNotFoundError:
             continue
         for requirement in map(Requirement, lines):
-            if requirement.name == name and (requirement.marker is None or requirement.marker.evaluate({"extra": ""})):
+            if requirement.name == name and applies(requirement):
                 return requirement.specifier
     return SpecifierSet()
+
+
+def applies(requirement: Requirement) -> bool:
+    """A requirement of this machine, with or without an extra."""
+    marker = requirement.marker
+    return marker is None or any(marker.evaluate({"extra": extra}) for extra in ("", *BROUGHT_BY.values()))
 
 
 def library(name: str, package: str) -> Check:

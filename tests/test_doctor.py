@@ -167,7 +167,7 @@ def test_a_version_out_of_range_is_needed_and_says_the_range(machine: Any, name:
     assert check.remedy == doctor.REINSTALL
 
 
-def test_the_range_of_torch_is_that_of_stable_baselines3(machine: Any) -> None:
+def test_a_torch_that_is_too_old_is_needed(machine: Any) -> None:
     machine(torch="1.0")
     assert failed()["torch"].needed
 
@@ -180,8 +180,16 @@ def test_a_local_build_of_the_right_version_passes(machine: Any) -> None:
 def test_a_missing_robosuite_names_the_compiler_that_evdev_needs(machine: Any) -> None:
     machine(robosuite=None)
     check = failed().pop("robosuite")
-    assert check.detail == "not installed"
-    assert check.remedy.startswith("apt-get install gcc libc6-dev linux-libc-dev python3-dev")
+    assert (check.needed, check.detail) == (False, "not installed")
+    assert check.remedy.startswith("apt-get install gcc libc6-dev linux-libc-dev python3-dev, then ")
+    assert "pip install 'asm-gym[robosuite]'" in check.remedy
+
+
+def test_what_every_install_has_is_needed_and_what_an_extra_brings_is_not(machine: Any) -> None:
+    machine(numba=None, torch=None)
+    found = failed()
+    assert (found["numba"].needed, found["numba"].remedy) == (True, doctor.REINSTALL)
+    assert (found["torch"].needed, found["torch"].remedy) == (False, "python -m pip install 'asm-gym[agents]'")
 
 
 @pytest.mark.parametrize(("version", "ok"), [("3.10.14", False), ("3.11.0", True), ("3.12.9", True), ("3.13.0", False)])

@@ -140,6 +140,7 @@ def test_a_wheel_holds_real_files_under_one_name(tmp_path: Path) -> None:
     }
     for link in LINKS:
         assert f"asm_gym/{link}/__init__.py" in names
+    assert "asm_gym/py.typed" in names
     assert all(mode == 0o100000 for mode in modes.values()), "regular files, no links"
     assert {f"{name.replace('.', '/')}.py" for name in MODULES} <= names
     agents = (ROOT / "policies" / "agents").iterdir()

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.choices import check_choice
+from asm_gym.extras import require
 from asm_gym.stream import Channel
 from asm_gym.tasks import ROBOTS, TaskSpec
 
@@ -30,8 +31,7 @@ def import_robosuite() -> Any:
     """Robosuite, without the warnings it prints at import about optional parts."""
     logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
     with _opencv_or_none():
-        import robosuite
-    return robosuite
+        return require("robosuite", what="a robosuite environment")
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from asm_gym.evaluation.scoring import Verdict
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.text_tables import markdown
 from asm_gym.evaluation.trace import window_steps
+from asm_gym.extras import needed_for
 from asm_gym.rollouts.benchmark import Judgement
 
 _HEADINGS = ("Monitor", "AUROC", "AP", "Found at 0.5 %", "at 1 %", "at 5 %", "Median delay [ms]", "p95 [ms]")
@@ -126,11 +127,9 @@ def publish(folder: Path, judgement: Judgement, details: Mapping[str, Any], vide
 
 
 def _write_parquet(path: Path, judgement: Judgement) -> None:
-    try:
+    with needed_for("results.parquet"):
         import pyarrow as pa
         import pyarrow.parquet as pq
-    except ImportError as error:
-        raise ImportError(f"results.parquet needs pyarrow: pip install 'asm-gym[evaluate]' ({error})") from error
     sights = {(s.task, s.kind, s.severity, s.seed): s for s in judgement.sights}
     rows = [
         _row(v, sights.get((v.task, v.kind, v.severity, v.seed)), judgement.thresholds[m][judgement.rate], judgement)

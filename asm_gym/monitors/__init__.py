@@ -6,6 +6,7 @@ import importlib
 from typing import Any
 
 from asm_gym.choices import check_choice
+from asm_gym.extras import needed_for
 from asm_gym.monitors.base import (
     ExpectsActions,
     ForgetsEvidence,
@@ -59,7 +60,8 @@ def monitor_class(name: str) -> type[Any]:
     if name == "neural_asm":
         return NeuralASM
     module, _, attribute = (_RIVALS | _LIMITS)[name.removesuffix(EVIDENCE)].partition(":")
-    found: type[Any] = getattr(importlib.import_module(f"asm_gym.monitors.baselines.{module}"), attribute)
+    with needed_for(f"monitor {name}"):
+        found: type[Any] = getattr(importlib.import_module(f"asm_gym.monitors.baselines.{module}"), attribute)
     return with_evidence(found) if name.endswith(EVIDENCE) and issubclass(found, Baseline) else found
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import import_module
 from typing import Any, TypeVar
 
 import gymnasium as gym
@@ -14,6 +13,7 @@ import joblib
 
 import asm_gym  # noqa: F401  (registers the environments in every worker)
 from asm_gym.choices import check_choice
+from asm_gym.extras import require
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -79,7 +79,7 @@ def _cluster(crew: ParallelConfig) -> Iterator[None]:
         with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
             yield
     elif crew.backend == "dask":
-        distributed = _need("distributed", "dask")
+        distributed = require("distributed", what="backend='dask'")
         try:
             client = distributed.Client(crew.address, timeout=10)
         except OSError as error:
@@ -87,20 +87,11 @@ def _cluster(crew: ParallelConfig) -> Iterator[None]:
         with client, joblib.parallel_config(backend="dask"):
             yield
     else:
-        ray = _need("ray", "ray")
+        ray = require("ray", what="backend='ray'")
         ray.init(address=crew.address or "auto", ignore_reinit_error=True)
-        _need("ray.util.joblib", "ray").register_ray()
+        require("ray.util.joblib", what="backend='ray'").register_ray()
         with joblib.parallel_config(backend="ray"):
             yield
-
-
-def _need(module: str, backend: str) -> Any:
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise ImportError(
-            f"backend={backend!r} needs the package {module.split('.')[0]}: pip install {module}"
-        ) from error
 
 
 def _gather(results: Any, total: int, progress: Progress | None) -> list[Any]:

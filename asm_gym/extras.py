@@ -1,0 +1,51 @@
+"""Optional packages: what is missing is named with the extra that brings it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
+
+BROUGHT_BY = {
+    **dict.fromkeys(("mujoco", "robosuite"), "robosuite"),
+    **dict.fromkeys(("torch", "stable_baselines3", "tensorboard"), "agents"),
+    **dict.fromkeys(("minari", "h5py"), "data"),
+    **dict.fromkeys(("matplotlib", "rich", "tyro", "imageio", "imageio_ffmpeg", "PIL"), "report"),
+    **dict.fromkeys(("pyarrow", "sklearn", "joblib", "packaging"), "report"),
+    **dict.fromkeys(("distributed", "dask", "ray"), "cluster"),
+    **dict.fromkeys(("moviepy",), "video"),
+}
+"""The extra of asm-gym that installs a package, by the name it is imported under."""
+
+
+def require(module: str, *, what: str, extra: str = "") -> Any:
+    """The module, imported.
+
+    Args:
+        module: its dotted name.
+        what: needs it, for the message.
+        extra: that installs it; looked up where it is not said.
+
+    Raises:
+        ImportError: it is not installed; the message says what to install.
+    """
+    with needed_for(what, extra):
+        return import_module(module)
+
+
+@contextmanager
+def needed_for(what: str, extra: str = "") -> Iterator[None]:
+    """Says what to install where a package turns out to be missing inside; any other error passes as it is.
+
+    Raises:
+        ImportError: a package that an extra brings is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").split(".")[0]
+        extra = extra or BROUGHT_BY.get(package, "")
+        if not extra or package == "asm_gym":
+            raise
+        raise ImportError(f"{what} needs {package}: pip install 'asm-gym[{extra}]'", name=package) from error

@@ -1,0 +1,156 @@
+"""A light install: the core watches a stream with nothing else installed, and what is missing is named."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tomllib
+import venv
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from asm_gym.extras import BROUGHT_BY, needed_for, require
+
+ROOT = Path(__file__).resolve().parents[1]
+CORE = ("gymnasium", "numpy", "numba", "scipy", "threadpoolctl")
+LARGEST = 500e6
+"""[bytes] that a core install may take."""
+
+WATCH = """
+import gymnasium, numpy as np
+import asm_gym, asm_gym.monitors, asm_gym.wrappers
+from asm_gym.episodes import Episode, load_episode, save_episode
+from asm_gym.monitors import NeuralASM
+from asm_gym.stream import Channel, StreamSpec
+
+spec = StreamSpec((Channel("x", 3, group="joint"), Channel("u", 1, group="action")), dt=0.05)
+rng = np.random.default_rng(0)
+t = np.arange(60)[:, None]
+waves = lambda: np.hstack([np.sin(t * (0.1, 0.2, 0.3)), np.ones((60, 1))]) + 0.01 * rng.normal(size=(60, 4))
+episodes = [Episode.from_stream(waves(), spec) for _ in range(24)]
+asm = NeuralASM(spec, hidden_size=8, association_size=8, epochs=1).fit(episodes[:5])
+asm.calibrate(episodes[5:], false_alarm_rate=0.05)
+asm.save("small.asm")
+asm = NeuralASM.load("small.asm")
+broken = waves()
+broken[30:, 1] = 3.0
+state, alarms = asm.initial_state(), []
+for row in load_episode(save_episode("one.npz", Episode.from_stream(broken, spec))).stream:
+    state, surprise = asm.observe(state, row[None])
+    alarms.append(bool(surprise.value[0] > asm.threshold))
+assert not any(alarms[:30]) and any(alarms[30:33]), alarms
+
+class Still(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-9, 9, (3,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    def reset(self, *, seed=None, options=None): return np.zeros(3, np.float32), {}
+    def step(self, action): return np.zeros(3, np.float32), 0.0, False, False, {}
+
+recorder = asm_gym.wrappers.StreamRecorder(Still())
+recorder.reset()
+recorder.step(np.zeros(1, np.float32))
+assert recorder.finish().stream.shape == (1, 4)
+
+def said(task):
+    try:
+        task()
+    except ImportError as error:
+        return str(error)
+
+import json
+print(json.dumps([
+    said(lambda: gymnasium.make("asm_gym/Lift-v0")),
+    said(lambda: asm_gym.wrappers.FaultInjection),
+    said(lambda: asm_gym.wrappers.SurpriseOverlay),
+    said(lambda: asm_gym.monitors.make_monitor("gru", spec)),
+    said(lambda: __import__("asm_gym.datasets").datasets.require_minari()),
+]))
+"""
+
+SAID = [
+    "a robosuite environment or a fault in one needs mujoco: pip install 'asm-gym[robosuite]'",
+    "a robosuite environment or a fault in one needs mujoco: pip install 'asm-gym[robosuite]'",
+    "SurpriseOverlay needs matplotlib: pip install 'asm-gym[report]'",
+    "monitor gru needs torch: pip install 'asm-gym[agents]'",
+    "a dataset needs h5py: pip install 'asm-gym[data]'",
+]
+
+NOTHING_ELSE = """
+import sys
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ABSENT:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Absent())
+"""
+
+
+def test_the_core_watches_a_stream_and_names_what_the_rest_needs(tmp_path):
+    code = NOTHING_ELSE.replace("ABSENT", repr(set(BROUGHT_BY))) + WATCH
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == SAID
+
+
+def test_a_command_says_which_extra_it_lacks(tmp_path):
+    code = NOTHING_ELSE.replace("ABSENT", "{'rich'}") + "from asm_gym.scripts.cli import main; sys.exit(main())"
+    done = subprocess.run([sys.executable, "-c", code, "doctor"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "asm-gym doctor: it needs rich: pip install 'asm-gym[report]'\n"
+
+
+def test_every_requirement_of_an_extra_is_known_by_the_name_it_is_imported_under():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    imported_as = {"pillow": "PIL", "scikit-learn": "sklearn"}
+
+    def names(requirements):
+        found = [re.match(r"[\w.-]+", line).group() for line in requirements]
+        return {imported_as.get(n, n.replace("-", "_")) for n in found}
+
+    assert names(project["dependencies"]) == set(CORE)
+    extras = {e: names(r) for e, r in project["optional-dependencies"].items() if e not in ("all", "dev", "docs")}
+    assert extras == {e: {n for n in BROUGHT_BY if BROUGHT_BY[n] == e and n != "dask"} for e in BROUGHT_BY.values()}
+
+
+def test_only_a_package_that_is_missing_is_said_to_be_missing(tmp_path, monkeypatch):
+    with pytest.raises(ImportError, match=r"^a chart needs nosuch: pip install 'asm-gym\[report\]'$"):
+        require("nosuch.part", what="a chart", extra="report")
+    (tmp_path / "matplotlib.py").write_text("import nosuch")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "matplotlib", raising=False)
+    with pytest.raises(ModuleNotFoundError, match="No module named 'nosuch'"), needed_for("a chart"):
+        import_module("matplotlib")
+
+
+@pytest.mark.slow
+def test_a_core_install_is_small_and_works(tmp_path):
+    venv.create(tmp_path / "venv", with_pip=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    pip = [python, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    before = _size(tmp_path / "venv")
+    subprocess.run([*pip, "wheel", "--no-deps", "--wheel-dir", tmp_path, ROOT], check=True)
+    (wheel,) = tmp_path.glob("asm_gym-*.whl")
+    subprocess.run([*pip, "install", "-c", ROOT / "constraints.txt", wheel], check=True)
+    grown = _size(tmp_path / "venv") - before
+    listed = subprocess.run([*pip, "list", "--format=json"], capture_output=True, text=True, check=True)
+    installed = {p["name"].lower().replace("-", "_") for p in json.loads(listed.stdout)}
+    print(f"{grown / 1e6:.0f} MB: {', '.join(sorted(installed))}")
+    assert installed <= {*CORE, "asm_gym", "pip", "setuptools", "llvmlite", "cloudpickle"} | {
+        "farama_notifications",
+        "typing_extensions",
+    }
+    assert grown < LARGEST
+    done = subprocess.run([python, "-I", "-c", WATCH], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == SAID
+
+
+def _size(folder: Path) -> int:
+    """[bytes] of all files."""
+    return sum(f.lstat().st_size for f in folder.rglob("*") if f.is_file())
