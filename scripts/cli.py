@@ -63,7 +63,7 @@ def main(argv: list[str] | None = None) -> int:
 
     def chosen() -> int:
         check_choice("command", name, COMMANDS)
-        with needed_for("it"):
+        with needed_for("this command"):
             main_of = import_module(COMMANDS[name].module).main
         code: int = main_of(rest)
         return code

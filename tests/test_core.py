@@ -102,7 +102,7 @@ def test_a_command_says_which_extra_it_lacks(tmp_path):
     code = NOTHING_ELSE.replace("ABSENT", "{'rich'}") + "from asm_gym.scripts.cli import main; sys.exit(main())"
     done = subprocess.run([sys.executable, "-c", code, "doctor"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "asm-gym doctor: it needs rich: pip install 'asm-gym[report]'\n"
+    assert done.stderr == "asm-gym doctor: this command needs rich: pip install 'asm-gym[report]'\n"
 
 
 def test_every_requirement_of_an_extra_is_known_by_the_name_it_is_imported_under():
