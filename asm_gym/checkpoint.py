@@ -90,6 +90,17 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
     return Checkpoint(header, arrays)
 
 
+def kind_of(path: str | Path) -> str:
+    """What a file is a checkpoint of. Raises FileNotFoundError, or ValueError where it is none."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            return str(json.loads(file.read(HEADER))["kind"])
+    except FileNotFoundError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, TypeError, EOFError, OSError) as error:
+        raise ValueError(f"{path} is damaged or not a checkpoint of asm-gym: {error}") from error
+
+
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
     """Every array of an ``.npz``, by name. Raises FileNotFoundError, or ValueError where it is damaged."""
     try:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from asm_gym.checkpoint import read_arrays, read_checkpoint, write_checkpoint
 from asm_gym.stream import StreamSpec
+from asm_gym.tables import stream_of
 
 KIND = "episode"
 
@@ -107,6 +109,21 @@ class Episode:
     def from_stream(cls, x: NDArray[np.floating[Any]], spec: StreamSpec, **fields: Any) -> Episode:
         """An episode from a stream recorded elsewhere, a real robot's included: ``x`` has the shape (T, D)."""
         return cls(np.ascontiguousarray(x, dtype=np.float32), spec, **fields)
+
+    @classmethod
+    def from_table(
+        cls,
+        frame: Any,
+        channels: StreamSpec | Mapping[str, str | Sequence[str]] | Sequence[str] | None = None,
+        rate: float | None = None,
+        action: Sequence[str] = (),
+        **fields: Any,
+    ) -> Episode:
+        """An episode from a log: a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
+
+        The arguments are those of ``asm_gym.tables.stream_of``, and whatever else an episode has.
+        """
+        return cls(*stream_of(frame, channels, rate, action), **fields)
 
 
 def save_episode(path: str | Path, episode: Episode) -> Path:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 from typing import Any
 
+from asm_gym.checkpoint import kind_of
 from asm_gym.choices import check_choice
 from asm_gym.extras import needed_for
 from asm_gym.monitors.base import (
@@ -29,6 +31,7 @@ __all__ = [
     "NamesSkills",
     "NeuralASM",
     "Surprise",
+    "load_monitor",
     "make_monitor",
     "monitor_class",
 ]
@@ -81,3 +84,8 @@ def make_monitor(name: str, spec: StreamSpec, **kwargs: Any) -> Monitor:
         check_choice(f"hyperparameter of {name}", parameter, kind.hyperparameters)
     monitor: Monitor = kind(spec, **kwargs)
     return monitor
+
+
+def load_monitor(path: str | Path) -> Any:
+    """Whatever monitor was saved there. Raises FileNotFoundError, or ValueError where it is none that can be read."""
+    return monitor_class(kind_of(path)).load(path)

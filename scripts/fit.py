@@ -1,0 +1,174 @@
+"""A memory of what is normal, learned from recordings: run folders, Minari datasets, or logs from elsewhere.
+
+Part of the episodes are learned from, the others set the threshold. Episodes that failed or hold a fault are left out.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from asm_gym.checks import check_number
+from asm_gym.choices import check_choice
+from asm_gym.detection.detector import conformal_episodes
+from asm_gym.episodes import Episode
+from asm_gym.logs import Layout, Log, read_logs
+from asm_gym.monitors import EVIDENCE, MONITORS, make_monitor, monitor_class
+from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.command import run
+
+FITTED = tuple(name for name in MONITORS if not name.endswith(EVIDENCE))
+"""What a file alone says how to read."""
+
+_QUICK = {"episodes": 20, "epochs": 5}
+
+
+@dataclass(frozen=True)
+class Args:
+    """A memory from recordings."""
+
+    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
+    """A run folder of collect, import or evaluate, a Minari dataset, or .npz and .csv logs (a file, or a folder)."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("runs/fit/memory.asm")
+    """File to write the memory to."""
+    monitor: str = "neural_asm"
+    """Name of the monitor."""
+    false_alarm_rate: float = 0.05
+    """Share of normal episodes that may raise an alarm."""
+    calibration_share: float = 0.5
+    """Share of the episodes that set the threshold, and are not learned from."""
+    action: tuple[str, ...] = ()
+    """Columns of logs that were commanded and not sensed: names, or patterns such as 'cmd*'."""
+    rate: float | None = None
+    """Rows of logs a second [Hz]; by default their column called time says it."""
+    split: float | None = None
+    """Length of the pieces that long logs are cut into [s]; each then counts as an episode."""
+    keep_failures: bool = False
+    """Learn from episodes that did not succeed, too."""
+    seed: int = 0
+    """Seed of the memory, and of which episodes it learns from."""
+    quick: bool = False
+    """Learn little, from few episodes: to see that everything runs."""
+
+    def __post_init__(self) -> None:
+        check_choice("monitor", self.monitor, FITTED)
+        conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
+        check_number("calibration_share", self.calibration_share, above=0, below=1)
+        for name in ("rate", "split"):
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), above=0)
+        if self.out.is_dir():
+            raise ValueError(f"out must be a file, and {self.out} is a folder")
+
+
+class Kept(NamedTuple):
+    """The episodes that are learned from, and how many others were left out, by why."""
+
+    episodes: list[Episode]
+    left_out: Counter[str]
+
+
+def chosen(logs: Iterable[Log], keep_failures: bool = False) -> Kept:
+    """The normal episodes among ``logs``."""
+    kept = Kept([], Counter())
+    for _, episode in logs:
+        why = _abnormal(episode)
+        if why == "failed" and keep_failures:
+            why = ""
+        if why:
+            kept.left_out[why] += 1
+        else:
+            kept.episodes.append(episode)
+    return kept
+
+
+def _abnormal(episode: Episode) -> str:
+    """What is not normal about an episode, in a word or two; empty where nothing is."""
+    if episode.faults.any() or (episode.label is not None and episode.label.role == "faulty"):
+        return "with a fault"
+    if episode.label is not None and episode.label.role == "harmless":
+        return "under a harmless variation"
+    return "" if episode.success else "failed"
+
+
+def pieces(episode: Episode, seconds: float) -> list[Episode]:
+    """An episode cut into pieces of one length; a rest that is shorter is left out."""
+    rows = max(1, round(seconds / episode.spec.dt))
+    ends = range(rows, len(episode) + 1, rows)
+    return [Episode.from_stream(episode.stream[n - rows : n], episode.spec, success=True) for n in ends]
+
+
+def divided(episodes: list[Episode], args: Args) -> tuple[list[Episode], list[Episode]]:
+    """Those to learn from, and those to calibrate on.
+
+    Raises:
+        ValueError: too few of them; the message says how many are needed.
+    """
+    n, needed = len(episodes), conformal_episodes(args.false_alarm_rate)
+    order = np.random.default_rng(args.seed).permutation(n)
+    calibration = math.floor(n * args.calibration_share + 1e-9)
+    if calibration < needed or calibration == n:
+        least = max(2, math.ceil(needed / args.calibration_share - 1e-9))
+        raise ValueError(
+            f"a false-alarm rate of {args.false_alarm_rate:g} needs {least} normal episodes, {needed} of them to "
+            f"calibrate on, got {n}: record more, take a higher --false-alarm-rate, or --split long logs"
+        )
+    return [episodes[i] for i in order[calibration:]], [episodes[i] for i in order[:calibration]]
+
+
+def learned(args: Args, fitting: list[Episode], calibration: list[Episode], progress: Any) -> Any:
+    """The monitor, fitted and calibrated."""
+    settings: dict[str, Any] = {"seed": args.seed}
+    if args.quick and "epochs" in monitor_class(args.monitor).hyperparameters:
+        settings["epochs"] = _QUICK["epochs"]
+    monitor: Any = make_monitor(args.monitor, fitting[0].spec, **settings)
+    return monitor.fit(fitting, progress).calibrate(calibration, args.false_alarm_rate)
+
+
+def fit(args: Args, console: Console) -> None:
+    """Reads, learns, calibrates, saves, and says what came of it."""
+    start = time.perf_counter()
+    kept = chosen(read_logs(args.data, Layout(rate=args.rate, action=args.action)), args.keep_failures)
+    left_out = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
+    if not kept.episodes:
+        hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""
+        raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
+    episodes = kept.episodes if args.split is None else [p for e in kept.episodes for p in pieces(e, args.split)]
+    fitting, calibration = divided(episodes, args)
+    fitting = fitting[: _QUICK["episodes"]] if args.quick else fitting
+    with stage("learning", console, {}) as progress:
+        monitor = learned(args, fitting, calibration, progress)
+    monitor.save(args.out)
+    spec = fitting[0].spec
+    rows = sum(map(len, fitting))
+    hours = float(np.mean([len(e) for e in calibration])) * spec.dt / 3600
+    say = partial(console.print, soft_wrap=True, highlight=False)
+    say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
+    if left_out:
+        say(f"Left out: {left_out}.")
+    say(
+        f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: an alarm in at most "
+        f"{args.false_alarm_rate:.1%} of normal ones, {args.false_alarm_rate / hours:.2g} an hour at their length."
+    )
+    seconds = time.perf_counter() - start
+    say(f"Wrote {args.out} after {seconds:.0f} s. Watch with it: asm-gym watch LOG --monitor {args.out}")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Fits, and returns the exit code."""
+    return run("fit", Args, fit, argv, __doc__)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

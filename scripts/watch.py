@@ -1,0 +1,241 @@
+"""Says when a recording is surprising, where, and how much; or watches rows as they come.
+
+A recording gives a table, figures and a report. With - as the source, JSON lines are read from standard input: a list
+of numbers, or an object by channel, one a row; every alarm is printed as it is raised. Exit code 1: there was an alarm.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+
+from asm_gym.checks import check_number
+from asm_gym.evaluation import plots
+from asm_gym.evaluation.report import Table, write_report
+from asm_gym.evaluation.trace import Trace, TraceDetail, spans
+from asm_gym.logs import Layout, Log, read_logs
+from asm_gym.monitors import load_monitor
+from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.command import BAD_NEWS, DONE, run
+from asm_gym.stream import StreamSpec
+
+AT_ONCE = 64
+"""Episodes scored side by side."""
+
+SHOWN_ROWS = 20
+"""Alarms printed; the file holds them all."""
+
+LATENCIES = 10_000
+"""Newest rows whose latency is kept."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Watches a recording, or rows as they come."""
+
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """What asm-gym fit reads; or - for JSON lines on standard input."""
+    monitor: Annotated[Path, tyro.conf.arg(metavar="FILE.asm")]
+    """A calibrated monitor, such as asm-gym fit writes."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/watch")
+    """Folder of the table, the figures and the report of a recording."""
+    rate: float | None = None
+    """Rows of logs a second [Hz]; by default their column called time says it, or else the memory."""
+    figures: int = 4
+    """How many of the most surprising episodes are drawn."""
+
+    def __post_init__(self) -> None:
+        check_number("figures", self.figures, low=1, whole=True)
+        if self.rate is not None:
+            check_number("rate", self.rate, above=0)
+
+
+class Alarm(NamedTuple):
+    """One alarm of a recording.
+
+    Attributes:
+        log: in which.
+        start, end: from when to when [s]; a row is known at the end of its step.
+        channel: which number surprised most, at its worst row.
+        excess: how surprising that row was, in thresholds; infinite where it was not finite.
+    """
+
+    log: str
+    start: float
+    end: float
+    channel: str
+    excess: float
+
+    def cells(self) -> tuple[str, ...]:
+        """For a table."""
+        return self.log, f"{self.start:.3f}", f"{self.end:.3f}", self.channel, f"{self.excess:.2f}"
+
+
+HEADINGS = ("log", "from [s]", "to [s]", "channel", "thresholds")
+"""The last: how surprising the worst row was, in multiples of the threshold."""
+
+
+def alarms_of(trace: Trace) -> list[Alarm]:
+    """Every alarm of an episode, in order."""
+    assert trace.detail is not None
+    found = []
+    for start, stop in spans(trace.alarm):
+        worst = start + int(np.argmax(trace.surprise[start:stop]))
+        channel = trace.detail.channels[int(np.argmax(trace.detail.attribution[worst]))]
+        excess = float(trace.surprise[worst] / trace.threshold)
+        found.append(Alarm(trace.kind, (start + 1) * trace.dt, stop * trace.dt, channel, excess))
+    return found
+
+
+def traces_of(logs: Sequence[Log], monitor: Any) -> list[Trace]:
+    """What the monitor says of each."""
+    spec: StreamSpec = monitor.spec
+    traces = []
+    for (name, episode), surprise in zip(logs, monitor.score_episodes([log.episode for log in logs]), strict=True):
+        fault = episode.faults if len(episode.faults) == len(episode) else np.zeros(len(episode), np.bool_)
+        detail = TraceDetail(surprise.attribution, spec.labels, fault, episode.stream)
+        traces.append(Trace(name, 0, spec.dt, monitor.threshold, surprise.value, detail=detail))
+    return traces
+
+
+def in_groups(logs: Iterable[Log], size: int) -> Iterator[list[Log]]:
+    """So many at a time: a folder of recordings may be larger than memory."""
+    rest = iter(logs)
+    while group := list(islice(rest, size)):
+        yield group
+
+
+def review(args: Args, monitor: Any, console: Console) -> int:
+    """Scores a recording, writes what came of it, and prints the alarms."""
+    alarms: list[Alarm] = []
+    worst: list[Trace] = []
+    episodes = 0
+    with stage("watching", console, {}) as progress:
+        for group in in_groups(read_logs(args.source, Layout(monitor.spec, args.rate)), AT_ONCE):
+            traces = traces_of(group, monitor)
+            alarms += [alarm for trace in traces for alarm in alarms_of(trace)]
+            worst = sorted([*worst, *traces], key=lambda trace: -float(trace.surprise.max()))[: args.figures]
+            episodes += len(group)
+            progress(episodes, episodes)
+    said = f"{len(alarms)} alarms in {len({a.log for a in alarms})} of {episodes} episodes"
+    publish(args, said, alarms, worst)
+    say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
+    shown = sorted(alarms, key=lambda alarm: -alarm.excess)[:SHOWN_ROWS]
+    say(said + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} greatest:"))
+    width = max((len(alarm.channel) for alarm in shown), default=0)
+    for cells in [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []:
+        log, start, end, channel, excess = cells
+        say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {log}")
+    say(f"Wrote {args.out / 'report.html'} and alarms.csv")
+    return BAD_NEWS if alarms else DONE
+
+
+def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Trace]) -> None:
+    """Writes the table of all alarms, and a report with the most surprising episodes."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    with (args.out / "alarms.csv").open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([HEADINGS, *(alarm.cells() for alarm in alarms)])
+    figures = {
+        "Surprise over time in the most surprising episodes": plots.surprise_figure(worst),
+        "Where the surprise came from in the most surprising one": plots.attribution_figure(worst[0]),
+        "What its most surprising channels sensed": plots.stream_figure(worst[0]),
+    }
+    for name, figure in zip(("surprise", "attribution", "stream"), figures.values(), strict=True):
+        plots.save(figure, args.out / f"{name}.png")
+    write_report(
+        args.out / "report.html",
+        f"asm-gym watch: {args.source}",
+        f"{said}, as {args.monitor} sees them.",
+        [Table("Alarms", HEADINGS, [alarm.cells() for alarm in alarms])] if alarms else [],
+        figures,
+        details={"command": f"asm-gym watch {args.source} --monitor {args.monitor}"},
+    )
+
+
+def row_of(line: str, number: int, spec: StreamSpec) -> NDArray[np.float64]:
+    """The numbers (D,) of a JSON line; NaN where one was lost. Raises ValueError where it is no row."""
+    try:
+        said: Any = json.loads(line)
+        row = _by_name(said, number, spec) if isinstance(said, dict) else np.asarray(said, np.float64)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"line {number} is no row of numbers: {error}") from error
+    if row.shape != (spec.size,):
+        raise ValueError(f"line {number} must hold {spec.size} numbers, got the shape {row.shape}")
+    return row
+
+
+def _by_name(said: dict[str, Any], number: int, spec: StreamSpec) -> NDArray[np.float64]:
+    """The numbers (D,) by the names of channels or of single numbers; the first row has to hold them all."""
+    parts, missing = [], []
+    for channel in spec.channels:
+        values = said[channel.name] if channel.name in said else [said.get(label) for label in channel.labels]
+        if channel.name not in said and not set(channel.labels) <= set(said):
+            missing.append(channel.name)
+        parts.append(np.ravel(np.asarray(values, np.float64)))  # null is NaN
+    if missing and number == 1:
+        raise ValueError(f"it lacks {', '.join(missing)}")
+    return np.concatenate(parts)
+
+
+def follow(lines: Iterable[str], monitor: Any, console: Console) -> int:
+    """Watches rows as they come, in constant memory: prints every alarm as it is raised."""
+    say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
+    spec: StreamSpec = monitor.spec
+    state = monitor.initial_state(1)
+    monitor.observe(state, np.zeros((1, spec.size)))  # compiles; the state is a value, and stays as it is
+    latencies: deque[float] = deque(maxlen=LATENCIES)
+    rows = alarms = 0
+    before = False
+    for line in lines:
+        if not line.strip():
+            continue
+        start = time.perf_counter()
+        rows += 1
+        state, surprise = monitor.observe(state, row_of(line, rows, spec)[None])
+        value = float(surprise.value[0])
+        latencies.append(1e3 * (time.perf_counter() - start))
+        if value > monitor.threshold and not before:
+            alarms += 1
+            channel = spec.labels[int(np.argmax(surprise.attribution[0]))]
+            excess = value / monitor.threshold
+            say(
+                f"{rows * spec.dt:.3f} s  {channel}  {excess:.2f} thresholds  {latencies[-1]:.2f} ms after the row came"
+            )
+        before = value > monitor.threshold
+    if not rows:
+        raise ValueError("no row came")
+    median, late = np.percentile(latencies, [50, 99])
+    say(f"{rows} rows, {alarms} alarms; a row took {median:.2f} ms, 99 % of the newest under {late:.2f} ms")
+    return BAD_NEWS if alarms else DONE
+
+
+def watch(args: Args, console: Console) -> int:
+    """Watches whichever it is."""
+    monitor: Any = load_monitor(args.monitor)
+    if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
+        raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
+    return follow(sys.stdin, monitor, console) if args.source == "-" else review(args, monitor, console)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Watches, and returns the exit code."""
+    return run("watch", Args, watch, argv, __doc__)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
