@@ -25,6 +25,7 @@ from asm_gym.detection.detector import conformal_episodes
 from asm_gym.episodes import Episode
 from asm_gym.logs import Layout, Log, read_logs
 from asm_gym.monitors import EVIDENCE, MONITORS, make_monitor, monitor_class
+from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
 
@@ -79,10 +80,12 @@ class Kept(NamedTuple):
     left_out: Counter[str]
 
 
-def chosen(logs: Iterable[Log], keep_failures: bool = False) -> Kept:
+def chosen(logs: Iterable[Log], keep_failures: bool = False, progress: Progress | None = None) -> Kept:
     """The normal episodes among ``logs``."""
     kept = Kept([], Counter())
-    for _, episode in logs:
+    for n, (_, episode) in enumerate(logs, 1):
+        if progress is not None:
+            progress(n, n)  # how many there are is known at the end
         why = _abnormal(episode)
         if why == "failed" and keep_failures:
             why = ""
@@ -127,7 +130,7 @@ def divided(episodes: list[Episode], args: Args) -> tuple[list[Episode], list[Ep
     return [episodes[i] for i in order[calibration:]], [episodes[i] for i in order[:calibration]]
 
 
-def learned(args: Args, fitting: list[Episode], calibration: list[Episode], progress: Any) -> Any:
+def learned(args: Args, fitting: list[Episode], calibration: list[Episode], progress: Progress) -> Any:
     """The monitor, fitted and calibrated."""
     settings: dict[str, Any] = {"seed": args.seed}
     if args.quick and "epochs" in monitor_class(args.monitor).hyperparameters:
@@ -139,7 +142,8 @@ def learned(args: Args, fitting: list[Episode], calibration: list[Episode], prog
 def fit(args: Args, console: Console) -> None:
     """Reads, learns, calibrates, saves, and says what came of it."""
     start = time.perf_counter()
-    kept = chosen(read_logs(args.data, Layout(rate=args.rate, action=args.action)), args.keep_failures)
+    with stage("reading", console, {}) as progress:
+        kept = chosen(read_logs(args.data, Layout(rate=args.rate, action=args.action)), args.keep_failures, progress)
     left_out = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
     if not kept.episodes:
         hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""
