@@ -12,7 +12,7 @@ BROUGHT_BY = {
     **dict.fromkeys(("torch", "stable_baselines3", "tensorboard"), "agents"),
     **dict.fromkeys(("minari", "h5py"), "data"),
     **dict.fromkeys(("matplotlib", "rich", "tyro", "imageio", "imageio_ffmpeg", "PIL"), "report"),
-    **dict.fromkeys(("pyarrow", "sklearn", "joblib", "packaging"), "report"),
+    **dict.fromkeys(("pyarrow", "sklearn", "loky", "packaging"), "report"),
     **dict.fromkeys(("distributed", "dask", "ray"), "cluster"),
     **dict.fromkeys(("moviepy",), "video"),
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ PolicyState = Any
 """What a policy carries from step to step: a value, passed in and handed back. None starts an episode."""
 
 
+@runtime_checkable
 class Policy(Protocol):
     """Acts. Every stable-baselines3 model is one."""
 
@@ -22,4 +23,13 @@ class Policy(Protocol):
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], PolicyState]:
         """The action for ``observation``, and the state to pass in next time."""
+        ...
+
+
+@runtime_checkable
+class Seeded(Protocol):
+    """What draws at random and can be told to draw the same again, as every stable-baselines3 model can."""
+
+    def set_random_seed(self, seed: int) -> None:
+        """All that is drawn from now on follows from ``seed``."""
         ...

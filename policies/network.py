@@ -117,6 +117,10 @@ class NetworkPolicy:
         self._low, self._high = env.action_space.low, env.action_space.high
         return self
 
+    def set_random_seed(self, seed: int) -> None:
+        """Its noise follows from ``seed`` from now on."""
+        self.np_random = np.random.default_rng(seed)
+
     def predict(
         self,
         observation: Any,

@@ -32,11 +32,12 @@ from asm_gym.evaluation.statistics import Share, binomial_interval
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
 from asm_gym.faults import Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
+from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
-from asm_gym.rollouts.video import Scene, film, prepare_film
-from asm_gym.rollouts.watch import Trial, watch_pair
-from asm_gym.scripts.collect import collect, episode_seeds
+from asm_gym.rollouts.seeds import episode_seeds
+from asm_gym.rollouts.trial import RolloutConfig, Trial, watch_pair
+from asm_gym.rollouts.video import Clip, can_record_video, record_video
 from asm_gym.tasks import task
 
 WINDOW_S = 1.0
@@ -123,7 +124,10 @@ def trials(args: Args) -> list[Trial]:
     broken = faults(args.seed, args.faulty_episodes)
     seeds = episode_seeds(args.seed, args.nominal_episodes + len(broken), stage=2)
     cases = [(NOMINAL, ())] * args.nominal_episodes + [(name, (fault,)) for name, fault in broken]
-    return [Trial(name, faulty, args.on_alarm, seed) for (name, faulty), seed in zip(cases, seeds, strict=True)]
+    return [
+        Trial(args.task, seed, name, faults=faulty, acting=args.on_alarm)
+        for (name, faulty), seed in zip(cases, seeds, strict=True)
+    ]
 
 
 def fit(args: Args, folder: Path, timed: Callable[[str], Any]) -> tuple[NeuralASM, Share]:
@@ -156,12 +160,6 @@ def observe_latency_us(memory: NeuralASM, calls: int = 2000) -> dict[str, float]
         times[k] = time.perf_counter() - start
     median, p95 = np.percentile(1e6 * times, [50, 95])
     return {"median": round(float(median), 1), "p95": round(float(p95), 1)}
-
-
-def scene(args: Args, trial: Trial) -> Scene:
-    """What to film of a trial."""
-    on_alarm = "monitor" if trial.acting == POLICY_ALONE else trial.acting
-    return Scene(args.task, f"{trial.condition}, {trial.acting}", trial.seed, lambda _: trial.faults, on_alarm)
 
 
 def typical(traces: list[Trace]) -> list[Trace]:
@@ -265,11 +263,11 @@ def run(args: Args, console: Console) -> list[Row]:
     seconds: dict[str, float] = {}
     timed = partial(stage, console=console, seconds=seconds)
 
-    can_film = args.video and prepare_film(console)
+    can_show = args.video and can_record_video(console)
     memory, expert = fit(args, folder, timed)
     todo = trials(args)
     with timed("testing, policy alone and wrapped") as progress:
-        work = partial(watch_pair, env_id=args.task, policy="scripted", memory=folder / "lift.asm")
+        work = partial(watch_pair, config=RolloutConfig(), memory=folder / "lift.asm")
         traces = [trace for pair in parallel_map(work, todo, args.workers, progress) for trace in pair]
     rows = summarise(traces, WINDOW_S)
     latency = observe_latency_us(memory)
@@ -287,12 +285,12 @@ def run(args: Args, console: Console) -> list[Row]:
     with timed("drawing"):
         drawn = figures(traces, folder)
     video = None
-    if can_film:
-        examples = {(t.condition, t.seed) for t in typical(traces)}
-        shown = [t for t in todo if (t.condition, t.seed) in examples]
-        with timed("filming") as progress:
-            scenes = [scene(args, trial) for trial in shown]
-            video = film(scenes, memory, folder / "demo.mp4", progress)
+    if can_show:
+        examples = {(t.kind, t.seed) for t in typical(traces)}
+        shown = [t for t in todo if (t.kind, t.seed) in examples]
+        with timed("recording a video") as progress:
+            clips = [Clip(trial, f"{trial.kind}, {trial.acting}") for trial in shown]
+            video = record_video(clips, RolloutConfig(), memory, folder / "demo.mp4", progress)
     write_json(folder / "demo.json", args, rows, expert, latency, seconds)
     write_report(
         folder / "report.html",

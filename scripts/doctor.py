@@ -4,13 +4,9 @@
 
 from __future__ import annotations
 
-import ctypes
-import os
 import platform
-import subprocess
 import sys
 from dataclasses import dataclass
-from functools import cache
 from importlib import metadata
 
 from packaging.requirements import Requirement
@@ -20,29 +16,15 @@ from rich.markup import escape
 from rich.table import Table
 
 from asm_gym.extras import BROUGHT_BY
+from asm_gym.graphics import GET_ENCODER, GET_RENDERING, encoder_problem, loads, rendering_backend, rendering_problem
 from asm_gym.scripts.command import run
 
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "mujoco", "robosuite", "stable-baselines3", "torch")
-BACKENDS = ("egl", "osmesa")  # EGL first: it uses a GPU where there is one
 REINSTALL = "make clean, then make doctor (or: python -m pip install -c constraints.txt -e .)"
 COMPILER = "apt-get install gcc libc6-dev linux-libc-dev python3-dev"
 
 # opencv-python links to these, and `import robosuite` imports it.
 LIBRARIES = {"libGL.so.1": "libgl1", "libglib-2.0.so.0": "libglib2.0-0", "libgthread-2.0.so.0": "libglib2.0-0"}
-GL_LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
-
-# A lit white ball on black: a driver that draws nothing returns a frame of one colour.
-ONE_FRAME = """
-import mujoco
-ball = "<mujoco><worldbody><light pos='0 0 3'/><geom size='.1' rgba='1 1 1 1'/></worldbody></mujoco>"
-model = mujoco.MjModel.from_xml_string(ball)
-data = mujoco.MjData(model)
-mujoco.mj_forward(model, data)
-with mujoco.Renderer(model, 32, 32) as renderer:
-    renderer.update_scene(data)
-    frame = renderer.render()  # (32, 32, 3) uint8
-assert frame.min() < frame.max(), "the frame is one colour"
-"""
 
 
 @dataclass(frozen=True)
@@ -133,57 +115,17 @@ def library(name: str, package: str) -> Check:
     return Check(name, ok, False, detail, "" if ok else f"apt-get install {package}")
 
 
-def loads(library: str) -> bool:
-    """The dynamic linker finds ``library``, and everything that it links to."""
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True
-
-
 def rendering() -> Check:
     """A way to draw without a screen; without one there is no video, and everything else runs."""
-    backend = rendering_backend()
-    if backend:
-        return Check("rendering", True, False, f"MUJOCO_GL={backend} draws a frame")
-    found = ", ".join(f"{lib} {'draws nothing' if loads(lib) else 'missing'}" for lib in GL_LIBRARIES.values())
-    remedy = "apt-get install libegl1 libgl1 libgl1-mesa-dri (or libosmesa6)"
-    return Check("rendering", False, False, f"no video: {found}", remedy)
-
-
-@cache
-def rendering_backend() -> str | None:
-    """The first value of ``MUJOCO_GL`` with which MuJoCo draws a frame here, ``"egl"`` or ``"osmesa"``; None: no video.
-
-    Tried in other processes: a choice of backend cannot be undone within one.
-    """
-    return next((backend for backend in BACKENDS if draws_a_frame(backend)), None)
-
-
-def draws_a_frame(backend: str) -> bool:
-    """MuJoCo draws one frame with ``MUJOCO_GL=backend``, in a process of its own."""
-    env = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": backend}
-    try:
-        # A driver may wait for a device for ever; importing mujoco on a busy machine takes tens of seconds.
-        done = subprocess.run([sys.executable, "-c", ONE_FRAME], env=env, capture_output=True, timeout=120, check=False)
-    except subprocess.TimeoutExpired:
-        return False
-    return done.returncode == 0
+    problem = rendering_problem()
+    detail = problem or f"MUJOCO_GL={rendering_backend()} draws a frame"
+    return Check("rendering", not problem, False, detail, GET_RENDERING if problem else "")
 
 
 def encoder() -> Check:
     """An ffmpeg with the H.264 encoder that browsers and players understand."""
-    remedy = "python -m pip install --force-reinstall imageio-ffmpeg (or: apt-get install ffmpeg)"
-    try:
-        from imageio_ffmpeg import get_ffmpeg_exe
-
-        exe = get_ffmpeg_exe()
-        encoders = subprocess.run([exe, "-hide_banner", "-encoders"], capture_output=True, timeout=60, check=True)
-    except (ImportError, RuntimeError, OSError, subprocess.SubprocessError) as error:
-        return Check("H.264 encoder", False, False, f"no video: {type(error).__name__}: {error}", remedy)
-    ok = b"libx264" in encoders.stdout
-    return Check("H.264 encoder", ok, False, f"{exe}" if ok else f"{exe} has no libx264", "" if ok else remedy)
+    problem = encoder_problem()
+    return Check("H.264 encoder", not problem, False, problem or "found", GET_ENCODER if problem else "")
 
 
 def exit_code(checks: list[Check]) -> int:

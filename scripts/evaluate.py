@@ -24,21 +24,22 @@ from asm_gym.detection.detector import conformal_episodes
 from asm_gym.episodes import EpisodeLabel
 from asm_gym.evaluation.publish import brief_tables, publish
 from asm_gym.evaluation.text_tables import console_table
-from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, possible, suite_fault
+from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, possible
 from asm_gym.monitors import MONITORS
 from asm_gym.policies import make_policy
 from asm_gym.rollouts.benchmark import Judgement, calibrated, judge
-from asm_gym.rollouts.folder import claim_folder
-from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
+from asm_gym.rollouts.folder import claimed, make_missing
+from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
-from asm_gym.rollouts.record import EXECUTIONS, Course, draw_onset, episode_seeds, record
-from asm_gym.rollouts.video import Scene, film, prepare_film
+from asm_gym.rollouts.seeds import draw_onset, role_seeds
+from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, record
+from asm_gym.rollouts.video import Clip, can_record_video, record_video
 from asm_gym.scripts.command import USAGE_ERRORS
 from asm_gym.tasks import task as task_spec
 
 _HARMLESS = (*HARMLESS, *EXECUTIONS)
-FILMED = 2
-"""Typical episodes in the film."""
+SHOWN = 2
+"""Typical episodes in the video."""
 
 _QUICK = ("neural_asm", "logpzo", "kalman+evidence", "autoregression", "external_torque_limit", "force_limit")
 """Monitors that are fitted in seconds."""
@@ -76,12 +77,8 @@ class Args:
     """Share of nominal episodes that may raise an alarm."""
     window: float = 1.0
     """How soon after its onset a fault must be noticed [s]."""
-    workers: int = 2
-    """Processes."""
-    backend: str = "loky"
-    """loky for processes on this machine; dask or ray for a cluster that is running."""
-    address: str | None = None
-    """Where the cluster is, such as tcp://host:8786."""
+    parallel: tyro.conf.OmitArgPrefixes[ParallelConfig] = TWO_PROCESSES
+    """Who does the work."""
     seed: int = 0
     """Seed of all that is drawn: the same seed gives the same table."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
@@ -139,8 +136,8 @@ class Args:
         )
 
     @property
-    def crew(self) -> ParallelConfig:
-        return ParallelConfig(self.workers, self.backend, self.address)
+    def config(self) -> RolloutConfig:
+        return RolloutConfig(self.policy, self.robot)
 
 
 def labels(args: Args) -> list[EpisodeLabel]:
@@ -155,9 +152,9 @@ def labels(args: Args) -> list[EpisodeLabel]:
         horizon = env.horizon
         env.close()
         for role in ("fit", "calibration", "nominal"):
-            seeds = episode_seeds(args.seed, task, role, getattr(args, f"{role}_episodes"))
+            seeds = role_seeds(args.seed, task, role, getattr(args, f"{role}_episodes"))
             made += [EpisodeLabel(task, role, seed=s) for s in seeds]
-        twins = episode_seeds(args.seed, task, "nominal", args.nominal_episodes)[: args.faulty_episodes]
+        twins = role_seeds(args.seed, task, "nominal", args.nominal_episodes)[: args.faulty_episodes]
         onsets = {s: draw_onset(s, horizon) for s in twins}
         made += [
             EpisodeLabel(task, "faulty", k, severity, s, onsets[s])
@@ -165,75 +162,41 @@ def labels(args: Args) -> list[EpisodeLabel]:
             for severity in args.severities
             for s in twins
         ]
-        others = episode_seeds(args.seed, task, "harmless", args.harmless_episodes)
+        others = role_seeds(args.seed, task, "harmless", args.harmless_episodes)
         made += [EpisodeLabel(task, "harmless", k, "", s, draw_onset(s, horizon)) for k in harmless for s in others]
     return made
 
 
-def record_all(args: Args, wanted: Sequence[EpisodeLabel], crew: ParallelConfig, progress: Progress) -> None:
-    """Records the episodes that are not there yet."""
-    missing = [label for label in wanted if not (args.out / label.path).is_file()]
-    done = len(wanted) - len(missing)
-    progress(done, len(wanted))
-    course = Course(args.robot, args.policy)
-    task = partial(record, course=course, folder=args.out.resolve())
-    parallel_map(task, missing, crew, lambda k, _: progress(done + k, len(wanted)))
-
-
-def claim(args: Args) -> None:
-    """Makes the folder this run's own, or goes on with it.
-
-    Raises:
-        ValueError: it holds a run of other settings; the message names them.
-    """
-    ours = {
-        name: value
-        for name, value in json.loads(json.dumps(asdict(args), default=str)).items()
-        if name in ("robot", "policy", "seed")
-    }
-    claim_folder(args.out, "recordings.json", ours)
-
-
-def film_examples(args: Args, judgement: Judgement, wanted: Sequence[EpisodeLabel], progress: Progress) -> Path:
+def show_examples(args: Args, judgement: Judgement, wanted: Sequence[EpisodeLabel], progress: Progress) -> Path:
     """The first of the typical episodes, as the first monitor saw them."""
     name = args.monitors[0]
     monitor = calibrated(args.out, name, wanted, args.seed, judgement.thresholds[name][args.false_alarm_rate])
-    after = round(Course().after_s / monitor.spec.dt)
-    scenes = [
-        Scene(
-            f"asm_gym/{label.task}-v0",
-            f"{label.severity} {label.kind.replace('_', ' ')}",
-            label.seed,
-            lambda env, x=label: [suite_fault(x.kind, env, x.severity, x.onset or 0, x.seed)],  # type: ignore[misc]
-            steps=(label.onset or 0) + after,
-            policy=args.policy,
-            robot=args.robot,
-        )
-        for label in judgement.shown[:FILMED]
+    clips = [
+        Clip(Trial.of(label), f"{label.severity} {label.kind.replace('_', ' ')}") for label in judgement.shown[:SHOWN]
     ]
-    return film(scenes, monitor, args.out / "examples.mp4", progress)
+    return record_video(clips, args.config, monitor, args.out / "examples.mp4", progress)
 
 
 def evaluate(args: Args, console: Console) -> Judgement:
     """Records, fits, judges and publishes."""
     seconds: dict[str, float] = {}
-    crew = args.crew
     with stage("listing episodes", console, seconds):
         wanted = labels(args)
-    claim(args)
-    with stage("recording", console, seconds) as progress:
-        record_all(args, wanted, crew, progress)
-    with stage("fitting and judging", console, seconds) as progress:
-        how = args.false_alarm_rate, args.window, args.seed, crew
-        judgement = judge(args.out, wanted, args.monitors, *how, progress)
-    video = None
-    if args.video and judgement.shown and prepare_film(console):
-        with stage("filming", console, seconds) as progress:
-            video = film_examples(args, judgement, wanted, progress)
-    with stage("drawing", console, seconds):
-        details = json.loads(json.dumps(asdict(args), default=str))
-        details |= {"python": platform.python_version(), "machine": platform.machine(), "seconds": seconds}
-        publish(args.out, judgement, details, video)
+    with claimed(args.out, "recordings.json", {name: getattr(args, name) for name in ("robot", "policy", "seed")}):
+        with stage("recording", console, seconds) as progress:
+            make = partial(record, config=args.config, folder=args.out.resolve())
+            make_missing(make, wanted, lambda label: args.out / label.path, args.parallel, progress)
+        with stage("fitting and judging", console, seconds) as progress:
+            how = args.false_alarm_rate, args.window, args.seed, args.parallel
+            judgement = judge(args.out, wanted, args.monitors, *how, progress)
+        video = None
+        if args.video and judgement.shown and can_record_video(console):
+            with stage("recording a video", console, seconds) as progress:
+                video = show_examples(args, judgement, wanted, progress)
+        with stage("drawing", console, seconds):
+            details = json.loads(json.dumps(asdict(args), default=str))
+            details |= {"python": platform.python_version(), "machine": platform.machine(), "seconds": seconds}
+            publish(args.out, judgement, details, video)
     return judgement
 
 

@@ -22,15 +22,22 @@ from asm_gym.choices import check_choice
 from asm_gym.datasets import read_dataset
 from asm_gym.episodes import Episode, load_episode
 from asm_gym.policies.network import NetworkPolicy
-from asm_gym.rollouts.folder import claim_folder
-from asm_gym.rollouts.parallel import Progress
+from asm_gym.rollouts.collect import check as check_policy
+from asm_gym.rollouts.collect import collect_to
+from asm_gym.rollouts.folder import claimed
+from asm_gym.rollouts.parallel import THIS_PROCESS, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.learners import ALGORITHMS
-from asm_gym.rollouts.training.run import BEST, CLONE, Plan, Run, success_rate
-from asm_gym.scripts import collect
-from asm_gym.scripts.collect import episode_seeds
+from asm_gym.rollouts.training.run import BEST, CLONE, Plan, TrainingRun, success_rate
+from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import USAGE_ERRORS
 from asm_gym.tasks import task as task_spec
+
+KEPT = ("env_id", "algorithm", "robot", "demonstrations", "dataset", "cloning_updates", "seed")
+"""What must not change while a run goes on."""
+FREE = ("task", "out", "quick", "parallel")
+"""What is left out of the command that is noted down."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +66,8 @@ class Args:
     """Episodes of the last evaluation, on other seeds."""
     checkpoint_every: int = 2_500
     """Control steps between checkpoints: what a kill loses at most."""
-    workers: int = 1
-    """Processes that record demonstrations; learning is done by one."""
+    parallel: tyro.conf.OmitArgPrefixes[ParallelConfig] = THIS_PROCESS
+    """Who records demonstrations; learning is done by one process."""
     seed: int = 0
     """Seed of all that is drawn."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/train")
@@ -100,18 +107,6 @@ class Args:
         return self.task if self.task in gym.registry else task_spec(self.task).id
 
     @property
-    def shown(self) -> collect.Args:
-        """How the expert's episodes are recorded."""
-        return collect.Args(
-            task=self.task,
-            robot=self.robot,
-            episodes=self.demonstrations,
-            workers=self.workers,
-            seed=self.seed,
-            out=self.out / "demonstrations",
-        )
-
-    @property
     def plan(self) -> Plan:
         settings = {} if self.robot is None else {"robot": self.robot}
         each = (
@@ -132,7 +127,12 @@ def check(args: Args) -> None:
     if args.dataset is not None:
         read_dataset(args.dataset, env_id=args.env_id)
     elif args.demonstrations:
-        collect.check(args.shown)
+        check_policy(args.env_id, RolloutConfig(robot=args.robot))
+
+
+def _recorded(args: Args, tick: Progress) -> list[Path]:
+    folder, seeds = args.out / "demonstrations" / "episodes", episode_seeds(args.seed, args.demonstrations)
+    return collect_to(folder, args.env_id, RolloutConfig(robot=args.robot), seeds, args.parallel, tick)
 
 
 def demonstrate(args: Args, tick: Progress) -> list[Episode]:
@@ -142,7 +142,7 @@ def demonstrate(args: Args, tick: Progress) -> list[Episode]:
     elif not args.demonstrations:
         return []
     else:
-        episodes = [load_episode(file) for file in collect.record_all(args.shown, tick)]
+        episodes = [load_episode(file) for file in _recorded(args, tick)]
     kept = [e for e in episodes if e.success]
     if not kept:
         raise ValueError(f"none of {len(episodes)} demonstrations succeeded")
@@ -151,12 +151,17 @@ def demonstrate(args: Args, tick: Progress) -> list[Episode]:
 
 def train(args: Args, console: Console) -> dict[str, Any]:
     """Trains, and says how well the best agent does; it is left in ``out/agent.npz``."""
+    with claimed(args.out, "train.json", {key: getattr(args, key) for key in KEPT}):
+        return _train(args, console)
+
+
+def _train(args: Args, console: Console) -> dict[str, Any]:
     torch.set_num_threads(1)  # more of them slow networks this small down
     seconds: dict[str, float] = {}
     start = time.perf_counter()
     with stage("recording demonstrations", console, seconds) as tick:
         episodes = demonstrate(args, tick)
-    run = Run(args.plan, args.out, episodes)
+    run = TrainingRun(args.plan, args.out, episodes)
     try:
         with stage("cloning", console, seconds) as tick:
             run.begin(tick)
@@ -171,7 +176,7 @@ def train(args: Args, console: Console) -> dict[str, Any]:
     result = {
         "success": success,
         "episodes": args.final_episodes,
-        "curve": run.progressed.curve,
+        "curve": run.state.curve,
         "seconds": seconds,
         "minutes": round((time.perf_counter() - start) / 60, 1),
         "command": _command(args),
@@ -182,7 +187,7 @@ def train(args: Args, console: Console) -> dict[str, Any]:
 
 
 def _command(args: Args) -> str:
-    changed = {k: v for k, v in vars(args).items() if v != getattr(Args, k, None) and k not in ("task", "out", "quick")}
+    changed = {k: v for k, v in vars(args).items() if v != getattr(Args, k, None) and k not in FREE}
     options = " ".join(f"--{k.replace('_', '-')} {v}" for k, v in changed.items())
     return f"asm-gym train {args.task} {options}".strip()
 
@@ -193,8 +198,6 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = tyro.cli(Args, args=argv, prog="asm-gym train", description=__doc__).scaled()
         check(args)
-        keys = ("env_id", "algorithm", "robot", "demonstrations", "dataset", "cloning_updates", "seed")
-        claim_folder(args.out, "train.json", {key: getattr(args, key) for key in keys})
         result = train(args, console)
     except USAGE_ERRORS as error:
         print(f"asm-gym train: {error}", file=sys.stderr)

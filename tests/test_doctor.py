@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from asm_gym import graphics
 from asm_gym.scripts import cli, doctor
 
 PACKAGE_OF = {"libGL.so.1": "libgl1", "libglib-2.0.so.0": "libglib2.0-0", "libgthread-2.0.so.0": "libglib2.0-0"}
@@ -22,9 +23,9 @@ PACKAGE_OF = {"libGL.so.1": "libgl1", "libglib-2.0.so.0": "libglib2.0-0", "libgt
 
 @pytest.fixture(autouse=True)
 def no_remembered_backend() -> Iterator[None]:
-    doctor.rendering_backend.cache_clear()
+    graphics.rendering_backend.cache_clear()
     yield
-    doctor.rendering_backend.cache_clear()
+    graphics.rendering_backend.cache_clear()
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
         monkeypatch.setattr(ctypes, "CDLL", load)
         monkeypatch.setattr(metadata, "version", installed)
-        monkeypatch.setattr(doctor, "draws_a_frame", lambda backend: backend in draws)
+        monkeypatch.setattr(graphics, "draws_a_frame", lambda backend: backend in draws)
         monkeypatch.setattr(sys, "platform", "linux")
 
     return make
@@ -93,7 +94,7 @@ def test_a_library_that_is_there_but_draws_nothing_is_told_from_a_missing_one(ma
 )
 def test_the_first_backend_that_draws_is_taken(machine: Any, draws: tuple[str, ...], backend: str | None) -> None:
     machine(draws=draws)
-    assert doctor.rendering_backend() == backend
+    assert graphics.rendering_backend() == backend
 
 
 def test_the_backend_is_looked_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,14 +104,14 @@ def test_the_backend_is_looked_for_once(monkeypatch: pytest.MonkeyPatch) -> None
         tried.append(backend)
         return False
 
-    monkeypatch.setattr(doctor, "draws_a_frame", draws_nothing)
-    assert doctor.rendering_backend() is doctor.rendering_backend() is None
+    monkeypatch.setattr(graphics, "draws_a_frame", draws_nothing)
+    assert graphics.rendering_backend() is graphics.rendering_backend() is None
     assert tried == ["egl", "osmesa"]
 
 
 def test_looking_for_a_backend_leaves_this_process_as_it_was() -> None:
     before = dict(os.environ)
-    doctor.rendering_backend()
+    graphics.rendering_backend()
     assert dict(os.environ) == before
 
 
@@ -119,7 +120,7 @@ def test_a_driver_that_hangs_draws_nothing(monkeypatch: pytest.MonkeyPatch) -> N
         raise subprocess.TimeoutExpired("python", kwargs["timeout"])
 
     monkeypatch.setattr(subprocess, "run", hang)
-    assert not doctor.draws_a_frame("egl")
+    assert not graphics.draws_a_frame("egl")
 
 
 FAKE_MUJOCO = """
@@ -151,11 +152,11 @@ def test_only_a_frame_with_something_in_it_counts(
 ) -> None:
     (tmp_path / "mujoco.py").write_text(FAKE_MUJOCO)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    assert doctor.draws_a_frame(backend) is draws
+    assert graphics.draws_a_frame(backend) is draws
 
 
 def test_a_backend_that_mujoco_does_not_know_draws_nothing() -> None:
-    assert not doctor.draws_a_frame("no_such_backend")
+    assert not graphics.draws_a_frame("no_such_backend")
 
 
 @pytest.mark.parametrize(("name", "version"), [("mujoco", "3.10.0"), ("mujoco", "3.2.9"), ("robosuite", "1.4.1")])

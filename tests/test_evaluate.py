@@ -12,7 +12,8 @@ import pytest
 
 from asm_gym.episodes import EpisodeLabel, load_episode
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
-from asm_gym.rollouts.record import Course, draw_onset, record
+from asm_gym.rollouts.seeds import draw_onset
+from asm_gym.rollouts.trial import RolloutConfig, record
 from asm_gym.scripts.evaluate import Args, labels, main
 
 MONITORS = ("neural_asm", "kalman+evidence", "autoregression", "force_limit")
@@ -159,4 +160,4 @@ class _Recorder:
         self.folder = folder
 
     def __call__(self, label):
-        return record(label, Course(), self.folder)
+        return record(label, RolloutConfig(), self.folder)

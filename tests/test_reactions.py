@@ -10,9 +10,9 @@ import pytest
 from asm_gym.evaluation.intervention import compare
 from asm_gym.evaluation.statistics import bootstrap, gain, reduction
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, InterventionOutcome, Trace
-from asm_gym.rollouts.bout import PASSING, Bout
+from asm_gym.rollouts.trial import PASSING
 from asm_gym.scripts.evaluate import main as evaluate
-from asm_gym.scripts.reproduce.reflexes import Args, bouts, main
+from asm_gym.scripts.reproduce.reflexes import Args, main, trials
 
 
 def trace(seed: int, acting: str, delay: int = 2, ended: bool = False, **changes) -> Trace:
@@ -61,13 +61,12 @@ def test_what_is_no_pair_is_refused():
 
 def test_every_reflex_has_the_twin_of_the_policy_alone():
     args = Args(tasks=("Lift", "Door"), reflexes=("hold", "retract"), faults=(NOMINAL, PASSING), episodes=3)
-    made = bouts(args)
+    made = trials(args)
     assert len(set(made)) == len(made) == 2 * 2 * 3 * 3
     seeds = {(b.task, b.acting): set() for b in made}
     for b in made:
         seeds[b.task, b.acting].add(b.seed)
     assert all(seeds["Lift", r] == seeds["Lift", POLICY_ALONE] for r in ("hold", "retract"))
-    assert isinstance(made[0], Bout)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 from asm_gym.envs import viewer
 from asm_gym.envs.rendering import OffscreenRenderer
 from asm_gym.envs.viewer import HumanViewer
-from asm_gym.scripts.doctor import rendering_backend
+from asm_gym.graphics import rendering_backend
 
 SCENE = """
 <mujoco>

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from asm_gym.evaluation.statistics import Share
-from asm_gym.evaluation.trace import POLICY_ALONE
 from asm_gym.faults import FrozenEncoder, Push
 from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.watch import Trial, watch
+from asm_gym.rollouts.trial import RolloutConfig, Trial, watch
 from asm_gym.scripts import demo
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.collect import collect, episode_seeds
 from asm_gym.wrappers import StreamRecorder
 from tests.fakes import FakeEnv
 
+LIFT = "asm_gym/Lift-v0"
 TINY = [
     *("--fit-episodes", "6", "--calibration-episodes", "19", "--nominal-episodes", "2"),
     *("--faulty-episodes", "1", "--epochs", "3", "--workers", "2"),
@@ -96,17 +96,16 @@ def test_the_same_seed_gives_the_same_table(folder, tmp_path):
 
 
 def test_an_episode_without_an_alarm_is_the_same_under_the_wrapper(folder):
-    trial = Trial("nominal", (), POLICY_ALONE, seed=77)
-    alone = watch(trial, "asm_gym/Lift-v0", "scripted", folder / "lift.asm")
-    held = watch(Trial("nominal", (), "hold", seed=77), "asm_gym/Lift-v0", "scripted", folder / "lift.asm")
+    alone = watch(Trial(LIFT, 77), RolloutConfig(), folder / "lift.asm")
+    held = watch(Trial(LIFT, 77, acting="hold"), RolloutConfig(), folder / "lift.asm")
     until = int(np.argmax(alone.alarm)) + 1 if alone.alarm.any() else len(alone)
     np.testing.assert_array_equal(alone.surprise[:until], held.surprise[:until])
 
 
 def test_a_hard_push_raises_an_alarm_even_in_a_memory_that_has_learned_little(folder):
-    trial = Trial("push", (Push(newtons=100.0, onset=10, duration=10),), "terminate", seed=3)
-    trace = watch(trial, "asm_gym/Lift-v0", "scripted", folder / "lift.asm")
-    assert trace.ended_by_alarm
+    push = Push(newtons=100.0, onset=10, duration=10)
+    trace = watch(Trial(LIFT, 3, "push", faults=(push,), acting="terminate"), RolloutConfig(), folder / "lift.asm")
+    assert trace.outcome.ended_by_alarm
     assert trace.detected_after is not None
     assert trace.detected_after <= 4
 
@@ -141,7 +140,7 @@ def test_quick_keeps_the_calibration_that_the_rate_needs():
 
 def test_a_fault_of_one_trial_does_not_reach_into_the_next(folder):
     def trace(condition, faults):
-        return watch(Trial(condition, faults, POLICY_ALONE, seed=9), "asm_gym/Lift-v0", "scripted", folder / "lift.asm")
+        return watch(Trial(LIFT, 9, condition, faults=faults), RolloutConfig(), folder / "lift.asm")
 
     before = trace("nominal", ())
     faulty = trace("frozen", (FrozenEncoder(onset=10),))

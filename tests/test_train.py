@@ -19,8 +19,8 @@ from asm_gym.episodes import Episode
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
 from asm_gym.rollouts.training.learners import ALGORITHMS, RECIPES, export, make_learner, warm_critic
-from asm_gym.rollouts.training.run import Plan, Run, Standard
-from asm_gym.rollouts.training.state import Progressed, newest, resume, save
+from asm_gym.rollouts.training.run import Plan, Standard, TrainingRun
+from asm_gym.rollouts.training.state import TrainingState, newest, resume, save
 from asm_gym.scripts.cli import main
 from asm_gym.stream import StreamSpec
 
@@ -133,21 +133,21 @@ def test_an_anchored_actor_stays_with_its_expert(env):
 def test_demonstrations_of_another_size_are_refused(tmp_path):
     plan = Plan("MountainCarContinuous-v0", {}, "sac", 0, 1, 1, 1, 1, 0)
     with pytest.raises(ValueError, match="demonstration 0 has observations of 3 numbers, the environment 2"):
-        Run(plan, tmp_path, linear_expert())
+        TrainingRun(plan, tmp_path, linear_expert())
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_checkpoint_gives_back_the_learner(algorithm, env, tmp_path):
     learner = small(algorithm, env, cloned=False)
     learner.learn(120)
-    progressed = Progressed(120, 0.5, ((100, 0.25), (120, 0.5)))
-    save(tmp_path, learner, Progressed(7, 0.0, ()))
+    progressed = TrainingState(120, 0.5, ((100, 0.25), (120, 0.5)))
+    save(tmp_path, learner, TrainingState(7, 0.0, ()))
     learner.num_timesteps += 1
     folder = save(tmp_path, learner, progressed)
     assert newest(tmp_path) == folder
     assert len(list(tmp_path.iterdir())) == 1  # the older one is gone
     other = small(algorithm, env, cloned=False)
-    assert resume(folder, other) == Progressed(learner.num_timesteps, 0.5, ((100, 0.25), (120, 0.5)))
+    assert resume(folder, other) == TrainingState(learner.num_timesteps, 0.5, ((100, 0.25), (120, 0.5)))
     assert other.num_timesteps == learner.num_timesteps
     for a, b in zip(learner.policy.parameters(), other.policy.parameters(), strict=True):
         assert torch.equal(a, b)

@@ -16,7 +16,7 @@ import numpy as np
 
 import asm_gym
 from asm_gym.detection.detector import conformal_episodes, conformal_threshold
-from asm_gym.episodes import Episode, EpisodeLabel, load_episode
+from asm_gym.episodes import Episode, EpisodeLabel
 from asm_gym.evaluation import comparison
 from asm_gym.evaluation.comparison import IDEAL, RATES, Cell, Score, Sight
 from asm_gym.evaluation.ideal import earliest, noise_floor, separation
@@ -24,14 +24,11 @@ from asm_gym.evaluation.scoring import Verdict, coverage
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.trace import InterventionOutcome, Trace, TraceDetail, window_steps
 from asm_gym.monitors import EVIDENCE, Monitor, make_monitor, monitor_class
+from asm_gym.rollouts.folder import NOMINAL_ROLES, Recordings, labelled
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 
 EXAMPLES = ("push", "collision", "weak_joint", "frozen_encoder", "snatch")
 """Kinds of which the report shows an episode."""
-
-
-NOMINAL = ("fit", "calibration", "nominal")
-"""Roles of the episodes that nothing is done to."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +127,7 @@ def judge(
     )
     found = {name: opinion for opinions in made for name, opinion in opinions.items()}
     opinions = {name: found[name] for name in monitors}
-    by_role, failed, twins = sorted_by_role(recordings_of(folder, labels))
+    by_role, failed, twins = Recordings.of(labelled(folder, labels))
     return Judgement(
         {n: o.verdicts for n, o in opinions.items()},
         {n: o.harmless for n, o in opinions.items()},
@@ -147,7 +144,7 @@ def judge(
 def _opinions(
     names: Sequence[str], folder: Path, labels: Sequence[EpisodeLabel], rate: float, seed: int
 ) -> dict[str, Opinion]:
-    by_role, _, _ = sorted_by_role(recordings_of(folder, labels))
+    by_role = Recordings.of(labelled(folder, labels)).roles
     return {name: opinion_of(name, folder, by_role, rate, seed) for name in names}
 
 
@@ -160,29 +157,6 @@ def opinion_of(name: str, folder: Path, by_role: Mapping[str, Sequence[Episode]]
     verdicts = _verdicts(name, monitor, tested, thresholds[rate])
     harmless = _verdicts(name, monitor, by_role.get("harmless", []), thresholds[rate])
     return Opinion(verdicts, harmless, thresholds, _examples(monitor, verdicts, tested, thresholds[rate]))
-
-
-def recordings_of(folder: Path, labels: Sequence[EpisodeLabel]) -> list[Episode]:
-    """Read from the folder of a run."""
-    return [load_episode(folder / label.path) for label in labels]
-
-
-def sorted_by_role(recordings: Sequence[Episode]) -> tuple[dict[str, list[Episode]], int, list[Episode]]:
-    """Recordings by role, how many nominal ones failed and are not among them, and all twins of faulty ones."""
-    by_role: dict[str, list[Episode]] = {}
-    failed = 0
-    for recording in recordings:
-        role = recording.labelled.role
-        # A nominal episode that fails is no example of what should feel normal, nor an alarm in it a false one.
-        if role in NOMINAL and not recording.success:
-            failed += 1
-        else:
-            by_role.setdefault(role, []).append(recording)
-    for role in NOMINAL:
-        if not by_role.get(role):
-            raise ValueError(f"none of the {role} episodes succeeded: there is nothing normal to learn or to test on")
-    twins = [r for r in recordings if r.labelled.role == "nominal"]
-    return by_role, failed, twins
 
 
 def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) -> Monitor:
@@ -205,8 +179,8 @@ def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) ->
 
 def calibrated(folder: Path, name: str, labels: Sequence[EpisodeLabel], seed: int, threshold: float) -> Any:
     """The monitor as it judged the run, with the threshold it judged by."""
-    by_role, _, _ = sorted_by_role(recordings_of(folder, [label for label in labels if label.role in NOMINAL]))
-    monitor: Any = fitted(folder, name, by_role["fit"], seed)
+    nominal = Recordings.of(labelled(folder, [label for label in labels if label.role in NOMINAL_ROLES]))
+    monitor: Any = fitted(folder, name, nominal.roles["fit"], seed)
     monitor.threshold_ = threshold
     return monitor
 

@@ -1,35 +1,67 @@
-"""Progress bars: one for each stage of a script."""
+"""How far a stage of a command has come: a bar in a terminal, elsewhere a line at least every ten seconds."""
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bars
 
-from asm_gym.rollouts import parallel
+from asm_gym.rollouts.parallel import Progress
+
+EVERY_S = 10.0
+"""Between two lines where there is no terminal [s]."""
 
 
 @contextmanager
-def stage(name: str, console: Console, seconds: dict[str, float]) -> Iterator[parallel.Progress]:
-    """Shows a bar called ``name`` while the block runs, and notes how long it took in ``seconds``.
+def stage(name: str, console: Console, seconds: dict[str, float]) -> Iterator[Progress]:
+    """Shows how far ``name`` has come while the block runs, and notes how long it took in ``seconds``.
 
     Yields:
         What the block calls as (done, total).
     """
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
     start = time.perf_counter()
-    with Progress(*columns, console=console) as progress:
-        bar = progress.add_task(name, total=None)
-        yield lambda done, total: progress.update(bar, completed=done, total=total)
-        task = progress.tasks[bar]
-        progress.update(bar, total=task.total or 1, completed=task.total or 1)
+    with (_bar if console.is_terminal else _lines)(name, console) as progress:
+        yield progress
     seconds[name] = round(time.perf_counter() - start, 1)
+
+
+@contextmanager
+def _bar(name: str, console: Console) -> Iterator[Progress]:
+    columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Bars(*columns, console=console) as bars:
+        bar = bars.add_task(name, total=None)
+        yield lambda done, total: bars.update(bar, completed=done, total=total)
+        total = bars.tasks[bar].total or 1
+        bars.update(bar, total=total, completed=total)
+
+
+@contextmanager
+def _lines(name: str, console: Console) -> Iterator[Progress]:
+    start, ended, reached = time.perf_counter(), threading.Event(), [""]
+
+    def say(what: str) -> None:
+        # Markup and wrapping are for readers; what reads a pipe wants a line.
+        console.print(
+            f"{name}: {what}{time.perf_counter() - start:.0f} s", markup=False, highlight=False, soft_wrap=True
+        )
+
+    def note(done: int, total: int) -> None:
+        reached[0] = f"{done} of {total}, "
+
+    def keep_saying() -> None:
+        while not ended.wait(EVERY_S):
+            say(reached[0])
+
+    speaker = threading.Thread(target=keep_saying, daemon=True)
+    speaker.start()
+    try:
+        yield note
+        say(f"{reached[0]}done in ")
+    finally:
+        ended.set()
+        speaker.join()

@@ -26,7 +26,7 @@ from asm_gym.policies.scripted.base import (
 REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT = range(8)
 
 
-class Errand(NamedTuple):
+class CarryTask(NamedTuple):
     """What to carry where.
 
     Args:
@@ -61,7 +61,7 @@ class CarryState(NamedTuple):
     since: int  # steps spent in the phase
     speed: float  # action units
     spread: Vector  # (3,) how this episode's way-points differ from the plan [m]
-    errand: Errand | None
+    task: CarryTask | None
     anchor: Vector  # (3,) where the hand was when the phase began [m]
     drift: Vector  # correlated action noise
 
@@ -77,7 +77,7 @@ class CarryExpert(Expert, ABC):
         self._gain = 3.0 if self._careful else 2.0
 
     @abstractmethod
-    def next_errand(self, observation: Any) -> Errand | None:
+    def next_task(self, observation: Any) -> CarryTask | None:
         """What to carry next; None where everything is done."""
 
     def predict(
@@ -103,7 +103,7 @@ class CarryExpert(Expert, ABC):
         style, rng = self.style, self.np_random
         pace = style.pace(self.pace, rng)
         spread = style.spread * rng.standard_normal(3)
-        return CarryState(REACH, 0, pace, spread, self.next_errand(observation), np.zeros(3), np.zeros(7))
+        return CarryState(REACH, 0, pace, spread, self.next_task(observation), np.zeros(3), np.zeros(7))
 
     def pose(self, observation: Any, name: str) -> tuple[Vector, Vector]:
         """(3,) position and (3, 3) rotation of an object."""
@@ -115,17 +115,17 @@ class CarryExpert(Expert, ABC):
         def to(phase: int) -> CarryState:
             return state._replace(phase=phase, since=0, anchor=hand_at)
 
-        errand, phase = state.errand, state.phase
-        if errand is None:
+        task, phase = state.task, state.phase
+        if task is None:
             return state
-        at, turned = self.pose(observation, errand.name)
+        at, turned = self.pose(observation, task.name)
         fingers = self._read(observation, "gripper_velocity")
-        grip = at + turned @ errand.grip
+        grip = at + turned @ task.grip
         off = hand_at - grip
         lost = np.linalg.norm(off) > 0.05
         if phase == REACH:
-            aligned = turn_left(hand, self._grasp(errand, hand, turned)) < 0.15
-            above = np.linalg.norm(off[:2] - state.spread[:2] * 0.3) < 0.02 and abs(off[2] - errand.clearance) < 0.03
+            aligned = turn_left(hand, self._grasp(task, hand, turned)) < 0.15
+            above = np.linalg.norm(off[:2] - state.spread[:2] * 0.3) < 0.02 and abs(off[2] - task.clearance) < 0.03
             return to(DESCEND) if above and aligned else state
         if phase == DESCEND:
             if np.linalg.norm(off) < 0.011 or (state.since > 30 and np.linalg.norm(off) < 0.02):
@@ -135,40 +135,40 @@ class CarryExpert(Expert, ABC):
             return to(RAISE) if has_settled(fingers, state.since, 7) else state
         if phase in (RAISE, CARRY, LOWER) and lost:
             return to(REACH)
-        place = errand.place + np.array([0.0, 0.0, errand.over])
+        place = task.place + np.array([0.0, 0.0, task.over])
         # Whoever cannot get nearer, at the end of his reach, makes do with less in time.
-        fit = errand.fit * (1 + state.since / 60) if self._careful else errand.fit
+        fit = task.fit * (1 + state.since / 60) if self._careful else task.fit
         if phase == RAISE:
             return to(CARRY) if at[2] > place[2] - 0.03 or state.since > 60 else state
         if phase == CARRY:
-            fits = abs(_to_fit(errand.headings, turned)) < errand.heading_fit
-            there = np.linalg.norm(at[:2] - errand.place[:2]) < fit
+            fits = abs(_to_fit(task.headings, turned)) < task.heading_fit
+            there = np.linalg.norm(at[:2] - task.place[:2]) < fit
             return to(LOWER) if there and fits else state
         if phase == LOWER:
-            if np.linalg.norm(at[:2] - errand.place[:2]) > errand.fit * (2.5 if self._careful else 1.0) + 0.02:
+            if np.linalg.norm(at[:2] - task.place[:2]) > task.fit * (2.5 if self._careful else 1.0) + 0.02:
                 return to(CARRY)
-            if at[2] < errand.place[2] + 0.006 or (state.since > 50 and at[2] < errand.place[2] + 0.03):
+            if at[2] < task.place[2] + 0.006 or (state.since > 50 and at[2] < task.place[2] + 0.03):
                 return to(RELEASE)
             return to(CARRY) if state.since > 60 else state  # it stands on something: up, and once more
         if phase == RELEASE:
             return to(RETREAT) if has_settled(fingers, state.since, 6) else state
         if state.since >= 14:
-            errand = self.next_errand(observation)
-            if errand is not None:
-                return to(REACH)._replace(errand=errand)
+            task = self.next_task(observation)
+            if task is not None:
+                return to(REACH)._replace(task=task)
         return state
 
     def _command(self, state: CarryState, observation: Any, hand_at: Vector, hand: Vector) -> Vector:
         """(7,) towards what the phase asks for."""
-        errand, phase = state.errand, state.phase
-        if errand is None:
+        task, phase = state.task, state.phase
+        if task is None:
             return np.append(np.zeros(6), OPEN)
-        at, turned = self.pose(observation, errand.name)
-        grip = at + turned @ errand.grip
-        held = self._held(errand, hand, turned)
+        at, turned = self.pose(observation, task.name)
+        grip = at + turned @ task.grip
+        held = self._held(task, hand, turned)
         if phase in (REACH, DESCEND):
-            aligned = self._grasp(errand, hand, turned)
-            above = np.array([0.0, 0.0, errand.clearance]) + 0.3 * state.spread
+            aligned = self._grasp(task, hand, turned)
+            above = np.array([0.0, 0.0, task.clearance]) + 0.3 * state.spread
             target = grip + above if phase == REACH else grip
             # From afar, first high: the way may lead over a wall or another object.
             if phase == REACH and np.linalg.norm((grip - hand_at)[:2]) > 0.1:
@@ -177,34 +177,34 @@ class CarryExpert(Expert, ABC):
         if phase == GRASP:
             gain = self._gain if self._careful else 1.0
             return np.append(move(hand_at, state.anchor, hand, gripping(hand, None), state.speed, gain), CLOSE)
-        goal = errand.place + np.array([0.0, 0.0, errand.over])
+        goal = task.place + np.array([0.0, 0.0, task.over])
         if phase == RAISE:
             wanted = np.array([at[0], at[1], goal[2] + 0.3 * state.spread[2]])
             return np.append(move(at, wanted, hand, gripping(hand, None), state.speed), CLOSE)
         if phase == CARRY:
             return np.append(move(at, goal, hand, held, state.speed, self._gain), CLOSE)
         if phase == LOWER:
-            place = self._lower(errand, at) if self._careful else errand.place
+            place = self._lower(task, at) if self._careful else task.place
             return np.append(move(at, place, hand, held, 0.6 * state.speed, self._gain), CLOSE)
         up = state.anchor + np.array([0.0, 0.0, 0.0 if phase == RELEASE else 0.12])
         return np.append(move(hand_at, up, hand, gripping(hand, None), state.speed), OPEN)
 
     @staticmethod
-    def _lower(errand: Errand, at: Vector) -> Vector:
+    def _lower(task: CarryTask, at: Vector) -> Vector:
         """(3,) where an object is to go next on its way down: the further from over its place, the less down."""
-        astray = float(np.linalg.norm((at - errand.place)[:2]))
-        down = 0.025 * float(np.clip(1.5 - 0.5 * astray / errand.fit, 0.0, 1.0))
-        return np.array([*errand.place[:2], max(errand.place[2], at[2] - down)])
+        astray = float(np.linalg.norm((at - task.place)[:2]))
+        down = 0.025 * float(np.clip(1.5 - 0.5 * astray / task.fit, 0.0, 1.0))
+        return np.array([*task.place[:2], max(task.place[2], at[2] - down)])
 
     @staticmethod
-    def _grasp(errand: Errand, hand: Vector, turned: Vector) -> Vector:
+    def _grasp(task: CarryTask, hand: Vector, turned: Vector) -> Vector:
         """(3, 3) how to hold the hand for grasping."""
-        return gripping(hand, None if errand.closing is None else turned @ errand.closing, errand.turns)
+        return gripping(hand, None if task.closing is None else turned @ task.closing, task.turns)
 
-    def _held(self, errand: Errand, hand: Vector, turned: Vector) -> Vector:
+    def _held(self, task: CarryTask, hand: Vector, turned: Vector) -> Vector:
         """(3, 3) how to hold the hand so that the object in it comes to fit its place."""
         down = gripping(hand, None)
-        angle = _to_fit(errand.headings, turned)
+        angle = _to_fit(task.headings, turned)
         c, s = np.cos(angle), np.sin(angle)
         turn: Vector = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ down
         return turn

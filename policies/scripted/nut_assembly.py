@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from asm_gym.policies.scripted.base import Vector
-from asm_gym.policies.scripted.carry import CarryExpert, Errand
+from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
 
 _HANDLE = {"SquareNut": 0.054, "RoundNut": 0.06}  # from the nut's middle to that of its handle [m]
 
@@ -17,7 +17,7 @@ class NutAssemblyExpert(CarryExpert):
 
     pace = 0.5
 
-    def next_errand(self, observation: Any) -> Errand | None:
+    def next_task(self, observation: Any) -> CarryTask | None:
         """A nut that is not around its peg; None where all are."""
         env = self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
         for i, nut in enumerate(env.nuts):
@@ -26,7 +26,7 @@ class NutAssemblyExpert(CarryExpert):
             at, turned = self.pose(observation, nut.name)
             if not env.on_peg(at, i):
                 peg = env.sim.data.body_xpos[(env.peg1_body_id, env.peg2_body_id)[i]]
-                return Errand(
+                return CarryTask(
                     name=nut.name,
                     grip=np.array([_HANDLE[nut.name], 0.0, 0.0]),
                     closing=np.array([0.0, 1.0, 0.0]),

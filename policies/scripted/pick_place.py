@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from asm_gym.policies.scripted.base import Style, Vector
-from asm_gym.policies.scripted.carry import CarryExpert, Errand
+from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
 
 _WALL = 0.09  # how high above the bins' floor the fingertips stay clear of the walls' tops with the palm [m]
 
@@ -34,7 +34,7 @@ class PickPlaceExpert(CarryExpert):
         super().__init__(env, seed, style)
         self.things = things
 
-    def next_errand(self, observation: Any) -> Errand | None:
+    def next_task(self, observation: Any) -> CarryTask | None:
         """The nearest object that is not in its bin; None where all are."""
         env = self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
         hand = self._read(observation, "hand_position")
@@ -58,7 +58,7 @@ class PickPlaceExpert(CarryExpert):
         if self._careful:  # let go over the walls: stretched out, the arm may stand nearer to one than it should
             place[2] += 0.04
         closing = self._closing(half, at, turned, env.bin1_pos, env.bin_size, self._careful and name == "Can")
-        return Errand(
+        return CarryTask(
             name=name,
             grip=np.array([0.0, 0.0, grip]),
             closing=closing,

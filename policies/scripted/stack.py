@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from asm_gym.policies.scripted.carry import CarryExpert, Errand
+from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
 
 _SMALL, _LARGE = 0.02, 0.025  # half the edges of the two cubes [m]
 
@@ -16,7 +16,7 @@ class StackExpert(CarryExpert):
 
     pace = 0.5
 
-    def next_errand(self, observation: Any) -> Errand | None:
+    def next_task(self, observation: Any) -> CarryTask | None:
         """The red cube, until it lies on the green one."""
         red, turned = self.pose(observation, "cubeA")
         green, _ = self.pose(observation, "cubeB")
@@ -28,7 +28,7 @@ class StackExpert(CarryExpert):
         if self._careful:  # a wide gripper would stand on the green cube with one finger
             sides = (side, np.cross([0.0, 0.0, 1.0], side))
             side, turns = min(sides, key=lambda s: abs(s @ (green - red))), np.pi
-        return Errand(
+        return CarryTask(
             name="cubeA",
             grip=np.zeros(3),
             closing=turned.T @ side,

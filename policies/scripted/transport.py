@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.policies.scripted.base import Expert, ObservationReader, Style, Vector, gripping, move
-from asm_gym.policies.scripted.carry import CARRY, RAISE, RETREAT, CarryExpert, CarryState, Errand
+from asm_gym.policies.scripted.carry import CARRY, RAISE, RETREAT, CarryExpert, CarryState, CarryTask
 from asm_gym.policies.scripted.handover import PART, HandoverExpert, HandoverState
 from asm_gym.policies.scripted.two_arms import Hands
 
@@ -49,27 +49,27 @@ class Carrier(CarryExpert):
             command[:6] = move(hand_at, up, hand, gripping(hand, None), state.speed, self._gain)
         return np.concatenate([base.T @ command[:3], base.T @ command[3:6], command[6:]])
 
-    def _held(self, errand: Errand, hand: Vector, turned: Vector) -> Vector:
+    def _held(self, task: CarryTask, hand: Vector, turned: Vector) -> Vector:
         """(3, 3) how to hold the hand on its way: with the wrist in the middle, where it turns both ways."""
         return gripping(hand, -self._hands.bases()[self._arm][:, 1], 2 * np.pi)
 
     @staticmethod
     def is_done(state: CarryState) -> bool:
         """Whether everything is where it belongs, and the hand has left it."""
-        return state.errand is None or (state.phase == RETREAT and state.since > 14)
+        return state.task is None or (state.phase == RETREAT and state.since > 14)
 
 
 class LidCarrier(Carrier):
     """Puts the lid of the start bin on the table."""
 
-    def next_errand(self, observation: Any) -> Errand | None:
+    def next_task(self, observation: Any) -> CarryTask | None:
         """The lid, until it is off."""
         env = self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
         start = env.sim.data.body_xpos[env.sim.model.body_name2id(env.transport.start_bin.root_body)]
         at, _ = self.pose(observation, "lid_handle")
         if np.linalg.norm((at - start)[:2]) > 0.25:
             return None
-        return Errand(
+        return CarryTask(
             name="lid_handle",
             grip=np.zeros(3),
             closing=np.array([1.0, 0.0, 0.0]),
@@ -83,14 +83,14 @@ class LidCarrier(Carrier):
 class TrashCarrier(Carrier):
     """Throws the trash into its bin."""
 
-    def next_errand(self, observation: Any) -> Errand | None:
+    def next_task(self, observation: Any) -> CarryTask | None:
         """The trash, until it is in its bin."""
         at, turned = self.pose(observation, "trash")
         trash_bin = self._read(observation, "trash_bin_pos")
         if np.linalg.norm((at - trash_bin)[:2]) < 0.14:
             return None
         side = turned[:, int(np.abs(turned[2]).argmin())]  # the one that lies flattest gives the cube's heading
-        return Errand(
+        return CarryTask(
             name="trash",
             grip=np.zeros(3),
             closing=turned.T @ side,
@@ -121,13 +121,13 @@ class PayloadCarrier(Carrier):
         at, turned = super().pose(observation, name)
         return at + _OFF_MIDDLE * turned[:, 2], turned
 
-    def next_errand(self, observation: Any) -> Errand | None:
+    def next_task(self, observation: Any) -> CarryTask | None:
         """The hammer, until it is in the bin."""
         at, _ = self.pose(observation, "payload")
         target = self._read(observation, "target_bin_pos")
         if np.linalg.norm((at - target)[:2]) < 0.14 and at[2] < target[2] + 0.05:
             return None
-        return Errand(
+        return CarryTask(
             name="payload",
             grip=np.array([0.0, 0.0, self._handover.hammer(observation).taking - _OFF_MIDDLE]),
             closing=np.array([1.0, 0.0, 0.0]),

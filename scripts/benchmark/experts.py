@@ -15,9 +15,10 @@ from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.text_tables import console_table
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.registry import EXPERTS
-from asm_gym.rollouts.parallel import environment, parallel_map
+from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.collect import episode_seeds
+from asm_gym.rollouts.seeds import episode_seeds
+from asm_gym.rollouts.trial import environment
 from asm_gym.tasks import ROBOTS
 
 _QUICK = 5

@@ -18,8 +18,8 @@ from asm_gym.evaluation.text_tables import console_table
 from asm_gym.memory.association import complete, hidden_units
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.baselines.gru import GRU
+from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.collect import collect
 
 HELD_OUT = 6
 """One in so many episodes is not learned but tested on."""

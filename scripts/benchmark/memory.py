@@ -20,8 +20,8 @@ from asm_gym.episodes import Episode
 from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.text_tables import console_table
 from asm_gym.monitors import NeuralASM
+from asm_gym.rollouts.collect import collect
 from asm_gym.scripts.benchmark.turns import take_turns
-from asm_gym.scripts.collect import collect
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 

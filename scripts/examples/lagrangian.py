@@ -12,7 +12,7 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, SupportsFloat
+from typing import Annotated
 
 import gymnasium as gym
 import tyro
@@ -25,23 +25,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import NeuralASMSafety
-
-
-class CostlyReward(gym.Wrapper[Any, Any, Any, Any]):
-    """r - weight x cost.
-
-    Args:
-        env: one whose ``info`` holds ``"cost"``.
-        weight: of the cost; may be changed at any time.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any], weight: float = 0.0) -> None:
-        super().__init__(env)
-        self.weight = weight
-
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, float(reward) - self.weight * info["cost"], terminated, truncated, info
+from asm_gym.wrappers.cost import CostlyReward
 
 
 class LagrangeMultiplier(BaseCallback):

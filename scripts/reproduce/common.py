@@ -24,9 +24,10 @@ from asm_gym.evaluation.plots import save
 from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.text_tables import console_table, markdown
-from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.progress import stage
-from asm_gym.rollouts.record import Course, episode_seeds, record
+from asm_gym.rollouts.seeds import role_seeds
+from asm_gym.rollouts.trial import RolloutConfig, record
 from asm_gym.scripts.command import run
 
 Record = dict[str, Any]
@@ -138,16 +139,15 @@ def recorded(
     args: Common, labels: Sequence[EpisodeLabel], console: Console, seconds: dict[str, float]
 ) -> list[Episode]:
     """The episodes of these labels, recorded where they are not there yet; those that failed are among them."""
-    missing = [label for label in labels if not (args.out / label.path).is_file()]
-    if missing:
-        with stage("recording robosuite episodes", console, seconds) as progress:
-            parallel_map(partial(record, course=Course(), folder=args.out.resolve()), missing, args.workers, progress)
+    with stage("recording robosuite episodes", console, seconds) as progress:
+        make = partial(record, config=RolloutConfig(), folder=args.out.resolve())
+        make_missing(make, labels, lambda label: args.out / label.path, args.workers, progress)
     return [load_episode(args.out / label.path) for label in labels]
 
 
 def nominal_labels(tasks: Sequence[str], role: str, episodes: int) -> list[EpisodeLabel]:
     """The first so many nominal episodes of each task; the same for every seed of a study."""
-    return [EpisodeLabel(task, role, seed=s) for task in tasks for s in episode_seeds(0, task, role, episodes)]
+    return [EpisodeLabel(task, role, seed=s) for task in tasks for s in role_seeds(0, task, role, episodes)]
 
 
 def demonstrations(

@@ -26,9 +26,10 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.base import Policy
 from asm_gym.policies.registry import EXPERTS
-from asm_gym.rollouts.parallel import environment, parallel_map
+from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
-from asm_gym.rollouts.record import episode_seeds
+from asm_gym.rollouts.seeds import role_seeds
+from asm_gym.rollouts.trial import environment
 from asm_gym.scripts.reproduce.apprentices import CONSISTENT, SETTINGS, Clone, demonstrate, stream_of
 from asm_gym.scripts.reproduce.common import (
     Common,
@@ -96,7 +97,7 @@ class Trial(NamedTuple):
     scenes: tuple[int, ...]
 
 
-class Pupil(NamedTuple):
+class TrainedModel(NamedTuple):
     """Somebody who has learned."""
 
     seed: int
@@ -105,7 +106,7 @@ class Pupil(NamedTuple):
     seconds: float
 
 
-def learn(what: tuple[str, int], episodes: Sequence[Episode], args: Args) -> Pupil:
+def learn(what: tuple[str, int], episodes: Sequence[Episode], args: Args) -> TrainedModel:
     """(model, seed) after the lessons."""
     model, seed = what
     start = time.perf_counter()
@@ -117,7 +118,7 @@ def learn(what: tuple[str, int], episodes: Sequence[Episode], args: Args) -> Pup
         sizes = {"hidden_size": 32, "association_size": 32, "epochs": 1, "iterations": 5}
         brain = NeuralASM(episodes[0].spec, seed=seed, **sizes).fit(episodes)  # type: ignore[arg-type]
         brain.learn_to_act(episodes, args.units)
-    return Pupil(seed, model, brain, time.perf_counter() - start)
+    return TrainedModel(seed, model, brain, time.perf_counter() - start)
 
 
 def attempt(trial: Trial, brains: Mapping[tuple[str, int], NeuralASM | Clone]) -> list[Record]:
@@ -143,7 +144,7 @@ def trials(args: Args) -> list[Trial]:
     plan = []
     for task in args.tasks:
         for seed in args.repetitions:
-            scenes = tuple(episode_seeds(seed, task, "express", args.trials))
+            scenes = tuple(role_seeds(seed, task, "express", args.trials))
             plan += [Trial(task, m, seed, scenes[i : i + 17]) for m in MODELS for i in range(0, len(scenes), 17)]
     return plan
 
@@ -198,14 +199,14 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     """Shows, teaches, and lets everybody try."""
     args = args.scaled()
     spec = stream_of(args.tasks)
-    plan = [(t, s) for t in args.tasks for s in episode_seeds(0, t, "demonstrate", args.demonstrations)]
+    plan = [(t, s) for t in args.tasks for s in role_seeds(0, t, "demonstrate", args.demonstrations)]
     with stage("demonstrating", console, seconds) as progress:
         shown_ones = parallel_map(partial(demonstrate, spec=spec), plan, args.workers, progress)
     episodes = [e for e in shown_ones if e is not None]
     # Those who take longest first, so that nobody waits for the last of them.
-    pupils = [(m, s) for m in ("gru", "memory") for s in args.repetitions]
+    wanted = [(m, s) for m in ("gru", "memory") for s in args.repetitions]
     with stage("learning", console, seconds) as progress:
-        learned = parallel_map(partial(learn, episodes=episodes, args=args), pupils, args.workers, progress)
+        learned = parallel_map(partial(learn, episodes=episodes, args=args), wanted, args.workers, progress)
     brains = {(p.model, p.seed): p.brain for p in learned}
     with stage("acting", console, seconds) as progress:
         found = parallel_map(partial(attempt, brains=brains), trials(args), args.workers, progress)

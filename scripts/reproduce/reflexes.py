@@ -9,8 +9,8 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,13 +26,13 @@ from asm_gym.evaluation.text_tables import console_table, markdown
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
 from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import NeuralASM
-from asm_gym.policies import make_policy
 from asm_gym.rollouts.benchmark import fitted
-from asm_gym.rollouts.bout import PASSING, Bout, run_bout
-from asm_gym.rollouts.folder import claim_folder
-from asm_gym.rollouts.parallel import ParallelConfig, Progress, environment, parallel_map
+from asm_gym.rollouts.collect import check
+from asm_gym.rollouts.folder import claimed, files_in, locked, make_missing
+from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress, parallel_map
 from asm_gym.rollouts.progress import stage
-from asm_gym.rollouts.record import Course, episode_seeds, record
+from asm_gym.rollouts.seeds import role_seeds
+from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, record, watch
 from asm_gym.scripts.command import USAGE_ERRORS
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers.safety import ON_ALARM
@@ -68,8 +68,8 @@ class Args:
     """How long a reflex may act at a stretch before the episode is ended [s]."""
     false_alarm_rate: float = 0.01
     """Share of nominal episodes that may raise an alarm."""
-    workers: int = 2
-    """Processes."""
+    parallel: tyro.conf.OmitArgPrefixes[ParallelConfig] = TWO_PROCESSES
+    """Who does the work."""
     seed: int = 0
     """Seed of the evaluation, of the memory and of the episodes."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/react")
@@ -89,8 +89,8 @@ class Args:
             raise ValueError(f"max_override_s must be > 0, got {self.max_override_s}")
 
     @property
-    def course(self) -> Course:
-        return Course(self.robot, self.policy, stream_freq=self.monitor_freq)
+    def config(self) -> RolloutConfig:
+        return RolloutConfig(self.policy, self.robot, self.monitor_freq, self.max_override_s)
 
 
 def learned_from(args: Args) -> NeuralASM:
@@ -103,7 +103,7 @@ def learned_from(args: Args) -> NeuralASM:
     folder = args.run if args.monitor_freq is None else args.out
 
     def role(name: str) -> list[Episode]:
-        paths = [p for task in args.tasks for p in sorted((folder / "episodes" / task / name).glob("*.npz"))]
+        paths = files_in(folder, args.tasks, name)
         return [e for e in map(load_episode, paths) if e.success]
 
     fit = role("fit")
@@ -121,20 +121,19 @@ def record_nominal(args: Args, progress: Progress) -> None:
         EpisodeLabel(task, role, seed=s)
         for task in args.tasks
         for role, n in roles.items()
-        for s in episode_seeds(args.seed, task, role, n)
+        for s in role_seeds(args.seed, task, role, n)
     ]
-    missing = [label for label in wanted if not (args.out / label.path).is_file()]
-    make = partial(record, course=args.course, folder=args.out.resolve())
-    parallel_map(make, missing, ParallelConfig(args.workers), lambda k, n: progress(len(wanted) - n + k, len(wanted)))
+    make = partial(record, config=args.config, folder=args.out.resolve())
+    make_missing(make, wanted, lambda label: args.out / label.path, args.parallel, progress)
 
 
-def bouts(args: Args) -> list[Bout]:
+def trials(args: Args) -> list[Trial]:
     """Every episode, those that share a task and a fault side by side."""
     return [
-        Bout(task, fault, acting, seed)
+        Trial(task_spec(task).id, seed, fault, "" if fault in (NOMINAL, PASSING) else "strong", acting=acting)
         for task in args.tasks
         for fault in args.faults
-        for seed in episode_seeds(args.seed, task, "react", args.episodes)
+        for seed in role_seeds(args.seed, task, "react", args.episodes)
         for acting in (POLICY_ALONE, *args.reflexes)
     ]
 
@@ -197,30 +196,29 @@ def _row(trace: Trace) -> dict[str, Any]:
 
 def react(args: Args, console: Console) -> Table:
     """Fits, runs, compares and writes."""
-    seconds: dict[str, float] = {}
     for task in args.tasks:
-        env = environment(f"asm_gym/{task}-v0", args.course.settings())
-        make_policy(args.policy, env, seed=0)  # what does not fit is refused before anything runs
-    args.out.mkdir(parents=True, exist_ok=True)
+        check(task_spec(task).id, args.config)  # what does not fit is refused before anything runs
+    settings = {"robot": args.robot, "policy": args.policy, "seed": args.seed, "monitor_freq": args.monitor_freq}
+    with claimed(args.out, "recordings.json", settings) if args.monitor_freq is not None else locked(args.out):
+        return _react(args, console)
+
+
+def _react(args: Args, console: Console) -> Table:
+    seconds: dict[str, float] = {}
     if args.monitor_freq is not None:
-        settings = {"robot": args.robot, "policy": args.policy, "seed": args.seed, "monitor_freq": args.monitor_freq}
-        claim_folder(args.out, "recordings.json", settings)
         with stage("recording", console, seconds) as progress:
             record_nominal(args, progress)
     with stage("fitting and calibrating", console, seconds):
         memory = args.out / "memory.asm"
         learned_from(args).save(memory)
     with stage("acting", console, seconds) as progress:
-        run: Callable[[Bout], Trace] = partial(
-            run_bout, course=args.course, max_override_s=args.max_override_s, memory=memory.resolve()
-        )
-        traces = parallel_map(run, bouts(args), ParallelConfig(args.workers), progress)
+        run = partial(watch, config=args.config, memory=memory.resolve())
+        traces = parallel_map(run, trials(args), args.parallel, progress)
     found = comparisons(traces, args)
     made = table(found, args)
     (args.out / "reactions.md").write_text(markdown(made) + "\n", encoding="utf-8")
-    settings = {f.name: getattr(args, f.name) for f in fields(args)}
     content = {
-        "settings": json.loads(json.dumps(settings, default=str)),
+        "settings": json.loads(json.dumps(asdict(args), default=str)),
         "seconds": seconds,
         "episodes": [_row(trace) for trace in traces],
     }

@@ -27,9 +27,9 @@ from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.text_tables import console_table, markdown
 from asm_gym.monitors import MONITORS
 from asm_gym.rollouts.benchmark import opinion_of, sights_of
+from asm_gym.rollouts.folder import files_in, recorded, tasks_in
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
-from asm_gym.rollouts.recordings import recorded
 from asm_gym.scripts.command import USAGE_ERRORS
 from asm_gym.scripts.reproduce.skill_recognition import Naming, experienced, name_skills
 from asm_gym.scripts.reproduce.skill_switch import NAMES, record_switch
@@ -89,7 +89,7 @@ class Args:
         Raises:
             ValueError: fewer than two tasks.
         """
-        found = sorted(p.name for p in (self.run / "episodes").glob("*") if p.is_dir())
+        found = tasks_in(self.run)
         if len(found) < 2:
             raise ValueError(f"{self.run} holds recordings of {len(found)} tasks, and a repertoire needs two: "
                              "run asm-gym evaluate first")  # fmt: skip
@@ -116,7 +116,7 @@ def jobs(args: Args) -> list[Job]:
         conformal_episodes(args.false_alarm_rate),
     )
     for task in tasks if args.alone_seeds else []:
-        count = len(list((args.run / "episodes" / task / "calibration").glob("*.npz")))
+        count = len(files_in(args.run, [task], "calibration"))
         if count < needed:
             raise ValueError(f"{task} alone has {count} calibration episodes, and a rate of {args.false_alarm_rate} "
                              f"needs {needed}: record more, or set alone_seeds to 0")  # fmt: skip
@@ -126,7 +126,7 @@ def jobs(args: Args) -> list[Job]:
 
 def score(job: Job, run: Path, rate: float, window_s: float) -> dict[str, Score]:
     """The job's monitor on each of its tasks, and on all of them under ``""``."""
-    recordings, twins = recorded(run, job.tasks)
+    recordings, _, twins = recorded(run, job.tasks)
     said = opinion_of(job.monitor, run, recordings, rate, job.seed)
     sights = sights_of(twins, recordings["faulty"], window_s)
 
@@ -218,7 +218,7 @@ def repertoire(args: Args, console: Console) -> list[Table]:
         with stage("naming skills", console, seconds) as progress:
             name = partial(name_skills, **what)
             named = parallel_map(name, range(args.seed, args.seed + args.seeds), args.workers, progress)
-        dt = recorded(args.run, tuple(args.tasks))[0]["nominal"][0].spec.dt
+        dt = recorded(args.run, tuple(args.tasks)).roles["nominal"][0].spec.dt
         tables.append(naming_table(named, args, dt))
         if switches:
             alarms = {"of single skills": [n.alarms for n in named]}

@@ -28,17 +28,21 @@ from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.safe_training import COUNTED, Outcome, counts_table, learning_figure, worth_table
 from asm_gym.evaluation.text_tables import console_table, markdown
 from asm_gym.monitors import NeuralASM
-from asm_gym.rollouts.folder import claim_folder
-from asm_gym.rollouts.parallel import Progress, parallel_map
+from asm_gym.rollouts.collect import collect_to
+from asm_gym.rollouts.folder import claimed, make_missing
+from asm_gym.rollouts.parallel import THIS_PROCESS, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.exploration import Gentle, explore, harmless
-from asm_gym.rollouts.training.safe_run import ALONE, CONDITIONS, Setting, run
-from asm_gym.scripts.collect import episode_seeds, record_to
+from asm_gym.rollouts.training.safe_run import ALONE, CONDITIONS, Setting, outcome_file, read_outcome, run
+from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import USAGE_ERRORS
 from asm_gym.tasks import task as task_spec
 
 DEMONSTRATIONS, FITTING, TESTING = 11, 12, 13
 """Stages of the seeds of episodes that are recorded."""
+FREE = ("seeds", "conditions", "parallel", "out")
+"""What may change while a comparison goes on."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +81,8 @@ class Args:
     """Episodes of each evaluation."""
     final_episodes: int = 100
     """Episodes of the last evaluation."""
-    workers: int = 1
-    """Processes."""
+    parallel: tyro.conf.OmitArgPrefixes[ParallelConfig] = THIS_PROCESS
+    """Who does the work."""
     seed: int = 0
     """The first of the runs' seeds, and the seed of all that is recorded."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/train_safely")
@@ -149,13 +153,15 @@ def record(args: Args, progress: Progress) -> Recorded:
     """Records what is not there yet."""
     folder = args.out.resolve() / "episodes"
     shown = episode_seeds(args.seed, 2 * args.demonstrations, DEMONSTRATIONS)
-    missing = [s for s in shown if not (folder / "expert" / f"{s}.npz").is_file()]
-    show = partial(record_to, env_id=args.env_id, policy="scripted", settings=(), folder=folder / "expert")
-    parallel_map(show, missing, args.workers, progress)
-    seek = partial(explore, env_id=args.env_id, gentle=args.gentle, folder=folder / "exploration")
-    counts = {FITTING: args.fit_episodes + args.calibration_episodes, TESTING: args.test_episodes}
-    found = {s: parallel_map(seek, episode_seeds(args.seed, n, s), args.workers, progress) for s, n in counts.items()}
-    return Recorded([folder / "expert" / f"{s}.npz" for s in shown], found[FITTING], found[TESTING])
+    expert = collect_to(folder / "expert", args.env_id, RolloutConfig(), shown, args.parallel, progress)
+
+    def explored(count: int, stage: int) -> list[Path]:
+        make = partial(explore, env_id=args.env_id, gentle=args.gentle, folder=folder / "exploration")
+        seeds = episode_seeds(args.seed, count, stage)
+        return make_missing(make, seeds, lambda s: folder / "exploration" / f"{s}.npz", args.parallel, progress)
+
+    fitting = explored(args.fit_episodes + args.calibration_episodes, FITTING)
+    return Recorded(expert, fitting, explored(args.test_episodes, TESTING))
 
 
 def memories(args: Args, recorded: Recorded) -> dict[str, Path]:
@@ -205,6 +211,11 @@ def surprise_table(args: Args, memory: Mapping[str, Path], recorded: Recorded) -
 
 def train_safely(args: Args, console: Console) -> list[Table]:
     """Records, fits, trains, compares and writes."""
+    with claimed(args.out, "train_safely.json", {k: v for k, v in vars(args).items() if k not in FREE}):
+        return _train_safely(args, console)
+
+
+def _train_safely(args: Args, console: Console) -> list[Table]:
     seconds: dict[str, float] = {}
     with stage("recording", console, seconds) as progress:
         recorded = record(args, progress)
@@ -212,15 +223,17 @@ def train_safely(args: Args, console: Console) -> list[Table]:
         memory = memories(args, recorded)
         surprises = surprise_table(args, memory, recorded)
     jobs = [(c, args.seed + n) for n in range(args.seeds) for c in args.conditions]
+    folder = args.out.resolve() / "outcomes"
     with stage("training", console, seconds) as progress:
         each = partial(
             run,
             setting=args.setting,
             memory=memory["exploration"],
             demonstrations=recorded.expert[: args.demonstrations],
-            folder=args.out.resolve() / "outcomes",
+            folder=folder,
         )
-        made = parallel_map(each, jobs, args.workers, progress)
+        outcome = make_missing(each, jobs, lambda job: outcome_file(folder, job), args.parallel, progress)
+        made = [read_outcome(path) for path in outcome]
     outcomes = {c: [o for o in made if o.condition == c] for c in args.conditions}
     tables = [counts_table(outcomes, args.force_limit), worth_table(outcomes, ALONE, args.force_limit), surprises]
     _write(args, outcomes, tables, seconds)
@@ -245,8 +258,6 @@ def main(argv: list[str] | None = None) -> int:
     console = Console()
     try:
         args = tyro.cli(Args, args=argv, prog="asm-gym train-safely", description=__doc__).scaled()
-        free = ("seeds", "conditions", "workers", "out")
-        claim_folder(args.out, "train_safely.json", {k: v for k, v in vars(args).items() if k not in free})
         tables = train_safely(args, console)
     except USAGE_ERRORS as error:
         print(f"asm-gym train-safely: {error}", file=sys.stderr)

@@ -14,7 +14,7 @@ from asm_gym.episodes import Episode
 from asm_gym.evaluation.repertoire import Alarms
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.benchmark import fitted
-from asm_gym.rollouts.recordings import recorded
+from asm_gym.rollouts.folder import recorded
 from asm_gym.scripts.reproduce.skill_switch import Switch
 
 
@@ -28,7 +28,7 @@ class Naming(NamedTuple):
 
 def name_skills(seed: int, run: Path, tasks: tuple[str, ...], rate: float, switches: Sequence[Path]) -> Naming:
     """What the memory of ``seed`` calls the skills of nominal test episodes, and of those that change skill."""
-    recordings, _ = recorded(run, tasks)
+    recordings = recorded(run, tasks).roles
     memory = fitted(run, "neural_asm", recordings["fit"], seed)
     assert isinstance(memory, NeuralASM)
     memory.calibrate(recordings["calibration"], rate)
@@ -53,7 +53,7 @@ def experienced(
     seed: int, run: Path, tasks: tuple[str, ...], rate: float, switches: Sequence[Path], experience: Sequence[Path]
 ) -> Alarms:
     """What a memory makes of a change of skill that has seen others, unlabelled among its episodes."""
-    recordings, _ = recorded(run, tasks)
+    recordings = recorded(run, tasks).roles
     spec = recordings["fit"][0].spec
     changes = [Switch.read(path, spec).episode for path in experience]
     calibration = changes[: len(changes) // 3]

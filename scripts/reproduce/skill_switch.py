@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from asm_gym.episodes import Episode, load_episode, save_episode
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
-from asm_gym.rollouts.parallel import environment
+from asm_gym.rollouts.trial import environment
 from asm_gym.stream import StreamSpec
 from asm_gym.wrappers import StreamRecorder
 
@@ -72,10 +72,10 @@ def _sort_both(seed: int) -> Episode | None:
     for _ in range(HORIZON):
         action, state = expert.predict(observation, state, start)
         start = np.zeros(1, np.bool_)
-        if state.errand is None:
+        if state.task is None:
             break
         observation, *_ = env.step(action)
-        skills.append(NAMES[state.errand.name])
+        skills.append(NAMES[state.task.name])
         simulator = env.unwrapped.robosuite_env  # type: ignore[attr-defined]
         left = any(
             simulator.not_in_bin(expert.pose(observation, thing.name)[0], i)

@@ -24,8 +24,8 @@ from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.text_tables import console_table, markdown
 from asm_gym.monitors import MONITORS
 from asm_gym.rollouts.benchmark import opinion_of, sights_of
+from asm_gym.rollouts.folder import recorded, tasks_in
 from asm_gym.rollouts.progress import stage
-from asm_gym.rollouts.recordings import recorded
 from asm_gym.scripts.command import USAGE_ERRORS
 
 Roles = Mapping[str, Sequence[Episode]]
@@ -68,10 +68,10 @@ def read_side(folder: Path, window_s: float) -> Side:
     Raises:
         ValueError: there are none.
     """
-    tasks = tuple(sorted(p.name for p in (folder / "episodes").glob("*") if p.is_dir()))
+    tasks = tuple(tasks_in(folder))
     if not tasks:
         raise ValueError(f"{folder} holds no recordings: run asm-gym evaluate first")
-    roles, twins = recorded(folder.resolve(), tasks)
+    roles, _, twins = recorded(folder.resolve(), tasks)
     return Side(folder, roles, comparison.visible_kinds(sights_of(twins, roles.get("faulty", []), window_s)))
 
 

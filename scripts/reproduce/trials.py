@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from asm_gym.episodes import Episode, EpisodeLabel
-from asm_gym.rollouts.record import draw_onset, episode_seeds
+from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.scripts.reproduce.common import Common, demonstrations, recorded
 from asm_gym.scripts.reproduce.handwriting import copybook, repertoire
 from asm_gym.scripts.reproduce.speed_accuracy import slips
@@ -57,7 +57,7 @@ def robot_trial(
         EpisodeLabel(task, "faulty", kind, severity, seed, draw_onset(seed, task_spec(task).horizon))
         for task in tasks
         for kind in kinds
-        for seed in episode_seeds(0, task, "nominal", faulty_episodes)
+        for seed in role_seeds(0, task, "nominal", faulty_episodes)
     ]
     recordings = recorded(args, labels, console, seconds)
     faulty = [

@@ -9,6 +9,7 @@ every kind of moving, and is surprised by forces alone.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,9 +19,9 @@ from numpy.typing import NDArray
 
 from asm_gym.episodes import Episode, load_episode, save_episode
 from asm_gym.monitors.monitor import columns
-from asm_gym.policies import make_policy, rollout
+from asm_gym.policies import make_policy
 from asm_gym.policies.base import Policy
-from asm_gym.rollouts.parallel import environment
+from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged
 from asm_gym.wrappers import StreamRecorder
 
 SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
@@ -96,14 +97,13 @@ def until_contact(episode: Episode, forces: NDArray[np.floating[Any]], gentle: G
 
 
 def explore(seed: int, env_id: str, gentle: Gentle, folder: Path) -> Path:
-    """Records the harmless part of an episode of exploration, where it is not recorded yet."""
-    path = folder / f"{seed}.npz"
-    if not path.is_file():
-        env = StreamRecorder(environment(env_id))
-        forces: list[float] = []
-        rollout(env, Explorer(env, seed), seed, lambda info: forces.append(info["external_force"]))
-        save_episode(path, until_contact(env.finish(), np.array(forces), gentle))
-    return path
+    """Records the harmless part of an episode of exploration."""
+    forces: list[float] = []
+    trial, config = Trial(env_id, seed), RolloutConfig(partial(Explorer, seed=seed))
+    with staged(trial, config) as env:
+        recorder = StreamRecorder(env)
+        play(trial, config, recorder, lambda info: forces.append(info["external_force"]))
+    return save_episode(folder / f"{seed}.npz", until_contact(recorder.finish(), np.array(forces), gentle))
 
 
 def harmless(files: list[Path]) -> list[Episode]:

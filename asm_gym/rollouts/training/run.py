@@ -21,10 +21,10 @@ from asm_gym.episodes import Episode
 from asm_gym.policies import rollout
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.parallel import Progress
+from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
 from asm_gym.rollouts.training.learners import RECIPES, export, make_learner, warm_critic
-from asm_gym.rollouts.training.state import Progressed, newest, resume, save
-from asm_gym.scripts.collect import episode_seeds
+from asm_gym.rollouts.training.state import TrainingState, newest, resume, save
 
 BEST, CLONE = "best.npz", "clone.npz"
 """The best agent of the evaluations, and what it was before it learned from its own steps."""
@@ -75,7 +75,7 @@ class Standard:
 class Evaluation(BaseCallback):
     """Judges the agent now and then, keeps the best one, and writes checkpoints."""
 
-    def __init__(self, run: Run, tick: Progress) -> None:
+    def __init__(self, run: TrainingRun, tick: Progress) -> None:
         super().__init__()
         self._run, self._tick = run, tick
 
@@ -87,11 +87,11 @@ class Evaluation(BaseCallback):
             self.logger.record("eval/success", success)
             self.logger.dump(steps)
         if steps % plan.checkpoint_every == 0:
-            save(self._run.out, self.model, self._run.progressed)
+            save(self._run.out, self.model, self._run.state)
         return True
 
 
-class Run:
+class TrainingRun:
     """One training run: the learner, its environments, and the best agent so far.
 
     Args:
@@ -112,7 +112,7 @@ class Run:
         self.standard = Standard.of(seen)
         around = Monitor(self.standard.around(self.env))
         self.learner = make_learner(plan.algorithm, around, plan.seed, bool(demonstrations), plan.steps)
-        self.progressed = Progressed(0, -1.0, ())
+        self.state = TrainingState(0, -1.0, ())
         self.cloner: Cloner | None = None
         if demonstrations:
             observations, actions = steps_of(demonstrations)
@@ -125,7 +125,7 @@ class Run:
         """Goes on from the newest checkpoint, or clones the expert."""
         folder = newest(self.out)
         if folder is not None:
-            self.progressed = resume(folder, self.learner)
+            self.state = resume(folder, self.learner)
             return
         if self.cloner is None:
             self.evaluate()
@@ -137,11 +137,11 @@ class Run:
             fill_buffer(self.learner, self.demonstrations, self.standard.mean, self.standard.scale)
             self.learner.set_logger(configure(None, []))
             warm_critic(self.learner, min(recipe.critic_updates, self.plan.cloning_updates) if self.plan.steps else 0)
-        save(self.out, self.learner, self.progressed)
+        save(self.out, self.learner, self.state)
 
     def learn(self, tick: Progress) -> None:
         """The steps that are left."""
-        done = self.progressed.steps
+        done = self.state.steps
         left = self.plan.steps - done
         if left <= 0:
             return
@@ -153,9 +153,9 @@ class Run:
             callbacks.append(Anchor(self.cloner, recipe.anchor))
         self.learner.set_random_seed(self.plan.seed + done)
         self.learner.learn(left, callback=callbacks, reset_num_timesteps=False)
-        if self.progressed.curve[-1][0] != self.learner.num_timesteps:
+        if self.state.curve[-1][0] != self.learner.num_timesteps:
             self.evaluate()
-        save(self.out, self.learner, self.progressed)
+        save(self.out, self.learner, self.state)
 
     def evaluate(self) -> float:
         """The share of successes of the agent as it is now, which is kept where it is the best.
@@ -165,13 +165,13 @@ class Run:
         agent = export(self.learner, self.plan.algorithm, self.standard.mean, self.standard.scale, self._judged)
         seeds = episode_seeds(self.plan.seed, self.plan.evaluation_episodes, stage=2)
         success = success_rate(agent, self._judged, seeds)
-        steps, best = self.learner.num_timesteps, self.progressed.best
+        steps, best = self.learner.num_timesteps, self.state.best
         if steps == 0:
             agent.save(self.out / CLONE, steps=steps, success=success, episodes=len(seeds))
         elif success >= best:
             agent.save(self.out / BEST, steps=steps, success=success, episodes=len(seeds))
             best = success
-        self.progressed = Progressed(steps, best, (*self.progressed.curve, (steps, success)))
+        self.state = TrainingState(steps, best, (*self.state.curve, (steps, success)))
         return success
 
     def close(self) -> None:

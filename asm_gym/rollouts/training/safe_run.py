@@ -23,13 +23,13 @@ from stable_baselines3.common.monitor import Monitor as EpisodeMonitor
 from asm_gym.episodes import Episode, load_episode
 from asm_gym.evaluation.safe_training import Outcome, count
 from asm_gym.monitors import NeuralASM
+from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
 from asm_gym.rollouts.training.learners import export, make_novice
 from asm_gym.rollouts.training.run import Standard, success_rate
 from asm_gym.rollouts.training.violations import TorqueWatch
-from asm_gym.scripts.collect import episode_seeds
-from asm_gym.scripts.examples.lagrangian import CostlyReward
 from asm_gym.wrappers import NeuralASMSafety
+from asm_gym.wrappers.cost import CostlyReward
 
 ALONE = "alone"
 CONDITIONS: dict[str, dict[str, Any]] = {
@@ -58,7 +58,7 @@ class Setting:
     span: int = 500
 
 
-class Witness(BaseCallback):
+class ViolationCallback(BaseCallback):
     """Notes every step's violations, and judges the agent now and then without the wrapper."""
 
     def __init__(self, setting: Setting, standard: Standard, judged: gym.Env[Any, Any], seed: int) -> None:
@@ -90,8 +90,8 @@ def _demonstrations(files: tuple[Path, ...]) -> list[Episode]:
     return [load_episode(f) for f in files]
 
 
-def run(job: tuple[str, int], setting: Setting, memory: Path, demonstrations: Sequence[Path], folder: Path) -> Outcome:
-    """Trains one agent, unless its outcome is there already.
+def run(job: tuple[str, int], setting: Setting, memory: Path, demonstrations: Sequence[Path], folder: Path) -> Path:
+    """Trains one agent, and writes its outcome.
 
     Args:
         job: condition and seed.
@@ -100,9 +100,7 @@ def run(job: tuple[str, int], setting: Setting, memory: Path, demonstrations: Se
         folder: for outcomes.
     """
     condition, seed = job
-    path = folder / f"{condition}-{seed}.json"
-    if path.is_file():
-        return read_outcome(path)
+    path = outcome_file(folder, job)
     torch.set_num_threads(1)
     episodes = _demonstrations(tuple(demonstrations))
     observations, actions = steps_of(episodes)
@@ -118,15 +116,15 @@ def run(job: tuple[str, int], setting: Setting, memory: Path, demonstrations: Se
         fill_buffer(learner, episodes, standard.mean, standard.scale)
         seen = ((observations - standard.mean) / standard.scale).astype(np.float32)
         cloner = Cloner(learner, seen, actions, ANCHOR_RATE, seed)
-        witness = Witness(setting, standard, judged, seed)
-        learner.learn(setting.steps, callback=[witness, Anchor(cloner, ANCHOR)])
-        success = witness.judge(setting.final_episodes, stage=3)
+        violations = ViolationCallback(setting, standard, judged, seed)
+        learner.learn(setting.steps, callback=[violations, Anchor(cloner, ANCHOR)])
+        success = violations.judge(setting.final_episodes, stage=3)
     finally:
         env.close()
         judged.close()
-    flags = {name: np.array(kept) for name, kept in witness.flags.items()}
-    counts = count(np.array(witness.forces), setting.force_limit, flags, setting.span)
-    steps, curve = len(witness.forces), tuple(witness.curve)
+    flags = {name: np.array(kept) for name, kept in violations.flags.items()}
+    counts = count(np.array(violations.forces), setting.force_limit, flags, setting.span)
+    steps, curve = len(violations.forces), tuple(violations.curve)
     outcome = Outcome(
         condition, seed, steps, setting.span, **counts, curve=curve, success=success, episodes=setting.final_episodes
     )
@@ -134,7 +132,12 @@ def run(job: tuple[str, int], setting: Setting, memory: Path, demonstrations: Se
     unfinished = path.with_suffix(".unfinished")
     unfinished.write_text(json.dumps(asdict(outcome)) + "\n", encoding="utf-8")
     unfinished.replace(path)
-    return outcome
+    return path
+
+
+def outcome_file(folder: Path, job: tuple[str, int]) -> Path:
+    """Where the outcome of a condition and a seed lies."""
+    return folder / f"{job[0]}-{job[1]}.json"
 
 
 def read_outcome(path: Path) -> Outcome:

@@ -17,7 +17,7 @@ _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "
 
 
 @dataclass(frozen=True)
-class Progressed:
+class TrainingState:
     """How far a run has come.
 
     Args:
@@ -31,7 +31,7 @@ class Progressed:
     curve: tuple[tuple[int, float], ...]
 
 
-def save(out: Path, learner: BaseAlgorithm, progressed: Progressed) -> Path:
+def save(out: Path, learner: BaseAlgorithm, reached: TrainingState) -> Path:
     """Writes a checkpoint, which appears when it is complete, and removes older ones."""
     steps = learner.num_timesteps
     folder = out / f"checkpoint_{steps}"
@@ -44,7 +44,7 @@ def save(out: Path, learner: BaseAlgorithm, progressed: Progressed) -> Path:
         size = buffer.size()
         arrays = {name: getattr(buffer, name)[:size] for name in _BUFFER}
         np.savez(unfinished / "buffer.npz", pos=buffer.pos, full=buffer.full, **arrays)
-    state = asdict(progressed) | {"steps": steps}
+    state = asdict(reached) | {"steps": steps}
     (unfinished / "state.json").write_text(json.dumps(state), encoding="utf-8")
     shutil.rmtree(folder, ignore_errors=True)
     unfinished.rename(folder)
@@ -60,7 +60,7 @@ def newest(out: Path) -> Path | None:
     return found[-1] if found else None
 
 
-def resume(folder: Path, learner: BaseAlgorithm) -> Progressed:
+def resume(folder: Path, learner: BaseAlgorithm) -> TrainingState:
     """Puts a learner of the same settings where the checkpoint was made; only tensors and arrays are read.
 
     Raises:
@@ -80,6 +80,6 @@ def resume(folder: Path, learner: BaseAlgorithm) -> Progressed:
                 buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
         learner.num_timesteps = state["steps"]
         curve = tuple((int(s), float(x)) for s, x in state["curve"])
-        return Progressed(state["steps"], state["best"], curve)
+        return TrainingState(state["steps"], state["best"], curve)
     except (OSError, KeyError, ValueError, RuntimeError) as error:
         raise ValueError(f"{folder} is no checkpoint to go on from: {error}") from error

@@ -1,0 +1,79 @@
+"""Whether this machine can draw without a screen, and encode a video that browsers play.
+
+Nothing looked for here is imported here: the answer has to come where ``import robosuite`` fails.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import subprocess
+import sys
+from functools import cache
+
+BACKENDS = ("egl", "osmesa")  # EGL first: it uses a GPU where there is one
+GL_LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
+GET_RENDERING = "apt-get install libegl1 libgl1 libgl1-mesa-dri (or libosmesa6)"
+GET_ENCODER = "python -m pip install --force-reinstall imageio-ffmpeg (or: apt-get install ffmpeg)"
+
+# A lit white ball on black: a driver that draws nothing returns a frame of one colour.
+ONE_FRAME = """
+import mujoco
+ball = "<mujoco><worldbody><light pos='0 0 3'/><geom size='.1' rgba='1 1 1 1'/></worldbody></mujoco>"
+model = mujoco.MjModel.from_xml_string(ball)
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 32, 32) as renderer:
+    renderer.update_scene(data)
+    frame = renderer.render()  # (32, 32, 3) uint8
+assert frame.min() < frame.max(), "the frame is one colour"
+"""
+
+
+def loads(library: str) -> bool:
+    """The dynamic linker finds ``library``, and everything that it links to."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+@cache
+def rendering_backend() -> str | None:
+    """The first value of ``MUJOCO_GL`` with which MuJoCo draws a frame here, ``"egl"`` or ``"osmesa"``; None: no video.
+
+    Tried in other processes: a choice of backend cannot be undone within one.
+    """
+    return next((backend for backend in BACKENDS if draws_a_frame(backend)), None)
+
+
+def draws_a_frame(backend: str) -> bool:
+    """MuJoCo draws one frame with ``MUJOCO_GL=backend``, in a process of its own."""
+    env = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": backend}
+    try:
+        # A driver may wait for a device for ever; importing mujoco on a busy machine takes tens of seconds.
+        done = subprocess.run([sys.executable, "-c", ONE_FRAME], env=env, capture_output=True, timeout=120, check=False)
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
+
+
+def rendering_problem() -> str:
+    """Why nothing can be drawn here; empty where it can."""
+    if rendering_backend():
+        return ""
+    found = ", ".join(f"{lib} {'draws nothing' if loads(lib) else 'missing'}" for lib in GL_LIBRARIES.values())
+    return f"no video: {found}"
+
+
+def encoder_problem() -> str:
+    """Why there is no ffmpeg with the H.264 encoder that browsers and players understand; empty where there is one."""
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        exe = get_ffmpeg_exe()
+        encoders = subprocess.run([exe, "-hide_banner", "-encoders"], capture_output=True, timeout=60, check=True)
+    except (ImportError, RuntimeError, OSError, subprocess.SubprocessError) as error:
+        return f"no video: {type(error).__name__}: {error}"
+    return "" if b"libx264" in encoders.stdout else f"{exe} has no libx264"

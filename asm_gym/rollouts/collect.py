@@ -1,0 +1,93 @@
+"""Records a policy's episodes in any Gymnasium environment, by workers; in memory, or each as a file of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
+
+from asm_gym.episodes import Episode, save_episode
+from asm_gym.rollouts.folder import make_missing
+from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
+from asm_gym.rollouts.seeds import episode_seeds
+from asm_gym.rollouts.trial import PolicySource, RolloutConfig, Trial, environment, play, policy_for, staged
+from asm_gym.wrappers import StreamRecorder
+
+
+def collect(
+    env_id: str,
+    policy: PolicySource = "scripted",
+    episodes: int = 100,
+    seed: int = 0,
+    workers: int | ParallelConfig = 2,
+    *,
+    stage: int = 0,
+    progress: Progress | None = None,
+    **env_kwargs: Any,
+) -> list[Episode]:
+    """Episodes of ``policy`` in ``env_id``, in an order that does not depend on ``workers``.
+
+    Where ``info`` has no ``"stream"``, observation and action are the stream.
+
+    Args:
+        env_id: any Gymnasium id with Box spaces, such as ``asm_gym/Lift-v0`` or ``Pusher-v5``.
+        policy: a name or a path, as ``asm_gym.policies.make_policy`` takes; whatever has stable-baselines3's
+            ``predict``; or a factory that makes one for an environment, called anew for every episode. An object is
+            shared by the episodes of one process, so it must forget the last one where ``episode_start`` is set; one
+            that draws at random must have ``set_random_seed``, as those of stable-baselines3 have.
+        episodes: how many.
+        seed: of everything; the same seed gives the same episodes.
+        workers: processes, 1 of which is this one; or a ``ParallelConfig`` that names a cluster.
+        stage: sets of episodes with the same ``seed`` and different stages are different.
+        progress: is called as (done, total).
+        env_kwargs: handed to ``gym.make``.
+
+    Raises:
+        ValueError: fewer than one episode or worker; whatever the environment and the policy refuse.
+        TypeError: spaces other than Boxes, or a policy that cannot be sent to another process.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    config = RolloutConfig(policy, env_kwargs=tuple(sorted(env_kwargs.items())))
+    task = partial(record_episode, spec=gym.spec(env_id), config=config)
+    return parallel_map(task, episode_seeds(seed, episodes, stage), workers, progress)
+
+
+def record_episode(seed: int, spec: EnvSpec, config: RolloutConfig) -> Episode:
+    """The episode of ``seed``."""
+    gym.registry.setdefault(spec.id, spec)  # what the user registered in one process is unknown in another
+    trial = Trial(spec.id, seed)
+    with staged(trial, config) as env:
+        recorder = StreamRecorder(env)
+        play(trial, config, recorder)
+    return recorder.finish()
+
+
+def collect_to(
+    folder: Path,
+    env_id: str,
+    config: RolloutConfig,
+    seeds: Sequence[int],
+    parallel: ParallelConfig | int = 2,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Records the episodes that are not in ``folder`` yet; where all of them are."""
+
+    def place(seed: int) -> Path:
+        return folder.resolve() / f"{seed}.npz"
+
+    record = partial(_record_to, folder=folder.resolve(), spec=gym.spec(env_id), config=config)
+    return make_missing(record, seeds, place, parallel, progress)
+
+
+def _record_to(seed: int, folder: Path, spec: EnvSpec, config: RolloutConfig) -> Path:
+    return save_episode(folder / f"{seed}.npz", record_episode(seed, spec, config))
+
+
+def check(env_id: str, config: RolloutConfig) -> None:
+    """Raises what the environment and the policy refuse, before anything runs."""
+    policy_for(config.policy, StreamRecorder(environment(env_id, config.settings)), seed=0)

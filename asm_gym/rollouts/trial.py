@@ -1,0 +1,279 @@
+"""One episode: the only place where environment, faults, wrappers and policy are put together and run."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+
+import asm_gym  # noqa: F401  (registers the environments in every worker)
+from asm_gym.episodes import Episode, EpisodeLabel, save_episode
+from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, InterventionOutcome, Trace, TraceDetail
+from asm_gym.faults import Fault, Push
+from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
+from asm_gym.monitors import Monitor, NeuralASM
+from asm_gym.policies import Policy, Seeded, make_policy, rollout
+from asm_gym.policies.scripted.base import Style
+from asm_gym.rollouts.seeds import draw_onset
+from asm_gym.stream import control_period
+from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder
+
+Settings = tuple[tuple[str, Any], ...]
+"""Arguments by name, in an order of their own."""
+PolicySource = str | Path | Policy | Callable[[gym.Env[Any, Any]], Policy]
+"""What ``make_policy`` takes, whatever has ``predict``, or what makes one for an environment."""
+
+PASSING = "passing_push"
+"""20 N for 0.3 s: a kind beside those of the suite."""
+EXECUTIONS = {"slower": 0.85, "faster": 1.15}
+"""Harmless variations of the expert itself: its speed."""
+AFTER_S = 2.0
+"""How long a faulty episode is recorded after its onset [s]."""
+
+
+@dataclass(frozen=True)
+class RolloutConfig:
+    """How the episodes of a run are made.
+
+    Args:
+        policy: what acts.
+        robot: the arm; the task's own by default.
+        stream_freq: rows of the stream a second [Hz]; one each control step by default.
+        max_override_s: how long a reflex may act at a stretch before the episode is ended [s].
+        env_kwargs: what ``gym.make`` is given besides.
+    """
+
+    policy: PolicySource = "scripted"
+    robot: str | None = None
+    stream_freq: int | None = None
+    max_override_s: float | None = None
+    env_kwargs: Settings = ()
+
+    @property
+    def settings(self) -> Settings:
+        """What the environment is made with."""
+        named = ("robot", self.robot), ("stream_freq", self.stream_freq)
+        return (*((name, value) for name, value in named if value is not None), *self.env_kwargs)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One episode to run.
+
+    Args:
+        env_id: such as ``asm_gym/Lift-v0``.
+        seed: of the environment and of the policy: trials that differ only in ``acting`` are paired by it.
+        kind: ``"nominal"``, ``"passing_push"``, a kind of fault or harmless variation of the suite, or, with
+            ``faults``, what to call them.
+        severity: of a fault of the suite.
+        onset: when it begins [steps]; by default drawn from the seed, in the first half of the episode.
+        faults: what goes wrong, in place of what ``kind`` names.
+        acting: ``"policy alone"``, or what ``on_alarm`` takes.
+        after_s: where to leave the episode, counted from the onset [s]; at its end by default.
+    """
+
+    env_id: str
+    seed: int
+    kind: str = NOMINAL
+    severity: str = ""
+    onset: int | None = None
+    faults: tuple[Fault, ...] | None = None
+    acting: str = POLICY_ALONE
+    after_s: float | None = None
+
+    @classmethod
+    def of(cls, label: EpisodeLabel) -> Trial:
+        """The trial that is recorded as ``label`` says."""
+        after = AFTER_S if label.role == "faulty" else None
+        kind = label.kind or NOMINAL
+        return cls(f"asm_gym/{label.task}-v0", label.seed, kind, label.severity, label.onset, after_s=after)
+
+    @property
+    def task(self) -> str:
+        """The name in the id: ``"Lift"`` of ``asm_gym/Lift-v0``."""
+        return self.env_id.rsplit("/", 1)[-1].rsplit("-v", 1)[0]
+
+    @property
+    def on_alarm(self) -> str:
+        """What the safety wrapper is told."""
+        return "monitor" if self.acting == POLICY_ALONE else self.acting
+
+    def begins(self, env: gym.Env[Any, Any]) -> int:
+        """When in ``env`` something goes wrong, or would [steps]."""
+        if self.onset is not None or self.faults:
+            return self.onset if self.onset is not None else min(f.onset for f in self.faults or ())
+        return draw_onset(self.seed, getattr(env.unwrapped, "horizon", 0))
+
+    def faults_in(self, env: gym.Env[Any, Any]) -> tuple[Fault, ...]:
+        """What goes wrong in ``env``."""
+        if self.faults is not None or self.kind == NOMINAL or self.kind in EXECUTIONS:
+            return self.faults or ()
+        inner: Any = env.unwrapped
+        onset = self.begins(env)
+        if self.kind == PASSING:
+            drawn, steps = draw(inner, onset, self.seed), max(1, round(0.3 / control_period(env)))
+            return (Push(body=drawn.link, newtons=20.0, direction=drawn.direction, duration=steps, onset=onset),)
+        if self.kind in KINDS:
+            return (suite_fault(self.kind, inner, self.severity, onset, self.seed),)
+        return (harmless_variation(self.kind, inner, onset, self.seed),)
+
+    def steps_in(self, env: gym.Env[Any, Any]) -> int | None:
+        """Where the episode is left; None for its end."""
+        return None if self.after_s is None else self.begins(env) + round(self.after_s / control_period(env))
+
+
+def environment(env_id: str, settings: Settings = ()) -> gym.Env[Any, Any]:
+    """This process's environment: making one costs as much as an episode, and a seeded reset forgets the last one.
+
+    Args:
+        settings: what ``gym.make`` is given besides.
+    """
+    return _environment(env_id, cloudpickle.dumps(settings))  # lists and dicts are no keys, their bytes are
+
+
+@lru_cache(maxsize=1)
+def _environment(env_id: str, settings: bytes) -> gym.Env[Any, Any]:
+    return gym.make(env_id, **dict(pickle.loads(settings)))
+
+
+@lru_cache(maxsize=1)
+def _memory(path: Path, written_ns: int) -> NeuralASM:
+    """Loaded once a process, and again when the file has been written anew."""
+    return NeuralASM.load(path)
+
+
+@contextmanager
+def staged(trial: Trial, config: RolloutConfig, env: gym.Env[Any, Any] | None = None) -> Iterator[gym.Env[Any, Any]]:
+    """``env``, or this process's environment, in which the trial's faults happen; they are undone in the end."""
+    base = environment(trial.env_id, config.settings) if env is None else env
+    faults = trial.faults_in(base)
+    if not faults:
+        yield base
+        return
+    faulty = FaultInjection(base, faults)
+    try:
+        yield faulty
+    finally:
+        faulty.undo_faults()  # the next trial has wrappers of its own around the same environment
+
+
+def play(
+    trial: Trial,
+    config: RolloutConfig,
+    env: gym.Env[Any, Any],
+    on_step: Callable[[dict[str, Any]], None] | None = None,
+) -> bool:
+    """Runs the policy in a staged and wrapped ``env``; whether the task was solved at some step.
+
+    Args:
+        on_step: is shown every step's ``info``.
+    """
+    kwargs: dict[str, Any] = {}
+    if trial.kind in EXECUTIONS and config.policy == "scripted":
+        kwargs["style"] = Style(speed=EXECUTIONS[trial.kind])
+    policy = policy_for(config.policy, env, trial.seed, **kwargs)
+    return rollout(env, policy, trial.seed, on_step, trial.steps_in(env))
+
+
+def policy_for(source: PolicySource, env: gym.Env[Any, Any], seed: int, **kwargs: Any) -> Policy:
+    """The policy for one episode; one with ``set_random_seed``, as stable-baselines3's have, is seeded anew."""
+    if isinstance(source, str | Path):
+        return make_policy(str(source), env, seed=seed, **kwargs)
+    policy = source if isinstance(source, Policy) and not isinstance(source, type) else source(env)
+    if isinstance(policy, Seeded):
+        policy.set_random_seed(seed)
+    return policy
+
+
+def guarded(
+    env: gym.Env[Any, Any], monitor: Monitor, trial: Trial, max_override_s: float | None = None
+) -> gym.Env[Any, Any]:
+    """``env`` under the safety wrapper, which acts as the trial says."""
+    limited = max_override_s is not None and trial.acting != POLICY_ALONE
+    steps = max(1, round((max_override_s or 0.0) / control_period(env))) if limited else None
+    return NeuralASMSafety(env, monitor, on_alarm=trial.on_alarm, max_override=steps, on_overrun="ignore")
+
+
+def record(label: EpisodeLabel, config: RolloutConfig, folder: Path) -> Path:
+    """Records the episode of ``label``, and writes it to its place under ``folder``."""
+    trial = Trial.of(label)
+    forces: list[float] = []
+    with staged(trial, config) as env:
+        recorder = StreamRecorder(env)
+        play(trial, config, recorder, lambda info: forces.append(info["contact_force"]))
+        inner: Any = env.unwrapped
+    affected = [fault.labels(inner) for fault in trial.faults_in(env)] if label.role == "faulty" else []
+    recorded = recorder.finish()
+    kept = Episode(  # what monitors look at: actions stand in the stream, and nobody learns to act from these
+        stream=recorded.stream,
+        spec=recorded.spec,
+        success=recorded.success,
+        seed=label.seed,
+        faults=recorded.faults,
+        contact_force=np.asarray(forces, np.float32),
+        label=replace(label, affected_channels=frozenset().union(*affected)),
+        info={"skill": label.task},
+    )
+    return save_episode(folder / label.path, kept)
+
+
+def watch(trial: Trial, config: RolloutConfig, memory: Path) -> Trace:
+    """The trace of one trial, in this process's environment.
+
+    Args:
+        memory: where the calibrated memory was saved; ``config.stream_freq`` is the rate that it watches at.
+    """
+    monitor = _memory(memory, memory.stat().st_mtime_ns)
+    infos: list[dict[str, Any]] = []
+    with staged(trial, config) as env:
+        success = play(trial, config, guarded(env, monitor, trial, config.max_override_s), infos.append)
+        began, dt = trial.begins(env), control_period(env)
+    asm = [info["asm"] for info in infos]
+    rows = len(asm[0]["surprises"])  # of each control step
+    fault = np.repeat([bool(info.get("fault")) for info in infos], rows)
+    attribution = np.repeat([list(a["attribution"].values()) for a in asm], rows, axis=0)  # the step's greatest
+
+    def felt(name: str, since: int) -> list[float]:
+        return [info.get(name, math.nan) for info in infos[since:]]
+
+    trace = Trace(
+        kind=trial.kind,
+        severity=trial.severity,
+        task=trial.task,
+        acting=trial.acting,
+        seed=trial.seed,
+        dt=monitor.spec.dt,
+        threshold=monitor.threshold,
+        surprise=np.concatenate([a["surprises"] for a in asm]),
+        onset=int(np.argmax(fault)) if fault.any() else None,
+        outcome=InterventionOutcome(
+            success,
+            ended_by_alarm=bool(asm[-1]["gave_up"] or (trial.acting == "terminate" and asm[-1]["alarm"])),
+            contact_force=float(np.max(felt("contact_force", 0))),
+            external_force=float(np.nanmax(felt("external_force", began), initial=0.0)),
+            impulse=float(np.nansum(felt("external_impulse", began))),
+            acted_s=sum(a["intervened"] for a in asm) * dt,
+        ),
+        detail=TraceDetail(attribution, monitor.spec.labels, fault),
+    )
+    return trace.attributed(attribution, monitor.spec.labels)
+
+
+def watch_pair(trial: Trial, config: RolloutConfig, memory: Path) -> list[Trace]:
+    """The traces of one trial with the policy alone, and as it says.
+
+    The wrapper acts only after an alarm, so without one both are the same episode, and it runs once.
+    """
+    alone = watch(replace(trial, acting=POLICY_ALONE), config, memory)
+    if alone.alarm.any():
+        return [alone, watch(trial, config, memory)]
+    return [alone, replace(alone, acting=trial.acting)]

@@ -1,0 +1,85 @@
+"""Episodes of any policy in any environment with Box spaces: the same ones, whoever records them."""
+
+import threading
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import SAC
+
+from asm_gym.rollouts import collect
+from asm_gym.scripts import collect as script
+from tests.fakes import FakeEnv
+
+PENDULUM = "Pendulum-v1"
+
+
+class Damp:
+    """Torque against the velocity; keeps nothing. The class is a factory, too."""
+
+    def __init__(self, env=None):
+        pass
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return np.array([-2.0 * observation[2]], np.float32).clip(-2, 2), state
+
+
+def streams(**how):
+    return [e.stream for e in collect(PENDULUM, episodes=3, seed=4, **how)]
+
+
+def test_an_object_and_a_factory_give_the_same_episodes_with_any_number_of_workers():
+    expected = streams(policy=Damp(), workers=1)
+    assert expected[0].shape == (200, 3 + 1)  # where info has no stream, observation and action are it
+    for policy in (Damp(), Damp, lambda env: Damp()):
+        for workers in (1, 2):
+            for a, b in zip(expected, streams(policy=policy, workers=workers), strict=True):
+                np.testing.assert_array_equal(a, b)
+
+
+def test_an_agent_that_draws_is_seeded_anew_for_every_episode():
+    agent = SAC("MlpPolicy", PENDULUM, seed=0, buffer_size=10)
+    agent.env = None
+    one, two = streams(policy=agent, workers=1), streams(policy=agent, workers=2)
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(one[0], one[1])
+
+
+def test_a_policy_that_cannot_be_sent_is_refused_with_a_way_out():
+    policy = Damp()
+    policy.lock = threading.Lock()
+    with pytest.raises(TypeError, match=r"cannot be sent.*factory"):
+        streams(policy=policy, workers=2)
+
+
+def test_a_name_that_this_environment_has_no_policy_for_is_refused():
+    with pytest.raises(ValueError, match="no scripted expert"):
+        streams(workers=1)
+
+
+def test_an_environment_that_only_this_process_registered_is_known_to_the_workers():
+    gym.register("tests/Fake-v0", entry_point=lambda **kwargs: FakeEnv(length=4, own_stream=False))
+    try:
+        episodes = collect("tests/Fake-v0", policy="hold", episodes=2, workers=2)
+    finally:
+        del gym.registry["tests/Fake-v0"]
+    assert [len(e) for e in episodes] == [4, 4]
+
+
+def test_arguments_of_the_environment_may_be_lists_and_dictionaries():
+    gym.register("tests/Any-v0", entry_point=lambda sizes, **kwargs: FakeEnv(length=sizes["length"][0]))
+    try:
+        episodes = collect("tests/Any-v0", policy="hold", episodes=1, workers=1, sizes={"length": [3]})
+    finally:
+        del gym.registry["tests/Any-v0"]
+    assert len(episodes[0]) == 3
+
+
+def test_spaces_that_are_no_boxes_are_refused():
+    with pytest.raises(TypeError, match="Box"):
+        collect("CartPole-v1", policy=Damp(), episodes=1, workers=1)
+
+
+def test_the_old_name_is_the_same_function():
+    assert script.collect is collect
