@@ -1,26 +1,45 @@
 """Checkpoints: one file of arrays and JSON, never pickle.
 
-The file is a zip of ``.npy`` arrays, as an ``.npz`` is, with a JSON header beside them. A zip carries a checksum of
-every member, so damage is noticed when it is read.
+The file is a zip of ``.npy`` arrays, as an ``.npz`` is, with a JSON header beside them that declares each. A zip has a
+checksum of every member, so damage is noticed when it is read. Nothing is read before its size is known: members are
+not compressed, so that all of them together are no larger than the file.
 """
 
 from __future__ import annotations
 
+import io
 import json
-import os
-import tempfile
+import math
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.files import regular_file, written_whole
+
 FORMAT = "asm-gym"
 VERSION = 1
 HEADER = "header.json"
+
+LONGEST_HEADER = 16 * 2**20
+"""[bytes]"""
+
+MOST_EXPANDED = 30
+"""How many times larger than its file the content of a compressed ``.npz`` may be; real streams shrink by 1.1."""
+
+DAMAGE = (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, RuntimeError, NotImplementedError)
+"""What reading a zip may raise whose bytes are not what they should be."""
+
+_npy: Any = np.lib.format
+
+
+class _OtherCheckpointError(ValueError):
+    """A checkpoint that is whole, and not what was asked for."""
 
 
 class Checkpoint(NamedTuple):
@@ -30,11 +49,13 @@ class Checkpoint(NamedTuple):
     arrays: dict[str, NDArray[Any]]
 
     def array(self, name: str, *shape: int) -> NDArray[Any]:
-        """The array of that name. Raises ValueError unless there is one, of numbers and of that shape."""
+        """The array of that name. Raises ValueError unless there is one, of finite numbers and of that shape."""
         array = self.arrays.get(name)
         if array is None or array.shape != shape or array.dtype.kind != "f":
             found = "none" if array is None else f"{array.dtype} {array.shape}"
             raise ValueError(f"the checkpoint is damaged: {name} should be an array of shape {shape}, found {found}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"the checkpoint is damaged: {name} should be finite")
         return array
 
 
@@ -49,18 +70,15 @@ def write_checkpoint(
         header: JSON-serialisable.
         arrays: of numbers.
     """
-    path = Path(path)
-    text = json.dumps({"format": FORMAT, "version": VERSION, "kind": kind, **header}, allow_nan=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            _write(file, text, arrays)
-        os.chmod(temporary, 0o644)  # mkstemp makes it readable by its owner alone
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    held = {name: np.asarray(array) for name, array in arrays.items()}
+    declared = {name: [array.dtype.str, *array.shape] for name, array in held.items()}
+    about = {"format": FORMAT, "version": VERSION, "kind": kind, **header, "arrays": declared}
+    text = json.dumps(about, allow_nan=False)
+    with written_whole(path) as file, zipfile.ZipFile(file, "w") as archive:
+        archive.writestr(HEADER, text)
+        for name, array in held.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                _npy.write_array(member, array, allow_pickle=False)
 
 
 def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
@@ -70,23 +88,23 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
         FileNotFoundError: there is none.
         ValueError: the file is damaged, foreign, of another kind, or of a newer format.
     """
-    try:
-        with zipfile.ZipFile(path) as file:
-            header = json.loads(file.read(HEADER))
-            arrays = {n.removesuffix(".npy"): _read(file, n) for n in file.namelist() if n != HEADER}
-    except FileNotFoundError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, RuntimeError) as error:
-        raise ValueError(f"{path} is damaged or not a checkpoint of asm-gym: {error}") from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise ValueError(f"{path} is not a checkpoint of asm-gym")
-    if header.get("version") != VERSION:
-        raise ValueError(
-            f"{path} has checkpoint format {header.get('version')!r}, this asm-gym reads {VERSION}; "
-            "a newer asm-gym may have written it"
-        )
-    if header.get("kind") != kind:
-        raise ValueError(f"{path} is a checkpoint of {header.get('kind')!r}, not of {kind!r}")
+    with _opened(path, "is damaged or not a checkpoint of asm-gym", expanded=1) as file:
+        header = _header(file)
+        if header.get("version") != VERSION:
+            raise _OtherCheckpointError(
+                f"{path} has checkpoint format {header.get('version')!r}, this asm-gym reads {VERSION}; "
+                "a newer asm-gym may have written it"
+            )
+        if header.get("kind") != kind:
+            raise _OtherCheckpointError(f"{path} is a checkpoint of {header.get('kind')!r}, not of {kind!r}")
+        names = {n.removesuffix(".npy") for n in file.namelist() if n != HEADER}
+        declared = header.pop("arrays", None)  # an older asm-gym declared none
+        if declared is not None and set(declared) != names:
+            raise ValueError(f"its header declares other arrays: {', '.join(sorted(set(declared) ^ names))}")
+        arrays = {name: _read(file, f"{name}.npy") for name in sorted(names)}
+        for name, as_declared in (declared or {}).items():
+            if [arrays[name].dtype.str, *arrays[name].shape] != as_declared:
+                raise ValueError(f"{name} is {arrays[name].dtype} {arrays[name].shape}, and declared otherwise")
     return Checkpoint(header, arrays)
 
 
@@ -103,25 +121,75 @@ def kind_of(path: str | Path) -> str:
 
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
     """Every array of an ``.npz``, by name. Raises FileNotFoundError, or ValueError where it is damaged."""
+    with _opened(path, "is damaged", expanded=MOST_EXPANDED) as file:
+        return {n.removesuffix(".npy"): _read(file, n, kinds="biufU") for n in file.namelist()}
+
+
+@contextmanager
+def opened_zip(source: str | Path | IO[bytes], size: int, expanded: int) -> Iterator[zipfile.ZipFile]:
+    """A zip whose members are looked at before anything is read.
+
+    Args:
+        source: a file, or the bytes of one.
+        size: of it [bytes].
+        expanded: how many times larger than the file its content may be; 1 where nothing may be compressed.
+
+    Raises:
+        ValueError: two members have one name, or they are larger than they may be.
+    """
+    with zipfile.ZipFile(source) as file:
+        members = file.infolist()
+        if len({m.filename for m in members}) < len(members):
+            raise ValueError("two of its members have one name")
+        if expanded == 1 and any(m.compress_type != zipfile.ZIP_STORED for m in members):
+            raise ValueError("its members are compressed, which asm-gym does not do")
+        if sum(m.file_size for m in members) > expanded * size:
+            raise ValueError(f"its members claim {sum(m.file_size for m in members)} bytes, in a file of {size}")
+        yield file
+
+
+@contextmanager
+def _opened(path: str | Path, what: str, expanded: int) -> Iterator[zipfile.ZipFile]:
+    """A zip; whatever is wrong with it is said in a line that names it."""
     try:
-        with zipfile.ZipFile(path) as file:
-            return {n.removesuffix(".npy"): _read(file, n) for n in file.namelist()}
-    except FileNotFoundError:
+        with opened_zip(path, regular_file(path), expanded) as file:
+            yield file
+    except (FileNotFoundError, _OtherCheckpointError):
         raise
-    except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, RuntimeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+    except DAMAGE as error:
+        raise ValueError(f"{path} {what}: {error}") from error
 
 
-def _write(file: IO[bytes], header: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr(HEADER, header)
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)  # type: ignore[no-untyped-call]
+def _header(file: zipfile.ZipFile) -> dict[str, Any]:
+    size = file.getinfo(HEADER).file_size
+    if size > LONGEST_HEADER:
+        raise ValueError(f"its header takes {size} bytes, {LONGEST_HEADER} at most")
+    header = json.loads(file.read(HEADER), parse_constant=_finite, parse_float=_finite)
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise ValueError("it has no header of asm-gym")
+    return header
 
 
-def _read(file: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    with file.open(name) as member:
-        array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)  # type: ignore[no-untyped-call]
-        member.read()  # the checksum is compared at the end of the member
-    return array
+def _finite(text: str) -> float:
+    """A number of JSON; 1e999 would pass for infinity."""
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"its header holds {text}, which is no number")
+    return number
+
+
+def _read(file: zipfile.ZipFile, name: str, kinds: str = "biuf") -> NDArray[Any]:
+    """An array of numbers, whose shape agrees with the bytes that are there; the zip compares its checksum."""
+    data = file.read(name)
+    start = io.BytesIO(data)
+    version = _npy.read_magic(start)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"{name} is of the unknown npy version {version}")
+    shape, fortran, dtype = (_npy.read_array_header_1_0 if version == (1, 0) else _npy.read_array_header_2_0)(start)
+    if dtype.kind not in kinds or not dtype.isnative:
+        raise ValueError(f"{name} cannot be of {dtype!r}")
+    found = len(data) - start.tell()
+    if any(n < 0 for n in shape) or math.prod(shape) * dtype.itemsize != found:
+        raise ValueError(f"{name} has {found} bytes, which are no {dtype} {shape}")
+    array: NDArray[Any] = np.frombuffer(data, dtype, offset=start.tell()) if found else np.zeros(0, dtype)
+    return array.reshape(shape, order="F" if fortran else "C").copy()

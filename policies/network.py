@@ -162,8 +162,10 @@ class NetworkPolicy:
         saved = read_checkpoint(path, KIND)
         try:
             count = sum(name.startswith("W") for name in saved.arrays)
-            layers = [(saved.arrays[f"W{n}"], saved.arrays[f"b{n}"]) for n in range(count)]
-            header, mean, scale = saved.header, saved.arrays["mean"], saved.arrays["scale"]
+            layers = [(saved.arrays.pop(f"W{n}"), saved.arrays.pop(f"b{n}")) for n in range(count)]
+            header, mean, scale = saved.header, saved.arrays.pop("mean"), saved.arrays.pop("scale")
+            if saved.arrays:
+                raise ValueError(f"an agent has no {', '.join(saved.arrays)}")
             how = header["activation"], header["squash"]
             return cls(layers, *how, mean=mean, scale=scale, trained_in=header["trained_in"])
         except (KeyError, TypeError, ValueError) as error:

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.checkpoint import MOST_EXPANDED, opened_zip
 from asm_gym.policies.network import NetworkPolicy
 
 MEMBERS = (
@@ -82,7 +83,7 @@ def read_archive(path: Path, seed: int | None = None) -> NetworkPolicy:
     if not path.is_file():
         raise FileNotFoundError(f"no agent at {path}")
     try:
-        with zipfile.ZipFile(path) as archive:
+        with opened_zip(path, path.stat().st_size, MOST_EXPANDED) as archive:
             foreign = sorted(set(archive.namelist()) - set(MEMBERS))
             if foreign:
                 raise ValueError(f"unexpected content: {', '.join(foreign)}")
@@ -139,11 +140,17 @@ def _tensors(pth: bytes) -> dict[str, NDArray[np.float32]]:
 
     import torch
 
+    if zipfile.is_zipfile(io.BytesIO(pth)):  # as torch has written them since 2020
+        with opened_zip(io.BytesIO(pth), len(pth), MOST_EXPANDED):
+            pass
     try:
         # Tensors alone: torch refuses everything else in the file.
         found = torch.load(io.BytesIO(pth), map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise ValueError(f"policy.pth holds more than tensors: {error}") from error
+    claimed = sum(tensor.numel() for tensor in found.values())
+    if claimed > len(pth):  # one number can be viewed as a tensor of any shape
+        raise ValueError(f"policy.pth has {len(pth)} bytes, and its tensors {claimed} numbers")
     return {name: tensor.numpy().astype(np.float32) for name, tensor in found.items()}
 
 

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import io
+import json
+import math
+import os
+import zipfile
+
 import numpy as np
 import pytest
 
-from asm_gym.checkpoint import read_checkpoint, write_checkpoint
+from asm_gym import checkpoint
+from asm_gym.checkpoint import read_arrays, read_checkpoint, write_checkpoint
 
 
 def test_checkpoint_keeps_every_bit(tmp_path):
@@ -50,3 +57,103 @@ def test_bad_checkpoints_are_refused(tmp_path):
     write_checkpoint(path, "test", {"version": 2}, {})
     with pytest.raises(ValueError, match="newer"):
         read_checkpoint(path, "test")
+
+
+def npy(array, **header):
+    """The bytes of an ``.npy`` whose header says something else than what is in it."""
+    file = io.BytesIO()
+    said = {"descr": array.dtype.str, "fortran_order": False, "shape": array.shape} | header
+    np.lib.format.write_array_header_1_0(file, said)
+    return file.getvalue() + array.tobytes()
+
+
+def packed(path, header=None, compression=zipfile.ZIP_STORED, **members):
+    """A zip with a header of ours, and arrays as bytes."""
+    text = json.dumps({"format": "asm-gym", "version": 1, "kind": "test"} | (header or {}))
+    with zipfile.ZipFile(path, "w", compression) as file:
+        file.writestr("header.json", text.replace('"1e999"', "1e999"))
+        for name, data in members.items():
+            file.writestr(f"{name}.npy", data)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ({"a": npy(np.zeros(3), shape=(10**12,))}, "24 bytes, which are no float64"),
+        ({"a": npy(np.zeros(3), shape=(2**62, 2**62))}, "24 bytes, which are no float64"),
+        ({"a": npy(np.zeros(3), shape=(-3,))}, "24 bytes, which are no float64"),
+        ({"a": npy(np.zeros(3, ">f8"))}, "cannot be of dtype"),
+        ({"a": npy(np.zeros(3, "S8"))}, "cannot be of dtype"),
+        ({"a": npy(np.zeros(3)), "header": {"arrays": {}}}, "declares other arrays: a"),
+        ({"header": {"arrays": {"a": ["<f8", 3]}}}, "declares other arrays: a"),
+        ({"a": npy(np.zeros(3)), "header": {"arrays": {"a": ["<f8", 4]}}}, "declared otherwise"),
+        ({"a": npy(np.zeros(3)), "header": {"arrays": {"a": ["<f4", 3]}}}, "declared otherwise"),
+        ({"header": {"threshold": math.nan}}, "NaN, which is no number"),
+        ({"header": {"threshold": math.inf}}, "Infinity, which is no number"),
+        ({"header": {"threshold": "1e999"}}, "1e999, which is no number"),
+        ({"a": npy(np.zeros(10**6)), "compression": zipfile.ZIP_DEFLATED}, "compressed"),
+    ],
+)
+def test_hostile_checkpoints_are_refused_with_a_reason(how, message, tmp_path):
+    with pytest.raises(ValueError, match=rf"x\.asm is damaged.*{message}"):
+        read_checkpoint(packed(tmp_path / "x.asm", **how), "test")
+
+
+def test_what_claims_to_be_larger_than_its_file_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    bomb = packed(tmp_path / "x.npz", compression=zipfile.ZIP_DEFLATED, a=npy(np.zeros(10**6)))
+    assert bomb.stat().st_size < 20_000
+    monkeypatch.setattr(zipfile.ZipFile, "read", None)  # calling it would be a TypeError, which nothing here catches
+    with pytest.raises(ValueError, match="its members claim 8000"):
+        read_arrays(bomb)
+    with pytest.raises(ValueError, match="compressed"):
+        read_checkpoint(bomb, "test")
+    with zipfile.ZipFile(tmp_path / "two.asm", "w") as file:
+        file.writestr("header.json", "{}")
+        with pytest.warns(UserWarning, match="Duplicate"):
+            file.writestr("header.json", "{}")
+    with pytest.raises(ValueError, match="one name"):
+        read_checkpoint(tmp_path / "two.asm", "test")
+
+
+def test_a_header_is_not_read_where_it_is_too_long(tmp_path, monkeypatch):
+    path = packed(tmp_path / "x.asm", {"long": "x" * 1000})
+    assert read_checkpoint(path, "test").header["long"] == "x" * 1000
+    monkeypatch.setattr(checkpoint, "LONGEST_HEADER", 1000)
+    with pytest.raises(ValueError, match="its header takes"):
+        read_checkpoint(path, "test")
+
+
+def test_files_of_before_arrays_were_declared_are_read(tmp_path):
+    found = read_checkpoint(packed(tmp_path / "x.asm", a=npy(np.arange(3.0))), "test")
+    np.testing.assert_array_equal(found.array("a", 3), np.arange(3.0))
+
+
+def test_arrays_that_are_not_finite_are_refused_where_they_are_asked_for(tmp_path):
+    write_checkpoint(tmp_path / "x.asm", "test", {}, {"a": np.array([1.0, np.inf])})
+    with pytest.raises(ValueError, match="a should be finite"):
+        read_checkpoint(tmp_path / "x.asm", "test").array("a", 2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_flipped_bit_changes_what_is_read(tmp_path, seed):
+    path, rng = tmp_path / "x.asm", np.random.default_rng(seed)
+    write_checkpoint(path, "test", {"n": 1}, {"a": rng.normal(size=20), "b": np.arange(5)})
+    whole, good = path.read_bytes(), read_checkpoint(path, "test")
+    for place in rng.integers(8 * len(whole), size=100):
+        flipped = bytearray(whole)
+        flipped[place // 8] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        try:
+            found = read_checkpoint(path, "test")
+        except ValueError:
+            continue
+        assert found.header == good.header
+        for name in good.arrays:
+            np.testing.assert_array_equal(found.arrays[name], good.arrays[name])
+
+
+def test_a_pipe_is_no_checkpoint(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="is no regular file"):
+        read_checkpoint(tmp_path / "pipe", "test")

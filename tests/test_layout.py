@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import os
-import shutil
 import subprocess
 import sys
 import zipfile
@@ -13,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-LINKS = ("policies", "wrappers", "scripts")
+from tests.wheel import LINKS, ROOT, build_wheel
+
 LAYERS = ("core", "policies", "wrappers", "rollouts", "scripts")  # each may import itself and what stands before it
 AUTOGRAD = ("torch", "jax", "autograd", "tensorflow", "theano")
 
@@ -121,15 +120,7 @@ def test_the_links_are_relative_and_resolve(link: str) -> None:
 
 @pytest.mark.slow
 def test_a_wheel_holds_real_files_under_one_name(tmp_path: Path) -> None:
-    source = tmp_path / "source"
-    # Only what the wheel is made of; build/ and *.egg-info would bring in files since deleted.
-    for name in ("asm_gym", *LINKS):
-        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source / name)
-    pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
-    subprocess.run([*pip, "--wheel-dir", str(tmp_path), str(source)], check=True)
-    (wheel,) = tmp_path.glob("*.whl")
+    wheel = build_wheel(tmp_path)
     with zipfile.ZipFile(wheel) as archive:
         files = archive.infolist()
         names = {f.filename for f in files}

@@ -16,6 +16,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
+from asm_gym.checkpoint import write_checkpoint
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.registry import SHIPPED, agents
@@ -174,6 +175,34 @@ def test_an_archive_that_cannot_be_unpacked_is_refused(archive):
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"edited\.zip is not an agent"):
         read_archive(path)
+
+
+def test_an_archive_larger_than_its_file_may_be_is_refused_before_it_is_read(archive, monkeypatch):
+    path = archive()
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as bomb:
+        bomb.writestr("actor.optimizer.pth", bytes(10**8))
+    monkeypatch.setattr(zipfile.ZipFile, "read", lambda *_: pytest.fail("it was read"))
+    with pytest.raises(ValueError, match="its members claim 100"):
+        read_archive(path)
+
+
+def test_one_number_that_claims_to_be_a_large_tensor_is_refused(archive):
+    vast = saved({"action_net.weight": torch.zeros(1).expand(10**6, 10**4)})
+    assert len(vast) < 2000
+    with pytest.raises(ValueError, match="its tensors 10000000000 numbers"):
+        read_archive(archive(policy_pth=lambda _: vast))
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as bomb:
+        bomb.writestr("archive/data/0", bytes(10**8))
+    with pytest.raises(ValueError, match="its members claim 100000000 bytes"):
+        read_archive(archive(policy_pth=lambda _: file.getvalue()))
+
+
+def test_an_agent_with_more_than_its_layers_is_refused(tmp_path):
+    arrays = {"W0": np.zeros((3, 2)), "b0": np.zeros(3), "mean": np.zeros(2), "scale": np.ones(2), "more": np.zeros(1)}
+    write_checkpoint(tmp_path / "a.npz", "agent", {"activation": "relu", "squash": "tanh", "trained_in": {}}, arrays)
+    with pytest.raises(ValueError, match=r"a\.npz is damaged: an agent has no more"):
+        NetworkPolicy.load(tmp_path / "a.npz")
 
 
 def test_an_agent_that_does_not_fit_is_refused_before_it_acts(tmp_path, lift):

@@ -1,0 +1,90 @@
+"""Files that are there complete or not at all, and that are looked at before they are read."""
+
+from __future__ import annotations
+
+import errno
+import os
+import platform
+import re
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+UNFINISHED = ".unfinished"
+
+SPARE = 16 * 2**20
+"""[bytes] that a disk must have beyond what is to be written."""
+
+
+@contextmanager
+def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
+    """A file to write that takes its place when the block ends well; a reader sees the old one or the new one.
+
+    A process that is killed leaves a hidden file, which the next one to write there removes. Missing folders are made.
+
+    Raises:
+        ValueError: something stands there that is no file, such as a device.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} is no regular file, and is not replaced by one")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mark = f".{path.name}.{re.sub(r'[^A-Za-z0-9-]', '-', platform.node())}."
+    _remove_left_behind(path.parent, mark)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f"{mark}{os.getpid()}.", suffix=UNFINISHED)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            yield file
+        os.chmod(temporary, 0o644)  # mkstemp makes it readable by its owner alone
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def regular_file(path: str | Path) -> int:
+    """Its size [bytes].
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is a folder, or a device or pipe, whose reading might never end.
+    """
+    try:
+        found = os.stat(path)
+    except FileNotFoundError:
+        raise FileNotFoundError(errno.ENOENT, "no such file", str(path)) from None
+    if not stat.S_ISREG(found.st_mode):
+        raise ValueError(f"{path} is no regular file")
+    return found.st_size
+
+
+def require_space(folder: Path, needed: int) -> None:
+    """Raises OSError unless the disk under ``folder``, which may not exist yet, has room for so many bytes."""
+    there = next(f for f in (folder, *folder.absolute().parents) if f.exists())
+    free = shutil.disk_usage(there).free
+    if free < needed + SPARE:
+        raise OSError(
+            errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed there, and {free / 1e6:.0f} MB are free", str(folder)
+        )
+
+
+def _remove_left_behind(folder: Path, mark: str) -> None:
+    """Removes what processes of this machine that run no longer began to write under this name."""
+    for entry in os.scandir(folder):
+        if entry.name.startswith(mark) and entry.name.endswith(UNFINISHED):
+            owner = entry.name.removeprefix(mark).split(".")[0]
+            if owner.isdigit() and not _runs(int(owner)):
+                Path(entry.path).unlink(missing_ok=True)
+
+
+def _runs(process: int) -> bool:
+    with suppress(PermissionError):  # it runs, and is somebody else's
+        try:
+            os.kill(process, 0)
+        except (ProcessLookupError, OverflowError):
+            return False
+    return True
