@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_number
+from asm_gym.envs.abilities import HasGrippers, HoldsItself, TurnsJoints
+from asm_gym.policies.base import Policy
 from asm_gym.stream import StreamSpec, control_period
 
 USUAL_GAIN = 0.1
@@ -26,42 +29,68 @@ class Begun(NamedTuple):
     steps: int  # that it has acted
 
 
-class Hold:
-    """Stay, and keep the grip.
+@runtime_checkable
+class Reflex(Policy, Protocol):
+    """A policy that is told of every step, and starts from what was done last."""
 
-    Under robosuite's delta controllers a zero command keeps the arm where it is; the gripper's command is repeated as
-    it was last given, so that nothing is dropped.
+    def reset(self) -> None:
+        """A new episode begins."""
+        ...
+
+    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
+        """What was sensed in a step, and what was done.
+
+        Args:
+            row: (D,) of the stream; NaN where it is missing.
+            executed: (A,).
+            acting: whether this reflex did it.
+        """
+        ...
+
+    def begin(self, executed: NDArray[np.float32]) -> Any:
+        """The state to start from, after ``executed`` (A,)."""
+        ...
+
+
+class Hold:
+    """Stay, and keep the grip, so that nothing is dropped.
+
+    An environment that can hold itself, as all of this package can, is told to: it stays under any controller and with
+    any wrapper in between. Each ``predict`` speaks for the next step, whatever action that is then given. In any other
+    environment a zero action is taken to mean "stay".
 
     Args:
         env: one with a Box action space.
-        safe_action: what to do instead, where a zero action does not mean "stay".
+        safe_action: what to do instead, where a zero action does not mean "stay"; it goes through all wrappers.
 
     Raises:
-        ValueError: ``safe_action`` does not fit the action space.
+        TypeError: the action space is no Box.
+        ValueError: ``safe_action`` does not fit the action space, or no action is known that arrives as zero.
     """
 
     def __init__(self, env: gym.Env[Any, Any], safe_action: NDArray[np.float32] | None = None) -> None:
         space = env.action_space
         if not isinstance(space, spaces.Box):
             raise TypeError(f"a reflex needs a Box action space, got {space}")
-        rest = np.zeros(space.shape, np.float32) if safe_action is None else np.asarray(safe_action, np.float32)
-        if not space.contains(rest):
-            raise ValueError(f"safe_action {rest} is not in {space}")
-        self._rest = rest
-        self._grip = np.asarray(getattr(env.unwrapped, "gripper_actions", ()), dtype=int)
-        self._explicit = safe_action is not None
+        inner = env.unwrapped
+        self.explicit = safe_action is not None
+        """It does ``safe_action``, and knows of no environment."""
+        self._robot = inner if isinstance(inner, HoldsItself) and not self.explicit else None
+        if safe_action is not None:
+            self._rest = np.asarray(safe_action, np.float32)
+        else:
+            self._rest = nearest_to_rest(space) if self._robot else resting_action(env)
+        if not space.contains(self._rest):
+            raise ValueError(f"safe_action {self._rest} is not in {space}")
+        self._grip = np.asarray(inner.gripper_actions if isinstance(inner, HasGrippers) else (), dtype=int)
+        if self._grip.size and self._grip.max() >= self._rest.size:  # a wrapper inside takes other numbers
+            self._grip = self._grip[:0]
 
     def reset(self) -> None:
         """A new episode begins."""
 
     def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
-        """What was sensed in a step, and what was done.
-
-        Args:
-            row: (D,) of the stream.
-            executed: (A,).
-            acting: whether this reflex did it.
-        """
+        """What was sensed in a step (D,), what was done (A,), and whether this reflex did it."""
 
     def begin(self, executed: NDArray[np.float32]) -> Begun:
         """The state to start from, after ``executed`` (A,)."""
@@ -75,15 +104,17 @@ class Hold:
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], Begun | None]:
         """The next action (A,)."""
-        action = self._rest.copy() if self._explicit else self.move()
+        action = self._rest.copy() if self.explicit else self.move()
         if state is None:
             return action, None
-        if not self._explicit:
+        if not self.explicit:
             action[self._grip] = state.executed[self._grip]
         return action, Begun(state.executed, state.steps + 1)
 
     def move(self) -> NDArray[np.float32]:
         """The next action (A,); the gripper's part of it does not count."""
+        if self._robot is not None:
+            self._robot.holding = True
         return self._rest.copy()
 
 
@@ -91,7 +122,18 @@ class Recall(Hold):
     """Goes on along what the memory expects to be commanded: the skill's own continuation.
 
     The wrapper says what that is after every step, by the monitor's ``expected_action``.
+
+    Args:
+        env: one whose stream carries the actions it is given.
+
+    Raises:
+        ValueError: a wrapper inside changes actions, so that those of the stream are others.
     """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        if env.has_wrapper_attr("stream_spec"):
+            _require_unchanged(env, "recall")
 
     def reset(self) -> None:
         self.expects(self._rest)
@@ -121,13 +163,15 @@ class Retract(Hold):
         steps: how many actions to undo.
 
     Raises:
-        ValueError: the environment's actions are no changes, or it does not say.
+        ValueError: the environment's actions are no changes, a wrapper inside changes them, or it does not say.
     """
 
     def __init__(self, env: gym.Env[Any, Any], steps: int = 10) -> None:
         super().__init__(env)
         _require_deltas(env, "retract")
-        self._path: deque[NDArray[np.float32]] = deque(maxlen=steps)
+        self._path: deque[NDArray[np.float32]] = deque(
+            maxlen=check_number("steps", steps, low=1, high=10_000, whole=True)
+        )
 
     def reset(self) -> None:
         self._path.clear()
@@ -138,7 +182,7 @@ class Retract(Hold):
 
     def move(self) -> NDArray[np.float32]:
         if not self._path:
-            return self._rest.copy()
+            return super().move()
         undone: NDArray[np.float32] = -self._path.pop()
         return undone
 
@@ -152,21 +196,21 @@ class Comply(Hold):
         tolerated: external torque that no joint gives way to [N m].
 
     Raises:
-        ValueError: the environment measures no external torque, or its controller cannot be told to move so.
+        ValueError: the environment measures no external torque, its controller cannot be told to move so, or a wrapper
+            inside changes actions.
     """
 
     def __init__(self, env: gym.Env[Any, Any], compliance: float = 0.05, tolerated: float = 2.0) -> None:
         super().__init__(env)
-        _require_deltas(env, "comply")
+        self._joints = _require_deltas(env, "comply")
         spec: StreamSpec = env.get_wrapper_attr("stream_spec")
         self._columns = [
             i for n, s in spec.slices.items() if n.endswith("external_torque") for i in range(spec.size)[s]
         ]
         if not self._columns:
             raise ValueError("comply needs the channel external_torque: make the environment with stream group torque")
-        self._env: Any = env.unwrapped
-        self.tolerated = tolerated
-        self._each_step = compliance * control_period(env)
+        self.tolerated = check_number("tolerated", tolerated, low=0)
+        self._each_step = check_number("compliance", compliance, low=0) * control_period(env)
         self.reset()
 
     def reset(self) -> None:
@@ -187,8 +231,7 @@ class Comply(Hold):
         return beyond
 
     def move(self) -> NDArray[np.float32]:
-        action: NDArray[np.float32] = self._env.action_for(self._each_step * self.load)
-        return action
+        return self._joints.action_for(self._each_step * self.load)
 
 
 class Graded(Comply):
@@ -206,10 +249,68 @@ class Graded(Comply):
         super().__init__(env, compliance, tolerated)
 
 
-def _require_deltas(env: gym.Env[Any, Any], name: str) -> None:
-    controller = getattr(env.unwrapped, "controller", None)
-    if controller not in DELTAS:
+def nearest_to_rest(space: spaces.Box) -> NDArray[np.float32]:
+    """(A,) the action of a space that comes nearest to none."""
+    nearest: NDArray[np.float32] = np.clip(np.zeros(space.shape), space.low, space.high).astype(np.float32)
+    return nearest
+
+
+def resting_action(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
+    """(A,) the action that reaches the innermost environment as zero.
+
+    Raises:
+        ValueError: a wrapper inside changes actions so that none is known.
+    """
+    space: Any = env.action_space
+    bounded = np.isfinite(space.low) & np.isfinite(space.high)
+    middle = 0.5 * (np.where(bounded, space.low, 0.0) + np.where(bounded, space.high, 0.0))
+    for candidate in (nearest_to_rest(space), middle.astype(np.float32)):
+        arrives, wrapper = candidate, env
+        while isinstance(wrapper, gym.Wrapper):
+            if isinstance(wrapper, gym.wrappers.TransformAction):  # a function of the action alone, so it may be asked
+                arrives = np.asarray(wrapper.action(arrives))
+            elif isinstance(wrapper, gym.ActionWrapper):
+                raise ValueError(_say_outside(wrapper, "hold"))
+            wrapper = wrapper.env
+        if not np.any(arrives):
+            return candidate
+    changed = _changing(env)
+    raise ValueError(
+        _say_outside(changed, "hold")
+        if changed
+        else f"hold takes a zero action for rest, which is not in {space}: use Hold(env, safe_action=...)"
+    )
+
+
+def _changing(env: gym.Env[Any, Any]) -> gym.ActionWrapper[Any, Any, Any] | None:
+    """The outermost wrapper that changes actions; None where there is none."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.ActionWrapper) and not isinstance(env, gym.wrappers.ClipAction):
+            return env
+        env = env.env
+    return None
+
+
+def _say_outside(wrapper: gym.Env[Any, Any], reflex: str) -> str:
+    return (
+        f"{type(wrapper).__name__} changes actions, so that {reflex} cannot know what reaches the robot: "
+        "put it outside of NeuralASMSafety, or use Hold(env, safe_action=...)"
+    )
+
+
+def _require_unchanged(env: gym.Env[Any, Any], name: str) -> None:
+    changed = _changing(env)
+    if changed is not None:
+        raise ValueError(_say_outside(changed, name))
+
+
+def _require_deltas(env: gym.Env[Any, Any], name: str) -> TurnsJoints:
+    inner = env.unwrapped
+    controller = inner.controller if isinstance(inner, TurnsJoints) else None
+    if not isinstance(inner, TurnsJoints) or controller not in DELTAS:
         raise ValueError(
             f"{name} needs an environment whose controller is {' or '.join(DELTAS)}, got {controller}: "
             "use hold with a safe_action of your own, or name any policy"
         )
+    _require_unchanged(env, name)
+    return inner

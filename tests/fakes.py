@@ -112,5 +112,5 @@ class FadingMonitor(CueMonitor):
         attribution[:, 0] = evidence
         return Remembered(evidence, state.steps + 1), Surprise(evidence, attribution)
 
-    def resynchronise(self, state: Remembered) -> Remembered:
+    def reset_evidence(self, state: Remembered) -> Remembered:
         return state._replace(evidence=0.5 * state.evidence)

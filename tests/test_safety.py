@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from asm_gym.policies.reflexes import Graded
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.safety import make_patience
+from asm_gym.wrappers.arguments import make_patience
 from tests.fakes import SPEC, CueMonitor, FakeEnv
 
 ACT = np.array([0.3, -0.2, 1.0], np.float32)
@@ -172,7 +172,7 @@ def test_control_is_not_handed_back_before_surprise_is_well_below_the_threshold(
 
 def test_evidence_that_was_acted_on_is_not_counted_again():
     class Remembering(CueMonitor):
-        def resynchronise(self, state):
+        def reset_evidence(self, state):
             forgotten.append(state)
             return state
 
@@ -209,7 +209,7 @@ def test_a_monitor_learns_on_the_job_only_when_asked_and_never_from_an_override(
     assert learned == [(t, 0.25) for t in (0, 1, 2, 5, 6)]  # steps 3 and 4 were held
     with pytest.raises(ValueError, match="CueMonitor cannot learn"):
         NeuralASMSafety(FakeEnv(), CueMonitor(), learning_rate=0.1)
-    with pytest.raises(ValueError, match=r"learning_rate must be in \[0, 1\], got 3"):
+    with pytest.raises(ValueError, match=r"learning_rate must be a number in \[0, 1\], got 3"):
         NeuralASMSafety(FakeEnv(), Learner(), learning_rate=3)
 
 
@@ -228,7 +228,7 @@ class Broken:
 @pytest.mark.parametrize("how", ["raises", "nan", "shape"])
 def test_where_a_backup_policy_fails_the_robot_holds_and_says_so(how):
     env = NeuralASMSafety(FakeEnv(), CueMonitor([2]), on_alarm=Broken(how), release_after=2)
-    with pytest.warns(UserWarning, match="the reflex failed, and the robot holds instead"):
+    with pytest.warns(UserWarning, match="reflex: .*; the robot holds instead"):
         infos = run(env, 6)
     np.testing.assert_array_equal(env.unwrapped.actions[3], [0, 0, 1])  # the grip is kept
     assert [bool(i["asm"]["failure"]) for i in infos[4:6]] == [True, True]
@@ -278,7 +278,7 @@ def test_an_overrun_warns_once_or_counts_as_an_alarm(monkeypatch):
             return super().observe(state, stream)
 
     clock = [0.0]
-    monkeypatch.setattr("asm_gym.wrappers.safety.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("asm_gym.wrappers.observer.time.perf_counter", lambda: clock[0])
     with pytest.warns(UserWarning, match=r"took 200\.0 ms for a row that lasts 50\.0 ms"):
         infos = run(NeuralASMSafety(FakeEnv(), Slow()), 6)
     assert not any(i["asm"]["alarm"] for i in infos)
@@ -314,7 +314,8 @@ def test_what_is_no_number_is_an_alarm():
             state, surprise = super().observe(state, stream)
             return state, surprise._replace(value=np.array([np.nan]))
 
-    infos = run(NeuralASMSafety(FakeEnv(), Lost()), 3)
+    with pytest.warns(UserWarning, match="its surprise is nan"):
+        infos = run(NeuralASMSafety(FakeEnv(), Lost()), 3)
     assert [i["asm"]["alarm"] for i in infos[1:]] == [True] * 3
     assert infos[-1]["asm"]["intervened"]
 

@@ -111,7 +111,7 @@ def test_one_wrapper_around_many_equals_many_wrappers(options, mode):
     assert acted == (options["on_alarm"] not in ("monitor", "terminate"))
 
 
-@pytest.mark.filterwarnings("ignore:.*the reflex failed")
+@pytest.mark.filterwarnings("ignore:.*the robot holds instead")
 @pytest.mark.parametrize("mode", [NEXT, SAME], ids=["next", "same"])
 def test_where_a_reflex_fails_only_that_environment_holds(mode):
     ours, theirs = both({"on_alarm": Broken()}, mode)
@@ -119,7 +119,7 @@ def test_where_a_reflex_fails_only_that_environment_holds(mode):
     ours.reset()
     for _ in range(4):
         asm = ours.step(np.full((3, 3), 0.2, np.float32))[4]["asm"]
-    assert asm["failure"].tolist() == ["RuntimeError('out of order')", "", ""]
+    assert asm["failure"].tolist() == ["reflex: RuntimeError('out of order')", "", ""]
     np.testing.assert_allclose(asm["executed_action"], [[0, 0, 0.2], [0.5] * 3, [0.2] * 3], rtol=1e-6)
 
 

@@ -1,4 +1,8 @@
-"""Who acts in one environment, the policy or a reflex: from the moment of an alarm on, until surprise is quiet."""
+"""Who acts in one environment, the policy or a reflex: from the moment of an alarm on, until surprise is quiet.
+
+An override that is asked for happens: what fails, be it the policy's action, the stream, the monitor or the reflex, is
+an alarm, and ends in the reflex or in staying, never in the policy.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +15,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_number, shown
 from asm_gym.policies.base import Policy
-from asm_gym.policies.reflexes import Hold, Recall
+from asm_gym.policies.reflexes import Hold, Recall, Reflex
 
 _log = logging.getLogger("asm_gym.safety")
 
@@ -38,14 +43,12 @@ class Patience:
     try_after: int | None = None
 
     def __post_init__(self) -> None:
-        if self.release_after < 1:
-            raise ValueError(f"release_after must be at least 1, got {self.release_after}")
-        if not 0.0 < self.release_below <= 1.0:
-            raise ValueError(f"release_below must be in (0, 1], got {self.release_below}")
+        check_number("release_after", self.release_after, low=1, whole=True)
+        check_number("release_below", self.release_below, above=0, high=1)
         for name in ("max_override", "try_after"):
             number = getattr(self, name)
-            if number is not None and number < 1:
-                raise ValueError(f"{name} must be at least 1, got {number}")
+            if number is not None:
+                check_number(name, number, low=1, whole=True)
 
     def in_rows(self, each: int) -> Self:
         """The same, counted in rows of a stream that has ``each`` of them in a control step."""
@@ -54,27 +57,43 @@ class Patience:
         return replace(self, release_after=each * self.release_after, max_override=longest, try_after=wait)
 
 
-class Verdict(NamedTuple):
+class Command(NamedTuple):
+    """What is to be done in a step.
+
+    Attributes:
+        action: (A,) finite; in the action space, unless it is the policy's own.
+        failure: what failed when it was chosen; empty where nothing did.
+        refused: the policy's action was no action, which is an alarm; another is done instead.
+    """
+
+    action: NDArray[np.float32]
+    failure: str = ""
+    refused: bool = False
+
+
+class Decision(NamedTuple):
     """What a row has come to.
 
     Attributes:
         alarm: surprise is over the threshold.
-        intervened: the reflex was acting.
+        intervened: something else than the policy was acting.
         gave_up: it has acted for as long as it may, and surprise is not quiet yet.
         acted_on: the surprise has had its consequence, so that its evidence is not to be counted again.
-        transition: ``"override"`` where the reflex takes over next, ``"release"`` where the policy does, ``"trial"``
-            where it does though surprise is not quiet, ``"give_up"``; empty where nothing changes.
+        failure: what failed in the reflex when it was told of the row; empty where nothing did.
+        transition: ``"override"`` where the reflex takes over, ``"release"`` where the policy goes on next,
+            ``"trial"`` where it does though surprise is not quiet, ``"give_up"``; empty where nothing changes.
     """
 
     alarm: bool
     intervened: bool
     gave_up: bool
     acted_on: bool
+    failure: str = ""
     transition: str = ""
 
 
-NOTHING = Verdict(False, False, False, False)
-"""Of a step in which there was nothing to judge."""
+NOTHING = Decision(False, False, False, False)
+"""Of a step in which there was nothing to decide."""
 
 
 class Arbiter:
@@ -83,75 +102,106 @@ class Arbiter:
     Args:
         reflex: acts after an alarm; None where nothing does.
         threshold: what surprise must exceed for an alarm.
-        patience: when control is handed back, counted in what ``judge`` is called for.
-        fallback: acts where the reflex fails to; None to let it fail.
+        patience: when control is handed back, counted in what ``decide`` is called for.
+        fallback: acts where nobody else can.
+        space: of the actions.
     """
 
     def __init__(
-        self, reflex: Policy | None, threshold: float, patience: Patience, fallback: Hold | None = None
+        self, reflex: Policy | None, threshold: float, patience: Patience, fallback: Hold, space: gym.spaces.Box
     ) -> None:
         self._reflex, self._threshold, self._patience, self._fallback = reflex, threshold, patience, fallback
+        self._space = space
         self.reset()
 
     def reset(self) -> None:
         """A new episode begins."""
         self.overriding = False
         """The reflex acts next."""
-        self.failure = ""
-        """Why the reflex could not act when it last should; empty where it could."""
         self._quiet = self._acted = self._held = 0
         self._wait: float = self._patience.try_after or math.inf
         self._handed_back: int | None = None  # so many rows ago, as long as it may turn out too early
         self._tried = False  # and it was on trial
         self._state: Any = None
-        self._fresh = False
-        if isinstance(self._reflex, Hold):
+        self._fresh = self._refused = False
+        self._warned: set[str] = set()
+        self._last = np.zeros(self._space.shape, np.float32)  # (A,) executed last
+        self._before = self._last  # (A,) executed last before the override
+        if isinstance(self._reflex, Reflex):
             self._reflex.reset()
 
-    def executed(self, action: Any, observation: Any) -> NDArray[np.float32]:
-        """What is done: the policy's ``action`` (A,), or the reflex's after ``observation``."""
-        if not self.overriding:
-            return np.asarray(action, dtype=np.float32)
+    def warn(self, failure: str, instead: str) -> None:
+        """Says what failed, and what happens instead: once an episode for each that can fail."""
+        who = failure.partition(":")[0]
+        if who not in self._warned:
+            self._warned.add(who)
+            gym.logger.warn(f"{failure}; {instead}")
+
+    def command(self, action: NDArray[np.float32], observation: Any) -> Command:
+        """What is to be done: the policy's ``action`` (A,), or the reflex's after ``observation``."""
+        command = self._command(action, observation)
+        self._last = command.action
+        return command
+
+    def _command(self, action: NDArray[np.float32], observation: Any) -> Command:
+        if self.overriding:
+            return self._reaction(observation)
+        if np.isfinite(action).all():
+            return Command(action)
+        self._refused = True
+        said = f"policy: the action must be finite, got {shown(action.tolist())}"
+        self.warn(said, "another is done instead")
+        if self._reflex is None:
+            return Command(self._stay(self._last, observation), said, True)
+        self._take_over(self._last)
+        reaction = self._reaction(observation)
+        return Command(reaction.action, "; ".join(filter(None, (said, reaction.failure))), True)
+
+    def _reaction(self, observation: Any) -> Command:
+        """What the reflex does; staying, where it fails."""
         assert self._reflex is not None
-        start = np.array([self._fresh])
-        self._fresh = False
         try:
+            start = np.array([self._fresh])
+            if self._fresh:
+                # Reflexes start from what was last done; any other policy starts as in a new episode.
+                self._state = self._reflex.begin(self._before) if isinstance(self._reflex, Reflex) else None
             chosen, self._state = self._reflex.predict(
                 observation, state=self._state, episode_start=start, deterministic=True
             )
-            self.failure = ""
+            self._fresh = False
             chosen = np.asarray(chosen, dtype=np.float32)
-            if chosen.shape != np.shape(action) or not np.isfinite(chosen).all():
-                raise ValueError(f"an action of shape {np.shape(action)} was needed, got {chosen}")
+            if chosen.shape != self._space.shape or not np.isfinite(chosen).all():
+                raise ValueError(f"a finite action of shape {self._space.shape} was needed, got {chosen}")
         except Exception as error:
             # Whatever a user's policy does, an alarm must not end in no action.
-            if self._fallback is None:
-                raise
-            if not self.failure:
-                gym.logger.warn(f"the reflex failed, and the robot holds instead: {error!r}")
-            self.failure = repr(error)
-            chosen, _ = self._fallback.predict(observation, self._fallback.begin(self._before))
-        return chosen
+            said = f"reflex: {error!r}"
+            self.warn(said, "the robot holds instead")
+            return Command(self._stay(self._before, observation), said)
+        return Command(np.clip(chosen, self._space.low, self._space.high))
 
-    def judge(
+    def _stay(self, executed: NDArray[np.float32], observation: Any) -> NDArray[np.float32]:
+        return self._fallback.predict(observation, self._fallback.begin(executed))[0]
+
+    def decide(
         self,
         surprise: float,
         row: NDArray[np.floating[Any]],
         executed: NDArray[np.float32],
         feel: bool = True,
         expected: NDArray[np.float32] | None = None,
-    ) -> Verdict:
+    ) -> Decision:
         """Decides who acts next, after ``executed`` (A,) was done and ``row`` (D,) was sensed.
 
         Args:
+            surprise: infinite where something has failed.
             feel: lets the reflex feel the row: once a control step.
             expected: (A,) what the memory expects to be commanded next, for reflexes that go on with it.
         """
-        alarm, intervened = not surprise <= self._threshold, self.overriding
+        alarm, intervened = not surprise <= self._threshold, self.overriding or self._refused
+        begun, self._refused = self._refused, False
         if self._reflex is None:
-            return Verdict(alarm, False, False, False)
-        if feel and isinstance(self._reflex, Hold):
-            self._reflex.feel(row, executed, intervened)
+            return Decision(alarm, intervened, False, False)
+        failure = self._tell(row, executed, intervened) if feel and isinstance(self._reflex, Reflex) else ""
         if expected is not None and isinstance(self._reflex, Recall):
             self._reflex.expects(expected)
         quiet = surprise <= self._threshold * (self._patience.release_below if intervened else 1.0)
@@ -162,10 +212,22 @@ class Arbiter:
             self._handed_back += 1
             if self._handed_back > self._patience.release_after:
                 self._handed_back = None
-        transition = self._next(alarm, executed)
+        transition = self._next(alarm, executed) or ("override" if begun else "")
         if transition:
             _log.info("%s: surprise %.3g, threshold %.3g", transition, surprise, self._threshold)
-        return Verdict(alarm, intervened, transition == "give_up", alarm or transition == "trial", transition)
+        acted_on = alarm or transition == "trial"
+        return Decision(alarm, intervened, transition == "give_up", acted_on, failure, transition)
+
+    def _tell(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], intervened: bool) -> str:
+        """Lets the reflex feel the row; what failed at that."""
+        assert isinstance(self._reflex, Reflex)
+        try:
+            self._reflex.feel(row, executed, intervened)
+        except Exception as error:
+            failure = f"reflex: {error!r}"
+            self.warn(failure, "it has not felt this row")
+            return failure
+        return ""
 
     def _next(self, alarm: bool, executed: NDArray[np.float32]) -> str:
         """Who acts next, as a transition."""
@@ -190,6 +252,3 @@ class Arbiter:
             self._wait *= 2
         self._held, self._before = 0, executed
         self.overriding = self._fresh = True
-        # Our own reflexes start from what was last done; a user's policy starts as in a new episode.
-        begin = getattr(self._reflex, "begin", None)
-        self._state = begin(executed) if begin else None

@@ -2,18 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from copy import deepcopy
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
 Mask = NDArray[np.bool_]
-ATTRIBUTES = ("stream_spec", "gripper_actions", "controller", "dt")
+ATTRIBUTES = ("stream_spec", "gripper_actions", "controller", "dt", "holding")
 """What monitors and reflexes ask an environment for."""
+
+
+@runtime_checkable
+class Askable(Protocol):
+    """A vector environment whose members can be asked, and told."""
+
+    def call(self, name: str, *args: Any) -> tuple[Any, ...]:
+        """What the method ``name`` of each returns."""
+        ...
+
+    def set_attr(self, name: str, values: list[Any]) -> None:
+        """Sets an attribute of each."""
+        ...
+
+
+@runtime_checkable
+class Named(Protocol):
+    """A named tuple."""
+
+    def _make(self, parts: Iterable[Any]) -> Any: ...
 
 
 class Member(gym.Env[Any, Any]):
@@ -46,8 +66,8 @@ def members(envs: VectorEnv[Any, Any, Any]) -> list[Member]:
     Raises:
         TypeError: it has no ``call``, by which Gymnasium's own are asked for what their members are.
     """
-    inner: Any = envs.unwrapped
-    if not hasattr(inner, "call"):
+    inner = envs.unwrapped
+    if not isinstance(inner, Askable):
         raise TypeError(
             f"{inner} cannot be asked what its environments are: make it with SyncVectorEnv or AsyncVectorEnv"
         )
@@ -60,6 +80,24 @@ def members(envs: VectorEnv[Any, Any, Any]) -> list[Member]:
     return [Member(envs, i, attributes) for i, attributes in enumerate(found)]
 
 
+def set_attribute(envs: VectorEnv[Any, Any, Any], name: str, values: list[Any]) -> None:
+    """Sets an attribute of each member; workers' too."""
+    inner = envs.unwrapped
+    assert isinstance(inner, Askable)
+    inner.set_attr(name, values)
+
+
+def refuse_changes(envs: VectorEnv[Any, Any, Any]) -> None:
+    """Raises ValueError where a wrapper around all of them changes actions."""
+    while isinstance(envs, VectorWrapper):
+        if isinstance(envs, VectorActionWrapper):
+            raise ValueError(
+                f"{type(envs).__name__} changes actions, so that the reflex cannot know what reaches the robot: put it "
+                "outside of VectorNeuralASMSafety"
+            )
+        envs = envs.env
+
+
 def choose(mask: Mask, new: Any, old: Any) -> Any:
     """A monitor's state with ``new`` where ``mask`` (n,) holds, ``old`` elsewhere.
 
@@ -68,7 +106,7 @@ def choose(mask: Mask, new: Any, old: Any) -> Any:
     """
     if isinstance(old, tuple):
         parts = [choose(mask, n, o) for n, o in zip(new, old, strict=True)]
-        return type(old)(*parts) if hasattr(old, "_fields") else tuple(parts)
+        return old._make(parts) if isinstance(old, Named) else tuple(parts)
     if not isinstance(old, np.ndarray) or len(old) != len(mask):
         raise TypeError(f"a monitor's state must be arrays whose first axis is {len(mask)} long, got {old!r}")
     return np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)

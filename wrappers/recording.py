@@ -39,6 +39,8 @@ class StreamSource:
     def row(self, observation: Any, action: Any, info: dict[str, Any]) -> NDArray[np.float32]:
         """(D,) what was sensed after ``action``, and the action."""
         if self._own:
+            if "stream" not in info:
+                raise KeyError('info has no "stream"')
             row: NDArray[np.float32] = info["stream"]
             return row
         both: NDArray[np.float32] = np.concatenate([np.ravel(observation), np.ravel(action)]).astype(np.float32)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Literal, NamedTuple, SupportsFloat
 
@@ -13,32 +11,30 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_flag, check_number
 from asm_gym.choices import check_choice
-from asm_gym.monitors import Monitor, Surprise
+from asm_gym.monitors import LearnsOnTheJob, Monitor, Surprise
 from asm_gym.policies.base import Policy
-from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract
-from asm_gym.stream import control_period
-from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Patience, Verdict
+from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Decision
+from asm_gym.wrappers.arguments import (
+    check_expectation,
+    check_monitor,
+    check_rate,
+    make_fallback,
+    make_patience,
+    make_reflex,
+)
+from asm_gym.wrappers.observer import Observer, joined
 from asm_gym.wrappers.recording import StreamSource
 
-REFLEXES: dict[str, Callable[[gym.Env[Any, Any]], Policy]] = {
-    "hold": Hold,
-    "retract": Retract,
-    "comply": Comply,
-    "recall": Recall,
-    "graded": Graded,
-}
-"""Reflexes by name: policies that act after an alarm."""
-ON_ALARM = ("monitor", *REFLEXES, "terminate")
-"""Names that ``on_alarm`` takes."""
 
-
-class Look(NamedTuple):
-    """What the monitor made of one row."""
+class RowReport(NamedTuple):
+    """What became of one row."""
 
     surprise: Surprise
-    verdict: Verdict
-    latency: float  # of the monitor [s]
+    decision: Decision
+    latency: float = 0.0  # of the monitor [s]
+    failure: str = ""
 
 
 class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -49,23 +45,29 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     ``release_after`` steps; what has alarmed is not counted again, so that a nudge costs a pause and not the task. With
     ``monitor_freq`` it watches within control steps too, and the reflex takes over at the next physics substep.
 
-    ``info["asm"]`` holds ``surprise`` (the largest of this step), ``threshold``, ``alarm`` (surprise is over the
-    threshold), ``intervened`` (the reflex acted in this step, or in a part of it), ``gave_up`` (it has acted for
-    ``max_override`` steps, and the episode ends), ``transition`` (who acts from now on: ``"override"``,
-    ``"release"``, ``"trial"``, ``"give_up"``, or empty where nothing changes; they go to the log ``asm_gym.safety`` as
-    well), ``failure`` (why the reflex could not act and the robot held instead,
-    or empty), ``executed_action`` (the last one), ``attribution`` (what each number of the stream adds to surprise),
-    ``surprises`` (n,) of all rows in this step, and ``latency_us`` (the longest time that the monitor took for one).
-    ``info["cost"]`` is 1.0 on every step with an alarm and 0.0 otherwise, as safe-RL libraries expect.
+    What fails is an alarm too, with the reflex in charge: a monitor that raises or returns nonsense, a stream that is
+    missing, a policy whose action is not finite, which is not done. A reflex that fails is replaced by staying; its
+    actions are clipped to the box. Where an exception leaves ``reset`` or ``step``, the episode has ended.
+
+    ``info["asm"]`` holds ``surprise`` (the largest of this step; infinite where something failed), ``threshold``,
+    ``alarm`` (surprise is over the threshold), ``intervened`` (something else than the policy acted in this step, or in
+    a part of it), ``gave_up`` (it has acted for ``max_override`` steps, and the episode ends), ``transition`` (who acts
+    from now on: ``"override"``, ``"release"``, ``"trial"``, ``"give_up"``, or empty where nothing changes; they go to
+    the log ``asm_gym.safety`` as well), ``failure`` (what failed in this step, ``policy: …``, ``stream: …``, ``monitor:
+    …`` or ``reflex: …``; or empty), ``executed_action`` (the last one), ``attribution`` (what each number of the stream
+    adds to surprise), ``surprises`` (n,) of all rows in this step, and ``latency_us`` (the longest time that the
+    monitor took for one). For loggers the same stands beside it as NumPy scalars: ``info["asm_surprise"]``,
+    ``info["asm_alarm"]``, ``info["asm_intervened"]``, and ``info["cost"]``, which is 1.0 on every step with an alarm
+    and 0.0 otherwise, as safe-RL libraries expect.
 
     Args:
         env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream.
         monitor: a fitted and calibrated monitor.
-        on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip; ``"retract"`` goes back along the
-            path; ``"comply"`` yields to what presses; ``"recall"`` goes on as the memory expects; ``"graded"`` stays,
-            yields to what keeps pressing, hands back on trial, and ends the episode where trials fail; ``"terminate"``
-            ends the episode; any other policy acts itself, and where it raises, or returns what is no finite action,
-            the robot holds.
+        on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip, in environments of this package under
+            every controller and wrapper; ``"retract"`` goes back along the path; ``"comply"`` yields to what presses;
+            ``"recall"`` goes on as the memory expects; ``"graded"`` stays, yields to what keeps pressing, hands back on
+            trial, and ends the episode where trials fail; ``"terminate"`` ends the episode; any other policy acts
+            itself, and where it raises, or returns what is no finite action, the robot holds.
         release_after: control steps of quiet after which control is handed back.
         release_below: share of the threshold, in (0, 1], that surprise must be under to count as quiet.
         max_override: control steps for which a reflex may act, after which the episode ends; an alarm that is back
@@ -84,7 +86,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Raises:
         ValueError: an unknown ``on_alarm``, a monitor fitted for another stream or rate (the message names what
-            differs), a rate that does not fit, or ``"recall"`` with a monitor that expects no action.
+            differs), a rate that does not fit, ``"recall"`` with a monitor that expects no action, or a wrapper inside
+            that changes actions, where the reflex cannot know what reaches the robot. Nothing is changed then.
         RuntimeError: the monitor is not calibrated.
     """
 
@@ -105,6 +108,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     ) -> None:
         RecordConstructorArgs.__init__(
             self,
+            _disable_deepcopy=True,  # a reflex holds its environment, and a memory is large
             monitor=monitor,
             on_alarm=on_alarm,
             release_after=release_after,
@@ -120,50 +124,66 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if not isinstance(env.action_space, gym.spaces.Box):
             raise TypeError(f"NeuralASMSafety needs a Box action space, got {env.action_space}")
         check_choice("on_overrun", on_overrun, ("warn", "alarm", "ignore"))
-        if not 0.0 <= learning_rate <= 1.0:
-            raise ValueError(f"learning_rate must be in [0, 1], got {learning_rate}")
-        if learning_rate > 0 and not hasattr(monitor, "adapt"):
+        self.learning_rate = check_number("learning_rate", learning_rate, low=0, high=1)
+        if learning_rate > 0 and not isinstance(monitor, LearnsOnTheJob):
             raise ValueError(f"{type(monitor).__name__} cannot learn on the job: learning_rate must be 0")
-        if monitor_freq is not None:
-            _watch_at(env, monitor_freq)
         self._source = StreamSource(env)
-        self._rows_per_step = self._source.rows_per_step
-        monitor.spec.require(self._source.spec, "the monitor")
+        watched = self._source.spec
+        if monitor_freq is not None:
+            sensing = check_rate(env, monitor_freq)
+            watched = sensing.stream_spec_at(monitor_freq)
+        self.threshold = check_monitor(monitor, watched)
         self.monitor = monitor
-        self.threshold, self.learning_rate = monitor.threshold, learning_rate
-        self._ends = "truncated" if truncate else "terminated"
+        self._ends = "truncated" if check_flag("truncate", truncate) else "terminated"
         self._on_alarm = on_alarm if isinstance(on_alarm, str) else "policy"
         reflex = make_reflex(on_alarm, env)
-        self._recalls = check_expectation(reflex, monitor)
+        self._observer = Observer(monitor, recalls=check_expectation(reflex, monitor))
         patience = make_patience(reflex, env, release_after, release_below, max_override, try_after)
-        self._arbiter = Arbiter(reflex, self.threshold, patience.in_rows(self._rows_per_step), make_fallback(env))
+        fallback = make_fallback(env)
+        if monitor_freq is not None:
+            sensing.stream_freq = monitor_freq  # nothing changes before everything is known to fit
+        self._rows_per_step = self._source.rows_per_step
+        self._arbiter = Arbiter(
+            reflex, self.threshold, patience.in_rows(self._rows_per_step), fallback, env.action_space
+        )
         self._on_overrun: str = on_overrun
         self._warm = self._warned = False
         self._ended = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self._ended = True  # until it has worked
         observation, info = self.env.reset(seed=seed, options=options)
-        self._state = self.monitor.initial_state(batch=1)
+        self._observer.begin()
         self._observation = observation
         self._arbiter.reset()
-        self._ended = False
         none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))
-        return observation, self._report(info, [Look(none, NOTHING, 0.0)], None)
+        self._ended = False
+        return observation, self._report(info, [RowReport(none, NOTHING)], None)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         if self._ended:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
-        self._executed = self._arbiter.executed(action, self._observation)
-        self._looks: list[Look] = []
+        action = np.asarray(action, dtype=np.float32)
+        if action.shape != self.action_space.shape:
+            raise ValueError(f"an action has the shape {self.action_space.shape}, got {action.shape}")
+        self._ended = True  # where anything raises, nobody knows what was done
+        self._failed = ""
+        self._command(action)
+        self._rows: list[RowReport] = []
         with self._within_steps():
             observation, reward, terminated, truncated, info = self.env.step(self._executed)
         self._observation = observation
-        self._look(self._source.row(observation, self._executed, info), ends_step=True)
-        asm = self._report(info, self._looks, self._executed)["asm"]
+        self._look(*self._sensed(observation, info), ends_step=True)
+        asm = self._report(info, self._rows, self._executed)["asm"]
         if asm["gave_up"] or (asm["alarm"] and self._on_alarm == "terminate"):
             terminated, truncated = terminated or self._ends == "terminated", truncated or self._ends == "truncated"
         self._ended = bool(terminated or truncated)
         return observation, reward, terminated, truncated, info
+
+    def _command(self, action: NDArray[np.float32]) -> None:
+        """Says what is to be done next: the policy's ``action`` (A,), or something else."""
+        self._executed, failure, self._refused = self._arbiter.command(action, self._observation)
+        self._failed = joined(self._failed, failure)
 
     @contextmanager
     def _within_steps(self) -> Iterator[None]:
@@ -178,23 +198,35 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         finally:
             hooks.remove(self._look)
 
-    def _look(self, row: NDArray[np.float32], ends_step: bool = False) -> None:
+    def _sensed(self, observation: Any, info: dict[str, Any]) -> tuple[NDArray[np.float32], str]:
+        """The row (D,) that ends a step, or NaN and what failed."""
+        try:
+            row = np.asarray(self._source.row(observation, self._executed, info), np.float32)
+            if row.shape != (self.monitor.spec.size,):
+                raise ValueError(f"a row has the shape {(self.monitor.spec.size,)}, got {row.shape}")
+        except Exception as error:
+            return np.full(self.monitor.spec.size, np.nan, np.float32), f"stream: {error!r}"
+        return row, ""
+
+    def _look(self, row: NDArray[np.float32], failure: str = "", ends_step: bool = False) -> None:
         """One row: what the monitor makes of it, and who acts next."""
-        before, start = self._state, time.perf_counter()
-        self._state, surprise = self.monitor.observe(before, row[None])
-        latency = time.perf_counter() - start
+        if self._refused:
+            failure, self._refused = joined(self._failed, failure), False
+        surprise, expected, (failure,), latency = self._observer.observe(row[None], (failure,))
         if self._late(latency):
-            surprise = surprise._replace(value=np.full(1, math.inf))
-        expected = self.monitor.expected_action(self._state)[0] if self._recalls else None  # type: ignore[attr-defined]
-        value = float(surprise.value[0])
-        verdict = self._arbiter.judge(value, row, self._executed, feel=ends_step, expected=expected)
-        if verdict.acted_on and hasattr(self.monitor, "resynchronise"):
-            self._state = self.monitor.resynchronise(self._state)
-        if self.learning_rate > 0 and not verdict.intervened:
-            self.monitor.adapt(before, row[None], surprise, self.learning_rate)  # type: ignore[attr-defined]
-        self._looks.append(Look(surprise, verdict, latency))
-        if self._arbiter.overriding and not verdict.intervened and not ends_step:
-            self._executed = self._arbiter.executed(self._executed, self._observation)
+            surprise = surprise._replace(value=np.full(1, np.inf))
+        if self.learning_rate > 0 and not self._arbiter.overriding and not failure:
+            failure = self._observer.learn(row[None], surprise, self.learning_rate)
+            surprise = surprise if not failure else surprise._replace(value=np.full(1, np.inf))
+        if failure:
+            self._arbiter.warn(failure, "which counts as an alarm")
+        decision = self._arbiter.decide(
+            float(surprise.value[0]), row, self._executed, ends_step, None if expected is None else expected[0]
+        )
+        forgot = self._observer.forget(np.array([decision.acted_on]))
+        self._rows.append(RowReport(surprise, decision, latency, joined(failure, decision.failure, forgot)))
+        if self._arbiter.overriding and not decision.intervened and not ends_step:
+            self._command(self._executed)
             self.env.get_wrapper_attr("command")(self._executed)
 
     def _late(self, latency: float) -> bool:
@@ -207,84 +239,27 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             )
         return late and self._on_overrun == "alarm"
 
-    def _report(self, info: dict[str, Any], looks: list[Look], executed: NDArray[np.float32] | None) -> dict[str, Any]:
-        surprises = np.array([look.surprise.value[0] for look in looks])
-        worst = looks[int(np.argmax(surprises))].surprise
-        alarm = any(not s <= self.threshold for s in surprises)
+    def _report(
+        self, info: dict[str, Any], rows: list[RowReport], executed: NDArray[np.float32] | None
+    ) -> dict[str, Any]:
+        surprises = np.array([row.surprise.value[0] for row in rows])
+        worst = rows[int(np.argmax(surprises))].surprise
+        alarm = bool((surprises > self.threshold).any())
+        intervened = any(row.decision.intervened for row in rows)
+        failed = (self._failed,) if executed is not None else ()
         info["asm"] = {
             "surprise": float(worst.value[0]),
             "threshold": self.threshold,
             "alarm": alarm,
-            "intervened": any(look.verdict.intervened for look in looks),
-            "gave_up": any(look.verdict.gave_up for look in looks),
-            "transition": next((t for look in reversed(looks) if (t := look.verdict.transition)), ""),
-            "failure": self._arbiter.failure,
+            "intervened": intervened,
+            "gave_up": any(row.decision.gave_up for row in rows),
+            "transition": next((t for row in reversed(rows) if (t := row.decision.transition)), ""),
+            "failure": joined(*failed, *(row.failure for row in rows)),
             "executed_action": executed,
             "attribution": dict(zip(self.monitor.spec.labels, worst.attribution[0].tolist(), strict=True)),
             "surprises": surprises,
-            "latency_us": 1e6 * max(look.latency for look in looks),
+            "latency_us": 1e6 * max(row.latency for row in rows),
         }
-        info["cost"] = 1.0 if alarm else 0.0
+        info["asm_surprise"], info["asm_alarm"] = np.float64(worst.value[0]), np.bool_(alarm)
+        info["asm_intervened"], info["cost"] = np.bool_(intervened), np.float64(alarm)
         return info
-
-
-def make_reflex(on_alarm: str | Policy, env: gym.Env[Any, Any]) -> Policy | None:
-    """The policy that acts during an alarm; None where none does."""
-    if not isinstance(on_alarm, str):
-        if not callable(getattr(on_alarm, "predict", None)):
-            raise ValueError(f"on_alarm must be one of {', '.join(ON_ALARM)} or have a predict(), got {on_alarm!r}")
-        return on_alarm
-    if on_alarm not in ON_ALARM:
-        raise ValueError(f"unknown on_alarm {on_alarm!r}; known: {', '.join(ON_ALARM)}, or any policy")
-    return REFLEXES[on_alarm](env) if on_alarm in REFLEXES else None
-
-
-def make_patience(
-    reflex: Policy | None,
-    env: gym.Env[Any, Any],
-    release_after: int,
-    release_below: float,
-    max_override: int | None,
-    try_after: int | None,
-) -> Patience:
-    """When control is handed back, in control steps; ``Graded`` has limits of its own where none are given."""
-    if isinstance(reflex, Graded):
-        dt = control_period(env)
-        try_after = try_after or max(1, round(reflex.TRY_AFTER_S / dt))
-        max_override = max_override or max(1, round(reflex.GIVE_UP_AFTER_S / dt))
-    return Patience(release_after, release_below, max_override, try_after)
-
-
-def make_fallback(env: gym.Env[Any, Any]) -> Hold:
-    """What acts where a reflex fails to: staying, or what comes nearest to no action."""
-    space = env.action_space
-    assert isinstance(space, gym.spaces.Box)
-    rest = np.clip(np.zeros(space.shape, np.float32), space.low, space.high)
-    return Hold(env) if not rest.any() else Hold(env, safe_action=rest)
-
-
-def check_expectation(reflex: Policy | None, monitor: Monitor) -> bool:
-    """Whether the reflex has to be told what the memory expects to be commanded.
-
-    Raises:
-        ValueError: it has, and the monitor expects nothing.
-    """
-    recalls = isinstance(reflex, Recall)
-    if recalls and not (hasattr(monitor, "expected_action") and monitor.spec.motor.size):
-        raise ValueError(f"recall needs a memory that expects actions, and {type(monitor).__name__} does not")
-    return recalls
-
-
-def _watch_at(env: gym.Env[Any, Any], rate: int) -> None:
-    """Makes an environment's stream run at ``rate`` [Hz]."""
-    inner: Any = env.unwrapped
-    if not hasattr(inner, "row_hooks"):
-        raise ValueError(f"monitor_freq needs an environment of asm_gym, which {inner} is not: leave it out")
-    wrapper = env
-    while isinstance(wrapper, gym.Wrapper):
-        if isinstance(wrapper, gym.ActionWrapper) and rate > 1 / control_period(env):
-            raise ValueError(
-                f"{type(wrapper).__name__} changes actions, and a reflex within a step would pass it by: put it outside"
-            )
-        wrapper = wrapper.env
-    inner.stream_freq = rate

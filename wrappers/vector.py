@@ -10,23 +10,26 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_flag
+from asm_gym.envs.abilities import HoldsItself
 from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.base import Policy
-from asm_gym.policies.reflexes import Hold
-from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Verdict
-from asm_gym.wrappers.batches import choose, final, members, replace
+from asm_gym.policies.reflexes import Hold, Reflex, nearest_to_rest
+from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Command, Decision
+from asm_gym.wrappers.arguments import check_expectation, check_monitor, make_fallback, make_patience, make_reflex
+from asm_gym.wrappers.batches import Mask, Member, final, members, refuse_changes, replace, set_attribute
+from asm_gym.wrappers.observer import Observer, joined
 from asm_gym.wrappers.recording import StreamSource
-from asm_gym.wrappers.safety import check_expectation, make_fallback, make_patience, make_reflex
-
-Mask = NDArray[np.bool_]
 
 
 class VectorNeuralASMSafety(VectorWrapper):
     """``NeuralASMSafety`` for n environments side by side, with one batched ``observe`` for all of them.
 
-    Arguments and reports are those of ``NeuralASMSafety``: ``info["asm"]`` holds arrays whose first axis is n, and
-    ``info["cost"]`` is (n,). Where an episode has just begun, surprise is 0 and ``executed_action`` NaN. Under
-    ``AutoresetMode.SAME_STEP`` the last step of an episode is reported in ``info["final_info"]``.
+    Arguments, promises and reports are those of ``NeuralASMSafety``: ``info["asm"]`` holds arrays whose first axis is
+    n, and ``info["cost"]``, ``info["asm_surprise"]``, ``info["asm_alarm"]`` and ``info["asm_intervened"]`` are (n,). A
+    monitor that raises has judged nobody, and all are in alarm; any other failure is that of one environment. Where an
+    episode has just begun, surprise is 0 and ``executed_action`` NaN. Under ``AutoresetMode.SAME_STEP`` the last step
+    of an episode is reported in ``info["final_info"]``.
 
     An episode that the wrapper itself ends begins anew as any other does. Under ``AutoresetMode.NEXT_STEP`` its
     environment, which cannot know, takes one more step before that, which nobody sees.
@@ -39,7 +42,8 @@ class VectorNeuralASMSafety(VectorWrapper):
 
     Raises:
         TypeError: ``env`` is no vector environment, cannot be asked for what its members are, or takes no Box actions.
-        ValueError: an unknown ``on_alarm``, or a monitor fitted for another stream (the message names the channels).
+        ValueError: an unknown ``on_alarm``, a monitor fitted for another stream (the message names the channels), or a
+            wrapper inside that changes actions, where the reflex cannot know what reaches the robot.
         RuntimeError: the monitor is not calibrated.
     """
 
@@ -58,47 +62,56 @@ class VectorNeuralASMSafety(VectorWrapper):
         super().__init__(env)
         if not isinstance(env.single_action_space, gym.spaces.Box):
             raise TypeError(f"VectorNeuralASMSafety needs a Box action space, got {env.single_action_space}")
-        if isinstance(on_alarm, Hold) and type(on_alarm) is not Hold:
+        self._space = env.single_action_space
+        if isinstance(on_alarm, Reflex) and not (isinstance(on_alarm, Hold) and on_alarm.explicit):
             raise ValueError(f"one {type(on_alarm).__name__} cannot act in several environments: give its name instead")
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
-        each = members(env)
-        self._own_stream = each[0].has_wrapper_attr("stream_spec")
-        for member in each:
+        self._members = members(env)
+        self._own_stream = self._members[0].has_wrapper_attr("stream_spec")
+        for member in self._members:
             source = StreamSource(member)
             if source.rows_per_step > 1:
                 raise ValueError("many environments are watched at their control rate: make them without stream_freq")
-            monitor.spec.require(source.spec, "the monitor")
-        self.monitor, self.threshold = monitor, monitor.threshold
-        self._ends_truncated = truncate
+            self.threshold = check_monitor(monitor, source.spec)
+        self.monitor = monitor
+        self._ends_truncated = check_flag("truncate", truncate)
         self._terminates = on_alarm == "terminate"
         limits = release_after, release_below, max_override, try_after
-        self._arbiters = [self._arbiter(on_alarm, member, limits) for member in each]
+        self._arbiters = [self._arbiter(on_alarm, member, limits) for member in self._members]
+        self._failures = [""] * env.num_envs
         self._ended: Mask | None = None
         self._forced = np.zeros(env.num_envs, bool)  # ended by this wrapper, which the environment does not know yet
 
-    def _arbiter(self, on_alarm: str | Policy, env: Any, limits: tuple[Any, ...]) -> Arbiter:
+    def _arbiter(self, on_alarm: str | Policy, env: Member, limits: tuple[Any, ...]) -> Arbiter:
         reflex = make_reflex(on_alarm, env)
-        self._recalls = check_expectation(reflex, self.monitor)
-        return Arbiter(reflex, self.threshold, make_patience(reflex, env, *limits), make_fallback(env))
+        holds = type(reflex) is Hold and (reflex.explicit or isinstance(env, HoldsItself))
+        if isinstance(reflex, Reflex) and not holds:
+            refuse_changes(self.env)
+        self._observer = Observer(self.monitor, self.num_envs, check_expectation(reflex, self.monitor))
+        patience = make_patience(reflex, env, *limits)
+        return Arbiter(reflex, self.threshold, patience, make_fallback(env), self._space)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         n = self.num_envs
         begun = np.array((options or {}).get("reset_mask", np.ones(n, bool)))
+        ended, self._ended = self._ended, None  # until it has worked
         # A copy: vector environments take the mask out of the options they are given.
         self._observations, infos = self.env.reset(seed=seed, options=dict(options) if options else options)
-        if self._ended is None:
+        if ended is None:
             if not begun.all():
                 raise gym.error.ResetNeeded("the first reset() must be of all environments")
-            self._ended, self._state = np.zeros(n, bool), self.monitor.initial_state(batch=n)
+            self._observer.begin()
+        self._ended = np.zeros(n, bool) if ended is None else ended
         self._begin(begun)
-        self._report(infos, self._unsurprised(), self._no_actions(), None, begun)
+        self._report(infos, self._nothing(), self._no_actions(), None, begun)
         return self._observations, infos
 
     def step(self, actions: Any) -> tuple[Any, NDArray[Any], Mask, Mask, dict[str, Any]]:
         if self._ended is None or (self._mode == AutoresetMode.DISABLED and self._ended.any()):
             raise gym.error.ResetNeeded("call reset() before step(): an environment's episode is not running")
-        begun = self._ended.copy()  # those that begin an episode in this step; none of them under SAME_STEP
-        executed = self._executed(actions)
+        begun, self._ended = self._ended.copy(), None  # where anything raises, nobody knows what was done
+        # Those of ``begun`` begin an episode in this step; none of them under SAME_STEP.
+        executed, commands = self._command(actions, begun)
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         if self._forced.any():
             forced = self._forced
@@ -108,71 +121,107 @@ class VectorNeuralASMSafety(VectorWrapper):
         same = self._mode == AutoresetMode.SAME_STEP
         known = np.asarray(terminated | truncated, bool)
         last = known if same else np.zeros_like(known)
-        surprise, verdicts = self._judge(self._rows(observations, executed, infos, last), executed, begun)
-        stopped = np.array([v.gave_up or (v.alarm and self._terminates) for v in verdicts]) & ~begun
+        rows, failures = self._sensed(observations, executed, infos, last)
+        surprise, decisions = self._decide(rows, executed, begun, commands, failures)
+        stopped = np.array([d.gave_up or (d.alarm and self._terminates) for d in decisions]) & ~begun
         terminated = np.asarray(terminated, bool) | (stopped & (not self._ends_truncated))
         truncated = np.asarray(truncated, bool) | (stopped & self._ends_truncated)
         self._forced = stopped & ~known
         if same and self._forced.any():
             observations, infos = self._restart(observations, infos)
         executed[begun] = np.nan
+        self._ended = np.zeros_like(begun)
         if same:
-            self._report_ends(infos, surprise, executed, verdicts, terminated | truncated)
+            self._report_ends(infos, surprise, executed, decisions, terminated | truncated)
         else:
             self._begin(begun)
-            self._report(infos, surprise, executed, verdicts, np.ones(self.num_envs, bool))
+            self._report(infos, surprise, executed, decisions, np.ones(self.num_envs, bool))
             self._ended = terminated | truncated
         self._observations = observations
         return observations, rewards, terminated, truncated, infos
 
-    def _executed(self, actions: Any) -> NDArray[np.float32]:
-        """(n, A) what is done."""
+    def _command(self, actions: Any, begun: Mask) -> tuple[NDArray[np.float32], list[Command]]:
+        """(n, A) what is done, and how it came to that in each."""
         chosen = np.array(actions, dtype=np.float32)
-        if any(a.overriding for a in self._arbiters):
-            observed = iterate(self.observation_space, self._observations)
-            for i, (arbiter, observation) in enumerate(zip(self._arbiters, observed, strict=True)):
-                chosen[i] = arbiter.executed(chosen[i], observation)
-        return chosen
+        if chosen.shape != self.env.action_space.shape:
+            raise ValueError(f"actions have the shape {self.env.action_space.shape}, got {chosen.shape}")
+        rest = Command(nearest_to_rest(self._space))  # where an episode begins, nothing is done
+        observed = iterate(self.observation_space, self._observations)
+        each = zip(self._arbiters, chosen, observed, begun, strict=True)
+        commands = [rest if fresh else arbiter.command(action, seen) for arbiter, action, seen, fresh in each]
+        able = [member for member in self._members if isinstance(member, HoldsItself)]
+        if any(member.holding for member in able):
+            set_attribute(self.env, "holding", [member.holding for member in able])
+            for member in able:
+                member.holding = False
+        return np.stack([command.action for command in commands]), commands
 
-    def _rows(
+    def _sensed(
         self, observations: Any, executed: NDArray[np.float32], infos: dict[str, Any], last: Mask
-    ) -> NDArray[np.float32]:
-        """(n, D) what was sensed in this step; of episodes that were in their ``last`` one, before they began anew."""
-        n = self.num_envs
-        if self._own_stream:
-            rows: NDArray[np.float32] = infos["stream"].copy()
-            if last.any():
-                rows[last] = infos["final_info"]["stream"][last]
-            return rows
-        sensed = np.array(observations, np.float32).reshape(n, -1)
-        for i in np.flatnonzero(last):
-            sensed[i] = np.ravel(infos["final_obs"][i])
-        return np.concatenate([sensed, executed.reshape(n, -1)], axis=1)
+    ) -> tuple[NDArray[np.float32], list[str]]:
+        """(n, D) what was sensed in this step, and what failed at that in each; of episodes that were in their ``last``
+        one, before they began anew."""
+        n, size = self.num_envs, self.monitor.spec.size
+        rows, failures = np.full((n, size), np.nan, np.float32), [""] * n
+        for i in range(n):
+            try:
+                row = self._row(i, observations, executed, infos, bool(last[i]))
+                if row.shape != (size,):
+                    raise ValueError(f"a row has the shape {(size,)}, got {row.shape}")
+                rows[i] = row
+            except Exception as error:
+                failures[i] = f"stream: {error!r}"
+        return rows, failures
 
-    def _judge(
-        self, rows: NDArray[np.float32], executed: NDArray[np.float32], begun: Mask
-    ) -> tuple[Surprise, list[Verdict]]:
+    def _row(
+        self, i: int, observations: Any, executed: NDArray[np.float32], infos: dict[str, Any], last: bool
+    ) -> NDArray[np.float32]:
+        """(D,) of one environment."""
+        if self._own_stream:
+            said = infos.get("final_info", {}) if last else infos
+            there = said.get("_stream")
+            if "stream" not in said or not (there is None or there[i]):
+                raise KeyError('info has no "stream"')
+            return np.asarray(said["stream"][i], np.float32)
+        sensed = infos["final_obs"][i] if last else observations[i]
+        both: NDArray[np.float32] = np.concatenate([np.ravel(sensed), np.ravel(executed[i])]).astype(np.float32)
+        return both
+
+    def _decide(
+        self,
+        rows: NDArray[np.float32],
+        executed: NDArray[np.float32],
+        begun: Mask,
+        commands: list[Command],
+        failures: list[str],
+    ) -> tuple[Surprise, list[Decision]]:
         """One ``observe`` for all, and who acts next in each; nothing counts where an episode has only ``begun``."""
-        self._state, surprise = self.monitor.observe(self._state, rows)
+        refused = (c.failure if c.refused else "" for c in commands)
+        known = (joined(r, f) if not b else "" for r, f, b in zip(refused, failures, begun, strict=True))
+        surprise, expected, failed, _ = self._observer.observe(rows, tuple(known))
         value = np.where(begun, 0.0, surprise.value)
-        surprise = Surprise(value, np.where(begun[:, None], 0.0, surprise.attribution))
-        expected: Any = [None] * len(rows)
-        if self._recalls:
-            expected = self.monitor.expected_action(self._state)  # type: ignore[attr-defined]
-        verdicts = [
-            NOTHING if begun[i] else arbiter.judge(float(value[i]), rows[i], executed[i], expected=expected[i])
-            for i, arbiter in enumerate(self._arbiters)
-        ]
-        acted_on = np.array([v.acted_on for v in verdicts])
-        if acted_on.any() and hasattr(self.monitor, "resynchronise"):
-            self._state = choose(acted_on, self.monitor.resynchronise(self._state), self._state)
-        return surprise, verdicts
+        surprise = surprise._replace(value=value, attribution=np.where(begun[:, None], 0.0, surprise.attribution))
+        decisions: list[Decision] = []
+        self._failures = [""] * self.num_envs
+        for i, arbiter in enumerate(self._arbiters):
+            if begun[i]:
+                decisions.append(NOTHING)
+                continue
+            if failed[i]:
+                arbiter.warn(failed[i], "which counts as an alarm")
+            said = None if expected is None else expected[i]
+            decisions.append(arbiter.decide(float(value[i]), rows[i], executed[i], expected=said))
+            self._failures[i] = joined(commands[i].failure, failed[i], decisions[i].failure)
+        forgot = self._observer.forget(np.array([d.acted_on for d in decisions]))
+        for i in np.flatnonzero([d.acted_on for d in decisions]):
+            self._failures[i] = joined(self._failures[i], forgot)
+        return surprise, decisions
 
     def _begin(self, begun: Mask) -> None:
         """New episodes."""
         assert self._ended is not None
         self._ended[begun] = self._forced[begun] = False
-        self._state = choose(begun, self.monitor.initial_state(batch=self.num_envs), self._state)
+        self._observer.begin_in(begun)
         for i in np.flatnonzero(begun):
             self._arbiters[i].reset()
 
@@ -188,46 +237,48 @@ class VectorNeuralASMSafety(VectorWrapper):
         infos: dict[str, Any],
         surprise: Surprise,
         executed: NDArray[np.float32],
-        verdicts: list[Verdict],
+        decisions: list[Decision],
         ended: Mask,
     ) -> None:
         """What ended is reported in ``final_info``, and what has begun in its place in ``infos``."""
         if ended.any():
-            self._report(infos["final_info"], surprise, executed, verdicts, ended)
+            self._report(infos["final_info"], surprise, executed, decisions, ended)
             self._begin(ended)
             surprise = Surprise(
                 np.where(ended, 0.0, surprise.value), np.where(ended[:, None], 0.0, surprise.attribution)
             )
             executed = np.where(ended[:, None], np.float32(np.nan), executed)
-            verdicts = [NOTHING if e else v for e, v in zip(ended, verdicts, strict=True)]
-        self._report(infos, surprise, executed, verdicts, np.ones(self.num_envs, bool))
+            decisions = [NOTHING if e else d for e, d in zip(ended, decisions, strict=True)]
+        self._report(infos, surprise, executed, decisions, np.ones(self.num_envs, bool))
 
     def _report(
         self,
         infos: dict[str, Any],
         surprise: Surprise,
         executed: NDArray[np.float32],
-        verdicts: list[Verdict] | None,
+        decisions: list[Decision] | None,
         present: Mask,
     ) -> None:
         """Adds ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
-        alarm = ~(surprise.value <= self.threshold)  # what is no number is an alarm
-        verdicts = verdicts or [NOTHING] * self.num_envs
+        alarm = surprise.value > self.threshold
+        decisions = decisions or [NOTHING] * self.num_envs
+        intervened = np.array([d.intervened for d in decisions])
         infos["asm"] = {
             "surprise": surprise.value,
             "threshold": np.full(self.num_envs, self.threshold),
             "alarm": alarm,
-            "intervened": np.array([v.intervened for v in verdicts]),
-            "gave_up": np.array([v.gave_up for v in verdicts]),
-            "transition": np.array([v.transition for v in verdicts]),
-            "failure": np.array([arbiter.failure for arbiter in self._arbiters]),
+            "intervened": intervened,
+            "gave_up": np.array([d.gave_up for d in decisions]),
+            "transition": np.array([d.transition for d in decisions]),
+            "failure": np.where([d is NOTHING for d in decisions], "", self._failures),
             "executed_action": executed,
             "attribution": dict(zip(self.monitor.spec.labels, surprise.attribution.T, strict=True)),
         }
-        infos["cost"] = alarm.astype(np.float64)
-        infos["_asm"] = infos["_cost"] = present
+        flat = {"asm_surprise": surprise.value, "asm_alarm": alarm, "asm_intervened": intervened}
+        infos.update(flat, cost=alarm.astype(np.float64))
+        infos.update({f"_{key}": present for key in ("asm", "cost", *flat)})
 
-    def _unsurprised(self) -> Surprise:
+    def _nothing(self) -> Surprise:
         return Surprise(np.zeros(self.num_envs), np.zeros((self.num_envs, self.monitor.spec.size)))
 
     def _no_actions(self) -> NDArray[np.float32]:

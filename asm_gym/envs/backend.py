@@ -23,6 +23,9 @@ PHYSICS_FREQ = 500
 CONTROLLERS = ("OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "JOINT_TORQUE", "IK_POSE")
 """Robosuite's controllers of an arm, less JOINT_VELOCITY, which fails inside robosuite 1.5."""
 
+IK_ROBOTS = ("Panda", "Sawyer")
+"""Arms that robosuite's inverse kinematics knows."""
+
 # Tasks that choose one of several objects for each episode, and the attribute that holds the choice.
 _CHOSEN = {"PickPlaceSingle": "object_id", "NutAssemblySingle": "nut_id"}
 
@@ -80,6 +83,9 @@ def make(
     robosuite = import_robosuite()
     if isinstance(controller, str):
         check_choice("controller", controller, CONTROLLERS)
+    unknown = [robot for robot in robots if robot not in IK_ROBOTS]
+    if unknown and (controller == "IK_POSE" or (isinstance(controller, dict) and controller.get("type") == "IK_POSE")):
+        raise ValueError(f"IK_POSE is for {', '.join(IK_ROBOTS)}, and not for {unknown[0]}")
     return robosuite.make(
         task.name,
         robots=list(robots),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -120,6 +121,9 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.row_hooks: list[Callable[[NDArray[np.float32]], None]] = []
         """Called with every row of the stream that is sensed within a control step, all but the last; ``command()``
         gives the controllers another action from the next physics substep on."""
+        self.holding = False
+        """Set, the arms stay in the next control step, and the grippers keep what they were told, whatever action
+        arrives; from within a hook, in the rest of the step that runs. The step unsets it."""
         self.substeps = backend.PHYSICS_FREQ // control_freq
         self._groups = tuple(stream)
         self._flat = observation == "flat"
@@ -180,6 +184,15 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._row_substeps = _row_substeps(rate, backend.PHYSICS_FREQ // self.substeps)
         self._build_spaces()
 
+    def stream_spec_at(self, rate: int) -> StreamSpec:
+        """``stream_spec`` as it would be at another rate [Hz]; nothing is changed.
+
+        Raises:
+            ValueError: a rate that does not fit physics or control.
+        """
+        substeps = _row_substeps(rate, backend.PHYSICS_FREQ // self.substeps)
+        return replace(self.stream_spec, dt=substeps / backend.PHYSICS_FREQ)
+
     # ------------------------------------------------------------------ episodes
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -194,6 +207,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         Raises:
             ValueError: an unknown option.
         """
+        self._ended = True  # until it has worked
         super().reset(seed=seed)
         noise = self._qpos_noise
         for name, value in (options or {}).items():
@@ -215,9 +229,10 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         else:
             self.simulation.begin_episode()
         self._warnings = self._bad_count()
-        self._steps, self._ended = 0, False
+        self._steps, self.holding = 0, False
         self._action = np.zeros(self.action_space.shape, np.float32)  # type: ignore[arg-type]
         self._row = self.measure()
+        self._ended = False
         if self.render_mode == "human":
             self.render()
         return self._observation(), self._info(bool(env._check_success()))
@@ -237,8 +252,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
         env = self.robosuite_env
         env.timestep += 1
-        self._action = action
-        self.simulation.begin(self._delivered(action))
+        self.simulation.begin()
+        self.command(action)
         self._rows: list[NDArray[np.float32]] = []
         self._advance()
         env.cur_time += env.control_timestep
@@ -280,8 +295,19 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         Raises:
             ValueError: a wrong shape, or an action that is not finite.
         """
-        self._action = self._checked(action)
-        self.simulation.command(self._delivered(self._action))
+        action = self._checked(action)
+        held, self.holding = self.holding, False
+        self._action = self._resting() if held else action
+        self.simulation.command(self._delivered(self._action), held)
+
+    def _resting(self) -> NDArray[np.float32]:
+        """(A,) the action that changes nothing, where there is one, with the grippers as they were told last."""
+        grip, action = list(self.gripper_actions), np.zeros_like(self._action)
+        if self.simulation.compiled:
+            for part, motion in self.simulation.motions(np.zeros(len(self.motors))):
+                action[part] = np.clip(motion, -1.0, 1.0)
+        action[grip] = self._action[grip]
+        return action
 
     def action_for(self, turns: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """The action that moves the arms' joints by ``turns`` from where they are, as nearly as one step can.

@@ -19,6 +19,9 @@ from asm_gym.envs.views import JOINTS, Goals, Nominal, Views
 
 # What the controllers and the torque estimate know of the robot. Whoever edits these in the model edits the world, not
 # the robot's knowledge of it.
+STIFFNESS, DAMPING = 150.0, 2 * 150.0**0.5
+"""Of arms that are held beneath their controllers [1/s², 1/s]: those of robosuite's own controllers of the hand."""
+
 _INERTIA = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
 
 
@@ -67,6 +70,11 @@ class Simulation:
         self.compiled = all(compilable(robot, arm) for robot, arm in self._parts)
         """Whether control runs compiled."""
         self._arms = describe(self._parts, self.model)
+        self._anchor: NDArray[np.float64] | None = None
+        self._joints, self._dofs = (
+            np.concatenate([getattr(robot, name) for robot, _ in self._parts])
+            for name in ("_ref_joint_pos_indexes", "_ref_joint_vel_indexes")
+        )
         n = len(self._parts)
         self._goals = Goals(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, JOINTS)))
         self._deltas = np.zeros((n, JOINTS))
@@ -80,14 +88,20 @@ class Simulation:
 
     # ------------------------------------------------------------------ control steps
 
-    def begin(self, action: NDArray[np.float64]) -> None:
+    def begin(self) -> None:
         """Begins a control step."""
         self._done = self._row_began = 0
         self._felt = (0.0, 0.0, 0.0)
-        self.command(action)
 
-    def command(self, action: NDArray[np.float64]) -> None:
-        """Gives the controllers a new set-point, which they take up in the next substep."""
+    def command(self, action: NDArray[np.float64], hold: bool = False) -> None:
+        """Gives the controllers a new set-point, which they take up in the next substep.
+
+        Args:
+            hold: the arms are to stay. Compiled controllers do so by an action of no change. Some of the others never
+                do: a pose is kept by turning joints, and a torque of zero brakes nothing. So the arms are braked
+                beneath them, and held where they were when they were first told to.
+        """
+        self._anchor = (self.data.qpos[self._joints] if self._anchor is None else self._anchor) if hold else None
         self._action = action
         self._fresh = True
         if self.compiled:
@@ -112,11 +126,22 @@ class Simulation:
             for k in range(self._done, self._done + count):
                 self.env.sim.step1()
                 self.env._pre_action(self._action, self._fresh)
+                if self._anchor is not None:
+                    self._brake(self._anchor)
                 self.env.sim.step2()
                 kernels.sample(self._views, self._nominal(), self._arms, k - self._row_began, self._samples)
                 self._fresh = False
         self._fresh = False
         self._done += count
+
+    def _brake(self, anchor: NDArray[np.float64]) -> None:
+        """τ = M (Kp (q₀ - q) - Kd q̇) + h, with q₀ the joints' ``anchor`` (J,) [rad]."""
+        M = np.zeros((self.model.nv, self.model.nv))
+        mujoco.mj_fullM(self.model, M, self.data.qM)
+        dofs, motors = self._dofs, self.motors
+        wanted = STIFFNESS * (anchor - self.data.qpos[self._joints]) - DAMPING * self.data.qvel[dofs]
+        torque = M[np.ix_(dofs, dofs)] @ wanted + self.data.qfrc_bias[dofs]
+        self.data.ctrl[motors] = np.clip(torque, *self.model.actuator_ctrlrange[motors].T)
 
     def begin_row(self) -> None:
         """What comes now is summarised by itself; the forces go on to be those of the whole control step."""

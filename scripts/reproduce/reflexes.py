@@ -35,7 +35,7 @@ from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, record, watch
 from asm_gym.scripts.command import USAGE_ERRORS
 from asm_gym.tasks import task as task_spec
-from asm_gym.wrappers.safety import ON_ALARM
+from asm_gym.wrappers.arguments import ON_ALARM
 
 FAULTS = (NOMINAL, PASSING, "collision", "held_by_person", "stuck_joint", "encoder_bias")
 

@@ -1,0 +1,53 @@
+"""What an environment may be able to do beyond Gymnasium's contract, said as typed protocols."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.stream import StreamSpec
+
+
+@runtime_checkable
+class HasGrippers(Protocol):
+    """Some numbers of its action command grippers."""
+
+    gripper_actions: tuple[int, ...]
+
+
+@runtime_checkable
+class HoldsItself(Protocol):
+    """It can stay where it is, whatever its controller, and whatever wrappers make of an action on its way."""
+
+    holding: bool
+    """Set, the arms stay in the next control step, and the grippers keep what they were told; the step unsets it."""
+
+
+@runtime_checkable
+class TurnsJoints(Protocol):
+    """Its actions can be found that turn the arms' joints."""
+
+    controller: str
+
+    def action_for(self, turns: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+        """(A,) the action that turns the joints by so much [rad]."""
+        ...
+
+
+@runtime_checkable
+class SensesWithinSteps(Protocol):
+    """Its stream can run faster than control, and its action be replaced within a step."""
+
+    row_hooks: list[Callable[[NDArray[np.float32]], None]]
+    stream_freq: int
+
+    def stream_spec_at(self, rate: int) -> StreamSpec:
+        """Of the stream at another rate [Hz]. Raises ValueError for one that does not fit."""
+        ...
+
+    def command(self, action: NDArray[np.float32]) -> None:
+        """From within a hook: another action for the rest of the control step."""
+        ...

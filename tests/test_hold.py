@@ -1,0 +1,186 @@
+"""A hold that holds: under every controller, every robot and every wrapper order, with the joints' motion as oracle."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+
+import asm_gym  # noqa: F401
+from asm_gym.envs.backend import CONTROLLERS, IK_ROBOTS
+from asm_gym.faults import Push
+from asm_gym.policies import make_policy
+from asm_gym.tasks import ROBOTS
+from asm_gym.wrappers import FaultInjection, NeuralASMSafety, VectorNeuralASMSafety
+from tests.fakes import CueMonitor, FadingMonitor
+
+AT = 8
+"""The control step from which the robot is held, at full speed."""
+FEEDBACK = ("OSC_POSE", "JOINT_POSITION")
+"""Controllers that hold by an action of no change; beneath all others the arms are braked."""
+
+
+def joints(env):
+    """Angles [rad] and speeds [rad/s]."""
+    sim = env.unwrapped.simulation
+    return sim.data.qpos[sim._joints].copy(), sim.data.qvel[sim._dofs].copy()
+
+
+def motion(env, held=30):
+    """How fast the joints were when they were held, how far they then went, and how fast they are at last."""
+    env.reset(seed=1)
+    action = np.sign(np.random.default_rng(1).standard_normal(env.action_space.shape)).astype(np.float32)
+    for _ in range(AT):
+        env.step(action)
+    (start, speed), farthest = joints(env), 0.0
+    for _ in range(held):
+        info = env.step(action)[4]
+        assert info["asm"]["intervened"]
+        assert not info["asm"]["failure"]
+        farthest = max(farthest, float(np.abs(joints(env)[0] - start).max()))
+    return float(np.abs(speed).max()), farthest, float(np.abs(joints(env)[1]).max())
+
+
+def made(robot="Panda", controller="OSC_POSE", **more):
+    return gym.make("asm_gym/Lift-v0", robot=robot, controller=controller, horizon=500, **more)
+
+
+def guarded(env, **more):
+    return NeuralASMSafety(env, CueMonitor(range(AT - 1, 500), spec=env.get_wrapper_attr("stream_spec")), **more)
+
+
+def assert_stays(controller, speed, farthest, last):
+    # Critically damped at ω a joint goes v₀/(e ω) further. OSC only damps, and goes on keeping its posture meanwhile.
+    assert farthest < (0.02 + 0.5 * speed if controller.startswith(FEEDBACK) else 0.005 + 0.06 * speed)
+    assert last < 0.25 if controller == "OSC_POSE" else last < 0.02
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("robot", [r if r == "Panda" else pytest.param(r, marks=pytest.mark.slow) for r in ROBOTS])
+def test_held_at_speed_the_joints_stop_where_they_are(robot, controller):
+    if controller == "IK_POSE" and robot not in IK_ROBOTS:
+        with pytest.raises(ValueError, match=f"IK_POSE is for Panda, Sawyer, and not for {robot}"):
+            made(robot, controller)
+        return
+    env = guarded(made(robot, controller))
+    assert_stays(controller, *motion(env))
+    env.close()
+
+
+def test_a_torque_controller_that_was_given_strength_is_braked():
+    strong = {"type": "JOINT_TORQUE", "input_max": 1, "input_min": -1, "output_max": 10.0, "output_min": -10.0}
+    env = guarded(made(controller=strong | {"interpolation": None, "torque_limits": None}))
+    speed, farthest, last = motion(env)
+    assert speed > 0.5
+    assert_stays("custom", speed, farthest, last)
+    env.close()
+
+
+class Halved(gym.ActionWrapper):
+    def action(self, action):
+        return 0.5 * action + 0.5
+
+
+class Stubborn(gym.Wrapper):
+    """Drives on at full scale whatever it is told, and is no ActionWrapper."""
+
+    def step(self, action):
+        return self.env.step(np.ones_like(action))
+
+
+INSIDE = {
+    "rescaled": lambda e: gym.wrappers.RescaleAction(e, np.float32(0.0), np.float32(1.0)),
+    "sticky": lambda e: gym.wrappers.StickyAction(e, 0.9),
+    "shifted": Halved,
+    "clipped": gym.wrappers.ClipAction,
+    "stubborn": Stubborn,
+    "faults": lambda e: FaultInjection(e, []),
+}
+
+
+@pytest.mark.parametrize("inside", INSIDE.values(), ids=INSIDE)
+def test_whatever_wrapper_is_inside_the_robot_stays(inside, lift):
+    assert_stays("OSC_POSE", *motion(guarded(inside(lift))))
+
+
+def test_whatever_wrapper_is_outside_the_robot_stays(lift):
+    assert_stays("OSC_POSE", *motion(INSIDE["rescaled"](guarded(lift))))
+
+
+def test_a_hold_keeps_the_grip_whatever_wrapper_is_inside(lift):
+    env = guarded(INSIDE["rescaled"](lift))
+    env.reset(seed=0)
+    for _ in range(AT + 2):
+        stream = env.step(np.ones(7, np.float32))[4]["stream"]
+    commanded = stream[lift.unwrapped.stream_spec.slices["action"]]
+    np.testing.assert_array_equal(commanded, [0, 0, 0, 0, 0, 0, 1])
+
+
+def test_held_within_a_step_the_robot_stays_too():
+    env = made(controller="IK_POSE")
+    spec = env.unwrapped.stream_spec_at(100)
+    env = NeuralASMSafety(env, CueMonitor(range(5 * AT - 3, 2500), spec=spec), monitor_freq=100)
+    speed, farthest, _ = motion(env)
+    assert farthest < 0.005 + 0.06 * speed
+    env.close()
+
+
+def test_the_policy_called_hold_holds_under_inverse_kinematics():
+    env = made(controller="IK_POSE")
+    observation, _ = env.reset(seed=0)
+    policy = make_policy("hold", env)
+    start = joints(env)[0]
+    for _ in range(20):
+        observation = env.step(policy.predict(observation)[0])[0]
+    assert np.abs(joints(env)[0] - start).max() < 0.005
+    env.close()
+
+
+def test_what_pushes_an_arm_that_is_braked_meets_a_spring_and_it_comes_back():
+    env = FaultInjection(made(controller="IK_POSE"), [Push(newtons=20.0, onset=AT + 5, duration=10)])
+    env = guarded(env)
+    env.reset(seed=0)
+    for _ in range(AT + 4):
+        env.step(np.zeros(7, np.float32))
+    start, moved = joints(env)[0], []
+    for _ in range(30):
+        env.step(np.zeros(7, np.float32))
+        moved.append(np.abs(joints(env)[0] - start).max())
+    assert 0.003 < max(moved) < 0.2
+    assert moved[-1] < 0.5 * max(moved)  # but for dry friction
+    env.close()
+
+
+def test_a_flag_left_behind_is_forgotten_by_reset_and_used_up_by_a_step(lift):
+    env = lift.unwrapped
+    action = np.full(7, 0.5, np.float32)
+    at = env.stream_spec.slices["action"]
+    env.reset(seed=0)
+    env.holding = True
+    env.reset(seed=0)
+    assert env.step(action)[4]["stream"][at][0] == 0.5
+    env.holding = True
+    assert env.step(action)[4]["stream"][at][0] == 0.0
+    assert env.step(action)[4]["stream"][at][0] == 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("many", [SyncVectorEnv, AsyncVectorEnv])
+def test_in_many_environments_those_that_are_held_stay_and_the_others_go_on(many):
+    def make():
+        return INSIDE["rescaled"](made(controller="IK_POSE"))
+
+    class Second(FadingMonitor):
+        def observe(self, state, stream):
+            state, surprise = super().observe(state, stream)
+            value = np.where(np.arange(2) == 1, 10.0, 0.0) * (state.steps > 3)
+            return state, surprise._replace(value=value)
+
+    inner = many([make, make])
+    env = VectorNeuralASMSafety(inner, Second(spec=inner.get_attr("stream_spec")[0]))
+    env.reset(seed=0)
+    at = env.monitor.spec.slices["joint_position"]
+    streams = np.stack([env.step(np.ones((2, 7), np.float32))[4]["stream"][:, at] for _ in range(25)])
+    moved = np.abs(streams - streams[5]).max(axis=2)[5:]  # (steps, environments)
+    assert moved[:, 1].max() < 0.05
+    assert moved[:, 0].max() > 0.2
+    env.close()

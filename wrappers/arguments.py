@@ -1,0 +1,106 @@
+"""What the safety wrappers are given: reflexes by name, patience, and whether monitor and environment fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+
+from asm_gym.checks import check_number, shown
+from asm_gym.envs.abilities import SensesWithinSteps
+from asm_gym.monitors import ExpectsActions, Monitor
+from asm_gym.policies.base import Policy
+from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract, nearest_to_rest
+from asm_gym.stream import StreamSpec, control_period
+from asm_gym.wrappers.arbitration import Patience
+
+REFLEXES: dict[str, Callable[[gym.Env[Any, Any]], Policy]] = {
+    "hold": Hold,
+    "retract": Retract,
+    "comply": Comply,
+    "recall": Recall,
+    "graded": Graded,
+}
+"""Reflexes by name: policies that act after an alarm."""
+ON_ALARM = ("monitor", *REFLEXES, "terminate")
+"""Names that ``on_alarm`` takes."""
+
+
+def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
+    """The monitor's threshold, once it can watch such a stream.
+
+    Raises:
+        ValueError: it is for another stream (the message names what differs), or would never alarm.
+        RuntimeError: it is not calibrated.
+    """
+    monitor.spec.require(watched, "the monitor")
+    return check_number("the monitor's threshold", monitor.threshold)
+
+
+def make_reflex(on_alarm: str | Policy, env: gym.Env[Any, Any]) -> Policy | None:
+    """The policy that acts during an alarm; None where none does."""
+    if not isinstance(on_alarm, str):
+        if not callable(getattr(on_alarm, "predict", None)):
+            raise ValueError(f"on_alarm must be one of {', '.join(ON_ALARM)} or have a predict(), got {on_alarm!r}")
+        return on_alarm
+    if on_alarm not in ON_ALARM:
+        raise ValueError(f"unknown on_alarm {shown(on_alarm)}; known: {', '.join(ON_ALARM)}, or any policy")
+    return REFLEXES[on_alarm](env) if on_alarm in REFLEXES else None
+
+
+def make_patience(
+    reflex: Policy | None,
+    env: gym.Env[Any, Any],
+    release_after: int,
+    release_below: float,
+    max_override: int | None,
+    try_after: int | None,
+) -> Patience:
+    """When control is handed back, in control steps; ``Graded`` has limits of its own where none are given."""
+    if isinstance(reflex, Graded):
+        dt = control_period(env)
+        try_after = max(1, round(reflex.TRY_AFTER_S / dt)) if try_after is None else try_after
+        max_override = max(1, round(reflex.GIVE_UP_AFTER_S / dt)) if max_override is None else max_override
+    return Patience(release_after, release_below, max_override, try_after)
+
+
+def make_fallback(env: gym.Env[Any, Any]) -> Hold:
+    """What acts where nobody else can: staying, or what comes nearest to no action."""
+    try:
+        return Hold(env)
+    except ValueError:  # no action is known to rest, and a reflex that needs one has refused already
+        space: Any = env.action_space
+        return Hold(env, safe_action=nearest_to_rest(space))
+
+
+def check_expectation(reflex: Policy | None, monitor: Monitor) -> bool:
+    """Whether the reflex has to be told what the memory expects to be commanded.
+
+    Raises:
+        ValueError: it has, and the monitor expects nothing.
+    """
+    recalls = isinstance(reflex, Recall)
+    if recalls and not (isinstance(monitor, ExpectsActions) and monitor.spec.motor.size):
+        raise ValueError(f"recall needs a memory that expects actions, and {type(monitor).__name__} does not")
+    return recalls
+
+
+def check_rate(env: gym.Env[Any, Any], rate: int) -> SensesWithinSteps:
+    """The environment underneath, once its stream can run at ``rate`` [Hz]; nothing is changed.
+
+    Raises:
+        ValueError: it cannot, or a wrapper inside changes actions, which a reflex within a step would pass by.
+    """
+    check_number("monitor_freq", rate, low=1, whole=True)
+    inner = env.unwrapped
+    if not isinstance(inner, SensesWithinSteps):
+        raise ValueError(f"monitor_freq needs an environment of asm_gym, which {inner} is not: leave it out")
+    wrapper = env
+    while isinstance(wrapper, gym.Wrapper):
+        if isinstance(wrapper, gym.ActionWrapper) and rate > 1 / control_period(env):
+            raise ValueError(
+                f"{type(wrapper).__name__} changes actions, and a reflex within a step would pass it by: put it outside"
+            )
+        wrapper = wrapper.env
+    return inner

@@ -1,0 +1,120 @@
+"""Asks a monitor what it makes of the rows, and takes whatever goes wrong with that for infinite surprise."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.monitors import ExpectsActions, ForgetsEvidence, LearnsOnTheJob, Monitor, Surprise
+from asm_gym.wrappers.batches import Mask, choose
+
+
+class Observation(NamedTuple):
+    """What a monitor made of n rows.
+
+    Attributes:
+        surprise: infinite, and attributed to nothing, where there is a failure.
+        expected: (n, A) what is likely to be commanded next; None where nobody asks.
+        failures: n, what failed; empty where nothing did.
+        latency: [s].
+    """
+
+    surprise: Surprise
+    expected: NDArray[np.float32] | None
+    failures: tuple[str, ...]
+    latency: float
+
+
+class Observer:
+    """Watches n streams with one monitor, and keeps its state.
+
+    Args:
+        monitor: fitted and calibrated.
+        batch: n.
+        recalls: the monitor is asked what it expects to be commanded.
+    """
+
+    def __init__(self, monitor: Monitor, batch: int = 1, recalls: bool = False) -> None:
+        self._monitor, self._batch, self._recalls = monitor, batch, recalls
+
+    def begin(self) -> None:
+        """New episodes in all streams."""
+        self._state = self._before = self._initial = self._monitor.initial_state(batch=self._batch)
+
+    def begin_in(self, begun: Mask) -> None:
+        """New episodes in the streams of ``begun`` (n,)."""
+        self._state = self._initial if begun.all() else choose(begun, self._initial, self._state)
+
+    def observe(self, rows: NDArray[np.float32], failures: tuple[str, ...]) -> Observation:
+        """Judges the next rows (n, D), some of which may be no more than NaN by the failures that are known already."""
+        self._before, start, latency = self._state, time.perf_counter(), 0.0
+        try:
+            state, surprise = self._monitor.observe(self._before, rows)
+            latency = time.perf_counter() - start
+            surprise = self._checked(surprise)
+            expected = self._expected(state)
+            self._state = state
+        except Exception as error:
+            # Nobody has looked at these rows.
+            none = Surprise(np.zeros(self._batch), np.zeros((self._batch, self._monitor.spec.size)))
+            failures = tuple(joined(f, f"monitor: {error!r}") for f in failures)
+            return Observation(_infinite(none, failures), None, failures, latency)
+        lost = ~(surprise.value > -np.inf)  # NaN too
+        failures = tuple(
+            joined(f, f"monitor: its surprise is {v}") if no else f
+            for f, v, no in zip(failures, surprise.value, lost, strict=True)
+        )
+        return Observation(_infinite(surprise, failures), expected, failures, latency)
+
+    def forget(self, acted_on: Mask) -> str:
+        """Lets the evidence begin anew in the streams of ``acted_on`` (n,); what failed at that."""
+        if not isinstance(self._monitor, ForgetsEvidence) or not acted_on.any():
+            return ""
+        try:
+            state = self._monitor.reset_evidence(self._state)
+            self._state = state if acted_on.all() else choose(acted_on, state, self._state)
+        except Exception as error:
+            return f"monitor: {error!r}"
+        return ""
+
+    def learn(self, rows: NDArray[np.float32], surprise: Surprise, rate: float) -> str:
+        """Lets the monitor learn from the rows that were observed last; what failed at that."""
+        try:
+            if isinstance(self._monitor, LearnsOnTheJob):
+                self._monitor.adapt(self._before, rows, surprise, rate)
+        except Exception as error:
+            return f"monitor: {error!r}"
+        return ""
+
+    def _checked(self, surprise: Surprise) -> Surprise:
+        shapes = (self._batch,), (self._batch, self._monitor.spec.size)
+        value, attribution = (np.array(part, np.float64) for part in (surprise.value, surprise.attribution))
+        if (value.shape, attribution.shape) != shapes:
+            raise ValueError(
+                f"a surprise must have values of shape {shapes[0]} and attributions of shape {shapes[1]}, "
+                f"got {value.shape} and {attribution.shape}"
+            )
+        return surprise._replace(value=value, attribution=attribution)
+
+    def _expected(self, state: Any) -> NDArray[np.float32] | None:
+        if not self._recalls or not isinstance(self._monitor, ExpectsActions):
+            return None
+        expected = np.asarray(self._monitor.expected_action(state), np.float32)
+        if expected.shape != (self._batch, self._monitor.spec.motor.size):
+            raise ValueError(f"expected_action has the shape {expected.shape}")
+        return expected
+
+
+def joined(*failures: str) -> str:
+    """Several failures in one line, each once; empty where there is none."""
+    return "; ".join(dict.fromkeys(f for f in failures if f))
+
+
+def _infinite(surprise: Surprise, failures: tuple[str, ...]) -> Surprise:
+    """Infinite, and attributed to nothing, where there are failures."""
+    failed = np.array([bool(f) for f in failures])
+    value = np.where(failed, np.inf, surprise.value)
+    return surprise._replace(value=value, attribution=np.where(failed[:, None], 0.0, surprise.attribution))
