@@ -12,7 +12,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib import metadata
@@ -22,14 +22,21 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 from rich.console import Console
-from rich.table import Table as RichTable
 
 from asm_gym.detection.detector import conformal_episodes
-from asm_gym.evaluation import plots
-from asm_gym.evaluation.metrics import Row, summarise
-from asm_gym.evaluation.report import detection_table, headline, outcome_table, write_report
+from asm_gym.evaluation import figures
+from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, false_alarms_per_hour, typical
+from asm_gym.evaluation.report import write_report
 from asm_gym.evaluation.statistics import Share, binomial_interval
-from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
+from asm_gym.evaluation.tables import (
+    BRIEF_CONDITION_COLUMNS,
+    console_table,
+    detection_table,
+    headline,
+    outcome_table,
+    tabulate,
+)
+from asm_gym.evaluation.trace import NOMINAL
 from asm_gym.faults import Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.collect import collect
@@ -162,71 +169,45 @@ def observe_latency_us(memory: NeuralASM, calls: int = 2000) -> dict[str, float]
     return {"median": round(float(median), 1), "p95": round(float(p95), 1)}
 
 
-def typical(traces: list[Trace]) -> list[Trace]:
-    """For each condition, the watched episode whose greatest surprise is the median one."""
-    chosen = []
-    for condition in dict.fromkeys(t.condition for t in traces):
-        group = [t for t in traces if t.condition == condition and t.watched_only]
-        chosen.append(sorted(group, key=lambda t: float(t.surprise[t.onset or 0 :].max()))[len(group) // 2])
-    return chosen
-
-
-def figures(traces: list[Trace], folder: Path) -> dict[str, Path]:
+def draw(rows: Sequence[DetectionMetrics], folder: Path) -> dict[str, Path]:
     """Draws and saves every plot: {caption: PNG}."""
-    examples = typical(traces)
-    worst = next(t for t in examples if t.condition == "frozen encoder")
+    examples = [typical(m.watched) for m in rows]
+    frozen = next(t for t in examples if t.kind == "frozen encoder")
     drawn = {
-        "Surprise over time in a typical episode of each condition": ("surprise", plots.surprise_figure(examples)),
-        "The greatest surprise of every episode against the threshold": (
-            "maxima",
-            plots.maxima_figure(traces, WINDOW_S),
+        "Surprise over time in a typical episode of each condition": (
+            "surprise",
+            figures.surprise_figure(examples),
         ),
-        "How soon faults were noticed": ("delay", plots.delay_figure(traces, WINDOW_S)),
-        "Faults told from nominal episodes at the same time": ("roc", plots.roc_figure(traces, WINDOW_S)),
-        "Where the surprise came from when an encoder froze": ("attribution", plots.attribution_figure(worst)),
+        "The greatest surprise of every episode against the threshold": ("maxima", figures.maxima_figure(rows)),
+        "How soon faults were noticed": ("delay", figures.delay_figure(rows)),
+        "Faults told from nominal episodes at the same time": ("roc", figures.roc_figure(rows)),
+        "Where the surprise came from when an encoder froze": ("attribution", figures.attribution_figure(frozen)),
     }
-    return {caption: plots.save(figure, folder / f"{name}.png") for caption, (name, figure) in drawn.items()}
+    return {caption: figures.save(figure, folder / f"{name}.png") for caption, (name, figure) in drawn.items()}
 
 
-def show(console: Console, rows: list[Row], acting: str) -> None:
-    """Prints one table: what was noticed, and what acting on it changed."""
-    title = f"Noticed while the policy acts alone; solved and force: alone → {acting}"
-    console.print()
-    table = RichTable(title=title, box=None, padding=(0, 2, 0, 0))
-    headings = (
-        "",
-        "\nepisodes",
-        "\ndetected",
-        "delay [ms]\nmedian, 95 %",
-        "false\nalarms",
-        "tasks\nsolved",
-        "peak\nforce [N]",
-    )
-    for heading in headings:
-        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
-    for row in rows:
-        alone, acted = row.outcome(POLICY_ALONE), row.outcome(acting)
-        assert alone is not None
-        assert acted is not None
-        table.add_row(
-            row.condition,
-            str(row.episodes),
-            str(row.detected.k) if row.detected.n else "",
-            "" if row.delays is None else f"{_ms(row.delays.median_ms)}, {_ms(row.delays.p95_ms)}",
-            str(row.false_alarm_episodes.k),
-            f"{alone.success.k} → {acted.success.k}",
-            f"{alone.peak_force:.1f} → {acted.peak_force:.1f}",
-        )
-    console.print(table)
-    console.print()
-
-
-def _ms(delay: float) -> str:
-    return f"{delay:.0f}" if np.isfinite(delay) else f">{1e3 * WINDOW_S:.0f}"
+def as_json(m: DetectionMetrics) -> dict[str, Any]:
+    """What one condition showed."""
+    return {
+        "condition": m.name,
+        "episodes": len(m.watched),
+        "false_alarm_episodes": false_alarms(m.watched),
+        "false_alarms_per_hour": false_alarms_per_hour(m.watched),
+        "detected": m.detected,
+        "delays": m.delays,
+        "auroc": m.auroc,
+        "top_labels": m.top_channels,
+        "outcomes": m.outcomes,
+    }
 
 
 def write_json(
-    path: Path, args: Args, rows: list[Row], expert: Share, latency: dict[str, float], seconds: dict[str, float]
+    path: Path,
+    args: Args,
+    rows: Sequence[DetectionMetrics],
+    expert: Share,
+    latency: dict[str, float],
+    seconds: dict[str, float],
 ) -> None:
     """Every figure, with what it takes to make it again."""
     packages = ("asm-gym", "mujoco", "robosuite", "gymnasium", "numpy", "numba")
@@ -234,7 +215,7 @@ def write_json(
         "arguments": {**asdict(args), "out": str(args.out)},
         "versions": {"python": platform.python_version(), **{p: metadata.version(p) for p in packages}},
         "window_s": WINDOW_S,
-        "results": [asdict(row) for row in rows],
+        "results": [as_json(m) for m in rows],
         "expert_success": expert._asdict(),
         "observe_us": latency,
         "seconds": seconds,
@@ -255,7 +236,7 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def run(args: Args, console: Console) -> list[Row]:
+def run(args: Args, console: Console) -> list[DetectionMetrics]:
     """The whole demo."""
     args = args.scaled()
     folder = args.out
@@ -269,9 +250,10 @@ def run(args: Args, console: Console) -> list[Row]:
     with timed("testing, policy alone and wrapped") as progress:
         work = partial(watch_pair, config=RolloutConfig(), memory=folder / "lift.asm")
         traces = [trace for pair in parallel_map(work, todo, args.workers, progress) for trace in pair]
-    rows = summarise(traces, WINDOW_S)
+    rows = by_condition(traces, WINDOW_S)
     latency = observe_latency_us(memory)
-    show(console, rows, args.on_alarm)
+    title = f"Noticed while the policy acts alone; solved and force: alone → {args.on_alarm}"
+    console.print("", console_table(tabulate(title, BRIEF_CONDITION_COLUMNS, rows), plain=True), "")
     low, high = binomial_interval(args.nominal_episodes, args.false_alarm_rate)
     expected = (
         f"At a false-alarm rate of {args.false_alarm_rate:g}, {low} to {high} of {args.nominal_episodes} nominal "
@@ -283,10 +265,10 @@ def run(args: Args, console: Console) -> list[Row]:
     )
 
     with timed("drawing"):
-        drawn = figures(traces, folder)
+        drawn = draw(rows, folder)
     video = None
     if can_show:
-        examples = {(t.kind, t.seed) for t in typical(traces)}
+        examples = {(t.kind, t.seed) for t in (typical(m.watched) for m in rows)}
         shown = [t for t in todo if (t.kind, t.seed) in examples]
         with timed("recording a video") as progress:
             clips = [Clip(trial, f"{trial.kind}, {trial.acting}") for trial in shown]
@@ -297,7 +279,7 @@ def run(args: Args, console: Console) -> list[Row]:
         f"asm-gym demo: {args.task}",
         f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "
         f"watched others, some of them faulty. {headline(rows)} {expected}",
-        [detection_table(rows, WINDOW_S), outcome_table(rows)],
+        [detection_table(rows), outcome_table(rows)],
         drawn,
         video,
         {"command": f"asm-gym demo --seed {args.seed}", **asdict(args), "observe() [µs]": latency},

@@ -22,12 +22,13 @@ from rich.console import Console
 from asm_gym.choices import check_choice
 from asm_gym.detection.detector import conformal_episodes
 from asm_gym.episodes import EpisodeLabel
-from asm_gym.evaluation.publish import brief_tables, publish
-from asm_gym.evaluation.text_tables import console_table
+from asm_gym.evaluation.comparison import BenchmarkResult
+from asm_gym.evaluation.report import publish
+from asm_gym.evaluation.tables import brief_monitors_table, console_table, harmless_table
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, possible
 from asm_gym.monitors import MONITORS
 from asm_gym.policies import make_policy
-from asm_gym.rollouts.benchmark import Judgement, calibrated, judge
+from asm_gym.rollouts.benchmark import benchmark, calibrated
 from asm_gym.rollouts.folder import claimed, make_missing
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
@@ -167,17 +168,18 @@ def labels(args: Args) -> list[EpisodeLabel]:
     return made
 
 
-def show_examples(args: Args, judgement: Judgement, wanted: Sequence[EpisodeLabel], progress: Progress) -> Path:
+def show_examples(args: Args, result: BenchmarkResult, wanted: Sequence[EpisodeLabel], progress: Progress) -> Path:
     """The first of the typical episodes, as the first monitor saw them."""
     name = args.monitors[0]
-    monitor = calibrated(args.out, name, wanted, args.seed, judgement.thresholds[name][args.false_alarm_rate])
+    monitor = calibrated(args.out, name, wanted, args.seed, result.monitors[name].thresholds[args.false_alarm_rate])
     clips = [
-        Clip(Trial.of(label), f"{label.severity} {label.kind.replace('_', ' ')}") for label in judgement.shown[:SHOWN]
+        Clip(Trial.of(EpisodeLabel(t.task, "faulty", t.kind, t.severity, t.seed, t.onset)), t.condition)
+        for t in result.monitors[name].examples[:SHOWN]
     ]
     return record_video(clips, args.config, monitor, args.out / "examples.mp4", progress)
 
 
-def evaluate(args: Args, console: Console) -> Judgement:
+def evaluate(args: Args, console: Console) -> BenchmarkResult:
     """Records, fits, judges and publishes."""
     seconds: dict[str, float] = {}
     with stage("listing episodes", console, seconds):
@@ -188,16 +190,16 @@ def evaluate(args: Args, console: Console) -> Judgement:
             make_missing(make, wanted, lambda label: args.out / label.path, args.parallel, progress)
         with stage("fitting and judging", console, seconds) as progress:
             how = args.false_alarm_rate, args.window, args.seed, args.parallel
-            judgement = judge(args.out, wanted, args.monitors, *how, progress)
+            result = benchmark(args.out, wanted, args.monitors, *how, progress)
         video = None
-        if args.video and judgement.shown and can_record_video(console):
+        if args.video and result.monitors[args.monitors[0]].examples and can_record_video(console):
             with stage("recording a video", console, seconds) as progress:
-                video = show_examples(args, judgement, wanted, progress)
+                video = show_examples(args, result, wanted, progress)
         with stage("drawing", console, seconds):
             details = json.loads(json.dumps(asdict(args), default=str))
             details |= {"python": platform.python_version(), "machine": platform.machine(), "seconds": seconds}
-            publish(args.out, judgement, details, video)
-    return judgement
+            publish(args.out, result, details, video)
+    return result
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -205,11 +207,11 @@ def main(argv: list[str] | None = None) -> int:
     console = Console()
     try:
         args = tyro.cli(Args, args=argv, prog="asm-gym evaluate", description=__doc__).scaled()
-        judgement = evaluate(args, console)
+        result = evaluate(args, console)
     except USAGE_ERRORS as error:
         print(f"asm-gym evaluate: {error}", file=sys.stderr)
         return 2
-    for table in brief_tables(judgement):
+    for table in (brief_monitors_table(result), harmless_table(result, args.monitors[:1])):
         console.print(console_table(table))
     console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.parquet'}")
     return 0

@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from asm_gym.checks import check_number
-from asm_gym.evaluation import plots
-from asm_gym.evaluation.report import Table, write_report
+from asm_gym.evaluation import figures
+from asm_gym.evaluation.report import write_report
+from asm_gym.evaluation.tables import Table
 from asm_gym.evaluation.trace import Trace, TraceDetail, spans
 from asm_gym.logs import Layout, Log, read_logs
 from asm_gym.monitors import load_monitor
@@ -150,19 +151,19 @@ def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Trac
     args.out.mkdir(parents=True, exist_ok=True)
     with (args.out / "alarms.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([HEADINGS, *(alarm.cells() for alarm in alarms)])
-    figures = {
-        "Surprise over time in the most surprising episodes": plots.surprise_figure(worst),
-        "Where the surprise came from in the most surprising one": plots.attribution_figure(worst[0]),
-        "What its most surprising channels sensed": plots.stream_figure(worst[0]),
+    drawn = {
+        "Surprise over time in the most surprising episodes": figures.surprise_figure(worst),
+        "Where the surprise came from in the most surprising one": figures.attribution_figure(worst[0]),
+        "What its most surprising channels sensed": figures.stream_figure(worst[0]),
     }
-    for name, figure in zip(("surprise", "attribution", "stream"), figures.values(), strict=True):
-        plots.save(figure, args.out / f"{name}.png")
+    for name, figure in zip(("surprise", "attribution", "stream"), drawn.values(), strict=True):
+        figures.save(figure, args.out / f"{name}.png")
     write_report(
         args.out / "report.html",
         f"asm-gym watch: {args.source}",
         f"{said}, as {args.monitor} sees them.",
         [Table("Alarms", HEADINGS, [alarm.cells() for alarm in alarms])] if alarms else [],
-        figures,
+        drawn,
         details={"command": f"asm-gym watch {args.source} --monitor {args.monitor}"},
     )
 

@@ -5,33 +5,35 @@ import math
 import numpy as np
 import pytest
 
-from asm_gym.evaluation import comparison
-from asm_gym.evaluation.comparison import Sight
-from asm_gym.evaluation.scoring import Verdict
+from asm_gym.evaluation import comparison, metrics
+from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
+from asm_gym.evaluation.tables import harmless_table, kinds_table, monitors_table
+from asm_gym.evaluation.trace import Trace
 
 
-def verdict(peak, kind="nominal", severity="", onset=None):
+def a_trace(peak, kind="nominal", severity="", onset=None):
     surprise = np.zeros(10)
     surprise[5] = peak
-    return Verdict("Lift", "asm", kind, severity, 0, 0.05, surprise, onset, "a" if onset else "", frozenset("a"))
+    trace = Trace(kind, 0, 0.05, 3.5, surprise, onset, severity, "Lift", "asm", affected_channels=frozenset("a"))
+    return trace.attributed(np.ones((10, 1)), ("a",))
 
 
-def sight(separation, kind="push", severity="strong", earliest=0):
-    return Sight("Lift", kind, severity, 0, separation, earliest, 0.05)
+def visibility(separation, kind="push", severity="strong", earliest=0):
+    return Detectability("Lift", kind, severity, 0, separation, earliest, 0.05)
 
 
-VERDICTS = [
-    *(verdict(p) for p in (1.0, 2.0, 3.0, 4.0)),
-    verdict(5.0, "push", "strong", onset=5),
-    verdict(2.5, "push", "mild", onset=5),
-    verdict(0.0, "noise", "mild", onset=5),
+TRACES = [
+    *(a_trace(p) for p in (1.0, 2.0, 3.0, 4.0)),
+    a_trace(5.0, "push", "strong", onset=5),
+    a_trace(2.5, "push", "mild", onset=5),
+    a_trace(0.0, "noise", "mild", onset=5),
 ]
 
 
 def test_a_kind_is_visible_where_an_ideal_observer_finds_half_of_it():
     # Power at 1 %: Φ(√S - 2.326), one half at S = 5.41.
-    sights = [sight(6.0), sight(5.0, "touch"), sight(100.0, "shove"), sight(0.0, "shove")]
-    assert comparison.visible_kinds(sights) == {
+    found = [visibility(6.0), visibility(5.0, "touch"), visibility(100.0, "shove"), visibility(0.0, "shove")]
+    assert comparison.visible_kinds(found) == {
         ("push", "strong"): True,
         ("touch", "strong"): False,
         ("shove", "strong"): True,  # half of them surely
@@ -39,25 +41,40 @@ def test_a_kind_is_visible_where_an_ideal_observer_finds_half_of_it():
 
 
 def test_the_ideal_row_holds_the_bounds():
-    cell = comparison.ideal_cell([sight(2.0, earliest=None), sight(np.inf, earliest=1)])
-    assert cell.auroc == pytest.approx((0.8413447 + 1) / 2)  # Φ(√(2/2)) and 1
-    assert (cell.median_ms, cell.p95_ms) == (pytest.approx(100.0), math.inf)
-    assert math.isnan(cell.precision)
+    ideal = comparison.ideal_metrics("ideal", [visibility(2.0, earliest=None), visibility(np.inf, earliest=1)])
+    assert ideal.auroc == pytest.approx((0.8413447 + 1) / 2)  # Φ(√(2/2)) and 1
+    assert ideal.delays == pytest.approx((100.0, math.inf, 1, 1))
+    assert math.isnan(ideal.average_precision)
+
+
+RESULT = MonitorResult(TRACES, [a_trace(9.0, "touch"), a_trace(0.0, "touch")], {0.01: 3.5, 0.05: 2.2})
 
 
 def test_scores_are_means_over_the_kinds_that_can_be_seen():
     visible = {("push", "strong"): True, ("push", "mild"): True, ("noise", "mild"): False}
-    score = comparison.score("asm", VERDICTS, {0.01: 3.5, 0.05: 2.2}, 0.01, 1.0, visible)
-    assert score.cell.auroc == pytest.approx((1.0 + 0.5) / 2)
-    assert (score.cell.found[0.01].k, score.cell.found[0.05].k, score.cell.found[0.05].n) == (1, 2, 2)
-    assert (score.cell.median_ms, score.cell.p95_ms) == (50.0, math.inf)
-    assert score.false_alarms.value == 0.25
-    assert score.false_alarms_per_hour == pytest.approx(1 / (40 * 0.05 / 3600))
-    assert score.balanced_accuracy == pytest.approx((0.5 + 0.75) / 2)
-    assert score.attribution.n == 2
+    asm = comparison.monitor_metrics("asm", RESULT, 1.0, visible)
+    assert asm.auroc == pytest.approx((1.0 + 0.5) / 2)
+    assert (asm.found[0.01].k, asm.found[0.05].k, asm.found[0.05].n) == (1, 2, 2)
+    assert asm.delays == pytest.approx((50.0, math.inf, 1, 1))
+    assert metrics.false_alarms(asm.nominal).value == 0.25
+    assert metrics.false_alarms_per_hour(asm.nominal) == pytest.approx(1 / (40 * 0.05 / 3600))
+    assert metrics.balanced_accuracy(asm.faulty, asm.nominal, 1.0) == pytest.approx((0.5 + 0.75) / 2)
+    assert metrics.attribution_accuracy(asm.faulty) == (1, 1)
 
 
-def test_each_kind_has_a_cell_of_its_own():
-    cells = comparison.by_kind(VERDICTS, {0.01: 3.5}, 0.01, 1.0)
-    assert list(cells) == [("push", "strong"), ("push", "mild"), ("noise", "mild")]
-    assert [c.auroc for c in cells.values()] == [1.0, 0.5, 0.0]
+def test_each_kind_is_counted_by_itself():
+    kinds = comparison.monitor_metrics("asm", RESULT, 1.0).kinds
+    assert list(kinds) == [("push", "strong"), ("push", "mild"), ("noise", "mild")]
+    assert [k.auroc for k in kinds.values()] == [1.0, 0.5, 0.0]
+
+
+def test_the_tables_of_a_benchmark_put_the_ideal_observer_first_and_hide_what_nobody_sees():
+    seen = [visibility(100.0), visibility(100.0, severity="mild"), visibility(0.1, "noise", "mild")]
+    result = BenchmarkResult({"asm": RESULT}, seen, rate=0.01, window_s=1.0)
+    ideal, asm = (dict(zip(monitors_table(result).headings, row, strict=True)) for row in monitors_table(result).rows)
+    assert (ideal["Monitor"], ideal["AUROC"], ideal["False alarms"]) == ("ideal observer", "1.000", "")
+    assert (asm["AUROC"], asm["at 1 %"], asm["Found at 0.5 %"]) == ("0.750", "50 % (9–91)", "")
+    assert (asm["False alarms"], asm["Median delay [ms]"], asm["p95 [ms]"]) == ("1 of 4", "50", "missed")
+    assert "left out: noise mild" in monitors_table(result).caption
+    assert kinds_table(result).rows[2] == ("(noise mild)", "0.59 / 0 %", "0.00 / 0 %")
+    assert harmless_table(result, ["asm"]).rows == [("touch", "1 of 2")]

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
-from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
 
+from asm_gym.evaluation import metrics
 from asm_gym.evaluation.metrics import (
     Delays,
-    delay_summary,
+    average_precision,
+    by_condition,
     delays_ms,
+    detected,
+    false_alarms,
     false_alarms_per_hour,
     placements,
-    summarise,
     time_matched_auroc,
+    typical,
 )
-from asm_gym.evaluation.statistics import Share, auroc, binomial_interval, wilson_interval
+from asm_gym.evaluation.statistics import Share, auroc, wilson_interval
 from asm_gym.evaluation.trace import InterventionOutcome, Trace, TraceDetail, spans, window_steps
 
 
@@ -128,64 +130,6 @@ def test_a_condition_is_the_kind_in_words():
     assert (trace.condition, trace.title) == ("mild weak joint", "mild weak joint in Lift")
 
 
-@pytest.mark.parametrize(
-    ("k", "n", "low", "high"),
-    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
-)
-def test_wilson_gives_the_intervals_of_newcombe_1998(k: int, n: int, low: float, high: float):
-    assert wilson_interval(k, n) == pytest.approx((low, high), abs=5e-5)
-
-
-def test_wilson_knows_nothing_from_no_trials_and_is_symmetric():
-    assert wilson_interval(0, 0) == (0.0, 1.0)
-    low, high = wilson_interval(3, 20)
-    assert wilson_interval(17, 20) == pytest.approx((1 - high, 1 - low))
-    assert wilson_interval(20, 20)[1] == 1.0
-
-
-def test_wilson_refuses_impossible_counts():
-    with pytest.raises(ValueError, match=r"k must be in \[0, n\], got 3 of 2"):
-        wilson_interval(3, 2)
-    with pytest.raises(ValueError, match=r"confidence must be in \(0, 1\), got 95"):
-        wilson_interval(1, 2, confidence=95)
-
-
-def test_binomial_interval_of_four_coins_by_hand():
-    # P(0) = P(4) = 1/16: with tails of at most 5 % both stay in, with tails of at most 10 % both fall out.
-    assert binomial_interval(4, 0.5, confidence=0.9) == (0, 4)
-    assert binomial_interval(4, 0.5, confidence=0.8) == (1, 3)
-
-
-@pytest.mark.parametrize(("n", "p", "confidence"), [*product((1, 30, 500), (0.01, 0.3, 0.87), (0.8, 0.95, 0.999))])
-def test_binomial_interval_is_that_of_scipy(n: int, p: float, confidence: float):
-    assert binomial_interval(n, p, confidence) == tuple(map(int, stats.binom.interval(confidence, n, p)))
-
-
-def test_binomial_interval_of_certainty_is_a_point():
-    assert binomial_interval(7, 0.0, 0.95) == (0, 0)
-    assert binomial_interval(7, 1.0, 0.95) == (7, 7)
-    assert binomial_interval(0, 0.5, 0.95) == (0, 0)
-
-
-def test_auroc_counts_pairs_and_half_of_ties():
-    # Of the six pairs 3 > 1, 3 > 2, 2 > 1 are won, 2 = 2 is tied, and 1 < 2 is lost and 1 = 1 tied: 4 of 6.
-    assert auroc([3, 2, 1], [1, 2]) == pytest.approx(4 / 6)
-
-
-def test_auroc_is_the_mann_whitney_statistic():
-    rng = np.random.default_rng(0)
-    pos, neg = rng.integers(0, 9, 40), rng.integers(0, 7, 60)
-    assert auroc(pos, neg) == pytest.approx(stats.mannwhitneyu(pos, neg).statistic / (40 * 60))
-
-
-def test_auroc_takes_infinity_and_refuses_nan_and_nothing():
-    assert auroc([math.inf, math.inf], [1.0, math.inf]) == pytest.approx(0.75)
-    with pytest.raises(ValueError, match="must not be NaN"):
-        auroc([math.nan], [1.0])
-    with pytest.raises(ValueError, match="0 positive and 1 negative"):
-        auroc([], [1.0])
-
-
 def test_a_window_holds_whole_steps_whatever_the_rounding():
     assert window_steps(0.3, 0.1) == 3  # 0.3 / 0.1 = 2.9999999999999996
     assert window_steps(1.0, 0.05) == 20
@@ -212,7 +156,7 @@ def test_time_matching_of_one_common_window_is_the_plain_auroc():
 
 def test_time_matching_leaves_out_nominal_episodes_that_ended_before_the_onset():
     faulty = a_trace([1, 1, 5], onset=2)
-    assert time_matched_auroc([faulty], [a_trace([99, 99])], window_s=1.0) is None
+    assert math.isnan(time_matched_auroc([faulty], [a_trace([99, 99])], window_s=1.0))
     assert time_matched_auroc([faulty], [a_trace([99, 99]), a_trace([1, 1, 1])], window_s=1.0) == 1.0
 
 
@@ -225,9 +169,9 @@ def test_a_delay_is_at_least_one_step_and_a_late_alarm_is_a_miss():
 
 def test_quantiles_of_the_delay_count_misses_as_infinitely_late():
     traces = [a_trace([1] * k + [20] + [1] * 30, onset=0) for k in range(20)]  # 100, 200, … 2000 ms
-    assert delay_summary(traces, window_s=5.0) == pytest.approx(Delays(1000.0, 1900.0, 20, 0))
-    assert delay_summary(traces, window_s=1.5) == pytest.approx(Delays(1000.0, math.inf, 15, 5))
-    assert delay_summary([a_trace([1, 1])], window_s=1.0) is None
+    assert Delays.of(delays_ms(traces, window_s=5.0)) == pytest.approx(Delays(1000.0, 1900.0, 20, 0))
+    assert Delays.of(delays_ms(traces, window_s=1.5)) == pytest.approx(Delays(1000.0, math.inf, 15, 5))
+    assert Delays.of(delays_ms([a_trace([1, 1])], window_s=1.0)) is None
 
 
 def test_false_alarms_per_hour_count_only_the_time_before_the_fault():
@@ -258,26 +202,74 @@ def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_
         a_trace([1, 2, 3, 4]),
         a_trace([1, 2, 30, 4]),
     ]
-    nominal, push = summarise(traces, window_s=0.2)
+    nominal, push = by_condition(traces, window_s=0.2)
 
-    assert (nominal.condition, nominal.episodes) == ("nominal", 2)
-    assert nominal.false_alarm_episodes == Share(1, 2)
+    assert (nominal.name, len(nominal.watched)) == ("nominal", 2)
+    assert false_alarms(nominal.watched) == Share(1, 2)
     assert nominal.detected == Share(0, 0)
     assert nominal.delays is None
-    assert nominal.auroc is None
-    assert nominal.false_alarms_per_hour == pytest.approx(3600 / 0.8)
+    assert math.isnan(nominal.auroc)
+    assert false_alarms_per_hour(nominal.watched) == pytest.approx(3600 / 0.8)
 
-    assert (push.condition, push.episodes) == ("push", 3)
-    assert push.false_alarm_episodes == Share(1, 3)
+    assert (push.name, len(push.watched)) == ("push", 3)
+    assert false_alarms(push.watched) == Share(1, 3)
     assert push.detected == Share(1, 3)  # the third alarm comes 300 ms after the onset
     assert push.detected.interval == wilson_interval(1, 3)
     assert push.delays == pytest.approx(Delays(math.inf, math.inf, 1, 2))
     # Maxima of steps 1 and 2: 20, 1, 1 against 3, 30: of the six pairs one is won.
     assert push.auroc == pytest.approx(1 / 6)
-    assert push.top_labels == (("loud", 2),)
+    assert push.top_channels == [("loud", 2)]
 
     alone, held = push.outcomes
     assert (alone.acting, alone.success, alone.peak_force) == ("policy alone", Share(1, 3), 70.0)
     assert (held.acting, held.success, held.ended_by_alarm, held.peak_force) == ("hold", Share(2, 2), Share(1, 2), 15.0)
-    assert push.outcome("hold") is held
-    assert push.outcome("terminate") is None
+
+
+def test_episodes_of_another_task_are_not_compared():
+    # In steps 1 and 2 the nominal maxima are 2, 3, 1, 0.
+    nominal = [a_trace(s) for s in ([1, 1, 2, 1], [1, 3, 1, 1], [5, 1, 1, 1], [0, 0, 0, 0])]
+    elsewhere = a_trace([9, 9, 9, 9], task="Door")
+    np.testing.assert_allclose(placements([a_trace([9, 2.5, 0, 9], onset=1)], [*nominal, elsewhere], 0.2), [0.25])
+    assert placements([a_trace([0, 9], onset=1, task="Wipe")], nominal, 0.2).size == 0
+    assert placements([a_trace([0, 9], onset=2)], nominal, 0.2).size == 0  # ended before it began
+
+
+def test_average_precision_of_a_hand_computed_case():
+    # Recalls 1/2 and 1 at false-alarm rates 0 and 0.5: precisions 1 and 2/3.
+    assert average_precision(np.array([0.5, 0.0])) == pytest.approx((1 + 2 / 3) / 2)
+    assert math.isnan(average_precision(np.array([])))
+
+
+def test_average_precision_of_chance_is_one_half():
+    assert average_precision(np.linspace(0, 1, 1001)) == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_fault_is_detected_by_an_alarm_that_is_raised_in_the_window():
+    faulty = [
+        a_trace([0, 0, 20, 0, 0], onset=2),  # at once: 100 ms
+        a_trace([0, 0, 0, 20, 0], onset=2),  # 200 ms
+        a_trace([0, 20, 20, 20, 0], onset=2),  # stood before the onset and was not raised again
+        a_trace([0, 20, 0, 0, 20], onset=2),  # a false alarm, then too late for the window
+    ]
+    assert detected(faulty, window_s=0.2) == Share(2, 4)
+    late = Delays.of(delays_ms(faulty, 0.2))
+    assert late == pytest.approx(Delays(200.0, math.inf, 2, 2))
+
+
+def test_accuracies():
+    nominal = [a_trace([0, 0, 0, 0]), a_trace([20, 0, 0, 0])]
+    faulty = [a_trace([0, 0, 0, 20, 0], onset=1), a_trace([0, 0, 0, 0, 0], onset=1)]
+    assert metrics.balanced_accuracy(faulty, nominal, 1.0) == pytest.approx(0.5)
+    # One of two faults found, 2 of 4 steps after its onset.
+    assert metrics.timestep_weighted_accuracy(faulty, nominal) == pytest.approx(0.5 * (0.25 + 0.5))
+
+
+def test_attribution_counts_alarms_alone():
+    affected = frozenset({"a", "b"})
+    faulty = [a_trace([20], onset=0, top_channel=c, affected_channels=affected) for c in ("a", "c", "")]
+    assert metrics.attribution_accuracy(faulty) == Share(1, 2)
+
+
+def test_the_typical_episode_has_the_median_of_the_greatest_surprises_since_the_onset():
+    traces = [a_trace([99, 0, peak], onset=1, seed=peak) for peak in (5, 1, 9)]
+    assert typical(traces).seed == 5

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from asm_gym.evaluation.intervention import compare
-from asm_gym.evaluation.statistics import bootstrap, gain, reduction
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, InterventionOutcome, Trace
 from asm_gym.rollouts.trial import PASSING
 from asm_gym.scripts.evaluate import main as evaluate
@@ -21,23 +20,6 @@ def trace(seed: int, acting: str, delay: int = 2, ended: bool = False, **changes
     what = {"success": True, "external_force": 40.0, "impulse": 8.0, "acted_s": 0.5, **changes}
     outcome = InterventionOutcome(ended_by_alarm=ended, **what)
     return Trace("push", seed, 0.05, 1.0, surprise, 2, task="Lift", acting=acting, outcome=outcome)
-
-
-def test_gain_and_reduction_are_the_hand_computed_ones():
-    pairs = np.array([[1.0, 0.0], [3.0, 2.0], [0.0, 1.0], [4.0, 1.0]])
-    assert gain(pairs) == -1.0
-    assert reduction(pairs) == 0.5
-    assert np.isnan(reduction(np.zeros((3, 2))))
-
-
-def test_the_bootstrap_interval_of_a_mean_is_about_the_normal_one():
-    rng = np.random.default_rng(0)
-    pairs = np.stack([np.zeros(400), rng.normal(1.0, 2.0, 400)], axis=1)
-    estimate = bootstrap(gain, pairs, rng)
-    half = 1.96 * pairs[:, 1].std() / 20
-    assert estimate.value == pytest.approx(pairs[:, 1].mean())
-    assert estimate.low == pytest.approx(estimate.value - half, abs=0.03)
-    assert estimate.high == pytest.approx(estimate.value + half, abs=0.03)
 
 
 def test_pairs_are_matched_by_seed_whatever_their_order():

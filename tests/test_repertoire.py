@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from asm_gym.episodes import load_episode
-from asm_gym.evaluation.repertoire import naming_figure, share_right
-from asm_gym.evaluation.statistics import Spread
 from asm_gym.scripts import evaluate
 from asm_gym.scripts.reproduce import repertoire
+from asm_gym.scripts.reproduce.skill_recognition import naming_figure, share_right
 from asm_gym.scripts.reproduce.skill_switch import NAMES, Switch, record_switch
 
 RIGHT = [np.array([False, True, True]), np.array([False, False, True, False])]
@@ -20,11 +19,6 @@ def test_a_share_is_taken_of_what_was_named_so_many_steps_after_the_beginning():
     line = naming_figure({"all": RIGHT}, dt=0.5, longest_s=2.0).axes[0].lines[0]
     np.testing.assert_allclose(line.get_xdata(), [0.5, 1.0, 1.5, 2.0])
     np.testing.assert_allclose(line.get_ydata(), [0, 50, 100, 50])
-
-
-def test_a_spread_is_mean_and_sample_deviation():
-    assert Spread.of([1.0, 2.0, 3.0]) == (2.0, 1.0)
-    assert Spread.of([0.5]).text(100, 1) == "50.0"
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from asm_gym.evaluation import plots
-from asm_gym.evaluation.metrics import summarise, time_matched_auroc
-from asm_gym.evaluation.report import Table, detection_table, headline, outcome_table, write_report
+from asm_gym.evaluation import figures
+from asm_gym.evaluation.metrics import by_condition, false_alarms, time_matched_auroc
+from asm_gym.evaluation.report import write_report
+from asm_gym.evaluation.tables import Column, Table, detection_table, headline, outcome_table, tabulate
 from asm_gym.evaluation.trace import InterventionOutcome, Trace, TraceDetail
 from asm_gym.evaluation.video import write_video
 
@@ -48,20 +49,20 @@ def traces() -> list[Trace]:
 def figures_of(traces: list[Trace]) -> dict[str, Figure]:
     faulty = next(t for t in traces if t.delay is not None)
     return {
-        "surprise": plots.surprise_figure([traces[0], faulty]),
-        "delay": plots.delay_figure(traces, 1.0),
-        "roc": plots.roc_figure(traces, 1.0),
-        "attribution": plots.attribution_figure(faulty),
-        "maxima": plots.maxima_figure(traces, 1.0),
+        "surprise": figures.surprise_figure([traces[0], faulty]),
+        "delay": figures.delay_figure(by_condition(traces, 1.0)),
+        "roc": figures.roc_figure(by_condition(traces, 1.0)),
+        "attribution": figures.attribution_figure(faulty),
+        "maxima": figures.maxima_figure(by_condition(traces, 1.0)),
     }
 
 
 def test_figures_are_the_same_bytes_each_time_whatever_the_users_style(traces: list[Trace], tmp_path: Path):
-    before = {name: plots.save(f, tmp_path / f"{name}.png").read_bytes() for name, f in figures_of(traces).items()}
+    before = {name: figures.save(f, tmp_path / f"{name}.png").read_bytes() for name, f in figures_of(traces).items()}
     with mpl.rc_context({"axes.facecolor": "red", "font.size": 30, "axes.labelsize": 30, "ytick.direction": "in"}):
         again = figures_of(traces)
     for name, figure in again.items():
-        assert plots.save(figure, tmp_path / "again.png").read_bytes() == before[name], name
+        assert figures.save(figure, tmp_path / "again.png").read_bytes() == before[name], name
 
 
 def test_figures_leave_pyplot_and_the_users_style_alone(traces: list[Trace]):
@@ -72,7 +73,7 @@ def test_figures_leave_pyplot_and_the_users_style_alone(traces: list[Trace]):
 
 
 def test_the_roc_curve_encloses_the_auroc_it_names(traces: list[Trace]):
-    ax = plots.roc_figure(traces, 1.0).axes[0]
+    ax = figures.roc_figure(by_condition(traces, 1.0)).axes[0]
     alone = [t for t in traces if t.watched_only]
     nominal = [t for t in alone if t.condition == "nominal"]
     for line, condition in zip(ax.lines[1:], ("push", "weak joint"), strict=True):
@@ -80,12 +81,12 @@ def test_the_roc_curve_encloses_the_auroc_it_names(traces: list[Trace]):
         area = float(np.sum(np.diff(x) * y[:-1]))  # steps hold their value to the right
         auroc = time_matched_auroc([t for t in alone if t.condition == condition], nominal, 1.0)
         assert area == pytest.approx(auroc)
-        assert line.get_label() == f"{condition}: AUROC {auroc:.2f}"
+        assert line.get_label() == f"{condition}: {auroc:.3f}"
 
 
 def test_the_delay_curve_ends_at_the_share_detected_in_the_window(traces: list[Trace]):
-    ax = plots.delay_figure(traces, 0.5).axes[0]
-    rows = [r for r in summarise(traces, 0.5) if r.condition != "nominal"]
+    ax = figures.delay_figure(by_condition(traces, 0.5)).axes[0]
+    rows = [r for r in by_condition(traces, 0.5) if r.name != "nominal"]
     assert any(0 < r.detected.value < 1 for r in rows)
     for line, row in zip(ax.lines, rows, strict=True):
         x, y = line.get_data()
@@ -94,7 +95,7 @@ def test_the_delay_curve_ends_at_the_share_detected_in_the_window(traces: list[T
 
 
 def test_curves_differ_in_colour_and_in_line(traces: list[Trace]):
-    lines = plots.delay_figure(traces, 1.0).axes[0].lines
+    lines = figures.delay_figure(by_condition(traces, 1.0)).axes[0].lines
     assert len({line.get_color() for line in lines}) == 2
     assert len({str(line._dash_pattern) for line in lines}) == 2
 
@@ -108,12 +109,12 @@ def test_infinite_and_zero_surprise_can_be_drawn(traces: list[Trace], tmp_path: 
     detail = dataclasses.replace(good.detail, attribution=attribution)
     broken = dataclasses.replace(good, surprise=surprise, detail=detail)
     for name, figure in figures_of([broken, *(t for t in traces if t.condition == "nominal")]).items():
-        assert plots.save(figure, tmp_path / f"{name}.png").stat().st_size > 5000
+        assert figures.save(figure, tmp_path / f"{name}.png").stat().st_size > 5000
 
 
 def test_attribution_shows_the_channels_with_the_greatest_share_first(traces: list[Trace]):
     trace = next(t for t in traces if t.delay is not None)
-    labels = [text.get_text() for text in plots.attribution_figure(trace, top=3).axes[0].get_yticklabels()]
+    labels = [text.get_text() for text in figures.attribution_figure(trace, top=3).axes[0].get_yticklabels()]
     peaks = trace.detail.attribution[20:].max(axis=0)
     assert labels == [trace.detail.channels[i] for i in np.argsort(-peaks)[:3]]
 
@@ -122,7 +123,7 @@ def test_the_stream_is_shown_beside_its_twin_and_the_most_surprising_channel_fir
     trace = next(t for t in traces if t.delay is not None)
     rng = np.random.default_rng(0)
     stream, twin = rng.normal(size=(2, len(trace), len(trace.detail.channels)))
-    axes = plots.stream_figure(
+    axes = figures.stream_figure(
         dataclasses.replace(trace, detail=dataclasses.replace(trace.detail, stream=stream, twin=twin)), top=2
     ).axes
     peaks = trace.detail.attribution[trace.onset :].max(axis=0)
@@ -132,16 +133,16 @@ def test_the_stream_is_shown_beside_its_twin_and_the_most_surprising_channel_fir
     np.testing.assert_array_equal(healthy, twin[:, order[0]])
     np.testing.assert_array_equal(sensed, stream[:, order[0]])
     with pytest.raises(ValueError, match="without its stream"):
-        plots.stream_figure(trace)
+        figures.stream_figure(trace)
     with pytest.raises(ValueError, match="without the detail"):
-        plots.stream_figure(dataclasses.replace(trace, detail=None))
+        figures.stream_figure(dataclasses.replace(trace, detail=None))
 
 
 def test_nothing_to_draw_is_an_error(traces: list[Trace]):
     with pytest.raises(ValueError, match="no traces to draw"):
-        plots.surprise_figure([])
+        figures.surprise_figure([])
     with pytest.raises(ValueError, match="needs nominal traces"):
-        plots.roc_figure([t for t in traces if t.condition == "push"], 1.0)
+        figures.roc_figure(by_condition([t for t in traces if t.condition == "push"], 1.0))
 
 
 class _Page(HTMLParser):
@@ -164,15 +165,15 @@ class _Page(HTMLParser):
 
 
 def test_a_report_holds_everything_and_fetches_nothing(traces: list[Trace], tmp_path: Path):
-    rows = summarise(traces, 1.0)
-    figures = figures_of(traces)
-    saved = plots.save(figures["roc"], tmp_path / "roc.png")
+    rows = by_condition(traces, 1.0)
+    drawn = figures_of(traces)
+    saved = figures.save(drawn["roc"], tmp_path / "roc.png")
     frames = [np.full((32, 48, 3), i, np.uint8) for i in range(5)]
     film = write_video(tmp_path / "film.mp4", frames, fps=20)
     out = write_report(
         tmp_path / "report.html", "Lift", "First.\n\nSecond.",
-        [detection_table(rows, 1.0), outcome_table(rows)],
-        {"As a figure": figures["maxima"], "As a file": saved}, film, {"seed": 0},
+        [detection_table(rows), outcome_table(rows)],
+        {"As a figure": drawn["maxima"], "As a file": saved}, film, {"seed": 0},
     )  # fmt: skip
     source = out.read_text(encoding="utf-8")
     page = _Page(source)
@@ -214,19 +215,24 @@ def test_a_row_must_have_as_many_cells_as_there_are_headings():
         Table("t", ("a", "b"), [("x",)])
 
 
+def test_a_new_column_is_a_heading_and_a_function():
+    table = tabulate("numbers", (Column("n", str), Column("squared", lambda n: f"{n * n:d}")), [2, 3])
+    assert (table.headings, table.rows) == (["n", "squared"], [("2", "4"), ("3", "9")])
+
+
 def test_tables_say_what_the_summary_says(traces: list[Trace]):
-    rows = summarise(traces, 0.5)
+    rows = by_condition(traces, 0.5)
     push = rows[1]
-    cells = dict(zip(*((t := detection_table(rows, 0.5)).headings, t.rows[1]), strict=True))
+    cells = dict(zip(*((t := detection_table(rows)).headings, t.rows[1]), strict=True))
     low, high = (round(100 * x) for x in push.detected.interval)
     assert cells["Condition"] == "push"
     assert cells["Detected"] == f"{push.detected.k} of 8 ({low}–{high} %)"
     assert cells["AUROC"] == f"{push.auroc:.2f}"
     assert cells["95th percentile [ms]"] == "> 500"  # there are misses
-    assert detection_table(rows, 0.5).rows[0][3] == ""  # a nominal episode has nothing to detect
+    assert detection_table(rows).rows[0][3] == ""  # a nominal episode has nothing to detect
     assert [row[:2] for row in outcome_table(rows).rows][:2] == [("nominal", "policy alone"), ("nominal", "hold")]
     found = sum(r.detected.k for r in rows)
-    assert headline(rows).startswith(f"{found} of 16 faults detected; {rows[0].false_alarm_episodes.k} of 8 nominal")
+    assert headline(rows).startswith(f"{found} of 16 faults detected; {false_alarms(rows[0].watched).k} of 8 nominal")
 
 
 def test_a_video_reads_back_with_its_frames_rate_and_colours(tmp_path: Path):

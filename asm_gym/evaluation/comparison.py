@@ -1,17 +1,18 @@
-"""Monitors side by side, the ideal observer on top: tables of numbers, made from verdicts."""
+"""Monitors side by side, and the ideal observer, whom no monitor can surpass."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from asm_gym.evaluation import scoring
 from asm_gym.evaluation.ideal import auroc_bound, power_bound
-from asm_gym.evaluation.scoring import Verdict
+from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Kind, KindMetrics, false_alarms, in_words
 from asm_gym.evaluation.statistics import Share
+from asm_gym.evaluation.trace import NOMINAL, Trace
 
 IDEAL = "ideal observer"
 
@@ -23,7 +24,7 @@ VISIBLE = 0.5
 
 
 @dataclass(frozen=True)
-class Sight:
+class Detectability:
     """What the ideal observer could see of one faulty episode.
 
     Args:
@@ -41,133 +42,124 @@ class Sight:
     earliest: int | None
     dt: float
 
-
-@dataclass(frozen=True)
-class Cell:
-    """One monitor on one kind of fault, or on several.
-
-    Args:
-        auroc, precision: over matched steps; AUROC and average precision.
-        found: faults detected within the window, by the false-alarm rate the threshold was set for.
-        median_ms, p95_ms: delay at the run's own rate, a miss counting as infinitely late.
-    """
-
-    auroc: float
-    precision: float
-    found: Mapping[float, Share]
-    median_ms: float
-    p95_ms: float
+    @property
+    def delay(self) -> float | None:
+        """Time from the beginning of the fault to being sure [s]; None where it never could be."""
+        return None if self.earliest is None else (self.earliest + 1) * self.dt
 
 
-@dataclass(frozen=True)
-class Score:
-    """One monitor on all visible kinds.
+@dataclass(frozen=True, eq=False)
+class MonitorResult:
+    """What one monitor made of a run's episodes.
 
     Args:
-        monitor: by name.
-        cell: means over kinds of AUROC and average precision; shares over all faults.
-        false_alarms: nominal test episodes with an alarm.
-        false_alarms_per_hour: [1/h].
-        balanced_accuracy, timestep_weighted_accuracy: at the run's own rate.
-        attribution: alarms whose most surprising channel belonged to the fault.
+        traces: of nominal and faulty episodes, judged at the run's own false-alarm rate.
+        harmless: of harmless variations, likewise.
+        thresholds: by the false-alarm rate they were set for.
+        examples: typical faulty episodes with all that figures need.
     """
 
-    monitor: str
-    cell: Cell
-    false_alarms: Share
-    false_alarms_per_hour: float
-    balanced_accuracy: float
-    timestep_weighted_accuracy: float
-    attribution: Share
+    traces: Sequence[Trace]
+    harmless: Sequence[Trace]
+    thresholds: Mapping[float, float]
+    examples: Sequence[Trace] = ()
 
 
-def visible_kinds(sights: Sequence[Sight]) -> dict[tuple[str, str], bool]:
-    """(kind, severity): whether an ideal observer could see it, in order of appearance."""
-    kinds = dict.fromkeys((s.kind, s.severity) for s in sights)
-    return {k: _mean_power([s for s in sights if (s.kind, s.severity) == k], 0.01) >= VISIBLE for k in kinds}
+@dataclass(frozen=True, eq=False)
+class BenchmarkResult:
+    """What monitors made of a run's episodes, and what an ideal observer could.
+
+    Args:
+        monitors: by name.
+        detectability: of every faulty episode.
+        rate: the run's own false-alarm rate.
+        window_s: how soon an alarm must come to count as detection [s].
+        failed: nominal episodes that did not succeed; they are left out.
+    """
+
+    monitors: Mapping[str, MonitorResult]
+    detectability: Sequence[Detectability]
+    rate: float
+    window_s: float
+    failed: int = 0
+
+    @cached_property
+    def visible(self) -> dict[Kind, bool]:
+        return visible_kinds(self.detectability)
+
+    @cached_property
+    def on_all(self) -> list[DetectionMetrics]:
+        """Each monitor on all kinds of fault."""
+        return [monitor_metrics(n, m, self.window_s) for n, m in self.monitors.items()]
+
+    @cached_property
+    def on_visible(self) -> list[DetectionMetrics]:
+        """Each monitor on the kinds of fault that can be seen."""
+        return [monitor_metrics(n, m, self.window_s, self.visible) for n, m in self.monitors.items()]
+
+    @property
+    def ideal(self) -> KindMetrics:
+        """The bound, over the kinds that can be seen."""
+        seen = [d for d in self.detectability if self.visible[d.kind, d.severity]]
+        return ideal_metrics(IDEAL, seen, (*RATES, self.rate))
+
+    @cached_property
+    def kinds(self) -> dict[str, dict[Kind, KindMetrics]]:
+        """Each monitor on each kind of fault, the ideal observer first."""
+        bound = {}
+        for kind in self.visible:
+            own = [d for d in self.detectability if (d.kind, d.severity) == kind]
+            bound[kind] = ideal_metrics(in_words(kind), own, (*RATES, self.rate))
+        return {IDEAL: bound} | {m.name: m.kinds for m in self.on_all}
+
+    def false_alarms_by_variation(self) -> dict[str, dict[str, Share]]:
+        """Episodes of each harmless variation with an alarm, by monitor."""
+        return {
+            name: {
+                kind: false_alarms([t for t in monitor.harmless if t.kind == kind])
+                for kind in dict.fromkeys(t.kind for t in monitor.harmless)
+            }
+            for name, monitor in self.monitors.items()
+        }
 
 
-def ideal_cell(sights: Sequence[Sight], rates: Sequence[float] = RATES) -> Cell:
+def visible_kinds(detectability: Sequence[Detectability]) -> dict[Kind, bool]:
+    """Whether an ideal observer could see faults of a kind and severity, in order of appearance."""
+    kinds: dict[Kind, list[Detectability]] = {}
+    for one in detectability:
+        kinds.setdefault((one.kind, one.severity), []).append(one)
+    return {kind: _mean_power(own, 0.01) >= VISIBLE for kind, own in kinds.items()}
+
+
+def ideal_metrics(name: str, detectability: Sequence[Detectability], rates: Sequence[float] = RATES) -> KindMetrics:
     """The bound on what any monitor can score on these faults.
 
     The bound on average precision is not known in closed form and left out.
     """
-    late = sorted(math.inf if s.earliest is None else 1e3 * (s.earliest + 1) * s.dt for s in sights)
-    auroc = float(np.mean(auroc_bound(np.array([s.separation for s in sights])))) if sights else math.nan
-    found = {r: Share(round(len(sights) * _mean_power(sights, r)), len(sights)) for r in rates if sights}
-    return Cell(auroc, math.nan, found, _quantile(late, 0.5), _quantile(late, 0.95))
-
-
-def cell(
-    faulty: Sequence[Verdict],
-    nominal: Sequence[Verdict],
-    thresholds: Mapping[float, float],
-    rate: float,
-    window_s: float,
-) -> Cell:
-    """One monitor's score on some faults.
-
-    Args:
-        thresholds: by the false-alarm rate they were set for.
-        rate: which of them delays are given for.
-    """
-    placed = scoring.placements(faulty, nominal, window_s)
-    late = scoring.delays(faulty, thresholds[rate], window_s)
-    return Cell(
-        auroc=float(1.0 - placed.mean()) if placed.size else math.nan,
-        precision=scoring.average_precision(placed),
-        found={r: scoring.detections(faulty, q, window_s) for r, q in thresholds.items()},
-        median_ms=late.median_ms if late else math.nan,
-        p95_ms=late.p95_ms if late else math.nan,
+    separations = np.array([d.separation for d in detectability])
+    return KindMetrics(
+        name=name,
+        auroc=float(np.mean(auroc_bound(separations))) if len(separations) else math.nan,
+        average_precision=math.nan,
+        found={
+            r: Share(round(len(separations) * _mean_power(detectability, r)), len(separations))
+            for r in rates
+            if len(separations)
+        },
+        delays=Delays.of([math.inf if d.delay is None else 1e3 * d.delay for d in detectability]),
     )
 
 
-def by_kind(
-    verdicts: Sequence[Verdict], thresholds: Mapping[float, float], rate: float, window_s: float
-) -> dict[tuple[str, str], Cell]:
-    """(kind, severity): one monitor's cell, in order of appearance."""
-    nominal = [v for v in verdicts if v.kind == "nominal"]
-    faulty = [v for v in verdicts if v.onset is not None]
-    kinds = dict.fromkeys((v.kind, v.severity) for v in faulty)
-    return {
-        k: cell([v for v in faulty if (v.kind, v.severity) == k], nominal, thresholds, rate, window_s) for k in kinds
-    }
+def monitor_metrics(
+    name: str, result: MonitorResult, window_s: float, visible: Mapping[Kind, bool] | None = None
+) -> DetectionMetrics:
+    """One monitor on all kinds of fault, or on those that are ``visible``."""
+    nominal = [t for t in result.traces if t.kind == NOMINAL]
+    faulty = [t for t in result.traces if t.onset is not None]
+    if visible is not None:
+        faulty = [t for t in faulty if visible.get((t.kind, t.severity), False)]
+    return DetectionMetrics(name, faulty, nominal, window_s, result.thresholds)
 
 
-def score(
-    monitor: str,
-    verdicts: Sequence[Verdict],
-    thresholds: Mapping[float, float],
-    rate: float,
-    window_s: float,
-    visible: Mapping[tuple[str, str], bool],
-) -> Score:
-    """One monitor's row: means over the kinds that an ideal observer can see."""
-    nominal = [v for v in verdicts if v.kind == "nominal"]
-    faulty = [v for v in verdicts if v.onset is not None and visible.get((v.kind, v.severity), False)]
-    cells = list(by_kind([*nominal, *faulty], thresholds, rate, window_s).values())
-    overall = cell(faulty, nominal, thresholds, rate, window_s)
-    threshold = thresholds[rate]
-    return Score(
-        monitor=monitor,
-        cell=Cell(
-            auroc=float(np.mean([c.auroc for c in cells])) if cells else math.nan,
-            precision=float(np.mean([c.precision for c in cells])) if cells else math.nan,
-            found=overall.found,
-            median_ms=overall.median_ms,
-            p95_ms=overall.p95_ms,
-        ),
-        false_alarms=scoring.coverage(nominal, threshold),
-        false_alarms_per_hour=scoring.false_alarms_per_hour(nominal, threshold),
-        balanced_accuracy=scoring.balanced_accuracy(faulty, nominal, threshold, window_s),
-        timestep_weighted_accuracy=scoring.timestep_weighted_accuracy(faulty, nominal, threshold),
-        attribution=scoring.attribution_accuracy(faulty),
-    )
-
-
-def _mean_power(sights: Sequence[Sight], rate: float) -> float:
-    return float(np.mean(power_bound(np.array([s.separation for s in sights]), rate))) if sights else math.nan
-
-
-def _quantile(ordered: Sequence[float], q: float) -> float:
-    return ordered[math.ceil(q * len(ordered)) - 1] if ordered else math.nan
+def _mean_power(detectability: Sequence[Detectability], rate: float) -> float:
+    return float(np.mean(power_bound(np.array([d.separation for d in detectability]), rate)))

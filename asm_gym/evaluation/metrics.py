@@ -1,52 +1,75 @@
-"""How well faults were told from nominal episodes: pure functions of recorded traces.
+"""How well faults were told from nominal episodes: pure functions of traces, each judged by its own threshold.
 
 Detection is measured where the monitor only watches (``acting == "policy alone"``), so that the override cannot
 change what it is judged on; what the override changes is measured on the other traces.
+
+Scores are compared over the same steps: the greatest surprise in ``[onset, onset + window)`` of a faulty episode stands
+against that of nominal episodes of the same task in the same steps, because surprise depends on the phase of the task.
+A fault's *placement* is the share of nominal episodes that were at least as surprising there (Janes and Pepe 2009: the
+covariate-adjusted ROC curve). It is uniform on [0, 1] for nominal episodes, so that placements of all tasks and onsets
+can be pooled.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.evaluation.statistics import Share, auroc
+from asm_gym.evaluation.statistics import Floats, Share, auroc
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace, window_steps
+
+Kind = tuple[str, str]
+"""Of a fault, and its severity."""
+
+
+def in_words(kind: Kind) -> str:
+    """Such as ``weak joint mild``."""
+    return " ".join(part.replace("_", " ") for part in kind if part)
 
 
 def placements(faulty: Sequence[Trace], nominal: Sequence[Trace], window_s: float) -> NDArray[np.float64]:
-    """For each fault, the share of nominal episodes that were at least as surprising over the same steps.
+    """(F,) for each fault, the share of nominal episodes of its task at least as surprising in the same steps.
 
-    The score is the greatest surprise in ``[onset, onset + window)``; a faulty episode is compared with the nominal
-    ones over its own steps, because surprise depends on the phase of the task: the covariate-adjusted ROC curve of
-    Janes & Pepe 2009, of which these are the placement values. Ties count half.
-
-    Returns:
-        (F,) for the F traces with a fault and at least one nominal episode that lasted until its onset.
+    Ties count half. Episodes without a fault are left out, and faults that no nominal episode of their task reaches.
     """
+    by_task: dict[str, list[Trace]] = {}
+    for trace in nominal:
+        by_task.setdefault(trace.task, []).append(trace)
     values = []
     for trace in faulty:
-        if trace.onset is None:
+        steps = trace.window(window_s)
+        if trace.onset is None or steps.stop <= steps.start:
             continue
-        end = min(trace.onset + window_steps(window_s, trace.dt), len(trace))
-        negatives = [n.surprise[trace.onset : end].max() for n in nominal if len(n) > trace.onset]
-        if negatives:
-            values.append(1.0 - auroc([trace.surprise[trace.onset : end].max()], negatives))
+        others = [n.surprise[steps].max() for n in by_task.get(trace.task, []) if len(n) > steps.start]
+        if others:
+            values.append(1.0 - auroc([trace.surprise[steps].max()], others))
     return np.array(values)
 
 
-def time_matched_auroc(faulty: Sequence[Trace], nominal: Sequence[Trace], window_s: float) -> float | None:
+def time_matched_auroc(faulty: Sequence[Trace], nominal: Sequence[Trace], window_s: float) -> float:
     """AUROC of the greatest surprise within the window, each fault against the same steps of nominal episodes.
 
-    Equal to :func:`auroc` where all onsets are; None where nothing can be compared.
+    Equal to :func:`auroc` where all onsets are; NaN where nothing can be compared.
     """
     values = placements(faulty, nominal, window_s)
-    return float(1.0 - values.mean()) if values.size else None
+    return float(1.0 - values.mean()) if values.size else math.nan
+
+
+def average_precision(placements: Floats) -> float:
+    """Area under the precision-recall curve, where as many episodes are faulty as nominal.
+
+    At the k-th smallest placement u the recall is k/F and the false-alarm rate u: precision (k/F) / (k/F + u).
+    """
+    u = np.sort(np.asarray(placements, np.float64))
+    recall = (np.arange(len(u)) + 1) / len(u)
+    return float((recall / (recall + u)).mean()) if len(u) else math.nan
 
 
 class Delays(NamedTuple):
@@ -64,6 +87,17 @@ class Delays(NamedTuple):
     detected: int
     missed: int
 
+    @classmethod
+    def of(cls, delays_ms: Sequence[float] | Floats) -> Delays | None:
+        """Of one delay a fault [ms], ``inf`` for a miss; None without faults."""
+        late = sorted(map(float, delays_ms))
+        if not late:
+            return None
+        # Observed values, not interpolated ones: between a number and a miss there is nothing.
+        median, p95 = (late[math.ceil(q * len(late)) - 1] for q in (0.5, 0.95))
+        detected = sum(map(math.isfinite, late))
+        return cls(median, p95, detected, len(late) - detected)
+
 
 def delays_ms(traces: Sequence[Trace], window_s: float) -> NDArray[np.float64]:
     """(F,) sorted times from the fault to its alarm [ms], ``inf`` where that took longer than the window.
@@ -75,15 +109,14 @@ def delays_ms(traces: Sequence[Trace], window_s: float) -> NDArray[np.float64]:
     return np.sort([math.inf if k is None or d is None or k >= window else 1e3 * d for k, window, d in found])
 
 
-def delay_summary(traces: Sequence[Trace], window_s: float) -> Delays | None:
-    """Median and 95th percentile of the delay within the window; None where no trace holds a fault."""
-    delays = delays_ms(traces, window_s)
-    if not delays.size:
-        return None
-    # Observed values, not interpolated ones: between a number and a miss there is nothing.
-    median, p95 = (float(delays[math.ceil(q * delays.size) - 1]) for q in (0.5, 0.95))
-    detected = int(np.isfinite(delays).sum())
-    return Delays(median, p95, detected, delays.size - detected)
+def detected(traces: Sequence[Trace], window_s: float) -> Share:
+    """Faults with an alarm raised within the window."""
+    return Share.of([math.isfinite(d) for d in delays_ms(traces, window_s)])
+
+
+def false_alarms(traces: Sequence[Trace]) -> Share:
+    """Episodes with an alarm before the fault, or with any where there is none."""
+    return Share.of([bool(t.false_alarms) for t in traces])
 
 
 def false_alarms_per_hour(traces: Sequence[Trace]) -> float:
@@ -92,11 +125,53 @@ def false_alarms_per_hour(traces: Sequence[Trace]) -> float:
     return sum(len(t.false_alarms) for t in traces) / hours if hours else math.nan
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """How episodes of one condition ended, with one kind of acting.
+def balanced_accuracy(faulty: Sequence[Trace], nominal: Sequence[Trace], window_s: float) -> float:
+    """Mean of the share of faults detected and the share of nominal episodes without an alarm."""
+    return 0.5 * (detected(faulty, window_s).value + 1.0 - false_alarms(nominal).value)
 
-    Args:
+
+def timestep_weighted_accuracy(faulty: Sequence[Trace], nominal: Sequence[Trace]) -> float:
+    """Balanced accuracy in which a detection counts the less the later it comes (FIPER; Römer et al. 2025).
+
+    ½ (share of nominal episodes without an alarm + mean over faults of 1 - t/T), where t of the T steps left at the
+    onset had passed at the alarm; an undetected fault counts 0.
+    """
+    early = [0.0 if (k := t.detected_after) is None else 1.0 - k / (len(t) - (t.onset or 0)) for t in faulty]
+    return 0.5 * (float(np.mean(early)) + 1.0 - false_alarms(nominal).value) if early else math.nan
+
+
+def attribution_accuracy(faulty: Sequence[Trace]) -> Share:
+    """Of the faults that raised an alarm, those whose most surprising channel belonged to the fault."""
+    return Share.of([t.top_channel in t.affected_channels for t in faulty if t.top_channel and t.affected_channels])
+
+
+def typical(traces: Sequence[Trace]) -> Trace:
+    """The episode whose greatest surprise since the onset is the median one."""
+    return sorted(traces, key=lambda t: float(t.surprise[t.onset or 0 :].max(initial=0.0)))[len(traces) // 2]
+
+
+class KindMetrics(NamedTuple):
+    """How well faults of one kind and severity were detected, or could be.
+
+    Attributes:
+        name: in words.
+        auroc: over matched steps.
+        average_precision: likewise; NaN where it is not known.
+        found: faults detected within the window, by the false-alarm rate that the threshold was set for.
+        delays: at the threshold of the traces; None without faults.
+    """
+
+    name: str
+    auroc: float
+    average_precision: float
+    found: Mapping[float, Share]
+    delays: Delays | None
+
+
+class ActingMetrics(NamedTuple):
+    """How episodes ended with one kind of acting.
+
+    Attributes:
         acting: ``"policy alone"``, or what the alarm did.
         success: episodes that solved the task.
         ended_by_alarm: episodes that the alarm ended.
@@ -109,72 +184,100 @@ class Outcome:
     peak_force: float
 
 
-@dataclass(frozen=True)
-class Row:
-    """What one condition showed.
+@dataclass(frozen=True, eq=False)
+class DetectionMetrics:
+    """Traces of one monitor summed up: a row of a table, a curve of a figure.
 
     Args:
-        condition: ``"nominal"``, or the name of the fault.
-        episodes: watched with the policy alone, as everything down to ``top_labels``.
-        false_alarm_episodes: those with an alarm before the fault; with any alarm, where there is none.
-        false_alarms_per_hour: [1/h] of operation before any fault.
-        detected: faults with an alarm raised within the window; of 0 where there was no fault.
-        delays: None where there was no fault.
-        auroc: time-matched, against the nominal traces; None where there is nothing to compare.
-        top_labels: the channel with the greatest share of surprise when the first alarm was raised (in a faulty
-            episode, the first since the onset), with the number of episodes; the three most frequent.
-        outcomes: one for each kind of acting, the policy alone first.
-    """
-
-    condition: str
-    episodes: int
-    false_alarm_episodes: Share
-    false_alarms_per_hour: float
-    detected: Share
-    delays: Delays | None
-    auroc: float | None
-    top_labels: tuple[tuple[str, int], ...]
-    outcomes: tuple[Outcome, ...]
-
-    def outcome(self, acting: str) -> Outcome | None:
-        """The outcome with this kind of acting; None where it was not tried."""
-        return next((o for o in self.outcomes if o.acting == acting), None)
-
-
-def summarise(traces: Sequence[Trace], window_s: float) -> list[Row]:
-    """One row a condition, the nominal one first, then in order of appearance.
-
-    Args:
-        traces: any mixture of conditions and kinds of acting.
+        name: of a condition, or of a monitor.
+        traces: of any kind of fault and acting.
+        nominal: traces that the faulty ones are compared with.
         window_s: how soon an alarm must come to count as detection [s].
+        thresholds: others to detect by, by the false-alarm rate that each was set for.
     """
-    conditions = sorted(dict.fromkeys(t.condition for t in traces), key=lambda c: c != NOMINAL)
-    nominal = [t for t in traces if t.condition == NOMINAL and t.watched_only]
-    return [_row(c, [t for t in traces if t.condition == c], nominal, window_s) for c in conditions]
+
+    name: str
+    traces: Sequence[Trace]
+    nominal: Sequence[Trace]
+    window_s: float
+    thresholds: Mapping[float, float] = field(default_factory=dict)
+
+    @cached_property
+    def watched(self) -> list[Trace]:
+        """Those in which the policy acted alone: detection is measured on them."""
+        return [t for t in self.traces if t.watched_only]
+
+    @cached_property
+    def faulty(self) -> list[Trace]:
+        return [t for t in self.watched if t.onset is not None]
+
+    @cached_property
+    def kinds(self) -> dict[Kind, KindMetrics]:
+        """By kind and severity, in order of appearance."""
+        groups: dict[Kind, list[Trace]] = {}
+        for trace in self.faulty:
+            groups.setdefault((trace.kind, trace.severity), []).append(trace)
+        return {kind: self._of(kind, group) for kind, group in groups.items()}
+
+    def _of(self, kind: Kind, faulty: Sequence[Trace]) -> KindMetrics:
+        placed = placements(faulty, self.nominal, self.window_s)
+        return KindMetrics(
+            name=in_words(kind),
+            auroc=float(1.0 - placed.mean()) if placed.size else math.nan,
+            average_precision=average_precision(placed),
+            found={r: detected([t.at(q) for t in faulty], self.window_s) for r, q in self.thresholds.items()},
+            delays=Delays.of(delays_ms(faulty, self.window_s)),
+        )
+
+    @property
+    def auroc(self) -> float:
+        """Mean over kinds; NaN without faults."""
+        return float(np.mean([k.auroc for k in self.kinds.values()])) if self.kinds else math.nan
+
+    @property
+    def average_precision(self) -> float:
+        """Mean over kinds; NaN without faults."""
+        return float(np.mean([k.average_precision for k in self.kinds.values()])) if self.kinds else math.nan
+
+    @property
+    def found(self) -> dict[float, Share]:
+        """All faults detected within the window, by false-alarm rate."""
+        each = [k.found for k in self.kinds.values()]
+        return {r: Share(sum(f[r].k for f in each), sum(f[r].n for f in each)) for r in self.thresholds}
+
+    @cached_property
+    def delays(self) -> Delays | None:
+        return Delays.of(delays_ms(self.faulty, self.window_s))
+
+    @property
+    def detected(self) -> Share:
+        """Faults detected within the window."""
+        return detected(self.faulty, self.window_s)
+
+    @property
+    def top_channels(self) -> list[tuple[str, int]]:
+        """The channels that surprised most at the alarms, with the number of episodes; the three most frequent."""
+        return Counter(t.top_channel for t in self.watched if t.top_channel).most_common(3)
+
+    @cached_property
+    def outcomes(self) -> list[ActingMetrics]:
+        """One for each kind of acting, the policy alone first."""
+        actings = sorted(dict.fromkeys(t.acting for t in self.traces), key=lambda a: a != POLICY_ALONE)
+        return [_ended(a, [t for t in self.traces if t.acting == a]) for a in actings]
 
 
-def _row(condition: str, traces: Sequence[Trace], nominal: Sequence[Trace], window_s: float) -> Row:
-    watched = [t for t in traces if t.watched_only]
-    delays = delay_summary(watched, window_s)
-    actings = sorted(dict.fromkeys(t.acting for t in traces), key=lambda a: a != POLICY_ALONE)
-    return Row(
-        condition=condition,
-        episodes=len(watched),
-        false_alarm_episodes=Share.of([bool(t.false_alarms) for t in watched]),
-        false_alarms_per_hour=false_alarms_per_hour(watched),
-        detected=Share(delays.detected, delays.detected + delays.missed) if delays else Share(0, 0),
-        delays=delays,
-        auroc=time_matched_auroc(watched, nominal, window_s),
-        top_labels=tuple(Counter(t.top_channel for t in watched if t.top_channel).most_common(3)),
-        outcomes=tuple(_outcome(a, [t for t in traces if t.acting == a]) for a in actings),
-    )
-
-
-def _outcome(acting: str, traces: Sequence[Trace]) -> Outcome:
-    peaks = [t.outcome.contact_force for t in traces]
-    return Outcome(
+def _ended(acting: str, traces: Sequence[Trace]) -> ActingMetrics:
+    ends = [t.outcome for t in traces]
+    return ActingMetrics(
         acting=acting,
-        success=Share.of([t.outcome.success for t in traces]),
-        ended_by_alarm=Share.of([t.outcome.ended_by_alarm for t in traces]),
-        peak_force=float(np.median(peaks)),
+        success=Share.of([o.success for o in ends]),
+        ended_by_alarm=Share.of([o.ended_by_alarm for o in ends]),
+        peak_force=float(np.median([o.contact_force for o in ends])),
     )
+
+
+def by_condition(traces: Sequence[Trace], window_s: float) -> list[DetectionMetrics]:
+    """One for each condition, the nominal one first, then in order of appearance."""
+    nominal = [t for t in traces if t.kind == NOMINAL and t.watched_only]
+    conditions = sorted(dict.fromkeys(t.condition for t in traces), key=lambda c: c != NOMINAL)
+    return [DetectionMetrics(c, [t for t in traces if t.condition == c], nominal, window_s) for c in conditions]

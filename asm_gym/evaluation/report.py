@@ -1,21 +1,24 @@
-"""One self-contained HTML file: tables, figures and a film, with nothing to fetch."""
+"""Results as files: one self-contained HTML page with nothing to fetch, and a benchmark's tables and rows."""
 
 from __future__ import annotations
 
 import base64
 import io
-import math
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from string import Template
+from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
-from asm_gym.evaluation.metrics import Row
-from asm_gym.evaluation.statistics import Share
-from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE
+from asm_gym.evaluation import figures
+from asm_gym.evaluation.comparison import BenchmarkResult, Detectability
+from asm_gym.evaluation.tables import Table, harmless_table, kinds_table, markdown, monitors_table
+from asm_gym.evaluation.trace import Trace, window_steps
+from asm_gym.extras import needed_for
 
 _PAGE = Template("""<!doctype html>
 <html lang="en">
@@ -74,80 +77,12 @@ $body
 """)
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table: one heading a column, and rows as long as the headings; the first cell of a row names it."""
-
-    caption: str
-    headings: Sequence[str]
-    rows: Sequence[Sequence[object]]
-
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.headings):
-                raise ValueError(f"the table has {len(self.headings)} columns, but a row of {len(row)}: {list(row)}")
-
-
-def detection_table(rows: Sequence[Row], window_s: float) -> Table:
-    """What the monitor told, watching the policy alone."""
-    window = 1e3 * window_s
-    cells = [
-        (
-            r.condition,
-            _share(r.false_alarm_episodes),
-            _number(r.false_alarms_per_hour),
-            _interval(r.detected),
-            _delay(r.delays.median_ms if r.delays else None, window),
-            _delay(r.delays.p95_ms if r.delays else None, window),
-            "" if r.auroc is None else f"{r.auroc:.2f}",
-            ", ".join(f"{label}\u00a0({n})" for label, n in r.top_labels),
-        )
-        for r in rows
-    ]
-    return Table(
-        f"Detection, the monitor only watching. False alarm: raised before the fault, or at all in nominal episodes. "
-        f"Detected: alarm raised within {window:.0f} ms of the onset, with the 95 % Wilson interval; a miss counts as "
-        f"infinitely late. AUROC: against nominal episodes over the same steps.",
-        ("Condition", "With false alarm", "False alarms per hour", "Detected", "Median delay [ms]",
-         "95th percentile [ms]", "AUROC", "Most surprising channel at the alarm"),
-        cells,
-    )  # fmt: skip
-
-
-def outcome_table(rows: Sequence[Row]) -> Table:
-    """What the override changed, against the policy alone."""
-    cells = [
-        (
-            r.condition,
-            o.acting,
-            _interval(o.success),
-            "" if o.acting == POLICY_ALONE else _share(o.ended_by_alarm),
-            _number(o.peak_force),
-        )
-        for r in rows
-        for o in r.outcomes
-    ]
-    return Table(
-        "What acting on the alarm changes. Peak contact force: median over episodes of the greatest force.",
-        ("Condition", "Acting", "Task solved", "Ended by the alarm", "Peak contact force [N]"),
-        cells,
-    )
-
-
-def headline(rows: Sequence[Row]) -> str:
-    """One sentence: detected of all faults, false alarms of all nominal episodes."""
-    detected = Share(sum(r.detected.k for r in rows), sum(r.detected.n for r in rows))
-    alarms = [r.false_alarm_episodes for r in rows if r.condition == NOMINAL]
-    false = Share(sum(a.k for a in alarms), sum(a.n for a in alarms))
-    return f"{_share(detected)} faults detected; {_share(false)} nominal episodes with a false alarm."
-
-
 def write_report(
     path: str | Path,
     title: str,
     intro: str,
     tables: Sequence[Table],
-    figures: Mapping[str, Path | Figure],
+    drawn: Mapping[str, Path | Figure],
     video: Path | None = None,
     details: Mapping[str, object] | None = None,
 ) -> Path:
@@ -158,7 +93,7 @@ def write_report(
         title: one line.
         intro: plain text; an empty line starts a new paragraph.
         tables: in order.
-        figures: caption to a PNG file, or to a Figure.
+        drawn: caption to a PNG file, or to a Figure.
         video: an MP4 file.
         details: what it takes to make the report again: arguments, seed, versions.
     """
@@ -171,8 +106,8 @@ def write_report(
         parts.append(f'<section class="film"><h2>Film</h2>\n{film}This browser plays no MP4.</video></section>')
     if tables:
         parts.append("<section><h2>Results</h2>\n" + "\n".join(map(_table, tables)) + "</section>")
-    if figures:
-        shown = "\n".join(_shown(caption, figure) for caption, figure in figures.items())
+    if drawn:
+        shown = "\n".join(_shown(caption, figure) for caption, figure in drawn.items())
         parts.append(f"<section><h2>Figures</h2>\n{shown}</section>")
     if details:
         items = "\n".join(f"<dt>{escape(k)}</dt><dd>{escape(str(v))}</dd>" for k, v in details.items())
@@ -225,22 +160,85 @@ def _uri(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-def _share(share: Share) -> str:
-    return f"{share.k} of {share.n}"
+def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any], video: Path | None = None) -> None:
+    """Writes ``results.parquet``, ``results.json``, ``results.md`` and ``report.html``."""
+    _write_parquet(folder / "results.parquet", result)
+    tables = [monitors_table(result), kinds_table(result), harmless_table(result, list(result.monitors))]
+    (folder / "results.md").write_text("\n\n".join(map(markdown, tables)) + "\n", encoding="utf-8")
+    summary = {"settings": details, "tables": [{"headings": t.headings, "rows": t.rows} for t in tables]}
+    (folder / "results.json").write_text(json.dumps(summary, indent=1, default=str) + "\n", encoding="utf-8")
+    write_report(
+        folder / "report.html",
+        "Who notices what",
+        f"{len(result.detectability)} faulty episodes, {len(result.monitors)} monitors. The ideal observer knows the "
+        "healthy twin of every faulty episode and the sensors' noise: no monitor can do better than its row.",
+        tables,
+        _benchmark_figures(result),
+        video,
+        details,
+    )
 
 
-def _interval(share: Share) -> str:
-    if not share.n:
-        return ""
-    low, high = share.interval
-    return f"{share.k} of {share.n} ({100 * low:.0f}–{100 * high:.0f} %)"
+def _benchmark_figures(result: BenchmarkResult) -> dict[str, Figure]:
+    drawn = {
+        "AUROC by kind of fault and severity. In brackets: no observer could see it.": figures.heat_map(
+            result.kinds, result.visible
+        ),
+        "ROC over all faults, each against nominal episodes of its task in the same steps.": figures.roc_figure(
+            result.on_all
+        ),
+        "How soon faults were found.": figures.delay_figure(result.on_all),
+    }
+    severities = list(dict.fromkeys(severity for _, severity in result.visible))
+    if len(severities) > 1:
+        drawn["Faults found at each severity."] = figures.severity_curves(result.kinds, severities, result.rate)
+    first, examples = next((name, monitor.examples) for name, monitor in result.monitors.items())
+    if examples:
+        drawn[f"Typical episodes as {first} saw them: surprise over its threshold, the fault's span, the alarms."] = (
+            figures.surprise_figure(examples)
+        )
+    for trace in examples:
+        drawn[f"{trace.title}: the channels that surprised most."] = figures.stream_figure(trace)
+        drawn[f"{trace.title}: where the surprise came from."] = figures.attribution_figure(trace)
+    return drawn
 
 
-def _delay(value: float | None, window_ms: float) -> str:
-    if value is None:
-        return ""
-    return f"{value:.0f}" if math.isfinite(value) else f"> {window_ms:.0f}"
+def _write_parquet(path: Path, result: BenchmarkResult) -> None:
+    with needed_for("results.parquet"):
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    possible = {(d.task, d.kind, d.severity, d.seed): d for d in result.detectability}
+    rows = [
+        _row(trace, possible.get((trace.task, trace.kind, trace.severity, trace.seed)), result.window_s)
+        for which in ("traces", "harmless")
+        for monitor in result.monitors.values()
+        for trace in getattr(monitor, which)
+    ]
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    pq.write_table(pa.Table.from_pylist(rows), unfinished, compression="zstd")
+    unfinished.replace(path)
 
 
-def _number(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:.1f}"
+def _row(trace: Trace, possible: Detectability | None, window_s: float) -> dict[str, Any]:
+    after, affected = trace.detected_after, trace.affected_channels
+    blamed = trace.top_channel if after is not None else ""
+    return {
+        "task": trace.task,
+        "monitor": trace.monitor,
+        "kind": trace.kind,
+        "severity": trace.severity,
+        "seed": trace.seed,
+        "onset": trace.onset,
+        "steps": len(trace),
+        "dt": trace.dt,
+        "threshold": trace.threshold,
+        "alarm": bool(trace.alarms),
+        "detected": after is not None and after < window_steps(window_s, trace.dt) if trace.onset is not None else None,
+        "delay_s": trace.delay,
+        "peak_in_window": float(trace.surprise[trace.window(window_s)].max(initial=0.0)),
+        "blamed": blamed or None,
+        "blamed_rightly": blamed in affected if blamed and affected else None,
+        "ideal_separation": possible.separation if possible else None,
+        "ideal_delay_s": possible.delay if possible else None,
+        "surprise": np.asarray(trace.surprise, np.float32).tolist(),
+    }

@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from asm_gym.evaluation.plots import figure, look
-from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.statistics import Estimate, Spread, bootstrap, gain, reduction
+from asm_gym.evaluation.tables import Table
 
 COUNTED = ("over", "contacts", "limited", "touched", "alarms", "acted", "noticed")
 """Names of what ``Outcome`` counts."""

@@ -20,8 +20,7 @@ from rich.progress import track
 
 import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
-from asm_gym.evaluation.report import Table
-from asm_gym.evaluation.text_tables import console_table
+from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.scripts.benchmark.experts import Experts
 from asm_gym.scripts.benchmark.fit import Fit
 from asm_gym.scripts.benchmark.memory import Memory, Safety

@@ -10,9 +10,8 @@ import numpy as np
 from rich.console import Console
 
 from asm_gym.choices import check_choice
-from asm_gym.evaluation.report import Table
 from asm_gym.evaluation.statistics import Share
-from asm_gym.evaluation.text_tables import console_table
+from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.registry import EXPERTS
 from asm_gym.rollouts.parallel import parallel_map

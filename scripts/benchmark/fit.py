@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from asm_gym.episodes import Episode
-from asm_gym.evaluation.report import Table
-from asm_gym.evaluation.text_tables import console_table
+from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.memory.association import complete, hidden_units
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.baselines.gru import GRU

@@ -17,8 +17,7 @@ from torch import Tensor
 from asm_gym.detection.detector import LATELY, POWER
 from asm_gym.detection.repetition import FADING, LIGHT, SURE
 from asm_gym.episodes import Episode
-from asm_gym.evaluation.report import Table
-from asm_gym.evaluation.text_tables import console_table
+from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.collect import collect
 from asm_gym.scripts.benchmark.turns import take_turns

@@ -20,10 +20,9 @@ from threadpoolctl import threadpool_limits
 
 import asm_gym
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
-from asm_gym.evaluation.plots import save
-from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.figures import save
 from asm_gym.evaluation.statistics import Spread
-from asm_gym.evaluation.text_tables import console_table, markdown
+from asm_gym.evaluation.tables import Table, console_table, markdown
 from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds

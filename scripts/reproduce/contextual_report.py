@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from asm_gym.evaluation.plots import figure, look
-from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.figures import figure, look
+from asm_gym.evaluation.tables import Table
 from asm_gym.scripts.reproduce.common import SKILLS, Record, over_seeds, shown
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import Rows

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from asm_gym.evaluation.plots import look
+from asm_gym.evaluation.figures import look
 
 
 def curve(

@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from asm_gym.episodes import Episode
-from asm_gym.evaluation.plots import figure, look
-from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.statistics import wilson_interval
+from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.base import Policy

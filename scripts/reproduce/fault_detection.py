@@ -8,6 +8,7 @@ sensors and actions. Each fault is compared with nominal episodes of its own ski
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,9 +23,10 @@ from rich.console import Console
 from asm_gym.choices import check_choice
 from asm_gym.detection.detector import conformal_episodes, conformal_threshold
 from asm_gym.episodes import Episode
-from asm_gym.evaluation.plots import figure, look
-from asm_gym.evaluation.report import Table
-from asm_gym.evaluation.statistics import auroc
+from asm_gym.evaluation.figures import figure, look
+from asm_gym.evaluation.metrics import detected, false_alarms, time_matched_auroc
+from asm_gym.evaluation.tables import Table
+from asm_gym.evaluation.trace import NOMINAL, Trace
 from asm_gym.faults.suite import KINDS, SEVERITIES
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.rollouts.parallel import parallel_map
@@ -164,32 +166,31 @@ def judged(seed: int, trial: Trial, args: Args) -> tuple[list[Record], dict[str,
         # Nobody who calibrates means to name the wrong skill.
         before = told(monitor, trial.calibration, skills, "right" if how == "wrong" else how)
         threshold = conformal_threshold(np.array([v.max() for v in before]), RATE)
-        nominal = told(monitor, trial.nominal, skills, how)
-        faulty = told(monitor, [e for _, _, e in trial.faulty], skills, how)
+        values = told(monitor, trial.nominal, skills, how)
+        nominal = [_trace(e, v, threshold) for e, v in zip(trial.nominal, values, strict=True)]
+        values = told(monitor, [e for _, _, e in trial.faulty], skills, how)
+        faulty = [
+            _trace(e, v, threshold, kind, onset) for (kind, onset, e), v in zip(trial.faulty, values, strict=True)
+        ]
         where = {"domain": trial.domain, "way": way, "seed": seed}
-        records += [{**where, "alarm": float(v.max() > threshold)} for v in nominal]
-        records += _found(trial, nominal, faulty, threshold, where)
-        example[way] = faulty[shown_one] / threshold
+        records += [{**where, "alarm": false_alarms([t]).value} for t in nominal]
+        records += [{**where, "kind": t.kind, **_found(t, nominal)} for t in faulty]
+        example[way] = faulty[shown_one].surprise / threshold
     example["onset"] = trial.faulty[shown_one][1]
     return records, example
 
 
-def _found(trial: Trial, nominal: Scores, faulty: Scores, threshold: float, where: Record) -> list[Record]:
-    """AUROC and detection of each faulty episode."""
-    records = []
-    for (kind, onset, episode), values in zip(trial.faulty, faulty, strict=True):
-        window = slice(onset, onset + WINDOW)
-        own = [
-            v[window].max()
-            for v, e in zip(nominal, trial.nominal, strict=True)
-            if _skill(e) == _skill(episode) and len(v) > onset
-        ]
-        if own:
-            # Already in alarm before anything happened is no detection.
-            raised = values[window].max() > threshold and not values[:onset].max(initial=0) > threshold
-            score = auroc([values[window].max()], own)
-            records.append({**where, "kind": kind, "auroc": score, "found": float(raised)})
-    return records
+def _trace(
+    episode: Episode, values: NDArray[np.float64], threshold: float, kind: str = NOMINAL, onset: int | None = None
+) -> Trace:
+    return Trace(kind, episode.seed or 0, episode.spec.dt, threshold, values, onset, task=_skill(episode))
+
+
+def _found(fault: Trace, nominal: Sequence[Trace]) -> Record:
+    """AUROC against nominal episodes of the same skill in the same steps, and whether an alarm was raised in time."""
+    window_s = WINDOW * fault.dt
+    score = time_matched_auroc([fault], nominal, window_s)
+    return {"auroc": None if math.isnan(score) else score, "found": detected([fault], window_s).value}
 
 
 def tables(records: Sequence[Record], args: Args) -> list[Table]:
@@ -217,7 +218,7 @@ def drawn(records: Sequence[Record], example: dict[str, Any]) -> Figure:
     domains = list(dict.fromkeys(r["domain"] for r in records))
     panels = (
         ("auroc", "AUROC"),
-        ("found", "found, no alarm before"),
+        ("found", "found"),
         ("alarm", "false alarms"),
     )
     with figure(height=3.6, width=11) as fig:

@@ -21,8 +21,8 @@ import torch
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from asm_gym.evaluation.plots import figure
-from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.figures import figure
+from asm_gym.evaluation.tables import Table
 from asm_gym.memory.inference import Weights
 from asm_gym.memory.learning import Batch, Learner, Schedule, Trajectory, batches, cosine_decay, side_by_side
 from asm_gym.memory.network import initial_weights

@@ -18,8 +18,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from asm_gym.evaluation.plots import figure, look
-from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.figures import figure, look
+from asm_gym.evaluation.tables import Table
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.reproduce import robot_recall

@@ -21,8 +21,7 @@ from rich.console import Console
 from asm_gym.choices import check_choice
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.intervention import Comparison, compare
-from asm_gym.evaluation.report import Table
-from asm_gym.evaluation.text_tables import console_table, markdown
+from asm_gym.evaluation.tables import Table, console_table, markdown
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
 from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import NeuralASM

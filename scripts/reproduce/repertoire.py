@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -19,23 +19,25 @@ from rich.console import Console
 
 from asm_gym.choices import check_choice
 from asm_gym.detection.detector import conformal_episodes
-from asm_gym.evaluation import comparison, plots
-from asm_gym.evaluation.comparison import Score
-from asm_gym.evaluation.repertoire import alarms_table, naming_figure, share_right
-from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.comparison import monitor_metrics, visible_kinds
+from asm_gym.evaluation.figures import save
+from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms
 from asm_gym.evaluation.statistics import Spread
-from asm_gym.evaluation.text_tables import console_table, markdown
+from asm_gym.evaluation.tables import Table, console_table, markdown, milliseconds
 from asm_gym.monitors import MONITORS
-from asm_gym.rollouts.benchmark import opinion_of, sights_of
+from asm_gym.rollouts.benchmark import detectability_of, result_of
 from asm_gym.rollouts.folder import files_in, recorded, tasks_in
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import USAGE_ERRORS
-from asm_gym.scripts.reproduce.skill_recognition import Naming, experienced, name_skills
+from asm_gym.scripts.reproduce.skill_recognition import (
+    alarms_table,
+    experienced,
+    name_skills,
+    naming_figure,
+    naming_table,
+)
 from asm_gym.scripts.reproduce.skill_switch import NAMES, record_switch
-
-AFTER_S = (0.5, 1.0, 2.0, 5.0)
-"""How long after a skill began it is asked for [s]."""
 
 
 @dataclass(frozen=True)
@@ -124,31 +126,32 @@ def jobs(args: Args) -> list[Job]:
     return together + [Job(args.monitors[0], s, (t,)) for s in seeds[: args.alone_seeds] for t in tasks]
 
 
-def score(job: Job, run: Path, rate: float, window_s: float) -> dict[str, Score]:
+def score(job: Job, run: Path, rate: float, window_s: float) -> dict[str, DetectionMetrics]:
     """The job's monitor on each of its tasks, and on all of them under ``""``."""
     recordings, _, twins = recorded(run, job.tasks)
-    said = opinion_of(job.monitor, run, recordings, rate, job.seed)
-    sights = sights_of(twins, recordings["faulty"], window_s)
+    result = result_of(job.monitor, run, recordings, rate, job.seed)
+    detectability = detectability_of(twins, recordings["faulty"], window_s)
 
-    def of(task: str) -> Score:
-        own = [v for v in said.verdicts if task in ("", v.task)]
+    def of(task: str) -> DetectionMetrics:
+        own = replace(result, traces=[t for t in result.traces if task in ("", t.task)])
         # By task, so that one learned alone is asked about the same kinds.
-        visible = comparison.visible_kinds([s for s in sights if task in ("", s.task)])
-        return comparison.score(job.monitor, own, said.thresholds, rate, window_s, visible)
+        visible = visible_kinds([d for d in detectability if task in ("", d.task)])
+        return monitor_metrics(job.monitor, own, window_s, visible)
 
     return {task: of(task) for task in ("", *job.tasks)}
 
 
-def seeds_table(found: Sequence[tuple[Job, dict[str, Score]]], args: Args) -> Table:
+def seeds_table(found: Sequence[tuple[Job, dict[str, DetectionMetrics]]], args: Args) -> Table:
     """Each monitor on all tasks, over seeds."""
     rows = []
     for monitor in args.monitors:
         own = [s[""] for job, s in found if job.monitor == monitor and len(job.tasks) > 1]
-        alarms = [100 * s.false_alarms.value for s in own]
-        at = [Spread.of([s.cell.found[r].value for s in own]).text(100, 1) for r in sorted(own[0].cell.found)]
-        auroc = Spread.of([s.cell.auroc for s in own]).text()
-        rows.append((monitor, auroc, *at, Spread.of(alarms).text(1, 1), _delays(own)))
-    rates = [f"Found at {100 * r:g} % [%]" for r in sorted(found[0][1][""].cell.found)]
+        alarms = [100 * false_alarms(s.nominal).value for s in own]
+        at = [Spread.of([s.found[r].value for s in own]).text(100, 1) for r in sorted(own[0].found)]
+        auroc = Spread.of([s.auroc for s in own]).text()
+        delays = ", ".join(milliseconds(s.delays, "median_ms") for s in own)
+        rows.append((monitor, auroc, *at, Spread.of(alarms).text(1, 1), delays))
+    rates = [f"Found at {100 * r:g} % [%]" for r in sorted(found[0][1][""].found)]
     return Table(
         f"One monitor for {', '.join(args.tasks)}: mean and standard deviation over {args.seeds} seeds.",
         ("Monitor", "AUROC", *rates, "False alarms [% of episodes]", "Median delay [ms]"),
@@ -156,7 +159,7 @@ def seeds_table(found: Sequence[tuple[Job, dict[str, Score]]], args: Args) -> Ta
     )
 
 
-def alone_table(found: Sequence[tuple[Job, dict[str, Score]]], args: Args) -> Table:
+def alone_table(found: Sequence[tuple[Job, dict[str, DetectionMetrics]]], args: Args) -> Table:
     """The first monitor's AUROC and share found for each task, learned together and alone."""
     first, rate = args.monitors[0], args.false_alarm_rate
     alone = {(j.seed, j.tasks[0]): s for j, s in found if len(j.tasks) == 1}
@@ -164,7 +167,7 @@ def alone_table(found: Sequence[tuple[Job, dict[str, Score]]], args: Args) -> Ta
     together = {j.seed: s for j, s in found if j.monitor == first and len(j.tasks) > 1 and j.seed in used}
     rows = []
     for task in args.tasks:
-        pairs = [(s[task].cell, alone[seed, task][task].cell) for seed, s in together.items()]
+        pairs = [(s[task], alone[seed, task][task]) for seed, s in together.items()]
         auroc = [Spread.of([p[i].auroc for p in pairs]).text() for i in (0, 1)]
         gained = Spread.of([a.auroc - b.auroc for a, b in pairs]).text()
         power = [Spread.of([p[i].found[rate].value for p in pairs]).text(100, 0) for i in (0, 1)]
@@ -175,24 +178,6 @@ def alone_table(found: Sequence[tuple[Job, dict[str, Score]]], args: Args) -> Ta
         ("Task", "AUROC, together", "alone", "gained", f"Found at {100 * rate:g} % [%], together", "alone"),
         rows,
     )
-
-
-def naming_table(found: Sequence[Naming], args: Args, dt: float) -> Table:
-    """How often the right skill is named."""
-
-    def row(name: str, which: str) -> tuple[str, ...]:
-        shares = [[100 * share_right(getattr(n, which), round(s / dt)) for n in found] for s in AFTER_S]
-        return (name, *(Spread.of(x).text(1, 1) for x in shares))  # fmt: skip
-
-    rows = [row("from the start of an episode", "nominal")]
-    caption = f"Right skill of {len(args.tasks)} named so long after it began [% of episodes]."
-    if found[0].switched:
-        rows.append(row("after a change of skill", "switched"))
-    return Table(caption, ("", *(f"{s:g} s" for s in AFTER_S)), rows)
-
-
-def _delays(scores: Sequence[Score]) -> str:
-    return ", ".join(f"{s.cell.median_ms:.0f}" for s in scores)
 
 
 def repertoire(args: Args, console: Console) -> list[Table]:
@@ -219,7 +204,7 @@ def repertoire(args: Args, console: Console) -> list[Table]:
             name = partial(name_skills, **what)
             named = parallel_map(name, range(args.seed, args.seed + args.seeds), args.workers, progress)
         dt = recorded(args.run, tuple(args.tasks)).roles["nominal"][0].spec.dt
-        tables.append(naming_table(named, args, dt))
+        tables.append(naming_table(named, len(args.tasks), dt))
         if switches:
             alarms = {"of single skills": [n.alarms for n in named]}
             if experience:
@@ -233,7 +218,7 @@ def repertoire(args: Args, console: Console) -> list[Table]:
         curves = {"from the start": [r for n in named for r in n.nominal]}
         if named[0].switched:
             curves["after a change"] = [r for n in named for r in n.switched]
-        plots.save(naming_figure(curves, dt), args.out / "naming.png")
+        save(naming_figure(curves, dt), args.out / "naming.png")
     _write(args, tables, seconds)
     return tables
 

@@ -23,10 +23,9 @@ from rich.console import Console
 from asm_gym.choices import check_choice
 from asm_gym.detection.detector import conformal_episodes
 from asm_gym.episodes import Episode, load_episode
-from asm_gym.evaluation import plots
-from asm_gym.evaluation.report import Table
+from asm_gym.evaluation import figures
 from asm_gym.evaluation.safe_training import COUNTED, Outcome, counts_table, learning_figure, worth_table
-from asm_gym.evaluation.text_tables import console_table, markdown
+from asm_gym.evaluation.tables import Table, console_table, markdown
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.collect import collect_to
 from asm_gym.rollouts.folder import claimed, make_missing
@@ -250,7 +249,7 @@ def _write(
         csv.writer(file).writerows([("condition", "seed", "steps", *COUNTED, "success"), *rows])
     content = {"settings": asdict(args), "seconds": seconds, "runs": [asdict(o) for o in every]}
     (args.out / "training.json").write_text(json.dumps(content, indent=1, default=str) + "\n", encoding="utf-8")
-    plots.save(learning_figure(outcomes, args.force_limit), args.out / "training.png")
+    figures.save(learning_figure(outcomes, args.force_limit), args.out / "training.png")
 
 
 def main(argv: list[str] | None = None) -> int:

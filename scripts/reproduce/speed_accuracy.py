@@ -25,9 +25,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 
-from asm_gym.evaluation.plots import figure, look
-from asm_gym.evaluation.report import Table
+from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.statistics import auroc
+from asm_gym.evaluation.tables import Table
 from asm_gym.memory.network import Network
 from asm_gym.memory.recall import at_rest, follow
 from asm_gym.rollouts.parallel import parallel_map

@@ -18,12 +18,11 @@ from rich.console import Console
 
 from asm_gym.choices import check_choice
 from asm_gym.episodes import Episode
-from asm_gym.evaluation import comparison
-from asm_gym.evaluation.comparison import Score
-from asm_gym.evaluation.report import Table
-from asm_gym.evaluation.text_tables import console_table, markdown
+from asm_gym.evaluation.comparison import monitor_metrics, visible_kinds
+from asm_gym.evaluation.metrics import DetectionMetrics, Kind, false_alarms
+from asm_gym.evaluation.tables import Column, Table, console_table, count, markdown, percent_within, tabulate
 from asm_gym.monitors import MONITORS
-from asm_gym.rollouts.benchmark import opinion_of, sights_of
+from asm_gym.rollouts.benchmark import detectability_of, result_of
 from asm_gym.rollouts.folder import recorded, tasks_in
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import USAGE_ERRORS
@@ -59,7 +58,7 @@ class Side(NamedTuple):
 
     folder: Path
     roles: Roles
-    visible: dict[tuple[str, str], bool]  # kinds and severities that an ideal observer could see
+    visible: dict[Kind, bool]  # kinds and severities that an ideal observer could see
 
 
 def read_side(folder: Path, window_s: float) -> Side:
@@ -72,11 +71,11 @@ def read_side(folder: Path, window_s: float) -> Side:
     if not tasks:
         raise ValueError(f"{folder} holds no recordings: run asm-gym evaluate first")
     roles, _, twins = recorded(folder.resolve(), tasks)
-    return Side(folder, roles, comparison.visible_kinds(sights_of(twins, roles.get("faulty", []), window_s)))
+    return Side(folder, roles, visible_kinds(detectability_of(twins, roles.get("faulty", []), window_s)))
 
 
-def scores(args: Args) -> dict[str, Score]:
-    """By what was done, on the kinds of fault that can be seen under both policies."""
+def scores(args: Args) -> list[DetectionMetrics]:
+    """One for each way, on the kinds of fault that can be seen under both policies."""
     known, watched = (read_side(folder, args.window) for folder in (args.known, args.watched))
     both = {k: seen and watched.visible.get(k, False) for k, seen in known.visible.items()}
     ways = {
@@ -85,7 +84,7 @@ def scores(args: Args) -> dict[str, Score]:
         "re-calibrated on the watched": (known, watched, watched),
         "fitted anew on the watched": (watched, watched, watched),
     }
-    found = {}
+    found = []
     for name, (fit, calibration, tested) in ways.items():
         roles = {
             "fit": fit.roles["fit"],
@@ -93,33 +92,27 @@ def scores(args: Args) -> dict[str, Score]:
             "nominal": tested.roles["nominal"],
             "faulty": tested.roles.get("faulty", []),
         }
-        said = opinion_of(args.monitor, fit.folder, roles, args.false_alarm_rate, args.seed)
-        found[name] = comparison.score(
-            args.monitor, said.verdicts, said.thresholds, args.false_alarm_rate, args.window, both
-        )
+        result = result_of(args.monitor, fit.folder, roles, args.false_alarm_rate, args.seed)
+        found.append(monitor_metrics(name, result, args.window, both))
     return found
 
 
-def table(found: Mapping[str, Score], args: Args) -> Table:
+COLUMNS: Sequence[Column[DetectionMetrics]] = (
+    Column("", lambda m: m.name),
+    Column("AUROC", lambda m: f"{m.auroc:.3f}"),
+    Column("Found", lambda m: percent_within(m.detected)),
+    Column("False alarms", lambda m: count(false_alarms(m.nominal))),
+)
+
+
+def table(found: Sequence[DetectionMetrics], args: Args) -> Table:
     """A row for each way."""
-    rows = []
-    for name, score in found.items():
-        found_share, false = score.cell.found[args.false_alarm_rate], score.false_alarms
-        low, high = found_share.interval
-        rows.append(
-            (
-                name,
-                f"{score.cell.auroc:.3f}",
-                f"{100 * found_share.value:.0f} % ({100 * low:.0f} to {100 * high:.0f})",
-                f"{false.k} of {false.n}",
-            )
-        )
-    return Table(
+    return tabulate(
         f"{args.monitor}, faults found within {args.window:g} s and nominal episodes with an alarm, at a "
         f"threshold for {100 * args.false_alarm_rate:g} % of them; mean AUROC over kinds of fault; in brackets 95 % "
         "Wilson intervals.",
-        ("", "AUROC", "Found", "False alarms"),
-        rows,
+        COLUMNS,
+        found,
     )
 
 

@@ -1,0 +1,275 @@
+"""Tables: their columns, each a heading and a function of what a row is about, and how they are written as text.
+
+A new column is one function and one entry in a list of columns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from rich.markup import escape
+from rich.table import Table as ConsoleTable
+
+from asm_gym.evaluation import metrics
+from asm_gym.evaluation.comparison import BenchmarkResult
+from asm_gym.evaluation.metrics import ActingMetrics, Delays, DetectionMetrics, KindMetrics, in_words
+from asm_gym.evaluation.statistics import Share
+from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE
+
+Subject = TypeVar("Subject")
+Compared = DetectionMetrics | KindMetrics
+"""A monitor, or the ideal observer, who has fewer columns."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: one heading a column, and rows as long as the headings; the first cell of a row names it."""
+
+    caption: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[object]]
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.headings):
+                raise ValueError(f"the table has {len(self.headings)} columns, but a row of {len(row)}: {list(row)}")
+
+
+class Column(NamedTuple, Generic[Subject]):
+    """A heading, and the cell beneath it of whatever a row is about."""
+
+    heading: str
+    cell: Callable[[Subject], str]
+
+
+def tabulate(caption: str, columns: Sequence[Column[Subject]], subjects: Iterable[Subject]) -> Table:
+    """A row for each subject."""
+    rows = [tuple(column.cell(subject) for column in columns) for subject in subjects]
+    return Table(caption, [column.heading for column in columns], rows)
+
+
+def console_table(table: Table, left: int = 1, plain: bool = False) -> ConsoleTable:
+    """For a terminal: the caption on top, the first ``left`` columns to the left, numbers to the right.
+
+    Args:
+        plain: without rules, and no column is wrapped.
+    """
+    style: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)} if plain else {}
+    made = ConsoleTable(title=escape(table.caption), **style)
+    for i, heading in enumerate(table.headings):
+        made.add_column(escape(heading), justify="left" if i < left else "right", no_wrap=plain or i < left)
+    for row in table.rows:
+        made.add_row(*(escape(str(cell)) for cell in row))
+    return made
+
+
+def markdown(table: Table) -> str:
+    """The caption, and a table of pipes and dashes."""
+
+    def line(cells: Sequence[object]) -> str:
+        return "| " + " | ".join(map(str, cells)) + " |"
+
+    rule = line(["---"] * len(table.headings))
+    return "\n".join([table.caption, "", line(table.headings), rule, *map(line, table.rows)])
+
+
+def number(value: float, digits: int) -> str:
+    """Empty where there is none."""
+    return "" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def count(share: Share | None) -> str:
+    """``k of n``."""
+    return "" if share is None else f"{share.k} of {share.n}"
+
+
+def count_within(share: Share) -> str:
+    """``k of n`` with its interval."""
+    low, high = share.interval
+    return f"{count(share)} ({100 * low:.0f}–{100 * high:.0f} %)" if share.n else ""
+
+
+def percent(share: Share | None) -> str:
+    """Empty where there is nothing to take a share of."""
+    return f"{100 * share.value:.0f} %" if share is not None and share.n else ""
+
+
+def percent_within(share: Share | None) -> str:
+    """With its interval."""
+    if share is None or not share.n:
+        return ""
+    low, high = share.interval
+    return f"{percent(share)} ({100 * low:.0f}–{100 * high:.0f})"
+
+
+def milliseconds(delays: Delays | None, which: str, otherwise: str = "missed") -> str:
+    """The ``median_ms`` or ``p95_ms``; ``otherwise`` where it is infinite."""
+    delay = math.inf if delays is None else getattr(delays, which)
+    return f"{delay:.0f}" if math.isfinite(delay) else otherwise
+
+
+def _late(which: str) -> Callable[[DetectionMetrics], str]:
+    return lambda m: milliseconds(m.delays, which, f"> {1e3 * m.window_s:.0f}") if m.delays else ""
+
+
+CONDITION_COLUMNS: Sequence[Column[DetectionMetrics]] = (
+    Column("Condition", lambda m: m.name),
+    Column("With false alarm", lambda m: count(metrics.false_alarms(m.watched))),
+    Column("False alarms per hour", lambda m: number(metrics.false_alarms_per_hour(m.watched), 1)),
+    Column("Detected", lambda m: count_within(m.detected)),
+    Column("Median delay [ms]", _late("median_ms")),
+    Column("95th percentile [ms]", _late("p95_ms")),
+    Column("AUROC", lambda m: number(m.auroc, 2)),
+    Column(
+        "Most surprising channel at the alarm",
+        lambda m: ", ".join(f"{channel}\u00a0({n})" for channel, n in m.top_channels),
+    ),
+)
+
+
+def detection_table(rows: Sequence[DetectionMetrics]) -> Table:
+    """What one monitor told, watching the policy alone: a row a condition."""
+    return tabulate(
+        "Detection, the monitor only watching. False alarm: raised before the fault, or at all in nominal episodes. "
+        f"Detected: alarm raised within {1e3 * rows[0].window_s:.0f} ms of the onset, with the 95 % Wilson interval; a "
+        "miss counts as infinitely late. AUROC: against nominal episodes over the same steps.",
+        CONDITION_COLUMNS,
+        rows,
+    )
+
+
+ACTING_COLUMNS: Sequence[Column[tuple[str, ActingMetrics]]] = (
+    Column("Condition", lambda row: row[0]),
+    Column("Acting", lambda row: row[1].acting),
+    Column("Task solved", lambda row: count_within(row[1].success)),
+    Column("Ended by the alarm", lambda row: "" if row[1].acting == POLICY_ALONE else count(row[1].ended_by_alarm)),
+    Column("Peak contact force [N]", lambda row: number(row[1].peak_force, 1)),
+)
+
+
+def outcome_table(rows: Sequence[DetectionMetrics]) -> Table:
+    """What the override changed, against the policy alone."""
+    return tabulate(
+        "What acting on the alarm changes. Peak contact force: median over episodes of the greatest force.",
+        ACTING_COLUMNS,
+        [(m.name, outcome) for m in rows for outcome in m.outcomes],
+    )
+
+
+def _before_and_after(measure: Callable[[ActingMetrics], str]) -> Callable[[DetectionMetrics], str]:
+    return lambda m: " → ".join(measure(outcome) for outcome in m.outcomes)
+
+
+def _late_briefly(m: DetectionMetrics) -> str:
+    longest = f">{1e3 * m.window_s:.0f}"
+    return ", ".join(milliseconds(m.delays, q, longest) for q in ("median_ms", "p95_ms")) if m.delays else ""
+
+
+BRIEF_CONDITION_COLUMNS: Sequence[Column[DetectionMetrics]] = (
+    Column("", lambda m: m.name),
+    Column("\nepisodes", lambda m: str(len(m.watched))),
+    Column("\ndetected", lambda m: str(m.detected.k) if m.detected.n else ""),
+    Column("delay [ms]\nmedian, 95 %", _late_briefly),
+    Column("false\nalarms", lambda m: str(metrics.false_alarms(m.watched).k)),
+    Column("tasks\nsolved", _before_and_after(lambda o: str(o.success.k))),
+    Column("peak\nforce [N]", _before_and_after(lambda o: f"{o.peak_force:.1f}")),
+)
+
+
+def headline(rows: Sequence[DetectionMetrics]) -> str:
+    """One sentence: detected of all faults, false alarms of all nominal episodes."""
+    found = Share(sum(m.detected.k for m in rows), sum(m.detected.n for m in rows))
+    false = metrics.false_alarms([t for m in rows if m.name == NOMINAL for t in m.watched])
+    return f"{count(found)} faults detected; {count(false)} nominal episodes with a false alarm."
+
+
+def _of_monitor(cell: Callable[[DetectionMetrics], str]) -> Callable[[Compared], str]:
+    """A cell that is empty in the row of the ideal observer, who raises no alarms."""
+    return lambda m: cell(m) if isinstance(m, DetectionMetrics) else ""
+
+
+def _found(rate: float) -> Callable[[Compared], str]:
+    return lambda m: percent_within(m.found.get(rate))
+
+
+_alarms_per_hour = _of_monitor(lambda m: f"{metrics.false_alarms_per_hour(m.nominal):.1f}")
+_right_channel = _of_monitor(lambda m: percent(metrics.attribution_accuracy(m.faulty)))
+
+MONITOR_COLUMNS: Sequence[Column[Compared]] = (
+    Column("Monitor", lambda m: m.name),
+    Column("AUROC", lambda m: f"{m.auroc:.3f}"),
+    Column("AP", lambda m: number(m.average_precision, 3)),
+    Column("Found at 0.5 %", _found(0.005)),
+    Column("at 1 %", _found(0.01)),
+    Column("at 5 %", _found(0.05)),
+    Column("Median delay [ms]", lambda m: milliseconds(m.delays, "median_ms")),
+    Column("p95 [ms]", lambda m: milliseconds(m.delays, "p95_ms")),
+    Column("False alarms", _of_monitor(lambda m: count(metrics.false_alarms(m.nominal)))),
+    Column("per hour", _alarms_per_hour),
+    Column(
+        "Balanced accuracy",
+        _of_monitor(lambda m: f"{metrics.balanced_accuracy(m.faulty, m.nominal, m.window_s):.3f}"),
+    ),
+    Column(
+        "Timestep-weighted", _of_monitor(lambda m: f"{metrics.timestep_weighted_accuracy(m.faulty, m.nominal):.3f}")
+    ),
+    Column("Right channel", _right_channel),
+)
+
+
+def _compared(result: BenchmarkResult) -> list[Compared]:
+    return [result.ideal, *result.on_visible]
+
+
+def monitors_table(result: BenchmarkResult) -> Table:
+    """Monitors side by side, the ideal observer on top."""
+    hidden = [in_words(kind) for kind, seen in result.visible.items() if not seen]
+    left_out = f" Kinds no observer could see, left out: {', '.join(hidden)}." if hidden else ""
+    return tabulate(
+        f"Detection within {1e3 * result.window_s:.0f} ms of the onset, over kinds of fault and severities that an "
+        f"ideal observer can see; thresholds from separate nominal episodes, delays and accuracies at a false-alarm "
+        f"rate of {100 * result.rate:g} % of episodes; 95 % Wilson intervals in brackets. Nominal episodes that did "
+        f"not succeed, {result.failed} in all, are left out.{left_out}",
+        MONITOR_COLUMNS,
+        _compared(result),
+    )
+
+
+def brief_monitors_table(result: BenchmarkResult) -> Table:
+    """The chief columns, narrow enough for a terminal."""
+    columns: Sequence[Column[Compared]] = (
+        Column("monitor", lambda m: m.name),
+        Column("AUROC", lambda m: f"{m.auroc:.3f}"),
+        Column("found", _found(result.rate)),
+        Column("median [ms]", lambda m: milliseconds(m.delays, "median_ms")),
+        Column("alarms/h", _alarms_per_hour),
+        Column("right channel", _right_channel),
+    )
+    caption = f"found within {result.window_s:g} s at a false-alarm rate of {100 * result.rate:g} %"
+    return tabulate(caption, columns, _compared(result))
+
+
+def kinds_table(result: BenchmarkResult) -> Table:
+    """AUROC and faults found of every kind."""
+    rows = []
+    for kind, seen in result.visible.items():
+        own = [kinds[kind] for kinds in result.kinds.values()]
+        found = (f"{k.auroc:.2f} / {percent(k.found.get(result.rate))}" for k in own)
+        rows.append((in_words(kind) if seen else f"({in_words(kind)})", *found))
+    return Table(
+        f"AUROC / faults found at a false-alarm rate of {100 * result.rate:g} %. In brackets: no observer could "
+        "see it.",
+        ("Fault", *result.kinds),
+        rows,
+    )
+
+
+def harmless_table(result: BenchmarkResult, monitors: Sequence[str]) -> Table:
+    """Alarms of these monitors at what is no fault."""
+    alarms = result.false_alarms_by_variation()
+    kinds = dict.fromkeys(kind for name in monitors for kind in alarms[name])
+    rows = [(kind.replace("_", " "), *(count(alarms[name].get(kind)) for name in monitors)) for kind in kinds]
+    return Table("Episodes with an alarm under harmless variations.", ("Variation", *monitors), rows)

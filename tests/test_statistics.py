@@ -1,0 +1,107 @@
+"""Statistics against published tables, scipy, and values worked out by hand."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from asm_gym.evaluation.statistics import (
+    Estimate,
+    Spread,
+    auroc,
+    binomial_interval,
+    bootstrap,
+    gain,
+    reduction,
+    wilson_interval,
+)
+
+
+@pytest.mark.parametrize(
+    ("k", "n", "low", "high"),
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+)
+def test_wilson_gives_the_intervals_of_newcombe_1998(k: int, n: int, low: float, high: float):
+    assert wilson_interval(k, n) == pytest.approx((low, high), abs=5e-5)
+
+
+def test_wilson_knows_nothing_from_no_trials_and_is_symmetric():
+    assert wilson_interval(0, 0) == (0.0, 1.0)
+    low, high = wilson_interval(3, 20)
+    assert wilson_interval(17, 20) == pytest.approx((1 - high, 1 - low))
+    assert wilson_interval(20, 20)[1] == 1.0
+
+
+def test_wilson_refuses_impossible_counts():
+    with pytest.raises(ValueError, match=r"k must be in \[0, n\], got 3 of 2"):
+        wilson_interval(3, 2)
+    with pytest.raises(ValueError, match=r"confidence must be in \(0, 1\), got 95"):
+        wilson_interval(1, 2, confidence=95)
+
+
+def test_binomial_interval_of_four_coins_by_hand():
+    # P(0) = P(4) = 1/16: with tails of at most 5 % both stay in, with tails of at most 10 % both fall out.
+    assert binomial_interval(4, 0.5, confidence=0.9) == (0, 4)
+    assert binomial_interval(4, 0.5, confidence=0.8) == (1, 3)
+
+
+@pytest.mark.parametrize(("n", "p", "confidence"), [*product((1, 30, 500), (0.01, 0.3, 0.87), (0.8, 0.95, 0.999))])
+def test_binomial_interval_is_that_of_scipy(n: int, p: float, confidence: float):
+    assert binomial_interval(n, p, confidence) == tuple(map(int, stats.binom.interval(confidence, n, p)))
+
+
+def test_binomial_interval_of_certainty_is_a_point():
+    assert binomial_interval(7, 0.0, 0.95) == (0, 0)
+    assert binomial_interval(7, 1.0, 0.95) == (7, 7)
+    assert binomial_interval(0, 0.5, 0.95) == (0, 0)
+
+
+def test_auroc_counts_pairs_and_half_of_ties():
+    # Of the six pairs 3 > 1, 3 > 2, 2 > 1 are won, 2 = 2 is tied, and 1 < 2 is lost and 1 = 1 tied: 4 of 6.
+    assert auroc([3, 2, 1], [1, 2]) == pytest.approx(4 / 6)
+
+
+def test_auroc_is_the_mann_whitney_statistic():
+    rng = np.random.default_rng(0)
+    pos, neg = rng.integers(0, 9, 40), rng.integers(0, 7, 60)
+    assert auroc(pos, neg) == pytest.approx(stats.mannwhitneyu(pos, neg).statistic / (40 * 60))
+
+
+def test_auroc_takes_infinity_and_refuses_nan_and_nothing():
+    assert auroc([math.inf, math.inf], [1.0, math.inf]) == pytest.approx(0.75)
+    with pytest.raises(ValueError, match="must not be NaN"):
+        auroc([math.nan], [1.0])
+    with pytest.raises(ValueError, match="0 positive and 1 negative"):
+        auroc([], [1.0])
+
+
+def test_gain_and_reduction_are_the_hand_computed_ones():
+    pairs = np.array([[1.0, 0.0], [3.0, 2.0], [0.0, 1.0], [4.0, 1.0]])
+    assert gain(pairs) == -1.0
+    assert reduction(pairs) == 0.5
+    assert np.isnan(reduction(np.zeros((3, 2))))
+
+
+def test_the_bootstrap_interval_of_a_mean_is_about_the_normal_one():
+    rng = np.random.default_rng(0)
+    pairs = np.stack([np.zeros(400), rng.normal(1.0, 2.0, 400)], axis=1)
+    estimate = bootstrap(gain, pairs, rng)
+    half = 1.96 * pairs[:, 1].std() / 20
+    assert estimate.value == pytest.approx(pairs[:, 1].mean())
+    assert estimate.low == pytest.approx(estimate.value - half, abs=0.03)
+    assert estimate.high == pytest.approx(estimate.value + half, abs=0.03)
+
+
+def test_a_spread_is_mean_and_sample_deviation():
+    assert Spread.of([1.0, 2.0, 3.0]) == (2.0, 1.0)
+    assert Spread.of([0.5]).text(100, 1) == "50.0"
+    assert Spread.of([1.0, 2.0, 3.0]).text(digits=1) == "2.0 ± 1.0"
+
+
+def test_an_estimate_is_told_in_percent_where_there_is_one():
+    assert Estimate(0.5, 0.25, 0.75).percent() == "50 % (25 to 75)"
+    assert Estimate(math.nan, math.nan, math.nan).percent("none") == "none"
