@@ -11,6 +11,7 @@ import csv
 import re
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -115,6 +116,13 @@ def read_table(path: Path) -> dict[str, Column]:
     return {name: column for name, column in columns.items() if column is not None}
 
 
+@cache
+def label_of(column: str) -> str:
+    """What a stream calls a number that a table calls so: ``joint[0]`` for ``joint_0``."""
+    found = _ELEMENT.fullmatch(column)
+    return f"{found['stem']}[{found['named'] or found['number']}]" if found else column
+
+
 def _numbers(where: str, cells: Sequence[str]) -> Column | None:
     """A column of text as numbers; None where none of it is one."""
     values, wrong = np.full(len(cells), np.nan), []
@@ -200,10 +208,8 @@ def _read_by(spec: StreamSpec, signals: Sequence[Signal], dt: float | None) -> N
     """The rows (T, D) as a memory of this spec reads them; what else the table holds is left out."""
     if dt is not None and abs(dt / spec.dt - 1) > RATE_TOLERANCE:
         raise ValueError(f"the memory reads {1 / spec.dt:g} rows a second, these come at {1 / dt:g}")
-    known = {s.column: s.values for s in signals}
-    for signal in signals:  # joint_0 is joint[0] too, though it may be the only one here
-        if found := _ELEMENT.fullmatch(signal.column):
-            known.setdefault(f"{found['stem']}[{found['named'] or found['number']}]", signal.values)
+    # joint_0 is joint[0] too, though it may be the only one here.
+    known = {label_of(s.column): s.values for s in signals} | {s.column: s.values for s in signals}
     missing = [label for label in spec.labels if label not in known]
     if missing:
         raise ValueError(f"the memory reads channels that are not there: {', '.join(missing)}")

@@ -156,14 +156,14 @@ def fit(args: Args, console: Console) -> None:
     monitor.save(args.out)
     spec = fitting[0].spec
     rows = sum(map(len, fitting))
-    hours = float(np.mean([len(e) for e in calibration])) * spec.dt / 3600
+    hourly = args.false_alarm_rate * 3600 / (spec.dt * float(np.mean([len(e) for e in calibration])))
     say = partial(console.print, soft_wrap=True, highlight=False)
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
     if left_out:
         say(f"Left out: {left_out}.")
     say(
         f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: an alarm in at most "
-        f"{args.false_alarm_rate:.1%} of normal ones, {args.false_alarm_rate / hours:.2g} an hour at their length."
+        f"{args.false_alarm_rate:.1%} of normal ones, {hourly:.{0 if hourly >= 10 else 1}f} an hour at their length."
     )
     seconds = time.perf_counter() - start
     say(f"Wrote {args.out} after {seconds:.0f} s. Watch with it: asm-gym watch LOG --monitor {args.out}")

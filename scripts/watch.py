@@ -34,6 +34,7 @@ from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 from asm_gym.stream import StreamSpec
+from asm_gym.tables import label_of
 
 AT_ONCE = 64
 """Episodes scored side by side."""
@@ -133,7 +134,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
             worst = sorted([*worst, *traces], key=lambda trace: -float(trace.surprise.max()))[: args.figures]
             episodes += len(group)
             progress(episodes, episodes)
-    said = f"{len(alarms)} alarms in {len({a.log for a in alarms})} of {episodes} episodes"
+    said = f"{len(alarms)} alarm{'s' * (len(alarms) != 1)} in {len({a.log for a in alarms})} of {episodes} episodes"
     publish(args, said, alarms, worst)
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     shown = sorted(alarms, key=lambda alarm: -alarm.excess)[:SHOWN_ROWS]
@@ -183,6 +184,7 @@ def row_of(line: str, number: int, spec: StreamSpec) -> NDArray[np.float64]:
 def _by_name(said: dict[str, Any], number: int, spec: StreamSpec) -> NDArray[np.float64]:
     """The numbers (D,) by the names of channels or of single numbers; the first row has to hold them all."""
     parts, missing = [], []
+    said = {label_of(name): value for name, value in said.items()} | said
     for channel in spec.channels:
         values = said[channel.name] if channel.name in said else [said.get(label) for label in channel.labels]
         if channel.name not in said and not set(channel.labels) <= set(said):
@@ -221,7 +223,7 @@ def follow(lines: Iterable[str], monitor: Any, console: Console) -> int:
     if not rows:
         raise ValueError("no row came")
     median, late = np.percentile(latencies, [50, 99])
-    say(f"{rows} rows, {alarms} alarms; a row took {median:.2f} ms, 99 % of the newest under {late:.2f} ms")
+    say(f"{rows} rows, {alarms} alarm{'s' * (alarms != 1)}; a row took {median:.2f} ms, 99 % of the newest under {late:.2f} ms")
     return BAD_NEWS if alarms else DONE
 
 
