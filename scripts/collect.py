@@ -23,7 +23,7 @@ from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig
-from asm_gym.scripts.command import USAGE_ERRORS
+from asm_gym.scripts.command import run
 from asm_gym.tasks import task as task_spec
 
 __all__ = ["collect", "episode_seeds"]  # which were here before there was a room for them
@@ -98,22 +98,20 @@ def record(args: Args, console: Console) -> tuple[Path, list[Episode]]:
         return assemble(args, files)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Records; 2 where the arguments make no sense."""
-    console = Console()
-    try:
-        args = tyro.cli(Args, args=argv, prog="asm-gym collect", description=__doc__)
-        args = replace(args, episodes=4) if args.quick else args
-        require_minari()
-        check(args.env_id, args.config)
-        folder, kept = record(args, console)
-    except USAGE_ERRORS as error:
-        print(f"asm-gym collect: {error}", file=sys.stderr)
-        return 2
+def record_and_report(args: Args, console: Console) -> None:
+    """Records, and says where the episodes are."""
+    args = replace(args, episodes=4) if args.quick else args
+    require_minari()
+    check(args.env_id, args.config)
+    folder, kept = record(args, console)
     steps = sum(map(len, kept))
     console.print(f"{len(kept)} episodes, {steps} steps, {sum(e.success for e in kept)} successful: {folder}")
     console.print(f"MINARI_DATASETS_PATH={args.out} lets minari.load_dataset({args.dataset_id!r}) find it")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Records, and returns the exit code."""
+    return run("collect", Args, record_and_report, argv, __doc__)
 
 
 if __name__ == "__main__":

@@ -143,12 +143,14 @@ def _complaint(said: str) -> str:
 
 
 def _fitted(help_text: str) -> str:
-    """Help whose paragraphs outside of frames are broken at the width of the terminal."""
+    """Help without marks, whose paragraphs outside of frames are broken at the width of the terminal."""
     width = min(shutil.get_terminal_size().columns, 120)
-    lines = [
-        line if line[:1] in "╭│╰" or len(line) <= width else textwrap.fill(line, width)
-        for line in help_text.splitlines()
-    ]
+    lines = []
+    for line in help_text.splitlines():
+        bare = line.replace("`", "")
+        if line.startswith("│"):  # what was taken out is made up for, or the frame would be dented
+            bare = bare[:-1].ljust(len(line) - 1) + bare[-1]
+        lines.append(bare if line[:1] in "╭│╰ " else textwrap.fill(bare, width))
     return "\n".join(lines) + "\n"
 
 

@@ -31,7 +31,7 @@ from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.learners import ALGORITHMS
 from asm_gym.rollouts.training.run import BEST, CLONE, Plan, TrainingRun, success_rate
 from asm_gym.rollouts.trial import RolloutConfig
-from asm_gym.scripts.command import USAGE_ERRORS
+from asm_gym.scripts.command import run
 from asm_gym.tasks import task as task_spec
 
 KEPT = ("env_id", "algorithm", "robot", "demonstrations", "dataset", "cloning_updates", "seed")
@@ -192,18 +192,17 @@ def _command(args: Args) -> str:
     return f"asm-gym train {args.task} {options}".strip()
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Trains; 2 where the arguments make no sense."""
-    console = Console()
-    try:
-        args = tyro.cli(Args, args=argv, prog="asm-gym train", description=__doc__).scaled()
-        check(args)
-        result = train(args, console)
-    except USAGE_ERRORS as error:
-        print(f"asm-gym train: {error}", file=sys.stderr)
-        return 2
+def train_and_report(args: Args, console: Console) -> None:
+    """Trains, and says how good the agent is."""
+    args = args.scaled()
+    check(args)
+    result = train(args, console)
     console.print(f"success {result['success']:.0%} of {args.final_episodes} episodes: {args.out / 'agent.npz'}")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Trains, and returns the exit code."""
+    return run("train", Args, train_and_report, argv, __doc__)
 
 
 if __name__ == "__main__":

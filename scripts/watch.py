@@ -223,7 +223,8 @@ def follow(lines: Iterable[str], monitor: Any, console: Console) -> int:
     if not rows:
         raise ValueError("no row came")
     median, late = np.percentile(latencies, [50, 99])
-    say(f"{rows} rows, {alarms} alarm{'s' * (alarms != 1)}; a row took {median:.2f} ms, 99 % of the newest under {late:.2f} ms")
+    counted = f"{rows} rows, {alarms} alarm{'s' * (alarms != 1)}"
+    say(f"{counted}; a row took {median:.2f} ms, 99 % of the newest under {late:.2f} ms")
     return BAD_NEWS if alarms else DONE
 
 

@@ -32,7 +32,7 @@ from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress, p
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, record, watch
-from asm_gym.scripts.command import USAGE_ERRORS
+from asm_gym.scripts.command import run
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers.arguments import ON_ALARM
 
@@ -225,18 +225,16 @@ def _react(args: Args, console: Console) -> Table:
     return made
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Runs the comparison; 2 where the arguments make no sense."""
-    console = Console()
-    try:
-        args = tyro.cli(Args, args=argv, prog="asm-gym react", description=__doc__)
-        made = react(args, console)
-    except USAGE_ERRORS as error:
-        print(f"asm-gym react: {error}", file=sys.stderr)
-        return 2
+def react_and_report(args: Args, console: Console) -> None:
+    """Compares, and prints the table."""
+    made = react(args, console)
     console.print(console_table(made, left=2))
     console.print(f"Wrote {args.out / 'reactions.md'} and {args.out / 'reactions.json'}")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Compares, and returns the exit code."""
+    return run("reproduce reflexes", Args, react_and_report, argv, __doc__)
 
 
 if __name__ == "__main__":

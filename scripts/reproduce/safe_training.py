@@ -35,7 +35,7 @@ from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.exploration import Gentle, explore, harmless
 from asm_gym.rollouts.training.safe_run import ALONE, CONDITIONS, Setting, outcome_file, read_outcome, run
 from asm_gym.rollouts.trial import RolloutConfig
-from asm_gym.scripts.command import USAGE_ERRORS
+from asm_gym.scripts import command
 from asm_gym.tasks import task as task_spec
 
 DEMONSTRATIONS, FITTING, TESTING = 11, 12, 13
@@ -252,19 +252,18 @@ def _write(
     figures.save(learning_figure(outcomes, args.force_limit), args.out / "training.png")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Runs the comparison; 2 where the arguments make no sense."""
-    console = Console()
-    try:
-        args = tyro.cli(Args, args=argv, prog="asm-gym train-safely", description=__doc__).scaled()
-        tables = train_safely(args, console)
-    except USAGE_ERRORS as error:
-        print(f"asm-gym train-safely: {error}", file=sys.stderr)
-        return 2
+def train_and_report(args: Args, console: Console) -> None:
+    """Trains, and prints the tables."""
+    args = args.scaled()
+    tables = train_safely(args, console)
     for table in tables:
         console.print(console_table(table))
     console.print(f"Wrote {args.out / 'training.md'}, training.csv, training.json and training.png")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Trains, and returns the exit code."""
+    return command.run("reproduce safe_training", Args, train_and_report, argv, __doc__)
 
 
 if __name__ == "__main__":
