@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from asm_gym.detection.detector import conformal_episodes
+from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, false_alarms_per_hour, typical
 from asm_gym.evaluation.report import write_report

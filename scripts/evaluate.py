@@ -20,7 +20,7 @@ import tyro
 from rich.console import Console
 
 from asm_gym.choices import check_choice
-from asm_gym.detection.detector import conformal_episodes
+from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import EpisodeLabel
 from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.report import publish

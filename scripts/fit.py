@@ -21,7 +21,7 @@ from rich.console import Console
 
 from asm_gym.checks import check_number
 from asm_gym.choices import check_choice
-from asm_gym.detection.detector import conformal_episodes
+from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode
 from asm_gym.logs import Layout, Log, read_logs
 from asm_gym.monitors import EVIDENCE, MONITORS, make_monitor, monitor_class

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asm_gym.detection.detector import (
+from asm_gym.detection import (
     Detector,
-    Run,
+    ModelOutput,
     accumulate,
     bounded,
     conformal_episodes,
@@ -21,7 +21,7 @@ from asm_gym.detection.detector import (
     worst_case,
 )
 from asm_gym.detection.habituation import USUAL, habituate
-from asm_gym.detection.repetition import LIGHT
+from asm_gym.detection.tails import TAIL_INDEX
 
 
 def correlated(rng: np.random.Generator, n: int = 4000, size: int = 5) -> np.ndarray:
@@ -118,8 +118,8 @@ def test_the_tail_of_the_maxima_is_that_of_the_distribution_they_come_from():
     maxima = 5.0 * (1.0 - rng.random((100_000, 3))) ** -index  # Pareto: P(v > q) = (q/5)^(-1/ξ)
     ceiling, tail = worst_case(maxima)
     np.testing.assert_allclose(ceiling, 5.0 * 0.1**-index, rtol=0.03)
-    np.testing.assert_allclose(tail, np.minimum(1.0, LIGHT / index), rtol=0.03)
-    # What is equally rare becomes the same ratio, in tails as heavy as LIGHT or heavier.
+    np.testing.assert_allclose(tail, np.minimum(1.0, TAIL_INDEX / index), rtol=0.03)
+    # What is equally rare becomes the same ratio, in tails as heavy as TAIL_INDEX or heavier.
     rare = np.quantile((maxima / ceiling) ** tail, 0.999, axis=0)
     assert rare[1] == pytest.approx(rare[2], rel=0.1)
     assert rare[0] < rare[1]
@@ -143,17 +143,17 @@ def test_habituation_finds_the_quantile_of_each_context():
         assert below == pytest.approx(USUAL, abs=0.015)
 
 
-def runs(rng: np.random.Generator, count: int, steps: int = 200) -> list[Run]:
+def runs(rng: np.random.Generator, count: int, steps: int = 200) -> list[ModelOutput]:
     """Errors four times as large in one of two contexts, between which an episode goes to and fro."""
     made = []
     for _ in range(count):
         rough = (np.arange(steps) // 50 + rng.integers(2)) % 2
         errors = rng.normal(size=(steps, 3)) * np.where(rough, 4.0, 1.0)[:, None]
-        made.append(Run(errors, np.stack([rough, 1 - rough], axis=1).astype(np.float32)))
+        made.append(ModelOutput(errors, np.stack([rough, 1 - rough], axis=1).astype(np.float32)))
     return made
 
 
-def judged(detector: Detector, run: Run) -> np.ndarray:
+def judged(detector: Detector, run: ModelOutput) -> np.ndarray:
     evidence, values = detector.start(1), []
     for e, c in zip(run.errors, run.contexts, strict=True):
         evidence, value, parts = detector.step(evidence, e[None], c[None])
@@ -178,10 +178,10 @@ def test_what_is_usual_in_a_context_alarms_no_more_than_elsewhere():
 def test_a_fault_in_a_calm_error_is_not_drowned_by_a_wild_one():
     rng = np.random.default_rng(1)
 
-    def episode() -> Run:
+    def episode() -> ModelOutput:
         errors = rng.normal(size=(100, 2))
         errors[rng.integers(100), 0] = 40.0  # one knock in every episode, in the first error only
-        return Run(errors, np.zeros((100, 0)))
+        return ModelOutput(errors, np.zeros((100, 0)))
 
     detector = Detector.fit([episode() for _ in range(60)], [episode() for _ in range(60)], [0.8, 0.2], 10.0, 1e-3, rng)
     threshold = np.quantile([judged(detector, episode()).max() for _ in range(100)], 0.95)
@@ -231,7 +231,9 @@ def test_the_compiled_step_is_the_same_equations_put_together():
         plain = accumulate(plain, bounded(errors, 5.0) @ detector.whitening, context, gains)
         ratios = (strength(plain, gains) / detector.ceiling) ** detector.tail
         pooled, _ = pool(ratios.reshape(2, -1))
-        usual = np.exp(np.hstack([context, plain.context]) @ detector.habit[:-1] + detector.habit[-1])
+        usual = np.exp(
+            np.hstack([context, plain.context]) @ detector.context_quantile[:-1] + detector.context_quantile[-1]
+        )
         np.testing.assert_allclose(value, pooled / usual, rtol=1e-9)
         np.testing.assert_allclose(parts.sum(axis=1), value, rtol=1e-9)
         for a, b in zip(evidence, plain, strict=True):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.scaling import StreamScaler
 from tests.streams import sine_episodes, sine_spec
 
@@ -21,26 +22,24 @@ def fast() -> NeuralASM:
 
 
 @pytest.fixture(scope="module")
-def slow(fast) -> NeuralASM:
+def slow(fast) -> MemoryModel:
     """The same weights, for a stream at the control rate."""
-    made = NeuralASM(sine_spec(), hidden_size=24, association_size=60, epochs=2)
-    made.learned_ = fast.learned_
-    made.build_model()
-    return made
+    asm = NeuralASM(sine_spec(), hidden_size=24, association_size=60, epochs=2)
+    return asm.model.restore(fast.model.learned_)
 
 
-def told(asm: NeuralASM, stream: np.ndarray) -> np.ndarray:
+def told(model: MemoryModel, stream: np.ndarray) -> np.ndarray:
     """(T, X) errors, row by row."""
-    state, errors = asm.start_model(1), []
+    state, errors = model.start(1), []
     for row in stream.astype(np.float64):
-        state, error, _ = asm.predict(state, row[None])
-        errors.append(error[0])
+        state, output = model.predict(state, row[None])
+        errors.append(output.errors[0])
     return np.array(errors)
 
 
 def test_every_third_row_feels_as_if_there_were_no_others(fast, slow):
     stream = sine_episodes(1, seed=3)[0].stream
-    errors = told(fast, stream)
+    errors = told(fast.model, stream)
     for first in range(LAG):
         np.testing.assert_allclose(errors[first::LAG], told(slow, stream[first::LAG]), rtol=2e-5, atol=2e-6)
     assert np.abs(errors[2 * LAG :]).max() > 0.1
@@ -48,14 +47,14 @@ def test_every_third_row_feels_as_if_there_were_no_others(fast, slow):
 
 def test_the_state_is_inferred_from_every_third_row(fast, slow):
     stream = sine_episodes(1, seed=3)[0].stream.astype(np.float64)
-    state, rare = fast.start_model(1), slow.start_model(1)
+    state, rare = fast.model.start(1), slow.start(1)
     for t, row in enumerate(stream[:12]):
-        state, _, context = fast.predict(state, row[None])
+        state, output = fast.model.predict(state, row[None])
         if t % LAG == 0:
-            rare, _, expected = slow.predict(rare, row[None])
+            rare, expected = slow.predict(rare, row[None])
         # The change of row 3 is over the three rows that are seen here as well
         np.testing.assert_allclose(state.hidden, rare.hidden, rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(context, expected, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(output.contexts, expected.contexts, rtol=1e-4, atol=1e-5)
 
 
 def test_a_whole_episode_is_read_as_its_rows_are(fast):
@@ -78,16 +77,16 @@ def test_changes_are_standardised_over_as_many_rows():
 
 def test_side_by_side_is_as_one_by_one_whenever_each_began(fast):
     streams = [e.stream[:20].astype(np.float64) for e in sine_episodes(2, seed=5)]
-    state = fast.start_model(2)
-    begun = fast.start_model(1)
+    state = fast.model.start(2)
+    begun = fast.model.start(1)
     late = []
     for t in range(20):
-        state, error, _ = fast.predict(state, np.stack([s[t] for s in streams]))
+        state, output = fast.model.predict(state, np.stack([s[t] for s in streams]))
         if t == 4:  # the second stream begins anew, as after a reset
             state = type(state)(*(np.concatenate([a[:1], b]) for a, b in zip(state, begun, strict=True)))
         if t > 4:
-            late.append(error[1])
-    np.testing.assert_allclose(late, told(fast, streams[1][5:]), rtol=2e-5, atol=2e-6)
+            late.append(output.errors[1])
+    np.testing.assert_allclose(late, told(fast.model, streams[1][5:]), rtol=2e-5, atol=2e-6)
 
 
 def test_recall_goes_on_with_every_third_row(fast, slow):

@@ -31,7 +31,7 @@ def schedule(**changes) -> Schedule:
             "iterations": 10,
             "prior_precision": 1.0,
             "sensory_precision": 1.0,
-            "carry_prior": 0.0,
+            "free_running_probability": 0.0,
             **changes,
         }
     )

@@ -1,4 +1,4 @@
-"""Recall against its oracles: a linear system in closed form, following itself, and what was rehearsed."""
+"""Recall against its oracles: a linear system in closed form, following itself, and what was learned by running on."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from asm_gym.memory.inference import motor_prediction
 from asm_gym.memory.learning import Learner, Schedule, Trajectory
 from asm_gym.memory.network import Network, initial_weights
 from asm_gym.memory.recall import at_rest, follow, run_on, to_rows
-from asm_gym.memory.scheduled_sampling import LONGEST_CUE, Rehearsal, one_after_another
+from asm_gym.memory.scheduled_sampling import LONGEST_CUE, ScheduledSampling, one_after_another
 from asm_gym.monitors import NeuralASM
 from tests.streams import sine_episodes, sine_spec
 
@@ -44,7 +44,7 @@ def schedule(**changes) -> Schedule:
         iterations=10,
         prior_precision=1.0,
         sensory_precision=1.0,
-        carry_prior=0.5,
+        free_running_probability=0.5,
     )
     return default._replace(**changes)
 
@@ -109,7 +109,7 @@ def test_what_is_unseen_is_recalled_as_if_alone():
 
 @pytest.fixture(scope="module")
 def asm() -> NeuralASM:
-    return NeuralASM(sine_spec(), 64, association_size=10, iterations=10, epochs=80, carry_prior=0.95).fit(
+    return NeuralASM(sine_spec(), 64, association_size=10, iterations=10, epochs=80, free_running_probability=0.95).fit(
         sine_episodes(24, steps=(60, 60))
     )
 
@@ -134,7 +134,7 @@ def test_recalled_rows_are_the_expected_ones_in_the_units_of_the_stream(asm):
     np.testing.assert_array_equal(rows, to_rows(reader, recalled)[:, 0])
 
 
-def test_what_was_rehearsed_is_recalled_better_than_by_standing_still(asm):
+def test_what_was_learned_by_running_on_is_recalled_better_than_by_standing_still(asm):
     errors = []
     for episode in sine_episodes(10, seed=9, steps=(60, 60)):
         true, spread = episode.stream[20:35, asm.spec.sensory], asm.senses_.spread[asm.spec.sensory]
@@ -192,13 +192,13 @@ def test_streams_play_whole_episodes_one_after_another_at_different_phases():
 def test_after_the_cue_the_expected_state_and_action_are_handed_on(free):
     episode = some_trajectories(1)[0]
     weights, rng = initial_weights(H, S, A, np.random.default_rng(3)), np.random.default_rng(0)
-    rehearsal = Rehearsal(Learner(weights, schedule(iterations=20), rng), 1)
+    sampling = ScheduledSampling(Learner(weights, schedule(iterations=20), rng), 1)
     stream = (m for m in one_after_another([episode], 1, np.random.default_rng(0)))
     first = next(m for m in stream if m.begins.all())
-    rehearsal.run([first], 0.0, free)
-    length = int(rehearsal.carried.cue[0, 0])
+    sampling.run([first], 0.0, free)
+    length = int(sampling.carried.cue[0, 0])
     assert 1 <= length < LONGEST_CUE
-    rehearsal.run(itertools.islice(stream, len(episode.senses) - 1), 0.0, free)
+    sampling.run(itertools.islice(stream, len(episode.senses) - 1), 0.0, free)
     net = Network(weights, network().association, 20, 1.0, 1.0)
     read = len(episode.senses) if free == 0.0 else length
     z = at_rest(net, 1)
@@ -210,7 +210,7 @@ def test_after_the_cue_the_expected_state_and_action_are_handed_on(free):
         h, action = motor_prediction(z, weights)
         taken = u[:, :-1] if t == read - 1 else action
         z = h + taken @ weights.W_U[:, :-1].T
-    np.testing.assert_allclose(rehearsal.carried.z, z, atol=1e-4)
+    np.testing.assert_allclose(sampling.carried.z, z, atol=1e-4)
 
 
 def test_a_broken_episode_is_refused_before_it_is_learned():
@@ -218,4 +218,4 @@ def test_a_broken_episode_is_refused_before_it_is_learned():
     stream = episode.stream.copy()
     stream[3, 2] = np.nan
     with pytest.raises(ValueError, match="must be finite, got nan"):
-        NeuralASM(sine_spec(), carry_prior=0.5).fit([replace(episode, stream=stream)])
+        NeuralASM(sine_spec(), free_running_probability=0.5).fit([replace(episode, stream=stream)])

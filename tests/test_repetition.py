@@ -9,14 +9,14 @@ import pytest
 
 from asm_gym.detection.repetition import (
     FADING,
-    LIGHT,
-    SURE,
+    REPETITION_OFFSET,
     Repetition,
     count_repetitions,
     improbability,
     repeated,
     unrepeated,
 )
+from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.monitors import NeuralASM
 from tests.streams import frozen, sine_episodes, sine_spec
 
@@ -59,7 +59,7 @@ def test_what_was_repeated_adds_up_and_fades():
     one, two = 8.0, 8.0 * (1 - FADING) + 3.0
     faded = two * (1 - FADING) ** np.arange(4)
     np.testing.assert_allclose([s.unlikely[0, 0] for s in states], [0.0, one, *faded])
-    np.testing.assert_allclose(improbability(states[2]), np.exp(LIGHT * (two - SURE)))
+    np.testing.assert_allclose(improbability(states[2]), np.exp(TAIL_INDEX * (two - REPETITION_OFFSET)))
     assert improbability(states[0]) == 0.0
 
 
@@ -82,5 +82,5 @@ def test_what_was_reacted_to_is_forgotten(asm):
     state, row = asm.initial_state(1), sine_episodes(1, spec=asm.spec)[0].stream[:1]
     for _ in range(3):
         state, _ = asm.observe(state, row)
-    assert state.repetition.unlikely.any()
-    assert not asm.resynchronise(state).repetition.unlikely.any()
+    assert state.detection.repetition.unlikely.any()
+    assert not asm.reset_evidence(state).detection.repetition.unlikely.any()

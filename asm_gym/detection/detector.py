@@ -1,27 +1,14 @@
-"""From prediction errors to evidence, and from evidence to an alarm.
+"""The detector: from a model's errors to one number that an alarm can be set on.
 
-    whitened   e_t = M ε_t/σ_t,   M = ((1 - λ) C + λ tr(C)/X I)^(-½),   C = E[(ε/σ)(ε/σ)ᵀ] over nominal steps
-    bounded    ẽ_i = e_i / √(1 + e_i²/ν²)                               |ẽ_i| < ν, however large e_i
-    evidence   w_t = (1 - a) w_{t-1} + a ẽ_t,   w_0 = 0
-               v_i = w_i² (2 - a) / (a (1 - (1 - a)^{2t}))              nominal mean 1 for white errors, for every t
-    ratio      r_i = (v_i/q_i)^κ_i                                      q_i: what v_i stays below in 90 % of episodes
-    pooled     s_t = (Σ_i r_i^p)^(1/p)                                  κ_i = min(1, ξ_0/ξ_i), ξ_i: the tail of v_i
-    value      s_t / ŝ(c_t)                                             ŝ: what s seldom exceeds in a context like this
-    alarm      value > the ⌈(n + 1)(1 - rate)⌉-th smallest of the maxima of n nominal episodes
-
-Each number is measured against what it does in nominal episodes at its worst, so that a wrist that is often surprised
-by contact does not drown an encoder that never is; p lets the most surprising one count, and several add up. Beyond q
-the maxima of episodes fall off as v^(-1/ξ): a ratio of 10 happens to a wrist now and then, to an encoder never. The
-exponent κ makes the same ratio as rare for the one as for the other.
-
-Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted as under a t distribution); Lowry et al.
-1992 (multivariate EWMA chart, its exact variance at start-up); Hill 1975 (the index ξ of a tail); Vovk et al. 2005 and
-Angelopoulos and Bates 2023 (split conformal prediction).
+ε_t/σ_t → whitened, bounded → evidence → ratios → pooled s_t          one module each: ``whitening`` to ``evidence``
+value      s_t / ŝ(c_t)                                               ŝ: what s seldom exceeds in such a context,
+                                                                      see ``habituation``
+joined     (value^p + Σ_i r_i^p)^(1/p)                                r_i: of senses that repeat themselves, see
+                                                                      ``repetition``
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
@@ -29,99 +16,21 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_number
 from asm_gym.compilation import compiled
+from asm_gym.detection.base import Array, Arrays, ModelOutput, Nominal, Place
+from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, accumulate, no_evidence, pool, strength
 from asm_gym.detection.habituation import habituate
-from asm_gym.detection.repetition import LIGHT
+from asm_gym.detection.repetition import Repetition, count_repetitions, improbability, repeated, unrepeated
+from asm_gym.detection.tails import worst_case
+from asm_gym.detection.whitening import bounded, whitening
+from asm_gym.stream import StreamSpec
 
-Array = NDArray[np.floating[Any]]
-
-POWER = 8
-"""p."""
-
-LATELY = 0.2
-"""Weight of the newest step in the running mean of the context."""
-
-WORST = 0.9
-"""Share of nominal episodes whose maximum of v stays below q; those above tell how far it goes."""
-
-DOUBT = 10
-"""How many maxima beyond q a tail must show of its own to count as much as what is common among all."""
-
-TINY = float(np.finfo(np.float64).tiny)
+GAINS = (0.8, 0.2, 0.05)
+BOUND = 20.0
 
 FAINTEST = 1e-9
 """Lower bound of s where its logarithm is taken."""
-
-
-def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
-    """The symmetric (ZCA) matrix M (X, X) that makes ``errors`` (N, X) white; of all, it turns them the least.
-
-    Args:
-        errors: normalised errors of nominal steps; their mean is taken to be 0, as that of a prediction should be.
-        shrinkage: λ in [0, 1], towards equal variance and no correlation. Above 0 a channel that is constant, or a
-            copy of another, is no trouble.
-    """
-    if not 0.0 <= shrinkage <= 1.0:
-        raise ValueError(f"shrinkage must be in [0, 1], got {shrinkage}")
-    exact = np.asarray(errors, np.float64)
-    covariance = exact.T @ exact / len(exact)  # (X, X)
-    scale = float(np.trace(covariance)) / len(covariance)
-    target = (scale if scale > 0 else 1.0) * np.eye(len(covariance))
-    values, vectors = np.linalg.eigh((1.0 - shrinkage) * covariance + shrinkage * target)
-    matrix: NDArray[np.float64] = (vectors / np.sqrt(values)) @ vectors.T
-    return matrix
-
-
-def bounded(errors: Array, bound: float) -> NDArray[np.float64]:
-    """Errors pulled in one by one: none counts more than ν = ``bound`` standard deviations."""
-    exact = np.asarray(errors, np.float64)
-    pulled: NDArray[np.float64] = exact / np.sqrt(1.0 + (exact / bound) ** 2)
-    return pulled
-
-
-class Evidence(NamedTuple):
-    """What the last steps of each stream in a batch have added up to; never changed in place."""
-
-    vector: NDArray[np.float64]  # (B, G, X) w_t, for each of G gains
-    context: NDArray[np.float64]  # (B, C) running mean of the contexts
-    steps: NDArray[np.int64]  # (B,) t, how many steps are in it
-
-
-def no_evidence(batch: int, gains: int, size: int, context: int = 0) -> Evidence:
-    """w_0 for ``batch`` streams of ``size`` errors."""
-    return Evidence(np.zeros((batch, gains, size)), np.zeros((batch, context)), np.zeros(batch, np.int64))
-
-
-def accumulate(evidence: Evidence, whitened: Array, context: Array, gains: Array) -> Evidence:
-    """w_t from w_{t-1} and the whitened errors e_t (B, X); a gain a in (0, 1] of 1 forgets all but this step."""
-    vector = evidence.vector + gains[:, None] * (whitened[:, None, :] - evidence.vector)
-    return Evidence(vector, evidence.context + LATELY * (context - evidence.context), evidence.steps + 1)
-
-
-def strength(evidence: Evidence, gains: Array) -> NDArray[np.float64]:
-    """v (B, G, X): the squared evidence in each error, with a nominal mean of 1."""
-    variance = gains / (2.0 - gains) * (1.0 - (1.0 - gains) ** (2 * evidence.steps[:, None]))  # (B, G) of each w_t,i
-    squared: NDArray[np.float64] = evidence.vector**2 / variance[:, :, None]
-    return squared
-
-
-def pool(ratios: Array, power: float = POWER) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(Σ_i r_i^p)^(1/p) (B,), and each one's part of it (B, X), which add up to it; r >= 0."""
-    greatest = np.maximum(ratios.max(axis=1, keepdims=True), np.finfo(float).tiny)
-    powers = (ratios / greatest) ** power
-    total = powers.sum(axis=1, keepdims=True)
-    pooled = greatest * total ** (1.0 / power)
-    return pooled[:, 0], pooled * (powers / np.maximum(total, np.finfo(float).tiny))
-
-
-def worst_case(maxima: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """q and κ, of the shape of one episode's maxima, from those of N nominal episodes (N, …)."""
-    ceiling = np.maximum(np.quantile(maxima, WORST, axis=0), FAINTEST)
-    beyond = np.log(np.maximum(maxima / ceiling, 1.0))
-    total, count = beyond.sum(axis=0), (beyond > 0).sum(axis=0)
-    common = np.median(total / np.maximum(count, 1))  # Hill's estimate of ξ is total / count
-    index = (total + DOUBT * common) / (count + DOUBT)
-    return ceiling, LIGHT / np.maximum(index, LIGHT)
 
 
 @compiled
@@ -134,7 +43,7 @@ def _step(
     whitening: Any,
     ceiling: Any,
     tail: Any,
-    habit: Any,
+    context_quantile: Any,
     gains: Any,
     bound: float,
 ) -> Any:
@@ -160,21 +69,14 @@ def _step(
                 part = (ratios[g, i] / greatest) ** POWER
                 shares[n, i] += part
                 total += part
-        drive = habit[2 * C]
+        drive = context_quantile[2 * C]
         for c in range(C):
-            recent[n, c] = lately[n, c] + LATELY * (context[n, c] - lately[n, c])
-            drive += context[n, c] * habit[c] + recent[n, c] * habit[C + c]
+            recent[n, c] = lately[n, c] + CONTEXT_GAIN * (context[n, c] - lately[n, c])
+            drive += context[n, c] * context_quantile[c] + recent[n, c] * context_quantile[C + c]
         value[n] = greatest * total ** (1.0 / POWER) / np.exp(drive)
         for i in range(X):
             shares[n, i] *= value[n] / max(total, TINY)
     return (new, recent, steps + 1), value, shares
-
-
-class Run(NamedTuple):
-    """What a model said of one nominal episode."""
-
-    errors: Array  # (T, X) normalised
-    contexts: Array  # (T, C) what the model took to be going on; C may be 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +87,7 @@ class Detector:
         whitening: (X, X) M.
         ceiling: (G, X) q.
         tail: (G, X) κ, in (0, 1].
-        habit: (2 C + 1,) weights of ŝ, on the context now and lately, and its bias.
+        context_quantile: (2 C + 1,) weights of ŝ, on the context now and lately, and its bias.
         gains: (G,) a, each in (0, 1].
         bound: ν > 0.
     """
@@ -193,15 +95,15 @@ class Detector:
     whitening: NDArray[np.float64]
     ceiling: NDArray[np.float64]
     tail: NDArray[np.float64]
-    habit: NDArray[np.float64]
+    context_quantile: NDArray[np.float64]
     gains: NDArray[np.float64]
     bound: float
 
     @classmethod
     def fit(
         cls,
-        learned: Sequence[Run],
-        held_out: Sequence[Run],
+        learned: Sequence[ModelOutput],
+        held_out: Sequence[ModelOutput],
         gains: Sequence[float],
         bound: float,
         shrinkage: float,
@@ -222,13 +124,13 @@ class Detector:
             contexts.append(np.hstack([r.contexts, lately]).astype(np.float32))
             ratios = ((strengths / ceiling) ** tail).reshape(len(lately), -1)
             levels.append(np.log(np.maximum(pool(ratios)[0], FAINTEST)))
-        habit = habituate(np.concatenate(contexts), np.concatenate(levels), rng)
-        return cls(matrix, ceiling, tail, habit.astype(np.float64), a, bound)
+        usual = habituate(np.concatenate(contexts), np.concatenate(levels), rng)
+        return cls(matrix, ceiling, tail, usual.astype(np.float64), a, bound)
 
     def start(self, batch: int) -> Evidence:
         """No evidence yet."""
         gains, size = self.ceiling.shape
-        return no_evidence(batch, gains, size, (len(self.habit) - 1) // 2)
+        return no_evidence(batch, gains, size, (len(self.context_quantile) - 1) // 2)
 
     def step(
         self, evidence: Evidence, errors: Array, context: Array
@@ -246,13 +148,13 @@ class Detector:
             self.whitening,
             self.ceiling,
             self.tail,
-            self.habit,
+            self.context_quantile,
             self.gains,
             self.bound,
         )
         return Evidence(*new), value, shares
 
-    def _strengths(self, run: Run) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _strengths(self, run: ModelOutput) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """v (T, G, X) and the running mean of the contexts (T, C) of a whole episode."""
         evidence = no_evidence(1, len(self.gains), len(self.whitening), run.contexts.shape[1])
         whitened = bounded(run.errors, self.bound) @ self.whitening
@@ -264,25 +166,86 @@ class Detector:
         return np.array(strengths), np.array(lately)
 
 
-def conformal_episodes(rate: float) -> int:
-    """How many nominal episodes a false-alarm rate needs at least: ⌈1/rate⌉ - 1."""
-    if not 0.0 < rate < 1.0:
-        raise ValueError(f"false_alarm_rate must be in (0, 1), got {rate}")
-    return math.ceil(1.0 / rate - 1e-9) - 1
+class EvidenceState(NamedTuple):
+    """What is carried from step to step, one row a stream; a value, never changed in place."""
+
+    evidence: Evidence
+    repetition: Repetition
 
 
-def conformal_threshold(maxima: Array, rate: float) -> float:
-    """The q that the maximum of a fresh nominal episode exceeds with a probability of at most ``rate``.
-
-    The guarantee is over the draw of both the n calibration episodes and the fresh one, and needs no more than that
-    they are exchangeable.
+class EvidenceDetection:
+    """The detector on a model's errors, and an eye for senses that are stuck.
 
     Args:
-        maxima: (n,) the largest value in each nominal episode.
-        rate: P(any alarm in a nominal episode).
+        spec: the stream that is watched.
+        gains: a in (0, 1], weights of the newest step in the accumulated evidence; several, for faults that come as
+            a knock and faults that creep.
+        bound: ν > 0, how many standard deviations an error counts at most, so that a knock that is soon over counts
+            less than what stays.
+        shrinkage: λ in [0, 1] of the whitening, towards no correlation between errors.
+
+    Attributes:
+        detector_: what turns errors into surprise; None before ``fit``.
     """
-    n, needed = len(maxima), conformal_episodes(rate)
-    if n < needed:
-        raise ValueError(f"a false alarm rate of {rate} needs at least {needed} nominal episodes, got {n}")
-    rank = math.ceil((n + 1) * (1.0 - rate) - 1e-9)  # (n + 1)(1 - rate) is often whole, but not in floating point
-    return float(np.sort(maxima)[rank - 1])
+
+    name = "evidence"
+    arrays: tuple[str, ...] = ("whitening", "ceiling", "tail", "context_quantile", "repetition")
+
+    def __init__(
+        self, spec: StreamSpec, gains: Sequence[float] = GAINS, bound: float = BOUND, shrinkage: float = 1e-3
+    ) -> None:
+        self.spec, self.gains = spec, tuple(map(float, gains))
+        if not self.gains or not all(0.0 < a <= 1.0 for a in self.gains):
+            raise ValueError(f"gains must be numbers in (0, 1], got {gains}")
+        self.bound = check_number("bound", bound, above=0.0)
+        self.shrinkage = check_number("shrinkage", shrinkage, low=0.0, high=1.0)
+        self.learned_: Arrays = {}
+        self.detector_: Detector | None = None
+
+    def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
+        """Whitening from what the model has learned; from what it has not, how surprise depends on context."""
+        certain = [ModelOutput(r.errors, r.contexts[:, :0]) for r in nominal.outputs(nominal.learned)]
+        surprised = nominal.outputs(nominal.held_out)
+        detector = Detector.fit(certain, surprised, self.gains, self.bound, self.shrinkage, rng)
+        senses = self.spec.sensory
+        counted = count_repetitions([e.stream[:, senses] for e in nominal.episodes], self.spec.noise[senses] > 0)
+        return self.restore({name: getattr(detector, name) for name in self.arrays[:-1]} | {"repetition": counted})
+
+    def restore(self, learned: Arrays) -> Self:
+        self.learned_ = learned
+        found = {name: learned[name] for name in self.arrays[:-1]}
+        self.detector_ = Detector(**found, gains=np.array(self.gains), bound=self.bound)
+        return self
+
+    def start(self, batch: int, errors: int) -> EvidenceState:
+        assert self.detector_ is not None
+        return EvidenceState(self.detector_.start(batch), unrepeated(batch, len(self.spec.sensory)))
+
+    def attribute_step(
+        self, state: EvidenceState, output: ModelOutput, rows: NDArray[np.float64], place: Place
+    ) -> tuple[EvidenceState, NDArray[np.float64]]:
+        assert self.detector_ is not None
+        evidence, _, parts = self.detector_.step(state.evidence, *output)
+        senses = self.spec.sensory
+        repetition = Repetition(*repeated(*state.repetition, rows[:, senses], self.learned_["repetition"]))
+        found = place(parts)
+        if repetition.unlikely.any():
+            ratios = np.zeros_like(found)
+            ratios[:, senses] = improbability(repetition)
+            found = _joined(found, ratios)
+        return EvidenceState(evidence, repetition), found
+
+    def reset(self, state: EvidenceState) -> EvidenceState:
+        """The state with the evidence so far forgotten; how long it is in the making, and its context, are kept."""
+        return EvidenceState(
+            state.evidence._replace(vector=np.zeros_like(state.evidence.vector)),
+            state.repetition._replace(unlikely=np.zeros_like(state.repetition.unlikely)),
+        )
+
+
+def _joined(found: NDArray[np.float64], ratios: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Each number's share (B, D) of what was found and of further ratios, pooled as those are that made it."""
+    value = found.sum(axis=1, keepdims=True)
+    _, parts = pool(np.hstack([value, ratios]))
+    shared: NDArray[np.float64] = found * (parts[:, :1] / np.maximum(value, TINY)) + parts[:, 1:]
+    return shared

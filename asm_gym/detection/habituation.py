@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array
+from asm_gym.detection.base import Array
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 
 USUAL = 0.95

@@ -2,7 +2,7 @@
 
     p_i = P(x_t,i = x_{t-1,i}), counted apart for senses that repeated themselves the time before and that did not
     n_t = (1 - a) n_{t-1} - [x_t = x_{t-1}] log p                    how unlikely the last repetitions were
-    r_t = exp(ξ_0 (n_t - n_0)) where n_t > 0, else 0                 beside the ratios of ``detection``
+    r_t = exp(ξ_0 (n_t - n_0)) where n_t > 0, else 0                 beside the ratios of ``tails``, with their ξ_0
 
 What predicts a change finds nothing odd in one that is just 0. Yet where the senses are noisy, the density of what
 comes next has no mass on any one number, and a repetition is as surprising as it was rare. A sense that is read more
@@ -18,14 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
+from asm_gym.detection.tails import TAIL_INDEX
 
 FADING = 0.2
 """a."""
 
-LIGHT = 0.3
-"""ξ_0: a ratio falls off as probability to this power. The tails of ``detection`` are brought to the same."""
-
-SURE = 12.0
+REPETITION_OFFSET = 12.0
 """n_0: one in 160,000, which among a hundred senses happens once in some thousand steps."""
 
 
@@ -66,7 +64,7 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
 def improbability(repetition: Repetition) -> NDArray[np.float64]:
     """r (B, X)."""
     unlikely = repetition.unlikely
-    ratio: NDArray[np.float64] = np.where(unlikely > 0, np.exp(LIGHT * (unlikely - SURE)), 0.0)
+    ratio: NDArray[np.float64] = np.where(unlikely > 0, np.exp(TAIL_INDEX * (unlikely - REPETITION_OFFSET)), 0.0)
     return ratio
 
 

@@ -174,7 +174,7 @@ class Schedule(NamedTuple):
     iterations: int
     prior_precision: float
     sensory_precision: float
-    carry_prior: float
+    free_running_probability: float
 
 
 class Step(NamedTuple):

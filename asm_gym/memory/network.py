@@ -6,8 +6,9 @@ association   a_t → Δ̂_t, σ_t       what each sense should do: from what ca
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from asm_gym.memory.energy import Array
 from asm_gym.memory.inference import Weights, expect, infer, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory, learn, passes
 from asm_gym.memory.precision import PRECISION_EPOCHS
-from asm_gym.memory.scheduled_sampling import rehearse
+from asm_gym.memory.scheduled_sampling import learn_scheduled
 from asm_gym.scaling import ScaledRows
 
 
@@ -55,6 +56,12 @@ class Network:
         self.prior_precision, self.sensory_precision = np.float32(prior_precision), np.float32(sensory_precision)
         norm = float(np.linalg.norm(weights.W_F.astype(np.float64), 2))
         self.curvature = np.float32(prior_precision + sensory_precision * norm**2)
+
+    def with_association(self, association: Association) -> Self:
+        """The same network with other synapses between senses; this one keeps its own."""
+        other = copy.copy(self)
+        other.association = association
+        return other
 
     @property
     def hidden_size(self) -> int:
@@ -116,7 +123,7 @@ def train(
     sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
     weights = initial_weights(hidden, sensory, commands - 1, rng)
     total = passes(trajectories, schedule) + TICKS + PRECISION_EPOCHS
-    how_to = rehearse if schedule.carry_prior > 0 else learn
+    how_to = learn_scheduled if schedule.free_running_probability > 0 else learn
     energy = how_to(weights, trajectories, schedule, rng, tick)
     inputs = np.concatenate([t.inputs for t in trajectories])
     association = learn_association(inputs, np.ascontiguousarray(inputs[:, changes]), groups, changes, units, rng, tick)

@@ -1,4 +1,4 @@
-"""Rehearsal: learning to run on alone, so that a skill can be recalled when the senses are gone.
+"""Scheduled sampling: learning to run on alone, so that a skill can be recalled when the senses are gone.
 
     after a random cue:    z_t ← μ_t, a_t ← â_t     with a probability that rises as learning goes on
 
@@ -69,7 +69,7 @@ class Carried(NamedTuple):
         return cls(np.zeros((batch, hidden), np.float32), none > 0, none, none + LONGEST_CUE)
 
 
-class Rehearsal:
+class ScheduledSampling:
     """Streams that a learner follows and runs on from, and where they are.
 
     Args:
@@ -103,7 +103,7 @@ class Rehearsal:
         return total
 
 
-def rehearse(
+def learn_scheduled(
     weights: Weights,
     trajectories: Sequence[Trajectory],
     schedule: Schedule,
@@ -112,13 +112,13 @@ def rehearse(
 ) -> NDArray[np.float64]:
     """Learns in place, as ``learning.learn`` does, but to run on alone; the mean energy of each epoch."""
     epochs, widest = passes(trajectories, schedule), largest_rate(weights, schedule)
-    rehearsal = Rehearsal(Learner(weights, schedule, rng), schedule.batch_size)
+    sampling = ScheduledSampling(Learner(weights, schedule, rng), schedule.batch_size)
     streams = one_after_another(trajectories, schedule.batch_size, rng)
     steps = -(-sum(len(t.senses) for t in trajectories) // schedule.batch_size)
     curve = np.zeros(epochs)
     for epoch in range(epochs):
         progress = epoch / epochs
-        rate, free = cosine_decay(widest, progress), schedule.carry_prior * progress
-        curve[epoch] = rehearsal.run(islice(streams, steps), rate, free) / (steps * schedule.batch_size)
+        rate, free = cosine_decay(widest, progress), schedule.free_running_probability * progress
+        curve[epoch] = sampling.run(islice(streams, steps), rate, free) / (steps * schedule.batch_size)
         tick()
     return curve

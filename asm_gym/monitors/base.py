@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.detection import ModelOutput
+from asm_gym.detection.base import Arrays
 from asm_gym.episodes import Episode
 from asm_gym.stream import StreamSpec
+
+Progress = Callable[[int, int], object]
+"""Called as ``progress(done, total)``."""
 
 State = Any
 """A monitor's running state: a value, passed in and handed back, never kept in the monitor."""
@@ -49,6 +54,52 @@ class Monitor(Protocol):
     def observe(self, state: State, stream: NDArray[np.floating[Any]]) -> tuple[State, Surprise]: ...
 
     def save(self, path: str | Path) -> None: ...
+
+
+class Model(Protocol):
+    """Expects each row of a stream, and says by how much it was wrong; what that means is for a detection to say.
+
+    Arguments of ``__init__`` beside the stream's spec are hyperparameters, kept under their own names.
+
+    Attributes:
+        kind: its name, in ``make_monitor`` and in checkpoints.
+        shortest: steps that an episode must have to be learned from.
+        held_out: one in so many episodes is not learned, but shows how wrong the model usually is; 0 for none.
+        learned_: what ``fit`` has found, by name; empty before.
+        skills_: names of the skills it knows, where it was told any.
+    """
+
+    kind: str
+    shortest: int
+    held_out: int
+    spec: StreamSpec
+    learned_: Arrays
+    skills_: tuple[str, ...]
+
+    @property
+    def error_columns(self) -> NDArray[np.intp]:
+        """(X,) the column of the stream that each error belongs to; -1 for none, of which all senses have a share."""
+        ...
+
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        """Learns from whole nominal episodes."""
+        ...
+
+    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        """Takes what another has learned. Raises ValueError where that does not fit together."""
+        ...
+
+    def start(self, batch: int, skills: Sequence[str] = ()) -> State:
+        """Before the first row of ``batch`` streams: a NamedTuple of arrays whose first axis is B.
+
+        Args:
+            skills: which runs in each stream, for models that have to be told; others do not look.
+        """
+        ...
+
+    def predict(self, state: State, rows: NDArray[np.float64]) -> tuple[State, ModelOutput]:
+        """The next rows (B, D), perhaps not all finite: the new state, and how wrong each expectation was."""
+        ...
 
 
 @runtime_checkable

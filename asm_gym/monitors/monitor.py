@@ -1,88 +1,127 @@
-"""What monitors share: checks, calibration, scoring of whole episodes, checkpoints."""
+"""A monitor: a model, a detection on its errors, a threshold from nominal episodes, and a file to keep them in."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+import copy
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from asm_gym.checkpoint import read_checkpoint, write_checkpoint
-from asm_gym.detection.detector import conformal_episodes, conformal_threshold
+from asm_gym.checkpoint import Checkpoint, write_checkpoint
+from asm_gym.checks import check_number
+from asm_gym.choices import check_choice
+from asm_gym.detection import Detection, ModelOutput, Nominal, conformal_episodes, conformal_threshold
 from asm_gym.episodes import Episode
-from asm_gym.monitors.base import State, Surprise
+from asm_gym.monitors.base import Model, Progress, State, Surprise
+from asm_gym.monitors.model import batch_of, model_outputs, parameter_names, side_by_side
+from asm_gym.monitors.nominal import check_nominal
 from asm_gym.stream import StreamSpec
 
-Progress = Callable[[int, int], object]
-"""Called as ``progress(done, total)``."""
+M = TypeVar("M", bound="CalibratedMonitor")
 
-WILD = 1e6
-"""How many times the range of its channel a number may be away from the median."""
+MAXIMA = "nominal_maxima"
+"""Under which name a checkpoint keeps what ``calibrate`` has found."""
 
-SCORED_AT_ONCE = 64
-"""Episodes scored side by side; with more the arrays no longer fit the cache."""
+RENAMED = {"habit": "context_quantile", "carry_prior": "free_running_probability"}
+"""What older checkpoints keep under another name."""
 
 
-class CalibratedMonitor(ABC):
-    """A monitor whose threshold is conformal on the maximum of nominal episodes.
+class MonitorState(NamedTuple):
+    """What is carried from step to step, one row a stream; a value, never changed in place."""
+
+    model: State
+    detection: State
+
+
+class CalibratedMonitor:
+    """Any model under any detection, with a threshold that is conformal on the maxima of nominal episodes.
 
     Args:
-        spec: the stream it watches.
+        model: what expects the stream.
+        detections: what makes surprise of its errors. The first does; the others are fitted and saved beside it.
         seed: of whatever learning draws.
 
     Attributes:
-        learned_: what ``fit`` has found, by name; empty before.
         threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
-        skills_: names of skills, where it was told any.
+        maxima_: (n,) largest surprise in each episode that ``calibrate`` was given; None before.
     """
 
-    kind: ClassVar[str]
-    """Its name, in checkpoints and in ``make_monitor``."""
+    model: Model
 
-    hyperparameters: ClassVar[tuple[str, ...]] = ("seed",)
-    """Arguments of ``__init__`` beside the spec, kept under their own names."""
-
-    shortest: int = 1
-    """Steps that an episode must have to be learned from."""
-
-    def __init__(self, spec: StreamSpec, seed: int = 0) -> None:
-        require("seed", seed, isinstance(seed, (int, np.integer)) and seed >= 0, "a whole number of at least 0")
-        self.spec = spec
-        self.seed = int(seed)
+    def __init__(self, model: Model, *detections: Detection, seed: int = 0) -> None:
+        if not detections:
+            raise ValueError("a monitor needs a detection, got none")
+        self.seed = check_number("seed", seed, low=0, whole=True)
+        self.spec, self.model, self.detection = model.spec, model, detections[0]
+        self.detections = {d.name: d for d in detections}
         self.threshold_: float | None = None
-        self.learned_: dict[str, NDArray[Any]] = {}
-        self.skills_: tuple[str, ...] = ()
+        self.maxima_: NDArray[np.float64] | None = None
 
-    @abstractmethod
-    def learn(self, streams: Sequence[NDArray[np.float32]], progress: Progress) -> dict[str, NDArray[Any]]:
-        """What is to be known of nominal streams, (T, D) each."""
+    @property
+    def learned_(self) -> dict[str, NDArray[Any]]:
+        """All that ``fit`` has found, by name; empty before."""
+        found = dict(self.model.learned_)
+        for detection in self.detections.values():
+            found |= detection.learned_
+        return found
 
-    def build(self) -> None:  # noqa: B027 (many need none)
-        """Makes what ``shares`` needs out of ``learned_``. Raises ValueError where that does not fit together."""
-
-    @abstractmethod
-    def start(self, batch: int) -> State:
-        """The state before the first row of ``batch`` streams: a NamedTuple of arrays whose first axis is B."""
-
-    @abstractmethod
-    def shares(self, state: State, rows: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
-        """The next rows (B, D), perhaps not all finite: the new state, and each number's share of the surprise."""
+    @property
+    def skills_(self) -> tuple[str, ...]:
+        """Names of skills, where it was told any."""
+        return self.model.skills_
 
     @property
     def threshold(self) -> float:
+        """What surprise must exceed for an alarm. Raises RuntimeError before ``calibrate``."""
         if self.threshold_ is None:
-            raise RuntimeError(
-                f"this {type(self).__name__} has no threshold yet: call calibrate(nominal_episodes) first"
-            )
+            raise RuntimeError(f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first")
         return self.threshold_
+
+    def threshold_at(self, false_alarm_rate: float) -> float:
+        """What the threshold would be at another rate, from the episodes that ``calibrate`` was given.
+
+        Raises:
+            ValueError: there were too few of them for this rate; the message says how many it takes.
+            RuntimeError: it is not calibrated, or was so by a version that did not keep what this takes.
+        """
+        if self.maxima_ is None and self.threshold_ is not None:
+            raise RuntimeError(
+                f"this {self._name} keeps a threshold, but not the surprise of the nominal episodes that it was set by "
+                "(an older asm-gym did not save it): call calibrate(nominal_episodes) again"
+            )
+        if self.maxima_ is None:
+            raise RuntimeError(f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first")
+        return conformal_threshold(self.maxima_, false_alarm_rate)
+
+    def with_threshold(self, value: float) -> Self:
+        """The same monitor with another threshold, ``inf`` for none that could be exceeded; this one keeps its own."""
+        other = self._copy()
+        other.threshold_ = check_number("threshold", value, infinite=True)
+        return other
+
+    def with_detection(self, detection: str | Detection) -> Self:
+        """The same model under another detection: a new one, which needs ``fit``, or the name of one fitted before.
+
+        It has no threshold yet.
+        """
+        other = self._copy()
+        if isinstance(detection, str):
+            check_choice(f"detection of this {self._name}", detection, self.detections)
+            detection = other.detections[detection]
+        other.detection, other.threshold_, other.maxima_ = detection, None, None
+        other.detections[detection.name] = detection
+        return other
 
     def get_params(self) -> dict[str, Any]:
         """The hyperparameters by name."""
-        return {name: getattr(self, name) for name in self.hyperparameters}
+        parts = (self.model, *reversed(self.detections.values()))
+        found = {n: getattr(p, n) for p in parts for n in parameter_names(type(p)) if n != "seed"}
+        return found | {"seed": self.seed}
 
     def fit(self, episodes: Sequence[Episode], progress: Progress | None = None) -> Self:
         """Learns from whole nominal episodes of any number of skills; no labels.
@@ -94,16 +133,28 @@ class CalibratedMonitor(ABC):
         Raises:
             ValueError: no episode, one that is too short or of another spec, or a number that is not finite.
         """
-        self._check(episodes)
+        check_nominal(episodes, self.spec, self.model.shortest)
+        rng, one_in = np.random.default_rng(self.seed), self.model.held_out
+        order = rng.permutation(len(episodes)) if one_in else np.arange(len(episodes))
+        kept = len(episodes) // one_in if one_in else 0
+        held_out, learned = ([episodes[i] for i in part] for part in (order[:kept], order[kept:]))
         # One thread: products this small are slowed down by several, and ruined by several that share a core.
         with threadpool_limits(1):
-            learned = self.learn([e.stream for e in episodes], progress or (lambda done, total: None))
-        self.learned_, self.threshold_ = learned, None
-        self.build()
+            self.model.fit(learned, rng, progress or (lambda done, total: None))
+            self.threshold_ = self.maxima_ = None
+            self._prepare()
+            nominal = Nominal(episodes, learned, held_out or learned, self._outputs)
+            for detection in self.detections.values():
+                taken = self.model.learned_.keys() & set(detection.arrays)
+                if taken:
+                    raise ValueError(f"{self.model.kind} and {detection.name} both learn {', '.join(sorted(taken))}")
+                detection.fit(nominal, rng)
         return self
 
     def calibrate(self, episodes: Sequence[Episode], false_alarm_rate: float = 0.01) -> Self:
         """Sets the threshold from nominal episodes that ``fit`` has not seen; P(any alarm in one) <= the rate.
+
+        What it finds is kept, so that ``threshold_at`` knows the threshold of every other rate too.
 
         Args:
             episodes: at least ``conformal_episodes(false_alarm_rate)`` of them.
@@ -111,19 +162,23 @@ class CalibratedMonitor(ABC):
         """
         self._fitted()
         conformal_episodes(false_alarm_rate)  # refuses a bad rate before the work begins
-        self._check(episodes)
+        check_nominal(episodes, self.spec, self.model.shortest)
         maxima = np.array([s.value.max() for s in self.score_episodes(episodes)])
-        self.threshold_ = conformal_threshold(maxima, false_alarm_rate)
+        self.threshold_, self.maxima_ = conformal_threshold(maxima, false_alarm_rate), maxima
         return self
 
-    def initial_state(self, batch: int = 1) -> State:
-        """The state before the first row of ``batch`` streams."""
+    def initial_state(self, batch: int = 1, skills: Sequence[str] = ()) -> MonitorState:
+        """The state before the first row of ``batch`` streams.
+
+        Args:
+            skills: which runs in each, for a model that has to be told; others do not look.
+        """
         if batch < 1:
             raise ValueError(f"batch must be at least 1, got {batch}")
         self._fitted()
-        return self.start(batch)
+        return MonitorState(self.model.start(batch, skills), self.detection.start(batch, len(self.model.error_columns)))
 
-    def observe(self, state: State, stream: NDArray[np.floating[Any]]) -> tuple[State, Surprise]:
+    def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
         """The next row of each stream: the new state, and how surprising the row was.
 
         A number that is not finite makes the value and its own attribution infinite; it counts as unseen, so that
@@ -136,15 +191,25 @@ class CalibratedMonitor(ABC):
         self._fitted()
         rows = np.asarray(stream, np.float64)
         self.spec.check_row(rows)
-        batch = _batch(state)
+        batch = batch_of(state)
         if rows.shape != (batch, self.spec.size):
             raise ValueError(f"stream must have the shape {(batch, self.spec.size)}, got {rows.shape}")
-        state, attribution = self.shares(state, rows)
+        model, output = self.model.predict(state.model, rows)
+        detection, attribution = self.detection.attribute_step(state.detection, output, rows, self._place)
         finite = np.isfinite(rows)
         broken = ~finite.all(axis=1)
         if broken.any():
             attribution[broken] = np.where(finite[broken], 0.0, np.inf)
-        return state, Surprise(attribution.sum(axis=1), attribution)
+        return MonitorState(model, detection), Surprise(attribution.sum(axis=1), attribution)
+
+    def reset_evidence(self, state: MonitorState) -> MonitorState:
+        """The state with the evidence so far forgotten, after an alarm that was acted on; the model goes on."""
+        return state._replace(detection=self.detection.reset(state.detection))
+
+    def resynchronise(self, state: MonitorState) -> MonitorState:
+        """``reset_evidence``, as it was called before."""
+        warnings.warn("resynchronise is now reset_evidence", DeprecationWarning, stacklevel=2)
+        return self.reset_evidence(state)
 
     def score(self, episode: Episode) -> Surprise:
         """The surprise of each step of an episode: value (T,), attribution (T, D)."""
@@ -157,7 +222,7 @@ class CalibratedMonitor(ABC):
         self._fitted()
         scores: list[Surprise] = [Surprise(np.zeros(0), np.zeros((0, self.spec.size)))] * len(episodes)
         with threadpool_limits(1):
-            for group, steps in side_by_side([e.stream for e in episodes], self.start, self.observe):
+            for group, steps in side_by_side(episodes, self.initial_state, self.observe):
                 for n, i in enumerate(group):
                     mine = steps[: len(episodes[i])]
                     value, attribution = (np.array([s[k][n] for s in mine]) for k in range(2))
@@ -167,117 +232,85 @@ class CalibratedMonitor(ABC):
     def save(self, path: str | Path) -> None:
         """Writes everything learned to one file: arrays and JSON."""
         self._fitted()
+        arrays = self.learned_ | ({} if self.maxima_ is None else {MAXIMA: self.maxima_})
         header = {
             "spec": self.spec.to_json(),
             "hyperparameters": self.get_params(),
+            "detection": self.detection.name,
             "threshold": self.threshold_,
             "skills": list(self.skills_),
-            "shapes": {name: list(array.shape) for name, array in self.learned_.items()},
+            "shapes": {name: list(array.shape) for name, array in arrays.items()},
         }
-        write_checkpoint(path, self.kind, header, self.learned_)
+        write_checkpoint(path, self.model.kind, header, arrays)
 
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Reads what ``save`` wrote.
+    def restore(self, saved: Checkpoint) -> Self:
+        """Takes what ``save`` wrote of a monitor of the same spec, model and hyperparameters.
+
+        A file may hold several detections; where it was calibrated for another one than this, it has no threshold here.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file is damaged, from a newer version, or something else.
+            ValueError: something is missing, or does not fit together.
         """
-        saved = read_checkpoint(path, cls.kind)
-        try:
-            monitor = cls(StreamSpec.from_json(saved.header["spec"]), **saved.header["hyperparameters"])
-            monitor.threshold_, monitor.skills_ = saved.header["threshold"], tuple(saved.header["skills"])
-            shapes = saved.header["shapes"]
-            monitor.learned_ = {name: saved.array(name, *shape) for name, shape in shapes.items()}
-            monitor.build()
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"{path} is damaged: {error}") from error
-        return monitor
+        header, new = saved.header, "detection" in saved.header
+        names = {n: n if new else RENAMED.get(n, n) for n in header["shapes"]}
+        arrays = {now: saved.array(n, *header["shapes"][n]) for n, now in names.items()}
+        maxima = arrays.pop(MAXIMA, None)
+        theirs = {n for d in self.detections.values() for n in d.arrays}
+        missing = [n for n in self.detection.arrays if n not in arrays]
+        if missing:
+            raise ValueError(f"the checkpoint has no {', '.join(missing)}: an older asm-gym wrote it, so fit it anew")
+        self.model.restore({n: a for n, a in arrays.items() if n not in theirs}, tuple(header["skills"]))
+        self._prepare()
+        for detection in self.detections.values():
+            if arrays.keys() >= set(detection.arrays):
+                detection.restore({n: arrays[n] for n in detection.arrays})
+        if not new or header["detection"] == self.detection.name:
+            self.threshold_, self.maxima_ = header["threshold"], maxima
+        return self
+
+    @property
+    def _name(self) -> str:
+        return f"{self.model.kind} monitor"
+
+    def _copy(self) -> Self:
+        """Another that nothing this one learns from now on can reach; learned arrays are never changed in place."""
+        other = copy.copy(self)
+        other.model = copy.copy(self.model)
+        other.detections = {name: copy.copy(d) for name, d in self.detections.items()}
+        other.detection = other.detections[self.detection.name]
+        return other
 
     def _fitted(self) -> None:
-        if not self.learned_:
-            raise RuntimeError(f"this {type(self).__name__} has learned nothing yet: call fit(episodes) first")
+        if not self.model.learned_ or (self.detection.arrays and not self.detection.learned_):
+            raise RuntimeError(f"this {self._name} has learned nothing yet: call fit(episodes) first")
 
-    def _check(self, episodes: Sequence[Episode]) -> None:
-        """Refuses episodes that cannot be learned from."""
-        if isinstance(episodes, Episode):
-            raise TypeError("episodes must be a list of them, got a single Episode")
-        if len(episodes) == 0:
-            raise ValueError("at least one episode is needed, got none")
-        for n, episode in enumerate(episodes):
-            self.spec.require(episode.spec, f"episode {n}")
-            if len(episode) < self.shortest:
-                raise ValueError(f"episode {n} must be at least {self.shortest} steps long, got {len(episode)}")
-            bad = np.argwhere(~np.isfinite(episode.stream))
-            if len(bad):
-                step, column = bad[0]
-                label, value = self.spec.labels[column], episode.stream[step, column]
-                raise ValueError(f"episode {n}, step {step}, {label} must be finite, got {value}")
-        refuse_wild(episodes)
+    def _outputs(self, episodes: Sequence[Episode]) -> list[ModelOutput]:
+        return model_outputs(self.model, episodes)
 
+    def _prepare(self) -> None:
+        """Where each error belongs in the stream, once the model knows."""
+        columns = self.model.error_columns
+        self._nowhere = columns < 0
+        self._places = np.zeros((len(columns), self.spec.size))  # (X, D)
+        self._places[np.flatnonzero(~self._nowhere), columns[~self._nowhere]] = 1.0
 
-def refuse_wild(episodes: Sequence[Episode]) -> None:
-    """Raises ValueError for a number out of all proportion, which would hide whatever its channel does otherwise."""
-    if max(float(np.abs(e.stream).max()) for e in episodes) <= WILD / 2:
-        return
-    rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)
-    low, middle, high = np.quantile(rows, (0.01, 0.5, 0.99), axis=0)
-    reach = WILD * np.maximum(np.maximum(high - low, np.abs(middle)), 1.0)
-    for n, episode in enumerate(episodes):
-        wild = np.argwhere(np.abs(episode.stream - middle) > reach)
-        if len(wild):
-            step, column = wild[0]
-            label, value = episode.spec.labels[column], episode.stream[step, column]
-            raise ValueError(
-                f"episode {n}, step {step}, {label} is {value:g}, where 98 % of all lie between {low[column]:g} and "
-                f"{high[column]:g}: leave the episode out"
-            )
+    def _place(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Each number's share (B, D), from each error's (B, X)."""
+        found: NDArray[np.float64] = parts @ self._places
+        if self._nowhere.any():
+            senses = self.spec.sensory
+            found[:, senses] += np.where(self._nowhere, parts, 0.0).sum(axis=1, keepdims=True) / len(senses)
+        return found
 
 
-def side_by_side(
-    streams: Sequence[NDArray[np.float32]],
-    start: Callable[[int], State],
-    advance: Callable[[State, NDArray[np.float64]], tuple[State, Any]],
-) -> Iterator[tuple[list[int], list[Any]]]:
-    """Runs many streams together, the longest first; those that have ended are left out.
-
-    Yields, for each group of streams, their indices and what ``advance`` said of each step.
-    """
-    order = sorted(range(len(streams)), key=lambda i: -len(streams[i]))
-    for first in range(0, len(order), SCORED_AT_ONCE):
-        group = order[first : first + SCORED_AT_ONCE]
-        state, said = start(len(group)), []
-        for t in range(len(streams[group[0]])):
-            rows = np.stack([streams[i][t] for i in group if t < len(streams[i])]).astype(np.float64)
-            state, step = advance(_first(state, len(rows)), rows)
-            said.append(step)
-        yield group, said
-
-
-def require(name: str, value: object, fulfilled: bool, what: str) -> None:
-    """Raises ValueError unless a hyperparameter is what it must be."""
-    if not fulfilled:
-        raise ValueError(f"{name} must be {what}, got {value}")
-
-
-def columns(spec: StreamSpec, suffix: str) -> NDArray[np.intp]:
-    """Where the channels whose name ends in ``suffix`` stand in a row; one for each arm.
+def restored(path: str | Path, saved: Checkpoint, make: Callable[..., M]) -> M:
+    """The monitor that a checkpoint is of, as ``make(spec, **hyperparameters)`` makes it before it is fitted.
 
     Raises:
-        ValueError: there is none.
+        ValueError: the file is damaged.
     """
-    found = [i for name, s in spec.slices.items() if name.endswith(suffix) for i in range(spec.size)[s]]
-    if not found:
-        raise ValueError(f"this stream has no {suffix}; it has: {', '.join(spec.slices)}")
-    return np.array(found, dtype=np.intp)
-
-
-def _first(state: State, count: int) -> State:
-    """The state of the first ``count`` streams."""
-    return type(state)(*(_first(s, count) for s in state)) if isinstance(state, tuple) else state[:count]
-
-
-def _batch(state: State) -> int:
-    """B."""
-    return _batch(state[0]) if isinstance(state, tuple) else len(state)
+    try:
+        hyperparameters = {RENAMED.get(n, n): value for n, value in saved.header["hyperparameters"].items()}
+        return make(StreamSpec.from_json(saved.header["spec"]), **hyperparameters).restore(saved)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error

@@ -11,16 +11,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import asm_gym
-from asm_gym.detection.detector import conformal_episodes, conformal_threshold
+from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode, EpisodeLabel
 from asm_gym.evaluation.comparison import RATES, BenchmarkResult, Detectability, MonitorResult
 from asm_gym.evaluation.ideal import earliest, noise_floor, separation
 from asm_gym.evaluation.metrics import typical
 from asm_gym.evaluation.trace import NOMINAL, InterventionOutcome, Trace, TraceDetail, window_steps
-from asm_gym.monitors import EVIDENCE, Monitor, make_monitor, monitor_class
+from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
 from asm_gym.rollouts.folder import NOMINAL_ROLES, Recordings, labelled
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 
@@ -84,9 +82,9 @@ def result_of(
         rate: share of nominal episodes that may raise an alarm.
     """
     monitor = fitted(folder, name, by_role["fit"], seed)
-    maxima = np.array([s.value.max() for s in _scores(monitor, by_role["calibration"])])
-    rates = sorted({rate, *(r for r in RATES if len(maxima) >= conformal_episodes(r))})
-    thresholds = {r: conformal_threshold(maxima, r) for r in rates}
+    monitor.calibrate(by_role["calibration"], rate)
+    rates = sorted({rate, *(r for r in RATES if len(by_role["calibration"]) >= conformal_episodes(r))})
+    thresholds = {r: monitor.threshold_at(r) for r in rates}
     tested = [*by_role["nominal"], *by_role.get("faulty", [])]
     traces = _traces(name, monitor, tested, thresholds[rate])
     return MonitorResult(
@@ -97,37 +95,36 @@ def result_of(
     )
 
 
-def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) -> Monitor:
+def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) -> CalibratedMonitor:
     """The monitor fitted on these episodes; kept in the folder for the next time, under the name of what it learned."""
     spec = recordings[0].spec
     model = name.removesuffix(EVIDENCE)
-    made: Any = make_monitor(name, spec, seed=seed)
+    made = make_monitor(name, spec, seed=seed)
     learned = model, asm_gym.__version__, made.get_params(), sorted(str(r.labelled.path) for r in recordings)
     digest = hashlib.sha256(json.dumps(learned, default=str).encode())
     path = folder / "monitors" / f"{model}-{digest.hexdigest()[:12]}.asm"
     # One that cannot be read, for it is damaged or of an older asm-gym, is made anew.
     with suppress(FileNotFoundError, ValueError):
-        loaded: Monitor = monitor_class(name).load(path)
-        return loaded
-    monitor: Monitor = made.fit(recordings)
+        return monitor_class(name).load(path)
+    monitor = made.fit(recordings)
     path.parent.mkdir(parents=True, exist_ok=True)
     monitor.save(path)
     return monitor
 
 
-def calibrated(folder: Path, name: str, labels: Sequence[EpisodeLabel], seed: int, threshold: float) -> Any:
+def calibrated(
+    folder: Path, name: str, labels: Sequence[EpisodeLabel], seed: int, threshold: float
+) -> CalibratedMonitor:
     """The monitor as it judged the run, with the threshold it judged by."""
     nominal = Recordings.of(labelled(folder, [label for label in labels if label.role in NOMINAL_ROLES]))
-    monitor: Any = fitted(folder, name, nominal.roles["fit"], seed)
-    monitor.threshold_ = threshold
-    return monitor
+    return fitted(folder, name, nominal.roles["fit"], seed).with_threshold(threshold)
 
 
-def _scores(monitor: Any, recordings: Sequence[Episode]) -> list[Any]:
+def _scores(monitor: CalibratedMonitor, recordings: Sequence[Episode]) -> list[Any]:
     return list(monitor.score_episodes(recordings)) if recordings else []
 
 
-def _traces(name: str, monitor: Monitor, episodes: Sequence[Episode], threshold: float) -> list[Trace]:
+def _traces(name: str, monitor: CalibratedMonitor, episodes: Sequence[Episode], threshold: float) -> list[Trace]:
     made = []
     for episode, surprise in zip(episodes, _scores(monitor, episodes), strict=True):
         label = episode.labelled
@@ -148,7 +145,7 @@ def _traces(name: str, monitor: Monitor, episodes: Sequence[Episode], threshold:
     return made
 
 
-def _examples(monitor: Any, traces: Sequence[Trace], episodes: Sequence[Episode]) -> list[Trace]:
+def _examples(monitor: CalibratedMonitor, traces: Sequence[Trace], episodes: Sequence[Episode]) -> list[Trace]:
     """Of each of a few kinds, at its strongest, the typical episode, with what is drawn of it."""
     twins = {(e.labelled.task, e.labelled.seed): e.stream for e in episodes if e.labelled.role == "nominal"}
     examples = []

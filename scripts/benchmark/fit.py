@@ -15,8 +15,9 @@ from rich.console import Console
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.memory.association import complete, hidden_units
-from asm_gym.monitors import NeuralASM
+from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.baselines.gru import GRU
+from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.progress import stage
 
@@ -48,12 +49,12 @@ class Fit:
         held_out = [e for n, e in enumerate(episodes) if not n % HELD_OUT]
         rows: dict[str, tuple[float, float]] = {}
         NeuralASM(episodes[0].spec, epochs=1).fit(learned[:4])  # compiles
-        for name, monitor in (("neural_asm", NeuralASM), ("gru", GRU)):
+        for name in ("neural_asm", "gru"):
             with stage(f"fitting {name}", console, seconds) as progress:
                 start = time.process_time()
-                fitted: Any = monitor(episodes[0].spec, seed=self.seed).fit(learned, progress)
+                fitted: Any = make_monitor(name, episodes[0].spec, seed=self.seed).fit(learned, progress)
                 spent = time.process_time() - start
-            rows[name] = spent, float(np.median(np.abs(np.concatenate(errors(fitted, held_out)))))
+            rows[name] = spent, float(np.median(np.abs(np.concatenate(errors(fitted.model, held_out)))))
         table = Table(
             f"{len(learned)} episodes of {', '.join(self.tasks)}, one core",
             ("", "s", "against the GRU", "median error of a step [sd of the change]"),
@@ -67,19 +68,17 @@ class Fit:
         return 0
 
 
-def errors(monitor: NeuralASM | GRU, episodes: Sequence[Episode]) -> list[NDArray[np.float32]]:
+def errors(model: MemoryModel | GRU, episodes: Sequence[Episode]) -> list[NDArray[np.float32]]:
     """Δ - Δ̂ (T - 2, X) of each episode, in standard deviations of the step from row to row."""
     made = []
     for episode in episodes:
-        r = monitor.senses_.read_episode(episode.stream.astype(np.float64))
-        if isinstance(monitor, NeuralASM):
-            assert monitor.network_ is not None
-            w = monitor.network_.association
+        r = model.senses_.read_episode(episode.stream.astype(np.float64))
+        if isinstance(model, MemoryModel):
+            w = model.network.association
             expected = complete(hidden_units(r.inputs, w.V), r.inputs, w.U, w.D)
         else:
-            assert monitor.module_ is not None
             before = np.hstack([np.vstack([r.senses[:1], r.senses[:-1]]), r.commands])
             with torch.no_grad():
-                expected = monitor.module_(torch.from_numpy(before)[None])[0].numpy()[0]
+                expected = model.module_(torch.from_numpy(before)[None])[0].numpy()[0]
         made.append((r.changes - expected)[2:])
     return made

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
 
-from asm_gym.detection.detector import LATELY, POWER
-from asm_gym.detection.repetition import FADING, LIGHT, SURE
+from asm_gym.detection.evidence import CONTEXT_GAIN, POWER
+from asm_gym.detection.repetition import FADING, REPETITION_OFFSET
+from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.monitors import NeuralASM
@@ -45,7 +46,7 @@ class PlainTorch:
         d, s = asm.detector_, asm.senses_
         found = d.whitening, d.ceiling, d.tail, d.gains
         self.M, self.q, self.kappa, self.gains = (torch.tensor(x, dtype=torch.float32) for x in found)
-        self.habit, self.bound = torch.tensor(d.habit, dtype=torch.float32), d.bound
+        self.usual, self.bound = torch.tensor(d.context_quantile, dtype=torch.float32), d.bound
         self.mean, self.spread, self.change = (torch.tensor(x) for x in (s.mean, s.spread, s.change))
         self.sensory, self.motor, self.slow = (torch.tensor(i) for i in (asm.spec.sensory, asm.spec.motor, s.slow))
         self.z = torch.zeros(asm.hidden_size)
@@ -91,10 +92,10 @@ class PlainTorch:
         ratios = (self.evidence**2 / variance[:, None] / self.q) ** self.kappa
         pooled = (ratios**POWER).sum() ** (1 / POWER)
         context = torch.tanh(mu)
-        self.lately = self.lately + LATELY * (context - self.lately)
-        usual = torch.exp(self.habit[:-1] @ torch.cat([context, self.lately]) + self.habit[-1])
+        self.lately = self.lately + CONTEXT_GAIN * (context - self.lately)
+        usual = torch.exp(self.usual[:-1] @ torch.cat([context, self.lately]) + self.usual[-1])
         self.z, self.before, self.earlier = z, x, before
-        repeated = (self.unlikely > 0) * torch.exp(LIGHT * (self.unlikely - SURE))
+        repeated = (self.unlikely > 0) * torch.exp(TAIL_INDEX * (self.unlikely - REPETITION_OFFSET))
         return float(((pooled / usual) ** POWER + (repeated**POWER).sum()) ** (1 / POWER))
 
 
@@ -243,5 +244,4 @@ class Safety:
         env_id = f"asm_gym/{self.task}-v0"
         episodes = collect(env_id, episodes=4, workers=1, horizon=40, stream_freq=rate)
         asm = NeuralASM(episodes[0].spec, hidden_size=self.hidden, epochs=1).fit(episodes)
-        asm.threshold_ = np.inf
-        return asm
+        return asm.with_threshold(np.inf)

@@ -18,8 +18,8 @@ from asm_gym.memory.association import Association, association_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, initial_weights
 from asm_gym.memory.recall import Recalled, at_rest, follow, run_on, to_rows
-from asm_gym.memory.scheduled_sampling import rehearse
-from asm_gym.monitors.baselines.skill_library import SkillLibrary
+from asm_gym.memory.scheduled_sampling import learn_scheduled
+from asm_gym.monitors import CalibratedMonitor, make_monitor
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import recurrent
 
@@ -60,7 +60,7 @@ class Memory:
         hidden: int,
         rng: np.random.Generator,
         steps: int,
-        carry_prior: float = 0.95,
+        free_running_probability: float = 0.95,
         iterations: int = 10,
         rate: float = 1e-3,
     ) -> Memory:
@@ -68,14 +68,15 @@ class Memory:
 
         Args:
             steps: in which its synapses change, with 32 episodes side by side.
-            carry_prior, iterations, rate: as in ``NeuralASM``.
+            free_running_probability, iterations, rate: as in ``NeuralASM``.
         """
         reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
         learned = trajectories(reader, episodes)
         weights = initial_weights(hidden, reader.size, len(reader.spec.motor), rng)
         size = 32
         epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
-        rehearse(weights, learned, Schedule(epochs, size, rate, iterations, 1.0, 1.0, carry_prior), rng, lambda: None)
+        schedule = Schedule(epochs, size, rate, iterations, 1.0, 1.0, free_running_probability)
+        learn_scheduled(weights, learned, schedule, rng, lambda: None)
         return cls(reader, Network(weights, unassociated(), iterations, 1.0, 1.0))
 
     def hidden(self, streams: Rows) -> NDArray[np.float32]:
@@ -180,25 +181,23 @@ class Hopfield:
 class Library:
     """Movement primitives, one a skill, and told which skill to express; only the hand is expressed."""
 
-    library: SkillLibrary
+    library: CalibratedMonitor
     skills: tuple[str, ...]
 
     @classmethod
     def learned(cls, episodes: Sequence[Episode], skills: Sequence[str]) -> Library:
         """From episodes that say their skill; ``skills`` are those of the streams that ``express`` will be given."""
-        return cls(SkillLibrary(episodes[0].spec).fit(episodes), tuple(skills))
+        return cls(make_monitor("skill_library", episodes[0].spec).fit(episodes), tuple(skills))
 
     def express(self, streams: Rows, cue: int) -> Rows:
-        library, made = self.library, np.full(streams.shape, np.nan)
-        state = library.start_model(streams.shape[1])
-        number = np.array([library.skills_.index(s) for s in self.skills])
-        state = state._replace(skill=number)
+        library, made = self.library.model, np.full(streams.shape, np.nan)
+        state = library.start(streams.shape[1], self.skills)
         hand = [
             i for n, s in library.spec.slices.items() if n.endswith("hand_position") for i in range(s.start, s.stop)
         ]
         for t in range(len(streams)):
             made[t][:, hand] = state.place if t else streams[0][:, hand]
-            state, _, _ = library.predict(state, streams[t])
+            state, _ = library.predict(state, streams[t])
         return made
 
 

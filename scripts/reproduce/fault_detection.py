@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from asm_gym.choices import check_choice
-from asm_gym.detection.detector import conformal_episodes, conformal_threshold
+from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.metrics import detected, false_alarms, time_matched_auroc

@@ -18,7 +18,7 @@ import tyro
 from rich.console import Console
 
 from asm_gym.choices import check_choice
-from asm_gym.detection.detector import conformal_episodes
+from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation.comparison import monitor_metrics, visible_kinds
 from asm_gym.evaluation.figures import save
 from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms

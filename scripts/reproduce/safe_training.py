@@ -21,7 +21,7 @@ import tyro
 from rich.console import Console
 
 from asm_gym.choices import check_choice
-from asm_gym.detection.detector import conformal_episodes
+from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode, load_episode
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.safe_training import COUNTED, Outcome, counts_table, learning_figure, worth_table

@@ -1,4 +1,4 @@
-"""The linear rival: each row predicted from the two before it and the commanded action.
+"""The linear baseline: each row predicted from the two before it and the commanded action.
 
     x̂_t = A₁ x_{t-1} + A₂ x_{t-2} + B u_t + c,    ridge regression over nominal steps
 
@@ -9,13 +9,16 @@ residuals.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.monitors.baselines.base import Mahalanobis
-from asm_gym.monitors.monitor import Progress
+from asm_gym.detection import ModelOutput
+from asm_gym.episodes import Episode
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.baselines.base import Standard, no_context
+from asm_gym.monitors.model import StreamModel
 
 RIDGE = 1e-3
 """Of the standardised inputs; keeps channels that are constant or copies of others from mattering."""
@@ -26,20 +29,18 @@ class _State(NamedTuple):
     earlier: NDArray[np.float64]  # (B, X) the one before
 
 
-class Autoregression(Mahalanobis):
-    """A linear model of the stream; the arguments are those of ``PredictiveMonitor``."""
+class Autoregression(StreamModel):
+    """A linear model of the stream."""
 
     kind = "autoregression"
     shortest = 3
 
-    def learn_model(
-        self, streams: Sequence[NDArray[np.float32]], rng: np.random.Generator, progress: Progress
-    ) -> dict[str, NDArray[Any]]:
-        rows = np.concatenate(streams)[:, self.spec.sensory].astype(np.float64)
-        self.learned_ = {"mean": rows.mean(axis=0), "spread": np.maximum(rows.std(axis=0), 1e-6)}
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        streams = [e.stream for e in episodes]
+        standard = Standard.fit(self.spec, streams)
         inputs, targets = [], []
         for stream in streams:
-            x, u = self._standard(stream.astype(np.float64)), stream[:, self.spec.motor].astype(np.float64)
+            x, u = standard(stream.astype(np.float64)), stream[:, self.spec.motor].astype(np.float64)
             # The first two rows have nothing before them to be predicted from.
             inputs.append(_regressors(x[1:-1], x[:-2], u[2:]))
             targets.append(x[2:])
@@ -47,19 +48,14 @@ class Autoregression(Mahalanobis):
         penalty = RIDGE * len(Z) * np.eye(Z.shape[1])
         weights = np.linalg.solve(Z.T @ Z + penalty, Z.T @ Y)  # (R, X)
         deviation = np.maximum((Y - Z @ weights).std(axis=0), 1e-9)
-        return {**self.learned_, "weights": weights, "deviation": deviation}
+        return self.restore({**standard.arrays, "weights": weights, "deviation": deviation})
 
-    def build_model(self) -> None:
-        """Nothing to make: the arrays are used as they are."""
-
-    def start_model(self, batch: int) -> _State:
+    def start(self, batch: int, skills: Sequence[str] = ()) -> _State:
         unknown = np.full((batch, len(self.spec.sensory)), np.nan)
         return _State(unknown, unknown)
 
-    def predict(
-        self, state: _State, rows: NDArray[np.float64]
-    ) -> tuple[_State, NDArray[np.float64], NDArray[np.float64]]:
-        x = self._standard(rows)
+    def predict(self, state: _State, rows: NDArray[np.float64]) -> tuple[_State, ModelOutput]:
+        x = Standard.of(self.spec, self.learned_)(rows)
         # What is not finite is taken to be what it was.
         x = np.where(np.isfinite(x), x, np.where(np.isfinite(state.before), state.before, 0.0))
         before = np.where(np.isfinite(state.before), state.before, x)
@@ -68,11 +64,7 @@ class Autoregression(Mahalanobis):
         expected = _regressors(before, earlier, np.where(np.isfinite(u), u, 0.0)) @ self.learned_["weights"]
         error = (x - expected) / self.learned_["deviation"]
         error[~np.isfinite(state.earlier).all(axis=1)] = 0.0  # two rows must have been seen to expect a third
-        return _State(x, state.before), error, np.zeros((len(rows), 0))
-
-    def _standard(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        scaled: NDArray[np.float64] = (rows[:, self.spec.sensory] - self.learned_["mean"]) / self.learned_["spread"]
-        return scaled
+        return _State(x, state.before), ModelOutput(error, no_context(rows))
 
 
 def _regressors(

@@ -1,4 +1,4 @@
-"""The simplest rival: what each sense is, so many steps after the beginning.
+"""The simplest baseline: what each sense is, so many steps after the beginning.
 
     s_t = Σ_i ((x_t,i - m_t,i) / σ_t,i)²        mean and spread over nominal episodes at step t
 
@@ -8,13 +8,16 @@ Whoever starts late or moves slower is wrong all along: it shows how much of a d
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.monitors.baselines.base import Baseline
-from asm_gym.monitors.monitor import Progress
+from asm_gym.detection import ModelOutput
+from asm_gym.episodes import Episode
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.baselines.base import no_context
+from asm_gym.monitors.model import StreamModel
 
 SMOOTH = 2
 """Steps before and after whose rows count too."""
@@ -24,32 +27,25 @@ class _Clock(NamedTuple):
     steps: NDArray[np.int64]  # (B,)
 
 
-class ElapsedTime(Baseline):
-    """Mean and spread of every sense at every step; the arguments are those of ``PredictiveMonitor``."""
+class ElapsedTime(StreamModel):
+    """Mean and spread of every sense at every step."""
 
     kind = "elapsed_time"
 
-    def learn_model(
-        self, streams: Sequence[NDArray[np.float32]], rng: np.random.Generator, progress: Progress
-    ) -> dict[str, NDArray[Any]]:
-        xs = [s[:, self.spec.sensory].astype(np.float64) for s in streams]
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        xs = [e.stream[:, self.spec.sensory].astype(np.float64) for e in episodes]
         overall = np.maximum(np.concatenate(xs).std(axis=0), 1e-6)
         mean, spread = [], []
         for t in range(max(map(len, xs))):
             near = np.concatenate([x[max(0, t - SMOOTH) : t + SMOOTH + 1] for x in xs])
             mean.append(near.mean(axis=0))
             spread.append(near.std(axis=0) + 0.01 * overall)
-        return {"mean": np.array(mean), "spread": np.array(spread)}
+        return self.restore({"mean": np.array(mean), "spread": np.array(spread)})
 
-    def build_model(self) -> None:
-        """Nothing to make: the arrays are used as they are."""
-
-    def start_model(self, batch: int) -> _Clock:
+    def start(self, batch: int, skills: Sequence[str] = ()) -> _Clock:
         return _Clock(np.zeros(batch, np.int64))
 
-    def predict(
-        self, state: _Clock, rows: NDArray[np.float64]
-    ) -> tuple[_Clock, NDArray[np.float64], NDArray[np.float64]]:
+    def predict(self, state: _Clock, rows: NDArray[np.float64]) -> tuple[_Clock, ModelOutput]:
         t = np.minimum(state.steps, len(self.learned_["mean"]) - 1)
         error = (rows[:, self.spec.sensory] - self.learned_["mean"][t]) / self.learned_["spread"][t]
-        return _Clock(state.steps + 1), np.where(np.isfinite(error), error, 0.0), np.zeros((len(rows), 0))
+        return _Clock(state.steps + 1), ModelOutput(np.where(np.isfinite(error), error, 0.0), no_context(rows))

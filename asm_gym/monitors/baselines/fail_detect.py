@@ -3,30 +3,28 @@
     RND      ‖f(x) - g(x)‖²              g random and fixed, f trained to follow it on nominal rows
     logpZO   ‖z(x)‖²                     z where the flow dx/ds = v(x, s), s from 0 to 1, carries x; N(0, I) if nominal
 
-Each is averaged over the last five steps, as there. Source: Xu et al. 2025 (RSS), “Can we detect failures without
-failure data? Uncertainty-aware runtime failure detection for imitation learning policies”; Burda et al. 2019 (ICLR) for
-distillation, Lipman et al. 2023 (ICLR) for the flow. What is scored there is an embedding of images and the action;
-here the sensorimotor row: values, changes and the action.
+There each is averaged over the last five steps: the detection ``moving_mean``. Source: Xu et al. 2025 (RSS), “Can we
+detect failures without failure data? Uncertainty-aware runtime failure detection for imitation learning policies”;
+Burda et al. 2019 (ICLR) for distillation, Lipman et al. 2023 (ICLR) for the flow. There an embedding of images and the
+action is scored; here the sensorimotor row: values, changes and the action.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from asm_gym.monitors.base import State
-from asm_gym.monitors.baselines.base import Rows, no_rows, read
+from asm_gym.detection import ModelOutput
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.baselines.base import Rows, no_context, no_rows, read
 from asm_gym.monitors.baselines.torch_model import TorchModel, adam, descend, steps_of
-from asm_gym.monitors.monitor import Progress
-from asm_gym.scaling import ScaledRows
+from asm_gym.scaling import ScaledRows, StreamScaler
 
-WINDOW = 5
 UPDATES, BATCH = 8000, 256
 WIDTH = 256
 EMBEDDING = 64
@@ -37,40 +35,24 @@ FARTHEST = 30.0
 """Where standardised numbers are cut off: networks of this kind diverge far from what they have seen."""
 
 
-class _Memory(NamedTuple):
-    seen: Rows
-    past: NDArray[np.float64]  # (B, WINDOW, X) the squares of the last errors, the newest first; NaN before the first
+class _Rowwise(TorchModel):
+    """A network on single rows: values, changes and the command."""
 
-
-class _Scored(TorchModel):
-    """A network on single rows, whose squared errors are averaged over a few steps."""
-
-    def start_model(self, batch: int) -> _Memory:
-        return _Memory(no_rows(batch, self.spec.size), np.full((batch, WINDOW, self.scored), np.nan))
-
-    @property
-    def scored(self) -> int:
-        """X, errors of a row."""
-        return len(self.judged)
+    def start(self, batch: int, skills: Sequence[str] = ()) -> Rows:
+        return no_rows(batch, self.spec.size)
 
     @abstractmethod
     def errors(self, x: Tensor) -> Tensor:
         """(B, X) of rows (B, N)."""
 
-    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, NDArray[Any], NDArray[Any]]:
-        reading = read(self.senses_, state.seen, rows)
+    def predict(self, state: Rows, rows: NDArray[np.float64]) -> tuple[Rows, ModelOutput]:
+        reading = read(self.senses_, state, rows)
         error = self.errors(torch.from_numpy(_features(reading))).numpy().astype(np.float64)
-        past = np.concatenate([error[:, None] ** 2, state.past[:, :-1]], axis=1)
-        return _Memory(state.seen.then(rows), past), error, np.zeros((len(rows), 0))
+        return state.then(rows), ModelOutput(error, no_context(rows))
 
-    def published(self, model: State, errors: NDArray[np.float64]) -> NDArray[np.float64]:
-        mean: NDArray[np.float64] = np.nanmean(model.past, axis=1)
-        return mean
-
-    @property
-    def size(self) -> int:
+    def size(self, senses: StreamScaler) -> int:
         """N, numbers in a row as it is scored."""
-        return self.senses_.size + len(self.spec.motor)
+        return senses.size + len(self.spec.motor)
 
 
 class _Distillation(nn.Module):
@@ -84,23 +66,18 @@ class _Distillation(nn.Module):
         return difference
 
 
-class RND(_Scored):
-    """Random network distillation; the arguments are those of ``PredictiveMonitor``."""
+class RND(_Rowwise):
+    """Random network distillation."""
 
     kind = "rnd"
 
     @property
-    def scored(self) -> int:
-        return EMBEDDING
+    def error_columns(self) -> NDArray[np.intp]:
+        """An embedding has no channels: its errors blame nobody."""
+        return np.full(EMBEDDING, -1)
 
-    def attribute(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """An embedding has no channels: its errors are shared out evenly, and blame nobody."""
-        shares = np.zeros((len(parts), self.spec.size))
-        shares[:, self.spec.sensory] = parts.sum(axis=1, keepdims=True) / len(self.spec.sensory)
-        return shares
-
-    def module(self) -> nn.Module:
-        return _Distillation(self.size)
+    def module(self, senses: StreamScaler) -> nn.Module:
+        return _Distillation(self.size(senses))
 
     def train(
         self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
@@ -113,22 +90,21 @@ class RND(_Scored):
             descend((module(x) ** 2).mean(), optimiser, schedule)
 
     def errors(self, x: Tensor) -> Tensor:
-        assert self.module_ is not None
         difference: Tensor = self.module_(x)
         return difference
 
 
-class LogpZO(_Scored):
-    """A flow from rows to noise; the arguments are those of ``PredictiveMonitor``."""
+class LogpZO(_Rowwise):
+    """A flow from rows to noise."""
 
     kind = "logpzo"
 
     @property
-    def judged(self) -> NDArray[np.intp]:
+    def error_columns(self) -> NDArray[np.intp]:
         return np.concatenate([self.spec.sensory, self.senses_.slow, self.spec.motor])
 
-    def module(self) -> nn.Module:
-        return _mlp(self.size + 1, self.size, 3)
+    def module(self, senses: StreamScaler) -> nn.Module:
+        return _mlp(self.size(senses) + 1, self.size(senses), 3)
 
     def train(
         self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
@@ -142,7 +118,6 @@ class LogpZO(_Scored):
             descend(((flow - (noise - x)) ** 2).mean(), optimiser, schedule)
 
     def errors(self, x: Tensor) -> Tensor:
-        assert self.module_ is not None
         for stage in range(STAGES):
             s = torch.full((len(x), 1), stage / STAGES)
             x = x + self.module_(torch.cat([x, s], dim=1)) / STAGES

@@ -1,4 +1,4 @@
-"""The recurrent rival: a GRU trained by backpropagation through time to predict the next row.
+"""The recurrent baseline: a GRU trained by backpropagation through time to predict the next row.
 
     h_t = GRU(h_{t-1}, [v_{t-1}, Δ_{t-1}, u_t])        Δ̂_t, log σ²_t = linear(h_t)        Gaussian log likelihood
 
@@ -9,17 +9,17 @@ prediction errors.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from asm_gym.monitors.baselines.base import Mahalanobis
+from asm_gym.detection import ModelOutput
+from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.torch_model import TorchModel, adam, descend, padded
-from asm_gym.monitors.monitor import Progress
-from asm_gym.scaling import ScaledRows
+from asm_gym.scaling import ScaledRows, StreamScaler
 
 HIDDEN = 256
 UPDATES, EPOCHS, BATCH = 1500, 60, 16
@@ -46,13 +46,13 @@ class _Module(nn.Module):
         return mean, log_variance.clamp(-12.0, 8.0), states
 
 
-class GRU(Mahalanobis, TorchModel):
-    """A gated recurrent network; the arguments are those of ``PredictiveMonitor``."""
+class GRU(TorchModel):
+    """A gated recurrent network; its context is its hidden state."""
 
     kind = "gru"
 
-    def module(self) -> nn.Module:
-        return _Module(self.senses_.size, len(self.spec.motor) + 1, len(self.spec.sensory))
+    def module(self, senses: StreamScaler) -> nn.Module:
+        return _Module(senses.size, len(self.spec.motor) + 1, len(self.spec.sensory))
 
     def train(
         self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
@@ -78,12 +78,11 @@ class GRU(Mahalanobis, TorchModel):
                 loss = (error + 0.5 * log_variance).mean(dim=-1)
                 descend((loss * real).sum() / real.sum(), optimiser, schedule)
 
-    def start_model(self, batch: int) -> _Memory:
+    def start(self, batch: int, skills: Sequence[str] = ()) -> _Memory:
         hidden, last = np.zeros((batch, HIDDEN), np.float32), np.zeros((batch, self.senses_.size), np.float32)
         return _Memory(hidden, last, np.zeros((batch, self.spec.size)), np.zeros(batch, np.int64))
 
-    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, NDArray[Any], NDArray[Any]]:
-        assert self.module_ is not None
+    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
         before = np.where(state.steps[:, None] > 0, state.before, rows)
         r = self.senses_.read(rows, before, before)
         last = np.where(state.steps[:, None] > 0, state.last, r.senses)
@@ -92,4 +91,4 @@ class GRU(Mahalanobis, TorchModel):
             y.numpy()[:, 0] for y in self.module_(inputs, torch.from_numpy(np.ascontiguousarray(state.hidden))[None])
         )
         error = r.whole * (r.changes - mean) * np.exp(-0.5 * log_variance)
-        return _Memory(hidden, r.senses, rows, state.steps + 1), error, hidden
+        return _Memory(hidden, r.senses, rows, state.steps + 1), ModelOutput(error, hidden)

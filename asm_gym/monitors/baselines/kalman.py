@@ -1,4 +1,4 @@
-"""The engineer's rival: a Kalman filter of the stream, and the Mahalanobis distance of its innovations.
+"""The engineer's baseline: a Kalman filter of the stream, and the Mahalanobis distance of its innovations.
 
     x_t = A x_{t-1} + B u_t + c + w,  w ~ N(0, Q)        y_t = x_t + v,  v ~ N(0, R)
 
@@ -9,14 +9,17 @@ Sources: Kalman 1960; Mehra and Peschon 1971 (Automatica 7) for faults found in 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, solve_discrete_are
 
-from asm_gym.monitors.baselines.base import Mahalanobis
-from asm_gym.monitors.monitor import Progress
+from asm_gym.detection import ModelOutput
+from asm_gym.episodes import Episode
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.baselines.base import Standard, no_context
+from asm_gym.monitors.model import StreamModel
 
 RIDGE = 1e-4
 """Of the standardised inputs."""
@@ -30,24 +33,22 @@ class _State(NamedTuple):
     steps: NDArray[np.int64]  # (B,)
 
 
-class Kalman(Mahalanobis):
-    """A steady-state Kalman filter; the arguments are those of ``PredictiveMonitor``."""
+class Kalman(StreamModel):
+    """A steady-state Kalman filter; its errors are innovations in standard deviations."""
 
     kind = "kalman"
 
-    def learn_model(
-        self, streams: Sequence[NDArray[np.float32]], rng: np.random.Generator, progress: Progress
-    ) -> dict[str, NDArray[Any]]:
-        rows = np.concatenate(streams)[:, self.spec.sensory].astype(np.float64)
-        self.learned_ = {"mean": rows.mean(axis=0), "spread": np.maximum(rows.std(axis=0), 1e-6)}
-        xs = [self._standard(s.astype(np.float64)) for s in streams]
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        streams = [e.stream for e in episodes]
+        standard = Standard.fit(self.spec, streams)
+        xs = [standard(s.astype(np.float64)) for s in streams]
         before, after = (np.concatenate([x[k : len(x) - 1 + k] for x in xs]) for k in (0, 1))
         u = np.concatenate([s[1:, self.spec.motor] for s in streams]).astype(np.float64)
         Z = np.hstack([before, u, np.ones((len(u), 1))])
         weights = np.linalg.solve(Z.T @ Z + RIDGE * len(Z) * np.eye(Z.shape[1]), Z.T @ after)  # (X + A + 1, X)
         X = len(self.spec.sensory)
         A, residual = weights[:X].T, after - Z @ weights
-        R = np.diag(np.maximum((self.spec.noise[self.spec.sensory] / self.learned_["spread"]) ** 2, FAINTEST))
+        R = np.diag(np.maximum((self.spec.noise[self.spec.sensory] / standard.spread) ** 2, FAINTEST))
         # A residual holds the new measurement's noise and, through A, that of the last.
         Q = _positive(residual.T @ residual / len(residual) - R - A @ R @ A.T)
         try:
@@ -56,29 +57,21 @@ class Kalman(Mahalanobis):
             P = Q + R
         S = P + R
         gain = np.linalg.solve(S.T, P.T).T
-        return {**self.learned_, "weights": weights, "gain": gain, "deviation": np.sqrt(np.diag(S))}
+        filtered = {"weights": weights, "gain": gain, "deviation": np.sqrt(np.diag(S))}
+        return self.restore(standard.arrays | filtered)
 
-    def build_model(self) -> None:
-        """Nothing to make: the arrays are used as they are."""
-
-    def start_model(self, batch: int) -> _State:
+    def start(self, batch: int, skills: Sequence[str] = ()) -> _State:
         return _State(np.zeros((batch, len(self.spec.sensory))), np.zeros(batch, np.int64))
 
-    def predict(
-        self, state: _State, rows: NDArray[np.float64]
-    ) -> tuple[_State, NDArray[np.float64], NDArray[np.float64]]:
-        y, u = self._standard(rows), rows[:, self.spec.motor]
+    def predict(self, state: _State, rows: NDArray[np.float64]) -> tuple[_State, ModelOutput]:
+        y, u = Standard.of(self.spec, self.learned_)(rows), rows[:, self.spec.motor]
         begun = (state.steps > 0)[:, None]
         inputs = np.hstack([state.estimate, np.where(np.isfinite(u), u, 0.0), np.ones((len(u), 1))])
         expected = np.where(begun, inputs @ self.learned_["weights"], np.where(np.isfinite(y), y, 0.0))
-        innovation = np.where(np.isfinite(y), y - expected, 0.0)
+        innovation: NDArray[np.float64] = np.where(np.isfinite(y), y - expected, 0.0)
         estimate = expected + innovation @ self.learned_["gain"].T
         error = innovation / self.learned_["deviation"]
-        return _State(estimate, state.steps + 1), error, np.zeros((len(rows), 0))
-
-    def _standard(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        scaled: NDArray[np.float64] = (rows[:, self.spec.sensory] - self.learned_["mean"]) / self.learned_["spread"]
-        return scaled
+        return _State(estimate, state.steps + 1), ModelOutput(error, no_context(rows))
 
 
 def _positive(matrix: NDArray[np.float64]) -> NDArray[np.float64]:

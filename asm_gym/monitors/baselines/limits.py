@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.monitors.monitor import CalibratedMonitor, Progress, columns
+from asm_gym.detection import ModelOutput
+from asm_gym.episodes import Episode
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.baselines.base import no_context
+from asm_gym.monitors.model import StreamModel
 from asm_gym.stream import StreamSpec
 
 
@@ -18,7 +23,42 @@ class _Nothing(NamedTuple):
     streams: NDArray[np.bool_]  # (B,)
 
 
-class ForceLimit(CalibratedMonitor):
+class _Limit(StreamModel):
+    """A constant to be expected of some channels.
+
+    Args:
+        spec: of a stream that has them.
+
+    Raises:
+        ValueError: it has none of them.
+    """
+
+    shortest = 1
+    held_out = 0  # so few numbers are not learned by heart
+    channel: str
+    """What their names end in."""
+
+    def __init__(self, spec: StreamSpec) -> None:
+        super().__init__(spec)
+        self._columns = columns(spec, self.channel)
+
+    @property
+    def error_columns(self) -> NDArray[np.intp]:
+        return self._columns
+
+    def start(self, batch: int, skills: Sequence[str] = ()) -> _Nothing:
+        return _Nothing(np.zeros(batch, np.bool_))
+
+    def predict(self, state: _Nothing, rows: NDArray[np.float64]) -> tuple[_Nothing, ModelOutput]:
+        error = self.error(rows[:, self._columns])
+        return state, ModelOutput(np.where(np.isfinite(error), error, 0.0), no_context(rows))
+
+    @abstractmethod
+    def error(self, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(B, X) of what was measured (B, X)."""
+
+
+class ForceLimit(_Limit):
     """A limit on the wrist's force, as force-guarded motions have it.
 
     The largest force of the step less the hand's own weight, which is the mean over nominal episodes:
@@ -27,24 +67,17 @@ class ForceLimit(CalibratedMonitor):
     """
 
     kind = "force_limit"
+    channel = "wrist_force_peak"
 
-    def __init__(self, spec: StreamSpec, seed: int = 0) -> None:
-        super().__init__(spec, seed)
-        self._force = columns(spec, "wrist_force_peak")
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        force = np.concatenate([e.stream for e in episodes])[:, self._columns]
+        return self.restore({"weight": force.mean(axis=0, dtype=np.float64)})
 
-    def learn(self, streams: Sequence[NDArray[np.float32]], progress: Progress) -> dict[str, NDArray[Any]]:
-        return {"weight": np.concatenate(streams)[:, self._force].mean(axis=0, dtype=np.float64)}
-
-    def start(self, batch: int) -> _Nothing:
-        return _Nothing(np.zeros(batch, np.bool_))
-
-    def shares(self, state: _Nothing, rows: NDArray[np.float64]) -> tuple[_Nothing, NDArray[np.float64]]:
-        attribution = np.zeros(rows.shape)
-        attribution[:, self._force] = (rows[:, self._force] - self.learned_["weight"]) ** 2
-        return state, attribution
+    def error(self, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+        return measured - self.learned_["weight"]
 
 
-class ExternalTorqueLimit(CalibratedMonitor):
+class ExternalTorqueLimit(_Limit):
     """A limit on each joint's external torque, as a momentum observer gives it.
 
     s = max_i |τ_ext,i - τ̄_i| / σ_i, each joint in units of its nominal spread; the channel itself comes from the
@@ -53,22 +86,23 @@ class ExternalTorqueLimit(CalibratedMonitor):
     """
 
     kind = "external_torque_limit"
+    channel = "external_torque_peak"
 
-    def __init__(self, spec: StreamSpec, seed: int = 0) -> None:
-        super().__init__(spec, seed)
-        self._torque = columns(spec, "external_torque_peak")
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        torque = np.concatenate([e.stream for e in episodes])[:, self._columns].astype(np.float64)
+        return self.restore({"mean": torque.mean(axis=0), "spread": np.maximum(torque.std(axis=0), 1e-6)})
 
-    def learn(self, streams: Sequence[NDArray[np.float32]], progress: Progress) -> dict[str, NDArray[Any]]:
-        torque = np.concatenate(streams)[:, self._torque].astype(np.float64)
-        return {"mean": torque.mean(axis=0), "spread": np.maximum(torque.std(axis=0), 1e-6)}
+    def error(self, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+        return (measured - self.learned_["mean"]) / self.learned_["spread"]
 
-    def start(self, batch: int) -> _Nothing:
-        return _Nothing(np.zeros(batch, np.bool_))
 
-    def shares(self, state: _Nothing, rows: NDArray[np.float64]) -> tuple[_Nothing, NDArray[np.float64]]:
-        score = np.abs(rows[:, self._torque] - self.learned_["mean"]) / self.learned_["spread"]  # (B, joints)
-        worst = score.argmax(axis=1)
-        attribution = np.zeros(rows.shape)
-        batch = np.arange(len(rows))
-        attribution[batch, self._torque[worst]] = score[batch, worst]
-        return state, attribution
+def columns(spec: StreamSpec, suffix: str) -> NDArray[np.intp]:
+    """Where the channels whose name ends in ``suffix`` stand in a row; one for each arm.
+
+    Raises:
+        ValueError: there is none.
+    """
+    found = [i for name, s in spec.slices.items() if name.endswith(suffix) for i in range(spec.size)[s]]
+    if not found:
+        raise ValueError(f"this stream has no {suffix}; it has: {', '.join(spec.slices)}")
+    return np.array(found, dtype=np.intp)

@@ -8,7 +8,7 @@ likelihood as score, and its expected value, which a support vector regression t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from sklearn.svm import SVR
 from torch import Tensor, nn
 
-from asm_gym.detection.detector import Run
-from asm_gym.monitors.base import State
+from asm_gym.detection import ModelOutput, Nominal
+from asm_gym.detection.scores import Squares
+from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.base import Rows, no_rows, read
 from asm_gym.monitors.baselines.torch_model import TorchModel, adam, descend, padded
-from asm_gym.monitors.monitor import Progress
-from asm_gym.scaling import ScaledRows
+from asm_gym.scaling import ScaledRows, StreamScaler
+from asm_gym.stream import StreamSpec
 
 HIDDEN, LATENT = 128, 16
 UPDATES, EPOCHS, BATCH = 1500, 60, 16
@@ -39,7 +40,6 @@ class _Cell(NamedTuple):
 class _Memory(NamedTuple):
     encoder: _Cell
     decoder: _Cell
-    latent: NDArray[np.float32]  # (B, Z) mean of z_t
     seen: Rows
 
 
@@ -63,15 +63,15 @@ class _Module(nn.Module):
 
 
 class LSTMVAE(TorchModel):
-    """A recurrent variational autoencoder of values and changes; the arguments are those of ``PredictiveMonitor``."""
+    """A recurrent variational autoencoder of values and changes; its context is its latent state."""
 
     kind = "lstm_vae"
 
-    def module(self) -> nn.Module:
-        return _Module(self.senses_.size)
+    def module(self, senses: StreamScaler) -> nn.Module:
+        return _Module(senses.size)
 
     @property
-    def judged(self) -> NDArray[np.intp]:
+    def error_columns(self) -> NDArray[np.intp]:
         return np.concatenate([self.spec.sensory, self.senses_.slow])
 
     def train(
@@ -97,41 +97,58 @@ class LSTMVAE(TorchModel):
                 divergence = 0.5 * (log_variance.exp() + prior - 1.0 - log_variance).sum(dim=-1)
                 descend(((likelihood + divergence) * real).sum() / real.sum(), optimiser, schedule)
 
-    def start_model(self, batch: int) -> _Memory:
+    def start(self, batch: int, skills: Sequence[str] = ()) -> _Memory:
         nothing = _Cell(np.zeros((batch, HIDDEN), np.float32), np.zeros((batch, HIDDEN), np.float32))
-        return _Memory(nothing, nothing, np.zeros((batch, LATENT), np.float32), no_rows(batch, self.spec.size))
+        return _Memory(nothing, nothing, no_rows(batch, self.spec.size))
 
-    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, NDArray[Any], NDArray[Any]]:
+    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
         assert isinstance(self.module_, _Module)
         r = read(self.senses_, state.seen, rows)
         z, _, encoder = self.module_.encode(torch.from_numpy(r.senses)[:, None], _torch(state.encoder))
         mean, log_variance, decoder = self.module_.decode(z, _torch(state.decoder))
         error = r.seen * (r.senses - mean.numpy()[:, 0]) * np.exp(-0.5 * log_variance.numpy()[:, 0])
-        latent = z.numpy()[:, 0]
-        return _Memory(_numpy(encoder), _numpy(decoder), latent, state.seen.then(rows)), error, latent
+        return _Memory(_numpy(encoder), _numpy(decoder), state.seen.then(rows)), ModelOutput(error, z.numpy()[:, 0])
 
-    def learn_score(self, runs: Sequence[Run]) -> dict[str, NDArray[Any]]:
-        contexts = np.concatenate([r.contexts for r in runs])
-        scores = 0.5 * (np.concatenate([r.errors for r in runs]) ** 2).sum(axis=1)
+
+class LatentThreshold(Squares):
+    """The negative log likelihood of errors, over what is expected of it in the model's context: its latent state.
+
+    Args:
+        spec: the stream that is watched.
+        seed: of which steps the expectation is learned from.
+    """
+
+    name = "latent_threshold"
+    arrays = ("centre", "scale", "support", "pull", "offset")
+
+    def __init__(self, spec: StreamSpec, seed: int = 0) -> None:
+        super().__init__(spec)
+        self.seed = seed
+
+    def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
+        outputs = nominal.outputs(nominal.episodes)
+        contexts = np.concatenate([r.contexts for r in outputs])
+        scores = 0.5 * (np.concatenate([r.errors for r in outputs]) ** 2).sum(axis=1)
         chosen = np.random.default_rng(self.seed).permutation(len(scores))[:REGRESSED]
         centre, spread = contexts.mean(axis=0), np.maximum(contexts.std(axis=0), 1e-6)
         machine = SVR(C=10.0, gamma=1.0 / LATENT, epsilon=0.1)
         machine.fit((contexts[chosen] - centre) / spread, np.log(scores[chosen] + 1e-6))
-        return {
-            "centre": centre.astype(np.float64),
-            "scale": spread.astype(np.float64),
-            "support": machine.support_vectors_,
-            "pull": machine.dual_coef_[0],
-            "offset": machine.intercept_,
-        }
+        return self.restore(
+            {
+                "centre": centre.astype(np.float64),
+                "scale": spread.astype(np.float64),
+                "support": machine.support_vectors_,
+                "pull": machine.dual_coef_[0],
+                "offset": machine.intercept_,
+            }
+        )
 
-    def published(self, model: State, errors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The negative log likelihood over what is expected of it in this latent state."""
+    def parts(self, output: ModelOutput) -> NDArray[np.float64]:
         found = self.learned_
-        z = (model.latent - found["centre"]) / found["scale"]
+        z = (output.contexts - found["centre"]) / found["scale"]
         distance = ((z[:, None] - found["support"]) ** 2).sum(axis=-1)  # (B, support vectors)
         usual = np.exp(np.exp(-distance / LATENT) @ found["pull"] + found["offset"])
-        parts: NDArray[np.float64] = 0.5 * errors**2 / usual[:, None]
+        parts: NDArray[np.float64] = 0.5 * np.asarray(output.errors, np.float64) ** 2 / usual[:, None]
         return parts
 
 

@@ -11,16 +11,16 @@ prediction for manipulation”; Ijspeert et al. 2013 (Neural Computation 25(2)) 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.detector import Run
+from asm_gym.detection import ModelOutput
 from asm_gym.episodes import Episode
-from asm_gym.monitors.base import Surprise
-from asm_gym.monitors.baselines.base import Baseline
-from asm_gym.monitors.monitor import Progress
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.baselines.base import no_context
+from asm_gym.monitors.model import StreamModel, skills_of
 from asm_gym.stream import StreamSpec
 
 BASES = 40
@@ -40,52 +40,30 @@ class _Running(NamedTuple):
     speed: NDArray[np.float64]  # (B, P) v
 
 
-class SkillLibrary(Baseline):
-    """A library of movement primitives; the arguments are those of ``PredictiveMonitor``.
-
-    Attributes:
-        selected: number of the skill in ``skills_`` that a new state starts with.
-    """
+class SkillLibrary(StreamModel):
+    """A library of movement primitives; ``start`` has to be told which of them is to run."""
 
     kind = "skill_library"
 
-    def __init__(self, spec: StreamSpec, **kwargs: Any) -> None:
-        super().__init__(spec, **kwargs)
+    def __init__(self, spec: StreamSpec) -> None:
+        super().__init__(spec)
         hand = [i for n, s in spec.slices.items() if n.endswith("hand_position") for i in range(spec.size)[s]]
         self._hand = np.searchsorted(spec.sensory, hand).astype(np.intp)  # among the sensory columns; perhaps none
-        self.selected = 0
-        self._skill: dict[int, str] = {}
 
-    def fit(self, episodes: Sequence[Episode], progress: Progress | None = None) -> Self:
-        self._skill = {id(e.stream): _name(e) for e in episodes}
-        try:
-            return super().fit(episodes, progress)
-        finally:
-            self._skill = {}
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        xs, names = [e.stream[:, self.spec.sensory].astype(np.float64) for e in episodes], skills_of(episodes)
+        floor = 0.01 * np.maximum(np.concatenate(xs).std(axis=0), 1e-6)
+        skills = sorted(set(names))
+        library = [_learn([x for x, n in zip(xs, names, strict=True) if n == s], self._hand, floor) for s in skills]
+        return self.restore({k: np.stack([one[k] for one in library]) for k in library[0]}, tuple(skills))
 
-    def learn_model(
-        self, streams: Sequence[NDArray[np.float32]], rng: np.random.Generator, progress: Progress
-    ) -> dict[str, NDArray[Any]]:
-        skills = sorted(set(self._skill.values()))
-        xs = [s[:, self.spec.sensory].astype(np.float64) for s in streams]
-        overall = np.maximum(np.concatenate(xs).std(axis=0), 1e-6)
-        learned = []
-        for name in skills:
-            own = [x for x, s in zip(xs, streams, strict=True) if self._skill[id(s)] == name] or xs
-            learned.append(_learn(own, self._hand, 0.01 * overall))
-        self.skills_ = tuple(skills)
-        return {k: np.stack([one[k] for one in learned]) for k in learned[0]}
-
-    def build_model(self) -> None:
-        """Nothing to make: the arrays are used as they are."""
-
-    def start_model(self, batch: int) -> _Running:
+    def start(self, batch: int, skills: Sequence[str] = ()) -> _Running:
+        """Of a skill that is not in the library, or not told, the first is taken to run."""
+        told = [self.skills_.index(name) if name in self.skills_ else 0 for name in skills or [""] * batch]
         nowhere = np.zeros((batch, len(self._hand)))
-        return _Running(np.full(batch, self.selected), np.zeros(batch, np.int64), nowhere, nowhere)
+        return _Running(np.array(told, np.intp), np.zeros(batch, np.int64), nowhere, nowhere)
 
-    def predict(
-        self, state: _Running, rows: NDArray[np.float64]
-    ) -> tuple[_Running, NDArray[np.float64], NDArray[np.float64]]:
+    def predict(self, state: _Running, rows: NDArray[np.float64]) -> tuple[_Running, ModelOutput]:
         found, skill = self.learned_, state.skill
         x = rows[:, self.spec.sensory]
         phase = np.minimum(state.steps / found["steps"][skill], 1.0)  # (B,) of the movement
@@ -104,31 +82,7 @@ class SkillLibrary(Baseline):
         force = np.einsum("bn,bnp->bp", basis, found["weights"][skill]) * clock
         v = v + dt * (STIFFNESS * (STIFFNESS / 4 * (found["goal"][skill] - y) - v) + force)
         running = _Running(skill, state.steps + 1, y + dt * v, v)
-        return running, np.where(np.isfinite(error), error, 0.0), np.zeros((len(rows), 0))
-
-    def score_episodes(self, episodes: Sequence[Episode]) -> list[Surprise]:
-        """As for any monitor, but each episode with the skill that its ``info["skill"]`` names."""
-        scores: dict[int, Surprise] = {}
-        for name in sorted({_name(e) for e in episodes}):
-            own = [i for i, e in enumerate(episodes) if _name(e) == name]
-            self.selected = self.skills_.index(name) if name in self.skills_ else 0
-            scores.update(zip(own, super().score_episodes([episodes[i] for i in own]), strict=True))
-        self.selected = 0
-        return [scores[i] for i in range(len(episodes))]
-
-    def _runs(self, streams: Sequence[NDArray[np.float32]]) -> list[Run]:
-        runs: dict[int, Run] = {}
-        for number, name in enumerate(sorted(set(self._skill.values()))):
-            self.selected = number
-            own = [i for i, s in enumerate(streams) if self._skill[id(s)] == name]
-            if own:
-                runs.update(zip(own, super()._runs([streams[i] for i in own]), strict=True))
-        self.selected = 0
-        return [runs[i] for i in range(len(streams))]
-
-
-def _name(episode: Episode) -> str:
-    return str(episode.info.get("skill", ""))
+        return running, ModelOutput(np.where(np.isfinite(error), error, 0.0), no_context(rows))
 
 
 def _basis(clock: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,35 +1,38 @@
-"""What the rivals that need torch share: a network trained by backpropagation, kept as arrays."""
+"""What the baselines that need torch share: a network trained by backpropagation, kept as arrays."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from asm_gym.detection.base import Arrays
+from asm_gym.episodes import Episode
 from asm_gym.memory.learning import shuffled
-from asm_gym.monitors.baselines.base import Baseline
-from asm_gym.monitors.monitor import Progress
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.model import StreamModel
 from asm_gym.scaling import ScaledRows, StreamScaler
 
 
-class TorchModel(Baseline):
-    """A rival whose model is a torch module.
+class TorchModel(StreamModel):
+    """A model that is a torch module.
 
     Attributes:
         senses_: how it reads a row, which is as the Neural ASM does.
-        module_: the network; None before ``fit``.
+        module_: the network, once it is fitted.
     """
 
-    module_: nn.Module | None = None
+    senses_: StreamScaler
+    module_: nn.Module
 
     @abstractmethod
-    def module(self) -> nn.Module:
-        """A fresh network for ``senses_``."""
+    def module(self, senses: StreamScaler) -> nn.Module:
+        """A fresh network for what is read so."""
 
     @abstractmethod
     def train(
@@ -37,32 +40,32 @@ class TorchModel(Baseline):
     ) -> None:
         """Trains it on whole nominal episodes."""
 
-    def learn_model(
-        self, streams: Sequence[NDArray[np.float32]], rng: np.random.Generator, progress: Progress
-    ) -> dict[str, NDArray[Any]]:
-        self.senses_ = senses = StreamScaler.fit(self.spec, streams)
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        streams = [e.stream for e in episodes]
+        senses = StreamScaler.fit(self.spec, streams)
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # as for every other monitor, so that times compare
         try:
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(int(rng.integers(2**31)))
-                module = self.module()
+                module = self.module(senses)
                 self.train(module, [senses.read_episode(s) for s in streams], rng, progress)
         finally:
             torch.set_num_threads(threads)
         standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change}
-        return {**standard, **{name: tensor.numpy() for name, tensor in module.state_dict().items()}}
+        return self.restore({**standard, **{name: tensor.numpy() for name, tensor in module.state_dict().items()}})
 
-    def build_model(self) -> None:
-        found = self.learned_
-        self.senses_ = StreamScaler(self.spec, found["mean"], found["spread"], found["change"])
-        module = self.module()
-        state = {name: torch.from_numpy(np.array(found[name], np.float32)) for name in module.state_dict()}
+    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        senses = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"])
+        with torch.random.fork_rng(devices=[]):
+            module = self.module(senses)
+        state = {name: torch.from_numpy(np.array(learned[name], np.float32)) for name in module.state_dict()}
         try:
             module.load_state_dict(state)
         except RuntimeError as error:
             raise ValueError(f"the weights of this {self.kind} do not fit: {error}") from error
-        self.module_ = module.eval().requires_grad_(False)
+        self.senses_, self.module_ = senses, module.eval().requires_grad_(False)
+        return super().restore(learned, skills)
 
 
 def adam(module: nn.Module, updates: int, rate: float = 1e-3) -> tuple[torch.optim.Optimizer, Any]:

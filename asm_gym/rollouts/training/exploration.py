@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.episodes import Episode, load_episode, save_episode
-from asm_gym.monitors.monitor import columns
+from asm_gym.monitors.baselines.limits import columns
 from asm_gym.policies import make_policy
 from asm_gym.policies.base import Policy
 from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged

@@ -1,0 +1,38 @@
+"""Conformal calibration: a threshold that a nominal episode exceeds no more often than was promised.
+
+    alarm      value > the ⌈(n + 1)(1 - rate)⌉-th smallest of the maxima of n nominal episodes
+
+Sources: Vovk et al. 2005 and Angelopoulos and Bates 2023 (split conformal prediction).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from asm_gym.detection.base import Array
+
+
+def conformal_episodes(rate: float) -> int:
+    """How many nominal episodes a false-alarm rate needs at least: ⌈1/rate⌉ - 1."""
+    if not 0.0 < rate < 1.0:
+        raise ValueError(f"false_alarm_rate must be in (0, 1), got {rate}")
+    return math.ceil(1.0 / rate - 1e-9) - 1
+
+
+def conformal_threshold(maxima: Array, rate: float) -> float:
+    """The q that the maximum of a fresh nominal episode exceeds with a probability of at most ``rate``.
+
+    The guarantee is over the draw of both the n calibration episodes and the fresh one, and needs no more than that
+    they are exchangeable.
+
+    Args:
+        maxima: (n,) the largest value in each nominal episode.
+        rate: P(any alarm in a nominal episode).
+    """
+    n, needed = len(maxima), conformal_episodes(rate)
+    if n < needed:
+        raise ValueError(f"a false alarm rate of {rate} needs at least {needed} nominal episodes, got {n}")
+    rank = math.ceil((n + 1) * (1.0 - rate) - 1e-9)  # (n + 1)(1 - rate) is often whole, but not in floating point
+    return float(np.sort(maxima)[rank - 1])

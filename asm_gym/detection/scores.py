@@ -1,0 +1,109 @@
+"""Scores of the literature: each row by itself, or a few, against nothing but what errors are usual.
+
+    squares        Σ_i ε_i²
+    mahalanobis    ‖M ε‖²                       M whitens the errors of nominal steps
+    moving_mean    mean over 5 steps of ε_i²    summed over i
+    largest        max_i |ε_i|
+
+Source: Xu et al. 2025 (RSS) for the moving mean; Haddadin, De Luca and Albu-Schäffer 2017, Eq. 31, for the largest.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.checks import check_number
+from asm_gym.detection.base import Arrays, ModelOutput, Nominal, Place, State
+from asm_gym.detection.whitening import whitening
+from asm_gym.stream import StreamSpec
+
+WINDOW = 5
+"""Rows that the moving mean is taken over."""
+
+
+class Squares:
+    """The sum of squared errors; nothing is learned, nothing carried on."""
+
+    name = "squares"
+    arrays: tuple[str, ...] = ()
+
+    def __init__(self, spec: StreamSpec) -> None:
+        self.learned_: Arrays = {}
+
+    def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
+        return self
+
+    def restore(self, learned: Arrays) -> Self:
+        self.learned_ = learned
+        return self
+
+    def start(self, batch: int, errors: int) -> State:
+        return ()
+
+    def attribute_step(
+        self, state: State, output: ModelOutput, rows: NDArray[np.float64], place: Place
+    ) -> tuple[State, NDArray[np.float64]]:
+        return state, place(self.parts(output))
+
+    def reset(self, state: State) -> State:
+        return state
+
+    def parts(self, output: ModelOutput) -> NDArray[np.float64]:
+        """(B, X) each error's share of the score; >= 0."""
+        squared: NDArray[np.float64] = np.asarray(output.errors, np.float64) ** 2
+        return squared
+
+
+class Mahalanobis(Squares):
+    """The Mahalanobis distance of errors, squared.
+
+    Args:
+        spec: the stream that is watched.
+        shrinkage: λ in [0, 1], towards no correlation between errors.
+    """
+
+    name = "mahalanobis"
+    arrays = ("mahalanobis",)
+
+    def __init__(self, spec: StreamSpec, shrinkage: float = 1e-3) -> None:
+        super().__init__(spec)
+        self.shrinkage = check_number("shrinkage", shrinkage, low=0.0, high=1.0)
+
+    def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
+        errors = np.concatenate([r.errors for r in nominal.outputs(nominal.episodes)])
+        return self.restore({"mahalanobis": whitening(errors, self.shrinkage)})
+
+    def parts(self, output: ModelOutput) -> NDArray[np.float64]:
+        white: NDArray[np.float64] = np.asarray(output.errors, np.float64) @ self.learned_["mahalanobis"]
+        return white**2
+
+
+class MovingMean(Squares):
+    """Squared errors, averaged over the last few rows.
+
+    The state is (B, WINDOW, X), the newest first; NaN before the first row.
+    """
+
+    name = "moving_mean"
+
+    def start(self, batch: int, errors: int) -> NDArray[np.float64]:
+        return np.full((batch, WINDOW, errors), np.nan)
+
+    def attribute_step(
+        self, state: NDArray[Any], output: ModelOutput, rows: NDArray[np.float64], place: Place
+    ) -> tuple[State, NDArray[np.float64]]:
+        state = np.concatenate([self.parts(output)[:, None], state[:, :-1]], axis=1)
+        return state, place(np.nanmean(state, axis=1))
+
+
+class Largest(Squares):
+    """The largest error alone."""
+
+    name = "largest"
+
+    def parts(self, output: ModelOutput) -> NDArray[np.float64]:
+        sizes = np.abs(np.asarray(output.errors, np.float64))
+        return np.where(np.arange(sizes.shape[1]) == sizes.argmax(axis=1)[:, None], sizes, 0.0)

@@ -1,0 +1,40 @@
+"""Tails: how surprised each number is in nominal episodes at its worst, and how much further it may go.
+
+    r_i = (v_i/q_i)^κ_i        q_i: what v_i stays below in 90 % of episodes
+                               κ_i = min(1, ξ_0/ξ_i),  ξ_i: the index of the tail beyond q_i
+
+Each number is measured against what it does at its worst, so that a wrist that is often surprised by contact does not
+drown an encoder that never is. Beyond q the maxima of episodes fall off as v^(-1/ξ): a ratio of 10 happens to a wrist
+now and then, to an encoder never. The exponent κ makes the same ratio as rare for the one as for the other.
+
+Source: Hill 1975 for the index of a tail.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.detection.base import Array
+
+TAIL_INDEX = 0.3
+"""ξ_0: a ratio falls off as probability to this power."""
+
+NOMINAL_QUANTILE = 0.9
+"""Share of nominal episodes whose maximum of v stays below q; those above tell how far it goes."""
+
+TAIL_PRIOR_COUNT = 10
+"""How many maxima beyond q a tail must show of its own to count as much as what is common among all."""
+
+SMALLEST = 1e-9
+"""Lower bound of q."""
+
+
+def worst_case(maxima: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """q and κ, of the shape of one episode's maxima, from those of N nominal episodes (N, …)."""
+    ceiling = np.maximum(np.quantile(maxima, NOMINAL_QUANTILE, axis=0), SMALLEST)
+    beyond = np.log(np.maximum(maxima / ceiling, 1.0))
+    total, count = beyond.sum(axis=0), (beyond > 0).sum(axis=0)
+    common = np.median(total / np.maximum(count, 1))  # Hill's estimate of ξ is total / count
+    index = (total + TAIL_PRIOR_COUNT * common) / (count + TAIL_PRIOR_COUNT)
+    return ceiling, TAIL_INDEX / np.maximum(index, TAIL_INDEX)

@@ -1,0 +1,40 @@
+"""Whitening: errors without correlation, of equal variance, and none of them out of all proportion.
+
+    whitened   e_t = M ε_t/σ_t,   M = ((1 - λ) C + λ tr(C)/X I)^(-½),   C = E[(ε/σ)(ε/σ)ᵀ] over nominal steps
+    bounded    ẽ_i = e_i / √(1 + e_i²/ν²)                               |ẽ_i| < ν, however large e_i
+
+Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted as under a t distribution).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.detection.base import Array
+
+
+def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
+    """The symmetric (ZCA) matrix M (X, X) that makes ``errors`` (N, X) white; of all, it turns them the least.
+
+    Args:
+        errors: normalised errors of nominal steps; their mean is taken to be 0, as that of a prediction should be.
+        shrinkage: λ in [0, 1], towards equal variance and no correlation. Above 0 a channel that is constant, or a
+            copy of another, is no trouble.
+    """
+    if not 0.0 <= shrinkage <= 1.0:
+        raise ValueError(f"shrinkage must be in [0, 1], got {shrinkage}")
+    exact = np.asarray(errors, np.float64)
+    covariance = exact.T @ exact / len(exact)  # (X, X)
+    scale = float(np.trace(covariance)) / len(covariance)
+    target = (scale if scale > 0 else 1.0) * np.eye(len(covariance))
+    values, vectors = np.linalg.eigh((1.0 - shrinkage) * covariance + shrinkage * target)
+    matrix: NDArray[np.float64] = (vectors / np.sqrt(values)) @ vectors.T
+    return matrix
+
+
+def bounded(errors: Array, bound: float) -> NDArray[np.float64]:
+    """Errors pulled in one by one: none counts more than ν = ``bound`` standard deviations."""
+    exact = np.asarray(errors, np.float64)
+    pulled: NDArray[np.float64] = exact / np.sqrt(1.0 + (exact / bound) ** 2)
+    return pulled

@@ -1,0 +1,161 @@
+"""The memory as a model: what it expects of a stream, and what else can be asked of it.
+
+row → standardise → memory: expect, infer, associate → ε_t/σ_t, and the context f(μ_t)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.detection import ModelOutput
+from asm_gym.detection.base import Arrays
+from asm_gym.episodes import Episode
+from asm_gym.memory.adaptation import followed
+from asm_gym.memory.association import Association, association_shapes, hidden_units, synapses
+from asm_gym.memory.inference import Weights, motor_prediction, weight_shapes
+from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
+from asm_gym.memory.network import Network, train
+from asm_gym.memory.readout import add_up, learn_readout, running
+from asm_gym.memory.recall import continued
+from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.model import StreamModel, skills_of
+from asm_gym.scaling import StreamScaler, rows_apart
+from asm_gym.stream import StreamSpec
+
+
+class MemoryModel(StreamModel):
+    """The temporal network, association, and what is learned on top of them: motor association and readout.
+
+    Args:
+        spec: the stream it is to expect.
+        hidden_size: H, hidden units of the temporal network.
+        association_size: hidden units of association, shared out among the groups of senses.
+        schedule: how to learn and to infer.
+
+    Attributes:
+        senses_: how it reads a row.
+        network_: the weights; None before ``fit``.
+        motor_: the motor association; None before ``learn_to_act``.
+    """
+
+    kind = "neural_asm"
+
+    def __init__(self, spec: StreamSpec, hidden_size: int, association_size: int, schedule: Schedule) -> None:
+        super().__init__(spec)
+        self.hidden_size, self.association_size, self.schedule = hidden_size, association_size, schedule
+        self.lag = rows_apart(spec.dt)
+        self.shortest = 1 + self.lag
+        self.network_: Network | None = None
+        self.motor_: Motor | None = None
+
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        streams, lag = [e.stream for e in episodes], self.lag
+        senses = StreamScaler.fit(self.spec, streams, lag)
+        readings = [senses.read_episode(s) for s in streams]
+        trajectories = [Trajectory(r.senses[::lag], r.commands[::lag], r.inputs) for r in readings]
+        sizes = self.hidden_size, self._units_each(senses)
+        trained = train(trajectories, senses.groups, senses.changes, *sizes, self.schedule, rng, progress)
+        standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change, "energy": trained.energy}
+        network = trained.network
+        return self.restore({**standard, **network.weights._asdict(), **network.association._asdict()})
+
+    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        senses = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
+        X, A = len(self.spec.sensory), len(self.spec.motor)
+        units = self._units_each(senses) * (int(senses.groups.max()) + 1)
+        shapes = weight_shapes(self.hidden_size, senses.size, A) | association_shapes(senses.inputs, units, X)
+        if skills:
+            shapes |= {"W_K": (len(skills), units), "b_K": (len(skills),)}
+        for name, shape in shapes.items():
+            if learned[name].shape != shape:
+                raise ValueError(f"{name} should be of shape {shape}, found {learned[name].shape}")
+        arrays = {name: np.ascontiguousarray(learned[name], np.float32) for name in shapes}
+        weights = Weights(**{n: arrays[n] for n in Weights._fields})
+        association = Association(**{n: arrays[n] for n in Association._fields})
+        how = self.schedule
+        self.network_ = Network(weights, association, how.iterations, how.prior_precision, how.sensory_precision)
+        self.senses_, self.motor_ = senses, Motor.found(learned, senses)
+        return super().restore(learned, skills)
+
+    def start(self, batch: int, skills: Sequence[str] = ()) -> MemoryState:
+        return at_start(batch, self.hidden_size, self.lag, self.spec.size, len(self.skills_))
+
+    def predict(self, state: MemoryState, rows: NDArray[np.float64]) -> tuple[MemoryState, ModelOutput]:
+        before, earlier = past(state, rows)
+        reading = self.senses_.read(rows, before, earlier)
+        hidden, expected = carry_on(self.network, state, reading)
+        error, units = self.network.associate(reading)
+        if state.steps.min() < self.lag:
+            error[state.steps < self.lag] = 0.0  # nothing came before, so that no change is known
+        skill = state.skill
+        if self.skills_:
+            skill = add_up(skill, units, self.learned_["W_K"], self.learned_["b_K"])
+        seen = newest(state.before, rows), newest(state.earlier, before), state.steps + 1
+        return MemoryState(hidden, expected, *seen, skill), ModelOutput(error, expected)
+
+    @property
+    def network(self) -> Network:
+        """The weights, which are there once it is fitted."""
+        assert self.network_ is not None
+        return self.network_
+
+    def name_skills(self, episodes: Sequence[Episode], rng: np.random.Generator) -> Self:
+        """Learns to tell which skill is running. Raises ValueError where an episode says none, or all say the same."""
+        names = skills_of(episodes)
+        if "" in names:
+            raise ValueError(f"episode {names.index('')} does not say its skill: set info['skill']")
+        known = sorted(set(names))
+        if len(known) < 2:
+            raise ValueError(f"two skills at least are needed to tell them apart, got {', '.join(known)}")
+        inputs = np.concatenate([self.senses_.read_episode(e.stream).inputs for e in episodes])
+        skills = np.repeat([known.index(name) for name in names], [len(e) for e in episodes])
+        V = self.network.association.V
+        W_K, b_K = learn_readout(lambda i: hidden_units(inputs[i], V), skills, len(known), rng)
+        return self.restore({**self.learned_, "W_K": W_K, "b_K": b_K}, tuple(known))
+
+    def skills(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.str_]:
+        """(T,) the skill that seems to run in each step of a stream (T, D), once some have a name."""
+        units = hidden_units(self.senses_.read_episode(np.asarray(stream)).inputs, self.network.association.V)
+        return np.array(self.skills_)[running(units, self.learned_["W_K"], self.learned_["b_K"])]
+
+    def adapt(
+        self, before: MemoryState, rows: NDArray[np.float64], quiet: NDArray[np.bool_], rate: float
+    ) -> NDArray[np.bool_]:
+        """Moves association towards those of the rows (B, D) that are ``quiet`` (B,) and whole; which those were."""
+        reading = self.senses_.read(rows, before.before[:, 0], before.earlier[:, 0])
+        learned: NDArray[np.bool_] = quiet & (before.steps >= 2 * self.lag) & (reading.whole[:, 0] > 0)
+        if learned.any():
+            senses = self.senses_
+            exists = synapses(senses.groups, senses.changes, senses.inputs, self._units_each(senses))
+            inputs, changes = reading.inputs[learned], reading.changes[learned]
+            now = followed(self.network.association, exists, inputs, changes, rate)
+            self.network_ = self.network.with_association(now)
+            self.learned_ = {**self.learned_, "U": now.U, "D": now.D}
+        return learned
+
+    def learn_to_act(self, episodes: Sequence[Episode], units: int, rng: np.random.Generator) -> Self:
+        """Learns what to command in which situation, for ``expected_action``."""
+        motor = learn_motor(*lessons(self.senses_, episodes), units, rng)
+        return self.restore({**self.learned_, **motor.named(self.senses_)}, self.skills_)
+
+    def expected_action(self, state: MemoryState) -> NDArray[np.float32]:
+        """(B, A) what is likely to be commanded next, in the units of the action."""
+        if self.motor_ is not None:
+            return self.motor_.command(situation(self.senses_, state.before[:, -1]))
+        motor, senses = self.spec.motor, self.senses_
+        _, action = motor_prediction(state.hidden, self.network.weights)
+        return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
+
+    def recall(self, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
+        """(steps, D) rows that come after a cue (T, D), in the units of the stream."""
+        return continued(self.network, self.senses_, cue, steps)
+
+    def _units_each(self, senses: StreamScaler) -> int:
+        """Hidden units of association for each group."""
+        return max(1, self.association_size // (int(senses.groups.max()) + 1))

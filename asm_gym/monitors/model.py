@@ -1,0 +1,100 @@
+"""What models share, and running them over many episodes side by side."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.detection import ModelOutput
+from asm_gym.detection.base import Arrays
+from asm_gym.episodes import Episode
+from asm_gym.monitors.base import Model, State
+from asm_gym.stream import StreamSpec
+
+HELD_OUT = 5
+"""One in so many training episodes is not learned by the model, but shows how surprised it usually is."""
+
+AT_ONCE = 64
+"""Episodes run side by side; with more the arrays no longer fit the cache."""
+
+
+class StreamModel:
+    """What most models have in common: an error for each sense, and arrays that are used as they are.
+
+    Args:
+        spec: the stream it is to expect.
+    """
+
+    kind: str
+    shortest: int = 2
+    held_out: int = HELD_OUT
+
+    def __init__(self, spec: StreamSpec) -> None:
+        self.spec = spec
+        self.learned_: Arrays = {}
+        self.skills_: tuple[str, ...] = ()
+
+    @property
+    def error_columns(self) -> NDArray[np.intp]:
+        return self.spec.sensory
+
+    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        self.learned_, self.skills_ = learned, skills
+        return self
+
+
+def parameter_names(kind: Callable[..., Any]) -> tuple[str, ...]:
+    """The hyperparameters of a model, a detection or a monitor: what its constructor takes beside the spec."""
+    taken = inspect.signature(kind).parameters.values()
+    return tuple(p.name for p in taken if p.name != "spec" and p.kind is p.POSITIONAL_OR_KEYWORD)
+
+
+def skills_of(episodes: Sequence[Episode]) -> list[str]:
+    """What each says of its skill; empty where it says nothing."""
+    return [str(e.info.get("skill", "")) for e in episodes]
+
+
+def model_outputs(model: Model, episodes: Sequence[Episode]) -> list[ModelOutput]:
+    """What a model says of each episode: errors (T, X) and contexts (T, C)."""
+    outputs: dict[int, ModelOutput] = {}
+    for group, steps in side_by_side(episodes, model.start, model.predict):
+        for n, i in enumerate(group):
+            mine = steps[: len(episodes[i])]
+            outputs[i] = ModelOutput(np.array([s.errors[n] for s in mine]), np.array([s.contexts[n] for s in mine]))
+    return [outputs[i] for i in range(len(episodes))]
+
+
+def side_by_side(
+    episodes: Sequence[Episode],
+    start: Callable[[int, Sequence[str]], State],
+    advance: Callable[[State, NDArray[np.float64]], tuple[State, Any]],
+) -> Iterator[tuple[list[int], list[Any]]]:
+    """Runs many episodes together, the longest first; those that have ended are left out.
+
+    Yields, for each group of episodes, their indices and what ``advance`` said of each step.
+    """
+    order, skills = sorted(range(len(episodes)), key=lambda i: -len(episodes[i])), skills_of(episodes)
+    for first in range(0, len(order), AT_ONCE):
+        group = order[first : first + AT_ONCE]
+        state, said = start(len(group), [skills[i] for i in group]), []
+        for t in range(len(episodes[group[0]])):
+            rows = np.stack([episodes[i].stream[t] for i in group if t < len(episodes[i])]).astype(np.float64)
+            state, step = advance(first_of(state, len(rows)), rows)
+            said.append(step)
+        yield group, said
+
+
+def first_of(state: State, count: int) -> State:
+    """The state of the first ``count`` streams."""
+    if not isinstance(state, tuple):
+        return state[:count]
+    return type(state)(*(first_of(s, count) for s in state))
+
+
+def batch_of(state: State) -> int:
+    """B."""
+    return batch_of(state[0]) if isinstance(state, tuple) else len(state)

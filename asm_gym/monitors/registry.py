@@ -1,0 +1,192 @@
+"""Monitors by name: one row for each model, and one for each detection, and any of them go together."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from asm_gym.checkpoint import kind_of, read_checkpoint
+from asm_gym.choices import check_choice
+from asm_gym.detection import Detection, EvidenceDetection
+from asm_gym.extras import needed_for
+from asm_gym.monitors.model import parameter_names
+from asm_gym.monitors.monitor import RENAMED, CalibratedMonitor, restored
+from asm_gym.stream import StreamSpec
+
+EVIDENCE = "+evidence"
+"""What the name of a monitor ends in where its errors are judged by the detection of the Neural ASM."""
+
+DETECTIONS: dict[str, Any] = {
+    "evidence": EvidenceDetection,
+    "squares": "asm_gym.detection.scores:Squares",
+    "mahalanobis": "asm_gym.detection.scores:Mahalanobis",
+    "moving_mean": "asm_gym.detection.scores:MovingMean",
+    "largest": "asm_gym.detection.scores:Largest",
+    "latent_threshold": "asm_gym.monitors.baselines.lstm_vae:LatentThreshold",
+}
+"""The class of each detection, or where it stands."""
+
+
+@dataclass(frozen=True)
+class MonitorKind:
+    """How the monitors of one name are made and loaded.
+
+    Args:
+        model: the class of its model, or of the whole monitor; or ``module:class``, imported when it is needed.
+        own: the detection that its authors judged it by; fitted whichever is in use, so that one fit serves both.
+        detection: the one in use.
+    """
+
+    model: Any
+    own: str = "evidence"
+    detection: str = "evidence"
+
+    @property
+    def model_class(self) -> Any:
+        """Of its model, or of the whole monitor."""
+        return _found(self.model)
+
+    @property
+    def detection_classes(self) -> list[Any]:
+        """Of its detections, the one in use first."""
+        check_choice("detection", self.detection, DETECTIONS)
+        return [_found(DETECTIONS[name]) for name in dict.fromkeys((self.detection, self.own, "evidence"))]
+
+    @property
+    def hyperparameters(self) -> tuple[str, ...]:
+        """What ``make_monitor`` takes beside the spec."""
+        parts = [self.model_class] if self._whole else [self.model_class, *self.detection_classes]
+        return tuple(dict.fromkeys([*(n for part in parts for n in parameter_names(part)), "seed"]))
+
+    def __call__(self, spec: StreamSpec, **hyperparameters: Any) -> CalibratedMonitor:
+        """The monitor, not yet fitted."""
+
+        def part(kind: Any) -> Any:
+            return kind(spec, **{n: hyperparameters[n] for n in parameter_names(kind) if n in hyperparameters})
+
+        if self._whole:
+            made: CalibratedMonitor = self.model_class(spec, **hyperparameters)
+            used = self.detection if self.detection in made.detections else part(self.detection_classes[0])
+            return made if used == made.detection.name else made.with_detection(used)
+        unknown = hyperparameters.keys() - set(self.hyperparameters)
+        if unknown:
+            raise TypeError(f"{self.model_class.kind} has no hyperparameter {', '.join(sorted(unknown))}")
+        detections = map(part, self.detection_classes)
+        return CalibratedMonitor(part(self.model_class), *detections, seed=hyperparameters.get("seed", 0))
+
+    def load(self, path: str | Path) -> CalibratedMonitor:
+        """Reads what a monitor of this model has saved, under any detection; raises as ``load_monitor``."""
+        return restored(path, read_checkpoint(path, self.model_class.kind), self)
+
+    def under(self, detection: str) -> MonitorKind:
+        """The same, with another detection in use."""
+        return replace(self, detection=detection)
+
+    @property
+    def _whole(self) -> bool:
+        """Whether its class is that of a monitor, and not of a mere model."""
+        return issubclass(self.model_class, CalibratedMonitor)
+
+
+def _row(model: str, own: str) -> MonitorKind:
+    return MonitorKind(f"asm_gym.monitors.baselines.{model}", own, own)
+
+
+_BASELINES = {
+    "skill_library": _row("skill_library:SkillLibrary", "squares"),
+    "logpzo": _row("fail_detect:LogpZO", "moving_mean"),
+    "rnd": _row("fail_detect:RND", "moving_mean"),
+    "lstm_vae": _row("lstm_vae:LSTMVAE", "latent_threshold"),
+    "gru": _row("gru:GRU", "mahalanobis"),
+    "kalman": _row("kalman:Kalman", "mahalanobis"),
+    "autoregression": _row("autoregression:Autoregression", "mahalanobis"),
+    "elapsed_time": _row("elapsed_time:ElapsedTime", "squares"),
+}
+
+MONITORS: dict[str, MonitorKind] = {
+    "neural_asm": MonitorKind("asm_gym.monitors.neural_asm:NeuralASM"),
+    **{n: k for name, row in _BASELINES.items() for n, k in ((name, row), (name + EVIDENCE, row.under("evidence")))},
+    "external_torque_limit": _row("limits:ExternalTorqueLimit", "largest"),
+    "force_limit": _row("limits:ForceLimit", "squares"),
+}
+"""Every monitor by name. A baseline's plain name scores as its authors did; with ``+evidence``, its errors are judged
+as those of the Neural ASM are. ``+`` and the name of any other detection will do as well."""
+
+
+def register_monitor(model: type[Any], detection: str = "evidence") -> None:
+    """Makes a model of one's own known under its ``kind``, and under ``kind+evidence``.
+
+    Args:
+        model: a class of models (see ``Model``), or of whole monitors.
+        detection: which judges it unless asked otherwise; a name in ``DETECTIONS``.
+
+    Raises:
+        ValueError: the name is taken, or there is no such detection.
+    """
+    check_choice("detection", detection, DETECTIONS)
+    name: str = model.kind
+    if name in MONITORS:
+        raise ValueError(f"there is a monitor {name!r} already")
+    row = MonitorKind(model, detection, detection)
+    MONITORS.update({name: row, name + EVIDENCE: row.under("evidence")})
+
+
+def monitor_class(name: str) -> MonitorKind:
+    """What makes and loads the monitors of that name; torch is imported only for those that need it.
+
+    Raises:
+        ValueError: there is no monitor of that name, or no such detection; the message lists what exists.
+        ImportError: a package that it needs is not installed; the message says what to install.
+    """
+    model, plus, detection = name.partition("+")
+    if name in MONITORS or not plus or model not in MONITORS:
+        check_choice("monitor", name, MONITORS)
+        kind = MONITORS[name]
+    else:
+        kind = MONITORS[model].under(detection)
+    with needed_for(f"monitor {name}"):
+        _ = kind.model_class, kind.detection_classes
+    return kind
+
+
+def make_monitor(
+    name: str, spec: StreamSpec, detection: str | Detection | None = None, **hyperparameters: Any
+) -> CalibratedMonitor:
+    """A monitor by name, not yet fitted.
+
+    Args:
+        name: for example ``neural_asm``, or ``gru+evidence``, which is ``gru`` with the detection ``evidence``.
+        spec: the stream it is to watch.
+        detection: what judges the model's errors, by name or one's own; where None, what the name says.
+        **hyperparameters: of that monitor.
+
+    Raises:
+        ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists.
+    """
+    kind = monitor_class(name if not isinstance(detection, str) else f"{name.partition('+')[0]}+{detection}")
+    for parameter in hyperparameters.keys() - RENAMED.keys():
+        check_choice(f"hyperparameter of {name}", parameter, kind.hyperparameters)
+    made = kind(spec, **hyperparameters)
+    return made if detection is None or isinstance(detection, str) else made.with_detection(detection)
+
+
+def load_monitor(path: str | Path) -> CalibratedMonitor:
+    """Reads what any monitor has saved, with the detection that it had.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, from a newer version, of a monitor that is not registered, or something else.
+    """
+    kind = monitor_class(kind_of(path))
+    saved = read_checkpoint(path, kind.model_class.kind)
+    return restored(path, saved, kind.under(saved.header.get("detection", kind.detection)))
+
+
+def _found(target: Any) -> Any:
+    """The class that ``module:class`` stands for."""
+    if not isinstance(target, str):
+        return target
+    module, _, name = target.partition(":")
+    return getattr(importlib.import_module(module), name)
