@@ -7,7 +7,9 @@ https://minari.farama.org.
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 import shutil
 import warnings
 from collections.abc import Sequence
@@ -20,12 +22,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym import episodes as single
-from asm_gym.episodes import Episode
+from asm_gym.checks import check_text
+from asm_gym.episodes import Episode, check_recorded
 from asm_gym.extras import require
+from asm_gym.files import require_space
+from asm_gym.hdf5 import opened_hdf5
 from asm_gym.stream import StreamSpec, control_period
 from asm_gym.tasks import TASKS
 
-METADATA = "metadata.json"
+METADATA, ARRAYS, CHECKSUMS = "metadata.json", "main_data.hdf5", "SHA256SUMS"
+"""What a dataset's folder ``data`` holds; the first two are Minari's."""
 
 
 def write_dataset(
@@ -42,7 +48,9 @@ def write_dataset(
         details: JSON-serialisable; kept in the metadata, for example versions.
 
     Raises:
-        ValueError: no episode, episodes of several specs, or one without observations, actions and rewards.
+        ValueError: no episode, episodes of several specs, or one without observations, actions and rewards; a name that
+            leads out of ``root``, or to a folder that holds what this package did not write.
+        OSError: the disk has no room for it.
     """
     storage_class = _minari("minari.dataset.minari_storage.MinariStorage")
     buffer = _minari("minari.data_collector.EpisodeBuffer")
@@ -54,9 +62,14 @@ def write_dataset(
         steps = len(episode.actions)
         if not steps or len(episode.observations) != steps + 1 or len(episode.rewards) != steps:
             raise ValueError(f"episode {n} needs an action, a reward and a flat observation of every step")
-    folder = root.resolve() / dataset_id  # Minari doubles a relative path
-    unfinished = folder.with_name(f".{folder.name}.unfinished")
-    shutil.rmtree(unfinished, ignore_errors=True)
+        check_recorded(episode)
+    folder = _place(root, dataset_id)
+    unfinished, replaced = (folder.with_name(f".{folder.name}.{what}") for what in ("unfinished", "replaced"))
+    for before in (folder, unfinished, replaced):
+        _refuse_what_is_not_ours(before)
+    require_space(folder, sum(map(_bytes, episodes)))
+    for before in (unfinished, replaced):
+        shutil.rmtree(before, ignore_errors=True)
     (unfinished / "data").mkdir(parents=True)
     spaces = {"observation_space": env.observation_space, "action_space": env.action_space}
     storage = storage_class.new(unfinished / "data", **spaces, env_spec=env.spec)
@@ -64,9 +77,64 @@ def write_dataset(
     storage.update_episode_metadata([{"success": bool(e.success), "info": json.dumps(e.info)} for e in episodes])
     about = {"dataset_id": dataset_id, "minari_version": _minari("minari.__version__"), "stream_spec": spec.to_json()}
     storage.update_metadata({**details, **about})
-    shutil.rmtree(folder, ignore_errors=True)
+    (unfinished / "data" / CHECKSUMS).write_text(
+        "".join(f"{_digest(unfinished / 'data' / name)}  {name}\n" for name in (ARRAYS, METADATA)), encoding="ascii"
+    )
+    if folder.exists():
+        folder.rename(replaced)
     unfinished.rename(folder)
+    shutil.rmtree(replaced, ignore_errors=True)
     return folder
+
+
+def _place(root: Path, dataset_id: str) -> Path:
+    """The folder of a dataset. Raises ValueError for a name that leads anywhere but below ``root``."""
+    check_text("dataset_id", dataset_id)
+    if not all(re.fullmatch(r"\w[\w.-]*", part) for part in dataset_id.split("/")):
+        raise ValueError(f"dataset_id must be a name such as asm_gym/lift-v0, got {dataset_id!r}")
+    top = root.resolve()  # Minari doubles a relative path
+    folder = top / dataset_id
+    if folder.resolve() != folder:
+        raise ValueError(f"{folder} is a link to {folder.resolve()}, and is not replaced")
+    return folder
+
+
+def _refuse_what_is_not_ours(folder: Path) -> None:
+    """Raises ValueError unless a folder that is to be replaced holds at most what ``write_dataset`` writes."""
+    found = {f for f in folder.rglob("*") if f.is_symlink() or not f.is_dir()} if folder.is_dir() else {folder}
+    foreign = found - {folder / "data" / name for name in (ARRAYS, METADATA, CHECKSUMS)}
+    if folder.exists() and foreign:
+        raise ValueError(f"{min(foreign)} is nothing that asm-gym wrote, so {folder} is not replaced")
+
+
+def _bytes(episode: Episode) -> int:
+    """That an episode takes in a dataset, at most [bytes]."""
+    columns = _columns(episode)
+    arrays = [*columns["infos"].values(), *(a for a in columns.values() if isinstance(a, np.ndarray))]
+    total: int = sum(a.nbytes for a in arrays)
+    return total + total // 10 + 2**16
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def _check_whole(folder: Path) -> None:
+    """Raises ValueError unless the files are those that were written, and hold what they declare.
+
+    ``sha256sum --check SHA256SUMS`` asks the first. Datasets of others and of earlier versions have no checksums.
+    """
+    if (folder / CHECKSUMS).is_file():
+        for line in (folder / CHECKSUMS).read_text(encoding="ascii").splitlines():
+            digest, _, name = line.partition("  ")
+            if name not in (ARRAYS, METADATA) or _digest(folder / name) != digest:
+                raise ValueError(
+                    f"{name} is not as it was written (where it was changed on purpose, remove {CHECKSUMS})"
+                )
+    if (folder / ARRAYS).exists():
+        with opened_hdf5(folder / ARRAYS):
+            pass
 
 
 def _columns(episode: Episode) -> dict[str, Any]:
@@ -104,6 +172,7 @@ def read_dataset(path: str | Path, env_id: str | None = None, dt: float | None =
     folder = find_dataset(Path(path))
     dataset_class = _minari("minari.MinariDataset")
     try:
+        _check_whole(folder)
         metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
         dataset = dataset_class(folder)
         recorded = list(dataset.iterate_episodes())
@@ -166,13 +235,17 @@ def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec) ->
     infos = data.infos or {}
     seed = note.get("seed")
     try:
+        lengths = {"actions": T, "observations": T + 1, "terminations": T, "truncations": T}
+        for name, length in lengths.items():
+            if len(getattr(data, name)) != length:
+                raise ValueError(f"{T} rewards need {length} {name}, got {len(getattr(data, name))}")
         actions = np.asarray(data.actions, np.float32).reshape(T, -1)
         observations = np.asarray(data.observations, np.float32).reshape(T + 1, -1)
         if spec.source == "spaces":
             stream = np.concatenate([observations[1:], actions], axis=1)
         else:
             stream = _without_reset(np.asarray(infos["stream"], np.float32), T)
-        return Episode(
+        episode = Episode(
             stream=stream,
             spec=spec,
             success=bool(note["success"] if "success" in note else np.any(infos.get("success", False))),
@@ -183,6 +256,8 @@ def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec) ->
             faults=_without_reset(np.asarray(infos.get("fault", np.zeros(len(stream))), np.bool_), T),
             info=json.loads(note.get("info", "{}")) | {"terminated": bool(np.any(data.terminations))},
         )
+        check_recorded(episode)
+        return episode
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{folder}, episode {data.id}: {error}") from error
 

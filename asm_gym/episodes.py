@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import read_arrays, read_checkpoint, write_checkpoint
+from asm_gym.files import regular_file
 from asm_gym.stream import StreamSpec
 from asm_gym.tables import stream_of
 
@@ -126,8 +127,28 @@ class Episode:
         return cls(*stream_of(frame, channels, rate, action), **fields)
 
 
+def check_recorded(episode: Episode) -> None:
+    """Raises ValueError unless the arrays of an episode are of one length, and its rewards are numbers."""
+    rows, steps = len(episode), len(episode.actions)
+    for name, length in (("observations", steps + 1), ("rewards", steps), ("contact_force", steps)):
+        found = len(getattr(episode, name))
+        if steps and found not in (0, length):
+            raise ValueError(f"{steps} actions need {length} {name}, got {found}")
+    for name in ("rewards", "faults", "contact_force"):
+        if getattr(episode, name).ndim != 1:
+            raise ValueError(f"{name} must have one dimension, got the shape {getattr(episode, name).shape}")
+    if len(episode.faults) not in (0, rows):
+        raise ValueError(f"{rows} rows of a stream need {rows} faults, got {len(episode.faults)}")
+    if steps and rows % steps:
+        raise ValueError(f"{steps} actions cannot have {rows} rows of a stream")
+    bad = np.flatnonzero(~np.isfinite(episode.rewards))
+    if len(bad):
+        raise ValueError(f"the reward of step {bad[0]} must be finite, got {episode.rewards[bad[0]]}")
+
+
 def save_episode(path: str | Path, episode: Episode) -> Path:
     """Writes one episode to a file of its own, which appears only when it is complete; returns where it is."""
+    check_recorded(episode)
     label = None if episode.label is None else asdict(episode.label)
     if label is not None:
         label["affected_channels"] = sorted(label["affected_channels"])
@@ -152,12 +173,15 @@ def load_episode(path: str | Path, spec: StreamSpec | None = None) -> Episode:
         FileNotFoundError: there is no such file.
         ValueError: the file is damaged or something else.
     """
+    regular_file(path)
     try:
         kept = _fields(Path(path), spec)
         for name, kinds in ARRAYS.items():
             if name in kept and kept[name].dtype.kind not in kinds:
                 raise ValueError(f"{name} cannot be of {kept[name].dtype}")
-        return Episode(**kept)
+        episode = Episode(**kept)
+        check_recorded(episode)
+        return episode
     except FileNotFoundError:
         raise
     except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile) as error:

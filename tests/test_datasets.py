@@ -2,12 +2,14 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import h5py
@@ -165,25 +167,26 @@ def _observed(episodes):
     ]
 
 
-def foreign(path, env_id="Pusher-v5", episodes=3, infos=None, actions=7):
+def foreign(path, env_id="Pusher-v5", episodes=3, infos=None, actions=7, changed=None):
     """A dataset that somebody else recorded, with Minari alone."""
     observations = gym.spaces.Box(-np.inf, np.inf, (23,), np.float64)
     path.mkdir(parents=True)
     spaces = {"observation_space": observations, "action_space": gym.spaces.Box(-2, 2, (actions,), np.float32)}
     storage = MinariStorage.new(path, **spaces, env_spec=gym.spec(env_id))
     rng = np.random.default_rng(0)
-    buffers = [
-        EpisodeBuffer(
-            seed=n,
-            observations=rng.normal(size=(11 + n, 23)),
-            actions=rng.normal(size=(10 + n, actions)).astype(np.float32),
-            rewards=rng.normal(size=10 + n),
-            terminations=np.zeros(10 + n, bool),
-            truncations=np.arange(10 + n) == 9 + n,
-            infos=infos,
-        )
+    columns = [
+        {
+            "seed": n,
+            "observations": rng.normal(size=(11 + n, 23)),
+            "actions": rng.normal(size=(10 + n, actions)).astype(np.float32),
+            "rewards": rng.normal(size=10 + n),
+            "terminations": np.zeros(10 + n, bool),
+            "truncations": np.arange(10 + n) == 9 + n,
+            "infos": infos,
+        }
         for n in range(episodes)
     ]
+    buffers = [EpisodeBuffer(**(c | (changed or {}))) for c in columns]
     storage.update_episodes(buffers)
     storage.update_metadata({"dataset_id": "somebody/thing-v0", "minari_version": minari.__version__})
     return buffers
@@ -249,6 +252,97 @@ def test_what_cannot_be_read_is_refused_by_name(tmp_path, folder):
     (broken / "metadata.json").write_text("{")
     with pytest.raises(ValueError, match="damaged"):
         read_dataset(broken)
+
+
+def test_no_name_leads_out_of_the_root_and_nothing_of_others_is_removed(tmp_path):
+    root, others = tmp_path / "root", tmp_path / "precious.txt"
+    root.mkdir()
+    others.write_text("kept")
+    (root / "mine.txt").write_text("kept")
+    (tmp_path / "elsewhere").mkdir()
+    (root / "link").symlink_to(tmp_path / "elsewhere")
+    episodes = _observed(sine_episodes(2))
+    for name in ("..", "", ".", "/etc", "a/../..", "a//b", "~", "../root", "a/", None, 3, "link", "link/a-v0"):
+        with pytest.raises(ValueError, match=r"dataset_id must be|is a link"):
+            write_dataset(root, name, episodes, _Sines(), {})
+    (root / "mine" / "data").mkdir(parents=True)
+    (root / "mine" / "data" / "notes.txt").write_text("kept")
+    with pytest.raises(ValueError, match=r"notes\.txt is nothing that asm-gym wrote"):
+        write_dataset(root, "mine", episodes, _Sines(), {})
+    with pytest.raises(ValueError, match=r"mine\.txt is nothing that asm-gym wrote"):
+        write_dataset(root, "mine.txt", episodes, _Sines(), {})
+    assert {f.read_text() for f in (others, root / "mine.txt", root / "mine" / "data" / "notes.txt")} == {"kept"}
+    write_dataset(root, "ours", episodes, _Sines(), {})
+    write_dataset(root, "ours", episodes[:1], _Sines(), {})
+    assert len(read_dataset(root / "ours")) == 1
+    assert sorted(p.name for p in root.iterdir()) == ["link", "mine", "mine.txt", "ours"]
+
+
+def test_a_full_disk_is_a_line_and_leaves_the_dataset_that_was_there(tmp_path, monkeypatch):
+    episodes = _observed(sine_episodes(2))
+    write_dataset(tmp_path, "ours", episodes, _Sines(), {})
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10**6))
+    with pytest.raises(OSError, match="MB are needed there, and 1 MB are free"):
+        write_dataset(tmp_path, "ours", episodes[:1], _Sines(), {})
+    assert len(read_dataset(tmp_path)) == 2
+    assert [p.name for p in tmp_path.iterdir()] == ["ours"]
+
+
+def test_no_flipped_bit_of_a_dataset_goes_unnoticed(tmp_path):
+    data = write_dataset(tmp_path, "ours", _observed(sine_episodes(2)), _Sines(), {}) / "data"
+    done = subprocess.run(["sha256sum", "--check", "SHA256SUMS"], cwd=data, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["main_data.hdf5: OK", "metadata.json: OK"]
+    rng = np.random.default_rng(0)
+    for name in ("main_data.hdf5", "metadata.json"):
+        whole = (data / name).read_bytes()
+        for place in rng.integers(8 * len(whole), size=20):
+            flipped = bytearray(whole)
+            flipped[place // 8] ^= 1 << place % 8
+            (data / name).write_bytes(flipped)
+            with pytest.raises(ValueError, match=f"{name} is not as it was written"):
+                read_dataset(data)
+        (data / name).write_bytes(whole)
+    assert len(read_dataset(data)) == 2
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"rewards": np.array([0.0] * 9 + [np.nan])}, "the reward of step 9 must be finite, got nan"),
+        ({"actions": np.zeros((20, 7), np.float32)}, "10 rewards need 10 actions, got 20"),
+        ({"observations": np.zeros((10, 23))}, "10 rewards need 11 observations, got 10"),
+    ],
+)
+def test_rewards_that_are_no_numbers_and_arrays_of_other_lengths_are_refused(changed, message, tmp_path):
+    foreign(tmp_path / "theirs", episodes=1, changed=changed)
+    with pytest.raises(ValueError, match=message):
+        read_dataset(tmp_path / "theirs")
+
+
+def test_what_a_file_declares_must_be_in_it(tmp_path):
+    foreign(tmp_path / "theirs", episodes=1)
+    file = tmp_path / "theirs" / "main_data.hdf5"
+    whole = file.read_bytes()
+
+    def declare(**more):
+        file.write_bytes(whole)
+        with h5py.File(file, "a") as opened:
+            del opened["episode_0/observations"]
+            opened["episode_0"].create_dataset("observations", **more)
+
+    declare(shape=(11, 23), dtype="f8")
+    with pytest.raises(ValueError, match="observations declares 2024 bytes that were never written"):
+        read_dataset(tmp_path / "theirs")
+    declare(data=np.zeros((10**6, 23)), chunks=(10**4, 23), compression="gzip")
+    assert file.stat().st_size < 1e6
+    with pytest.raises(ValueError, match="declares 184"):
+        read_dataset(tmp_path / "theirs")
+    file.write_bytes(whole)
+    with h5py.File(file, "a") as opened:
+        del opened["episode_0/observations"]
+        opened["episode_0/observations"] = h5py.ExternalLink("/etc/passwd", "/")
+    with pytest.raises(ValueError, match="points elsewhere"):
+        read_dataset(tmp_path / "theirs")
 
 
 # ---------------------------------------------------------------------- robosuite's and robomimic's files
@@ -339,10 +433,24 @@ def test_files_that_do_not_fit_are_refused_by_name(demonstrated, tmp_path, capsy
         del data["demo_9/states"]
         data["demo_9/states"] = states
 
+    def set_to(value, what):
+        def edit(data):
+            numbers = data[f"demo_9/{what}"][:].astype(np.float64)
+            numbers[5, 2] = value
+            del data[f"demo_9/{what}"]
+            data[f"demo_9/{what}"] = numbers
+
+        return edit
+
     for edit, message in (
         (lambda data: data.attrs.__setitem__("env", "Juggle"), "Juggle"),
         (lambda data: data.attrs.__delitem__("env"), "no file of robosuite"),
         (drop_a_column, "has 32 numbers"),
+        (set_to(np.nan, "states"), "states of step 5 must be finite and below 1e+10, got nan"),
+        (set_to(1e300, "states"), "states of step 5 must be finite and below 1e+10, got 1e+300"),
+        (set_to(1e300, "actions"), "actions of step 5 must be finite and below 1e+10, got 1e+300"),
+        (lambda data: data["demo_9"].create_dataset("rewards", data=np.full(12, np.nan)), "rewards of step 0 must be"),
+        (lambda data: data["demo_9"].create_dataset("rewards", data=np.zeros(3)), "need as many rewards"),
     ):
         assert main(["import", str(edited(edit)), "--out", str(tmp_path / "out")]) == 2
         assert message in capsys.readouterr().err

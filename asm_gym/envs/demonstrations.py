@@ -19,14 +19,20 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_number
 from asm_gym.envs.layout import Layout
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.episodes import Episode
+from asm_gym.hdf5 import opened_hdf5
 from asm_gym.stream import MOTOR
 from asm_gym.tasks import task as task_spec
 
 GROUPS = ("joint", "hand", MOTOR)
 """Channel groups that a state determines. What motors and contacts do within a step is in no such file."""
+
+
+LARGEST = 1e10
+"""Beyond it MuJoCo itself takes a state for a bad one (mjMAXVAL)."""
 
 
 class Recorded(NamedTuple):
@@ -67,9 +73,10 @@ def recorded_in(path: Path) -> Recorded:
         demos = sorted((n for n in file["data"] if re.fullmatch(r"demo_\d+", n)), key=lambda n: int(n[5:]))
     if not demos:
         raise ValueError(f"{path} holds no demonstration")
+    control_freq = check_number(f"{path}: control_freq", kwargs.get("control_freq", 20), low=1, high=500)
     robots = kwargs.get("robots", "Panda")
     robots = (robots,) if isinstance(robots, str) else tuple(robots)
-    return Recorded(task_spec(name).name, robots, int(kwargs.get("control_freq", 20)), tuple(demos))
+    return Recorded(task_spec(name).name, robots, int(control_freq), tuple(demos))
 
 
 def replay(path: Path, recorded: Recorded, env: gym.Env[Any, Any], seed: int = 0) -> Iterator[Episode]:
@@ -88,10 +95,10 @@ def replay(path: Path, recorded: Recorded, env: gym.Env[Any, Any], seed: int = 0
     with _open(path) as file:
         for name in recorded.demos:
             demo = file["data"][name]
-            states, actions = np.array(demo["states"]), np.array(demo["actions"], np.float32)
-            rewards = np.array(demo["rewards"], np.float32) if "rewards" in demo else None
-            _check(path, name, inner, states, actions)
-            yield _episode(inner, name, states, actions, rewards, path)
+            states, actions = (_numbers(path, name, demo, what) for what in ("states", "actions"))
+            rewards = _numbers(path, name, demo, "rewards").astype(np.float32) if "rewards" in demo else None
+            _check(path, name, inner, states, actions, rewards)
+            yield _episode(inner, name, states, actions.astype(np.float32), rewards, path)
 
 
 def _episode(
@@ -131,7 +138,28 @@ def _sense(
     return row, bool(env.robosuite_env._check_success())
 
 
-def _check(path: Path, name: str, env: RobosuiteEnv, states: NDArray[np.float64], actions: NDArray[np.float32]) -> None:
+def _numbers(path: Path, name: str, demo: Any, what: str) -> NDArray[np.float64]:
+    """An array of a demonstration. Raises ValueError for numbers that no simulation comes to."""
+    found = np.array(demo[what])
+    if found.dtype.kind not in "iuf":
+        raise ValueError(f"{path}, {name}: {what} must be numbers, got {found.dtype}")
+    found = found.astype(np.float64)
+    wild = np.argwhere(~(np.abs(found) <= LARGEST))  # what is not a number is neither
+    if len(wild):
+        step = int(wild[0][0])
+        value = f"{found[tuple(wild[0])]:g}"
+        raise ValueError(f"{path}, {name}: {what} of step {step} must be finite and below {LARGEST:g}, got {value}")
+    return found
+
+
+def _check(
+    path: Path,
+    name: str,
+    env: RobosuiteEnv,
+    states: NDArray[np.float64],
+    actions: NDArray[np.float64],
+    rewards: NDArray[np.float32] | None,
+) -> None:
     model = env.simulation.model
     size = 1 + model.nq + model.nv
     what = f"{path}, {name}"
@@ -144,6 +172,8 @@ def _check(path: Path, name: str, env: RobosuiteEnv, states: NDArray[np.float64]
         raise ValueError(
             f"{what}: {len(states)} states need actions of shape {env.action_space.shape}, got {actions.shape}"
         )
+    if rewards is not None and rewards.shape != (len(states),):
+        raise ValueError(f"{what}: {len(states)} states need as many rewards, got {rewards.shape}")
     if len(states) < 2:
         raise ValueError(f"{what}: two states at least are needed, got {len(states)}")
 
@@ -152,14 +182,10 @@ def _check(path: Path, name: str, env: RobosuiteEnv, states: NDArray[np.float64]
 def _open(path: Path) -> Iterator[Any]:
     """An HDF5 file. Raises ValueError where what is looked for in it is not there."""
     try:
-        import h5py
-    except ImportError as error:
-        raise ImportError("HDF5 files need the package h5py: pip install 'asm-gym[data]'") from error
-    if not path.is_file():
-        raise FileNotFoundError(f"no file {path}")
-    try:
-        with h5py.File(path, "r") as file:
+        with opened_hdf5(path) as file:
             yield file
+    except FileNotFoundError:
+        raise
     except (OSError, LookupError, TypeError, AttributeError, json.JSONDecodeError) as error:
         raise ValueError(
             f"{path} is damaged, or no file of robosuite's or robomimic's demonstrations: {error}"
