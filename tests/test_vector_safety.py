@@ -202,7 +202,7 @@ def test_robots_side_by_side_are_watched_as_each_alone():
     settings, on_alarm = {"horizon": 15}, "comply"
     episodes = collect("asm_gym/Lift-v0", episodes=4, seed=3, workers=1, **settings)
     asm = NeuralASM(episodes[0].spec, hidden_size=16, association_size=40, epochs=2).fit(episodes[:3])
-    asm.threshold_ = 0.5 * asm.score(episodes[3]).value.max()
+    asm = asm.with_threshold(0.5 * asm.score(episodes[3]).value.max())
     many = gym.make_vec("asm_gym/Lift-v0", num_envs=2, vectorization_mode="sync", **settings)
     many = VectorNeuralASMSafety(many, asm, on_alarm=on_alarm, release_after=2)
     alone = [NeuralASMSafety(gym.make("asm_gym/Lift-v0", **settings), asm, on_alarm, release_after=2) for _ in range(2)]
