@@ -12,11 +12,11 @@ pytest = $(one_thread) $(bin)/python -m pytest -n $(JOBS) --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo reproduce doctor test test-all check format clean
+.PHONY: help demo reproduce doctor test test-all check format docs page stale clean
 
 help: ## list the commands
 	@sed -nE 's/^([a-z-]+):.* ## (.*)/  make \1\t\2/p' Makefile | expand -t 20
-	@echo "Variables: PYTHON=$(PYTHON) makes .venv, JOBS=$(JOBS) test processes, ARGS goes to demo, reproduce and pytest."
+	@echo "Variables: PYTHON=$(PYTHON) makes .venv, JOBS=$(JOBS) test processes, ARGS goes to demo, reproduce and pytest, PAGE to page."
 
 demo: $(stamp) ## a robot that notices when something is wrong; ARGS=--help lists its options
 	@$(bin)/asm-gym demo $(ARGS)
@@ -42,8 +42,18 @@ format: $(stamp) ## formats the code, and fixes what lint can
 	$(bin)/ruff check --fix .
 	$(bin)/ruff format .
 
+docs: $(stamp) ## this documentation as a site, in docs/_build/html
+	$(bin)/python -m sphinx -b html -W --keep-going -q docs docs/_build/html
+	@echo "make: open docs/_build/html/index.html"
+
+page: $(stamp) ## runs the command of a page of results, and keeps what it prints: PAGE=docs/results/demo.md
+	$(bin)/python docs/pages.py print $(PAGE)
+
+stale: $(stamp) ## marks the pages of results whose code has changed
+	$(bin)/python docs/pages.py mark
+
 clean: ## removes .venv, builds and caches; runs/ stays
-	rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist docs/_build docs/reference/api *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Still there, finished once, and its Python still runs: not interrupted half-way, nor left by a Python since removed.

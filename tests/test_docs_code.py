@@ -1,0 +1,97 @@
+"""Every block of code in README and docs runs, page by page; every command in them is one that its parser takes."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tyro
+
+from asm_gym.scripts.cli import main
+from tests import documents
+
+PYTHON = [p for p in documents.written() if any(b.language == "python" for b in documents.blocks(p))]
+SHELL = [p for p in documents.written() if any(b.language == "sh" for b in documents.blocks(p))]
+RESULTS = [p for p in documents.written() if p.parent.name == "results" and p.name != "index.md"]
+
+RECORDER = 'asm-gym() { printf "%s\\n" "asm-gym $*"; }; make() { printf "%s\\n" "make $*"; }; apt-get() { :; }\n'
+"""Instead of commands: what they would have been given."""
+
+
+class Parsed(Exception):  # noqa: N818 (it is no error)
+    """The arguments make sense; nothing need run."""
+
+
+@pytest.mark.parametrize("page", PYTHON, ids=documents.name)
+def test_the_code_of_a_page_runs_from_top_to_bottom(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"__name__": "page"}
+    for block in documents.blocks(page):
+        if block.language == "python":
+            code = compile("\n" * (block.line - 1) + block.text, str(page), "exec")  # tracebacks name the page's lines
+            exec(code, names)
+
+
+def commands(script: str) -> list[str]:
+    """What a script of a shell would call, a line each, with its variables filled in; no program is run."""
+    done = subprocess.run(["/bin/bash", "-euc", RECORDER + script], env={"PATH": ""}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def check(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fails unless the command exists and takes these arguments."""
+    program, *argv = command.split()
+    if program == "make":
+        targets = re.findall(r"^([a-z-]+):", (documents.ROOT / "Makefile").read_text(), re.M)
+        assert argv[0] in targets
+        return
+    parse = tyro.cli
+
+    def dry(*args: Any, **kwargs: Any) -> Any:
+        parse(*args, **kwargs)
+        raise Parsed
+
+    monkeypatch.setattr(tyro, "cli", dry)
+    try:
+        code = main(argv)
+    except Parsed:
+        return
+    except SystemExit as stopped:
+        code = stopped.code
+    finally:
+        monkeypatch.setattr(tyro, "cli", parse)
+    assert code == 0, command
+
+
+@pytest.mark.parametrize("page", SHELL, ids=documents.name)
+def test_the_commands_of_a_page_exist_and_take_their_arguments(page: Path, monkeypatch: pytest.MonkeyPatch):
+    for block in documents.blocks(page):
+        if block.language == "sh":
+            for command in commands(block.text):
+                check(command, monkeypatch)
+
+
+@pytest.mark.parametrize("page", RESULTS, ids=documents.name)
+def test_the_command_of_a_page_of_results_can_be_given_again(page: Path, monkeypatch: pytest.MonkeyPatch):
+    pages = documents.tool("pages")
+    given = commands(pages.Page.read(page).meta["command"])
+    assert given
+    for command in given:
+        check(command, monkeypatch)
+
+
+def test_a_command_with_a_wrong_argument_is_found(monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(AssertionError):
+        check("asm-gym demo --no-such-thing", monkeypatch)
+    with pytest.raises(AssertionError):
+        check("make no-such-thing", monkeypatch)
+
+
+def test_a_comment_that_makes_a_block_small_must_match_it():
+    assert documents.small("collect(episodes=60)", "<!-- small: 60 -> 6 -->\n") == "collect(episodes=6)"
+    with pytest.raises(AssertionError, match="does not occur"):
+        documents.small("collect(episodes=60)", "<!-- small: 50 -> 6 -->\n")
