@@ -14,7 +14,15 @@ project = "asm-gym"
 author = "the asm-gym authors"
 release = version = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "mathml", "docstrings", "printed", "reference"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "mathml",
+    "docstrings",
+    "printed",
+    "reference",
+]
 exclude_patterns = ["_build"]
 nitpicky = False  # what a signature names need not have a page: NumPy's types, for example
 

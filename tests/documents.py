@@ -42,7 +42,7 @@ def body(path: Path) -> str:
 
 
 def small(block: str, before: str) -> str:
-    """A block as it is tested: with the numbers that a comment above it gives, ``<!-- small: 60 -> 6; [:40] -> [:4] -->``.
+    """A block as it is tested, with the numbers of a comment above it: ``<!-- small: 60 -> 6; [:40] -> [:4] -->``.
 
     Each is replaced once, in the order given; one that does not occur is an error, so that comments stay true.
     """

@@ -9,7 +9,8 @@
 
 A joint that moves and a hand that does not, a torque commanded and none measured: each group is completed from the
 rest, so that what a body cannot do is an error, in whatever skill. ε_h is what one step of inference moves the hidden
-units by; learning from it follows the gradient of the squared error, with nothing but local products.
+units by. The rule equals the gradient of a Huber loss, and Uᵀ is the transpose of the weights that predict (weight
+transport): this is backpropagation through one layer, at one moment, and only ΔU and ΔD are local.
 
 Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning by prediction errors; Salvatori et al. 2021
 (NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest; Huber 1964 for ψ.
@@ -114,7 +115,7 @@ def normalised_errors(
 def association_change(
     a: Array, delta: Array, spread: Array, V: Array, U: Array, D: Array, bound: float = 1.0
 ) -> tuple[Change, Array]:
-    """The local rules for inputs (B, I) and changes (B, X), as if every synapse existed; and the errors (B, X)."""
+    """What each synapse changes by for inputs (B, I) and changes (B, X), as if all existed; and the errors (B, X)."""
     f = hidden_units(a, V)
     error = delta - complete(f, a, U, D)
     pulled = np.clip(error / spread, np.float32(-bound), np.float32(bound))

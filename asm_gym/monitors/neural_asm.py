@@ -32,7 +32,7 @@ from asm_gym.stream import StreamSpec
 
 
 class NeuralASM(CalibratedMonitor):
-    """Predictive coding through time and across the senses, learned by local rules, with a calibrated threshold.
+    """A predictive coding network through time, association across the senses, and a calibrated threshold.
 
     Args:
         spec: the stream it watches.

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sphinx.application import Sphinx
-
 from pages import RESULTS, Page
+from sphinx.application import Sphinx
 
 
 def banner(page: Page) -> str:

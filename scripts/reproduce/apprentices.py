@@ -1,4 +1,4 @@
-"""Who learns to act from demonstrations: a memory by local rules, and a GRU cloned by backpropagation through time.
+"""Who learns to act from demonstrations: a memory without a gradient through time, and a GRU with one.
 
     GRU    h_t = cell(h_{t-1}, m_t)     â_{t+1} = A h_t + b       Σ ‖a_{t+1} - â_{t+1}‖², the action that was intended
 

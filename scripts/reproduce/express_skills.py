@@ -46,7 +46,7 @@ MODELS = ("memory", "gru", "expert")
 INPUTS = 75
 """Numbers read of the four tasks."""
 
-CALLED = {"memory": "Neural ASM, local rules", "gru": "GRU, BPTT", "expert": "scripted expert"}
+CALLED = {"memory": "Neural ASM, no BPTT", "gru": "GRU, BPTT", "expert": "scripted expert"}
 
 
 @dataclass(frozen=True)
