@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from asm_gym.rollouts.folder import LOCK, claimed, locked, make_missing
+from asm_gym.scripts.cli import main
 
 HOLD = """
 import sys, time
@@ -72,3 +73,13 @@ def test_only_what_is_missing_is_made(tmp_path):
     made = make_missing(make, [0, 1, 2], lambda n: tmp_path / str(n), 1, lambda done, total: seen.append((done, total)))
     assert [p.read_text() for p in made] == ["new", "old", "new"]
     assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["collect", "Pendulum-v1", "--policy", "hold"], ["train", "Pendulum-v1", "--demonstrations", "0", "--steps", "9"]],
+)
+def test_two_commands_on_one_folder_are_one_too_many(command, holder, tmp_path, capsys):
+    assert main([*command, "--out", str(tmp_path)]) == 2
+    assert f"in use by process {holder.pid} on" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == [LOCK]

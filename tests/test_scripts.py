@@ -45,17 +45,6 @@ def test_bad_counts_are_refused():
         parallel_map(abs, [1], 0)
 
 
-def test_dispatch_keeps_the_order_and_reports_progress():
-    seen = []
-    assert parallel_map(abs, [-3, 1, -2], 2, lambda done, total: seen.append((done, total))) == [3, 1, 2]
-    assert seen == [(1, 3), (2, 3), (3, 3)]
-
-
-def test_what_a_task_raises_is_raised_here():
-    with pytest.raises(TypeError):
-        parallel_map(abs, ["a"], 2)
-
-
 def test_the_recorder_keeps_whole_and_cut_short_episodes():
     env = StreamRecorder(FakeEnv(length=4, own_stream=False))
     for steps in (4, 2):

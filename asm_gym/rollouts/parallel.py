@@ -9,11 +9,12 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import cloudpickle
@@ -27,8 +28,8 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Progress = Callable[[int, int], None]
 """Is called as (done, total)."""
-Submit = Callable[[bytes, Any], "Future[Any]"]
-"""Hands a pickled task and one item to a worker."""
+Ended = Generator[tuple[int, Any], None, None]
+"""Which item has ended, and its result."""
 
 BACKENDS = ("loky", "dask", "ray")
 IDLE_S = 300.0
@@ -98,13 +99,12 @@ def parallel_map(
         return results
     if not items:
         return []
-    sent = _pickled(task)
-    with _WORKERS[parallel.backend](parallel) as submit:
-        futures = [submit(sent, item) for item in items]
-        for done, future in enumerate(as_completed(futures), 1):
-            future.result()  # raises what the task raised, before the others have ended
-            tell(done, len(items))
-        return [future.result() for future in futures]
+    found: dict[int, Result] = {}
+    with closing(_RUN[parallel.backend](parallel, _pickled(task), items)) as ended:
+        for index, result in ended:
+            found[index] = result
+            tell(len(found), len(items))
+    return [found[index] for index in range(len(items))]
 
 
 def _pickled(task: Callable[[Any], Any]) -> bytes:
@@ -132,20 +132,25 @@ def _call_on_cluster(task: bytes, item: Any) -> Any:
         return _call(task, item)
 
 
-@contextmanager
-def _loky(parallel: ParallelConfig) -> Iterator[Submit]:
+def _loky(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
     # A process that another thread starts would end with that thread.
     here = threading.current_thread() is threading.main_thread()
     executor = get_reusable_executor(
         parallel.workers, timeout=IDLE_S, initializer=_end_with_parent, initargs=(os.getpid(), here), env=ONE_THREAD
     )
     try:
-        yield lambda task, item: executor.submit(_call, task, item)
+        yield from _as_they_end([executor.submit(_call, task, item) for item in items])
     except BrokenProcessPool as error:
         raise ChildProcessError(f"a worker process was killed, perhaps for want of memory: {error}") from error
     except BaseException:
         executor.shutdown(wait=True, kill_workers=True)  # of an error or a Ctrl-C nothing is left running
         raise
+
+
+def _as_they_end(futures: Sequence[Future[Any]]) -> Ended:
+    index = {future: k for k, future in enumerate(futures)}
+    for future in as_completed(index):
+        yield index[future], future.result()
 
 
 def _end_with_parent(parent: int, by_signal: bool) -> None:
@@ -162,38 +167,31 @@ def _end_with_parent(parent: int, by_signal: bool) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-@contextmanager
-def _dask(parallel: ParallelConfig) -> Iterator[Submit]:
+def _dask(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
     distributed = require("distributed", what="backend='dask'")
     try:
         client = distributed.Client(parallel.address, timeout=10)
     except OSError as error:
         raise ConnectionError(f"no dask scheduler answers at {parallel.address}: {error}") from error
     with client:  # tasks that nobody waits for any more are dropped when it closes
-        executor = client.get_executor(pure=False)
-        yield lambda task, item: executor.submit(_call_on_cluster, task, item)
+        sent = client.map(partial(_call_on_cluster, task), list(items), pure=False)
+        index = {future.key: k for k, future in enumerate(sent)}
+        for future, result in distributed.as_completed(sent, with_results=True):
+            yield index[future.key], result
 
 
-@contextmanager
-def _ray(parallel: ParallelConfig) -> Iterator[Submit]:
+def _ray(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
     ray = require("ray", what="backend='ray'")
     joined = not ray.is_initialized()
     if joined:
         ray.init(address=parallel.address or "auto", log_to_driver=False, logging_level="ERROR")
-    kept: dict[bytes, Any] = {}
-    remote = ray.remote(_call_on_cluster)
-
-    def submit(task: bytes, item: Any) -> Future[Any]:
-        if task not in kept:
-            kept[task] = ray.put(task)  # it is sent once to each machine
-        future: Future[Any] = remote.remote(kept[task], item).future()
-        return future
-
     try:
-        yield submit
+        remote, kept = ray.remote(_call_on_cluster), ray.put(task)  # which is sent once to each machine
+        yield from _as_they_end([remote.remote(kept, item).future() for item in items])
     finally:
         if joined:
             ray.shutdown()
 
 
-_WORKERS = {"loky": _loky, "dask": _dask, "ray": _ray}
+_RUN = {"loky": _loky, "dask": _dask, "ray": _ray}
+"""Runs a pickled task on every item, and says of each, as it ends, which it was and what came out."""
