@@ -57,7 +57,7 @@ def start(tmp_path):
     def started(where: str) -> tuple[subprocess.Popen, list[int]]:
         command = [sys.executable, "-c", PARENT, str(tmp_path), where]
         parents.append(subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True))
-        assert until(lambda: len(list(tmp_path.iterdir())) == 2, 120), "no workers"
+        assert until(lambda: len(list(tmp_path.iterdir())) == 2, 300), "no workers"
         return parents[-1], [int(p.name) for p in tmp_path.iterdir()]
 
     yield started
