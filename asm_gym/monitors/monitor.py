@@ -118,8 +118,8 @@ class CalibratedMonitor:
         return other
 
     def get_params(self) -> dict[str, Any]:
-        """The hyperparameters by name."""
-        parts = (self.model, *reversed(self.detections.values()))
+        """The hyperparameters by name, in one order whichever detection is in use."""
+        parts = (self.model, *(self.detections[name] for name in sorted(self.detections)))
         found = {n: getattr(p, n) for p in parts for n in parameter_names(type(p)) if n != "seed"}
         return found | {"seed": self.seed}
 
