@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.episodes import Episode
 from asm_gym.monitors import Monitor, NeuralASM, make_monitor
 from asm_gym.stream import Channel, StreamSpec
@@ -229,6 +230,61 @@ def without(*names):
         members["header.json"] = json.dumps(header).encode()
 
     return change
+
+
+def tampered(asm, path, arrays=None, **header):
+    """A checkpoint of ``asm`` in which something else is written."""
+    asm.save(path)
+    saved = read_checkpoint(path, asm.kind)
+    write_checkpoint(path, asm.kind, saved.header | header, saved.arrays | (arrays or {}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"whitening": lambda a: 0 * a}, "no error can add up to evidence: at most 0"),
+        ({"whitening": lambda a: 1e-9 * a}, "no error can add up to evidence"),
+        ({"ceiling": lambda a: np.full_like(a, np.inf)}, "ceiling should be finite"),
+        ({"ceiling": lambda a: np.full_like(a, 1e300)}, "no error can add up to evidence"),
+        ({"ceiling": lambda a: -a}, r"ceiling of evidence must be in \(0, inf\]"),
+        ({"tail": lambda a: 0 * a}, r"tail of evidence must be in \(0, 1\]"),
+        ({"context_quantile": lambda a: a + 1000.0}, "no error can add up to evidence"),
+        ({"W_H": lambda a: a * np.nan}, "W_H should be finite"),
+        ({"extra": lambda _: np.zeros(3)}, "declares no extra"),
+    ],
+)
+def test_weights_that_disarm_a_memory_are_refused(asm, tmp_path, arrays, message):
+    changed = {name: change(asm.learned_.get(name)) for name, change in arrays.items()}
+    with pytest.raises(ValueError, match=message):
+        NeuralASM.load(tampered(asm, tmp_path / "m.asm", changed))
+
+
+@pytest.mark.parametrize("threshold", [1e300, -1.0, True, "high", 10**400])
+def test_a_threshold_that_nothing_exceeds_is_refused(asm, tmp_path, threshold):
+    with pytest.raises(ValueError, match="threshold must be"):
+        NeuralASM.load(tampered(asm, tmp_path / "m.asm", threshold=threshold))
+
+
+def test_a_memory_that_would_never_answer_is_refused(asm, tmp_path):
+    slow = asm.get_params() | {"iterations": 10**9}
+    with pytest.raises(ValueError, match=r"iterations must be a whole number in \[1, 1000\], got 1000000000"):
+        NeuralASM.load(tampered(asm, tmp_path / "m.asm", hyperparameters=slow))
+
+
+def test_an_interrupted_fit_leaves_the_memory_as_it_was():
+    asm = NeuralASM(sine_spec(), **SMALL).fit(sine_episodes(8)).calibrate(sine_episodes(19, seed=1), 0.05)
+    episode, threshold = sine_episodes(1, seed=13)[0], asm.threshold
+    before, weights = asm.score(episode).value.tobytes(), learned_bytes(asm)
+
+    def interrupt(done, total):
+        if done > total // 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        asm.fit(sine_episodes(8, seed=5), interrupt)
+    assert asm.threshold == threshold
+    assert (asm.score(episode).value.tobytes(), learned_bytes(asm)) == (before, weights)
 
 
 @pytest.mark.parametrize("member", ["W_H.npy", "whitening.npy", "mean.npy"])

@@ -48,6 +48,11 @@ class Detection(Protocol):
     arrays: tuple[str, ...]
     learned_: Arrays
 
+    @property
+    def reach(self) -> float:
+        """What errors alone can make of surprise, in a context of 0: a threshold above it would hardly ever alarm."""
+        ...
+
     def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
         """Learns what is usual of errors."""
         ...

@@ -9,6 +9,7 @@ joined     (value^p + Σ_i r_i^p)^(1/p)                                r_i: of s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
@@ -127,6 +128,17 @@ class Detector:
         usual = habituate(np.concatenate(contexts), np.concatenate(levels), rng)
         return cls(matrix, ceiling, tail, usual.astype(np.float64), a, bound)
 
+    @property
+    def reach(self) -> float:
+        """What the value comes to at most in a context of 0: every error at ν, and for ever.
+
+        |w_i| <= ν Σ_j |M_ji|, so that v_i <= (ν Σ_j |M_ji|)² (2 - a) / a.
+        """
+        most = (self.bound * np.abs(self.whitening).sum(axis=0)) ** 2 * ((2.0 - self.gains) / self.gains)[:, None]
+        with np.errstate(over="ignore"):
+            ratios = (most / self.ceiling) ** self.tail  # (G, X)
+            return float(pool(ratios.reshape(1, -1))[0][0] / np.exp(self.context_quantile[-1]))
+
     def start(self, batch: int) -> Evidence:
         """No evidence yet."""
         gains, size = self.ceiling.shape
@@ -212,10 +224,25 @@ class EvidenceDetection:
         return self.restore({name: getattr(detector, name) for name in self.arrays[:-1]} | {"repetition": counted})
 
     def restore(self, learned: Arrays) -> Self:
-        self.learned_ = learned
         found = {name: learned[name] for name in self.arrays[:-1]}
-        self.detector_ = Detector(**found, gains=np.array(self.gains), bound=self.bound)
+        X = len(found["whitening"])
+        for name, shape in {"whitening": (X, X), **dict.fromkeys(("ceiling", "tail"), (len(self.gains), X))}.items():
+            if found[name].shape != shape:
+                raise ValueError(f"the {name} of evidence should be of shape {shape}, found {found[name].shape}")
+        for name, most in (("ceiling", math.inf), ("tail", 1.0)):
+            if not ((found[name] > 0.0) & (found[name] <= most)).all():
+                raise ValueError(f"the {name} of evidence must be in (0, {most:g}]")
+        detector = Detector(**found, gains=np.array(self.gains), bound=self.bound)
+        if not detector.reach > 1.0:  # what is seldom exceeded in nominal episodes
+            raise ValueError(f"no error can add up to evidence: at most {detector.reach:g} of what is usual")
+        self.learned_, self.detector_ = learned, detector
         return self
+
+    @property
+    def reach(self) -> float:
+        assert self.detector_ is not None
+        # Repetitions add to it, in senses that have noise.
+        return self.detector_.reach
 
     def start(self, batch: int, errors: int) -> EvidenceState:
         assert self.detector_ is not None

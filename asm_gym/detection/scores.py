@@ -10,6 +10,7 @@ Source: Xu et al. 2025 (RSS) for the moving mean; Haddadin, De Luca and Albu-Sch
 
 from __future__ import annotations
 
+import math
 from typing import Any, Self
 
 import numpy as np
@@ -29,6 +30,7 @@ class Squares:
 
     name = "squares"
     arrays: tuple[str, ...] = ()
+    reach = math.inf
 
     def __init__(self, spec: StreamSpec) -> None:
         self.learned_: Arrays = {}

@@ -134,13 +134,19 @@ class CalibratedMonitor:
             ValueError: no episode, one that is too short or of another spec, or a number that is not finite.
         """
         check_nominal(episodes, self.spec, self.model.shortest)
+        new = self._copy()  # whatever interrupts leaves this one as it was
+        new._learn(episodes, progress or (lambda done, total: None))
+        vars(self).update(vars(new))
+        return self
+
+    def _learn(self, episodes: Sequence[Episode], progress: Progress) -> None:
         rng, one_in = np.random.default_rng(self.seed), self.model.held_out
         order = rng.permutation(len(episodes)) if one_in else np.arange(len(episodes))
         kept = len(episodes) // one_in if one_in else 0
         held_out, learned = ([episodes[i] for i in part] for part in (order[:kept], order[kept:]))
         # One thread: products this small are slowed down by several, and ruined by several that share a core.
         with threadpool_limits(1):
-            self.model.fit(learned, rng, progress or (lambda done, total: None))
+            self.model.fit(learned, rng, progress)
             self.threshold_ = self.maxima_ = None
             self._prepare()
             nominal = Nominal(episodes, learned, held_out or learned, self._outputs)
@@ -149,7 +155,6 @@ class CalibratedMonitor:
                 if taken:
                     raise ValueError(f"{self.model.kind} and {detection.name} both learn {', '.join(sorted(taken))}")
                 detection.fit(nominal, rng)
-        return self
 
     def calibrate(self, episodes: Sequence[Episode], false_alarm_rate: float = 0.01) -> Self:
         """Sets the threshold from nominal episodes that ``fit`` has not seen; P(any alarm in one) <= the rate.
@@ -252,6 +257,9 @@ class CalibratedMonitor:
             ValueError: something is missing, or does not fit together.
         """
         header, new = saved.header, "detection" in saved.header
+        undeclared = sorted(set(saved.arrays) - set(header["shapes"]))
+        if undeclared:
+            raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
         names = {n: n if new else RENAMED.get(n, n) for n in header["shapes"]}
         arrays = {now: saved.array(n, *header["shapes"][n]) for n, now in names.items()}
         maxima = arrays.pop(MAXIMA, None)
@@ -265,8 +273,18 @@ class CalibratedMonitor:
             if arrays.keys() >= set(detection.arrays):
                 detection.restore({n: arrays[n] for n in detection.arrays})
         if not new or header["detection"] == self.detection.name:
-            self.threshold_, self.maxima_ = header["threshold"], maxima
+            self.threshold_, self.maxima_ = self._reachable(header["threshold"]), maxima
         return self
+
+    def _reachable(self, threshold: object) -> float | None:
+        """A threshold that was read, once it is a number that surprise can exceed."""
+        if threshold is None:
+            return None
+        number = check_number("threshold", threshold, low=0.0)
+        if number >= self.detection.reach:
+            most = f"{self.detection.reach:g}, all that errors can add up to"
+            raise ValueError(f"threshold must be below {most}, got {number:g}")
+        return number
 
     @property
     def _name(self) -> str:

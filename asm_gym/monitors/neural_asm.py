@@ -30,6 +30,9 @@ from asm_gym.monitors.nominal import check_nominal
 from asm_gym.scaling import StreamScaler
 from asm_gym.stream import StreamSpec
 
+MOST_ITERATIONS = 1000
+"""Of inference in a row: twenty are enough, and a file that asks for a thousand million would never answer."""
+
 
 class NeuralASM(CalibratedMonitor):
     """A predictive coding network through time, association across the senses, and a calibrated threshold.
@@ -90,7 +93,7 @@ class NeuralASM(CalibratedMonitor):
         self.association_size = check_number("association_size", association_size, low=1, whole=True)
         self.epochs = check_number("epochs", epochs, low=1, whole=True)
         self.batch_size = check_number("batch_size", batch_size, low=1, whole=True)
-        self.iterations = check_number("iterations", iterations, low=1, whole=True)
+        self.iterations = check_number("iterations", iterations, low=1, high=MOST_ITERATIONS, whole=True)
         self.learning_rate = check_number("learning_rate", learning_rate, above=0.0)
         self.prior_precision = check_number("prior_precision", prior_precision, above=0.0)
         self.sensory_precision = check_number("sensory_precision", sensory_precision, above=0.0)
