@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from types import CodeType, ModuleType
 
 MOVED = {
+    "asm_gym.faults.catalogue": "asm_gym.faults.base",
     "asm_gym.memory.checkpoint": "asm_gym.checkpoint",
     "asm_gym.memory.senses": "asm_gym.scaling",
     "asm_gym.scripts.adopt": "asm_gym.scripts.reproduce.transfer",

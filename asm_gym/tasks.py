@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from asm_gym.checks import check_text
+
 ROBOTS = ("Panda", "Sawyer", "UR5e", "Kinova3", "IIWA", "Jaco")
 """Arms that the tasks are tested with."""
 
@@ -79,7 +81,7 @@ def task(name: str) -> TaskSpec:
     Raises:
         ValueError: there is no such task; the message lists those that exist.
     """
-    short = name.removeprefix("asm_gym/").removesuffix("-v0")
+    short = check_text("task", name).removeprefix("asm_gym/").removesuffix("-v0")
     if short not in TASKS:
         raise ValueError(f"unknown task {name!r}; known tasks: {', '.join(TASKS)}")
     return TASKS[short]

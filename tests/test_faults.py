@@ -116,7 +116,7 @@ def test_severities_grow(stack, course):
 def test_edits_of_one_number_compose_and_end_in_any_order():
     ledger, array = SimulatorEdits(), np.array([0.3, 5.0])
     nominal = array.copy()
-    double, add = ledger.hold(array, 0), ledger.hold(array, 0)
+    double, add = ledger.edit(array, 0), ledger.edit(array, 0)
     double.change(lambda v: 2 * v)
     add.change(lambda v: v + 0.1)
     assert array[0] == 2 * 0.3 + 0.1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 
@@ -27,6 +27,15 @@ ON_ALARM = ("monitor", *REFLEXES, "terminate")
 """Names that ``on_alarm`` takes."""
 
 
+@runtime_checkable
+class Watches(Protocol):
+    """What the safety wrappers need of a monitor."""
+
+    def initial_state(self, batch: int = 1) -> Any: ...
+
+    def observe(self, state: Any, stream: Any) -> Any: ...
+
+
 def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
     """The monitor's threshold, once it can watch such a stream.
 
@@ -34,6 +43,8 @@ def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
         ValueError: it is for another stream (the message names what differs), or would never alarm.
         RuntimeError: it is not calibrated.
     """
+    if not isinstance(monitor, Watches):
+        raise TypeError(f"monitor must have initial_state() and observe(), got {shown(monitor)}")
     monitor.spec.require(watched, "the monitor")
     return check_number("the monitor's threshold", monitor.threshold)
 

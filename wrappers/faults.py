@@ -8,6 +8,7 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
+from asm_gym.checks import shown
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import Fault
 
@@ -34,11 +35,11 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         inner = env.unwrapped
         if not isinstance(inner, RobosuiteEnv):
             raise TypeError(f"faults are injected into robosuite environments of asm_gym, got {inner}")
-        if isinstance(faults, Fault):
-            raise TypeError(f"faults must be a sequence, got one fault: [{faults}]")
+        if not isinstance(faults, Sequence):
+            raise TypeError(f"faults must be a sequence, got {shown(faults)}")
         for fault in faults:
             if not isinstance(fault, Fault):
-                raise TypeError(f"faults must be asm_gym.faults.Fault objects, got {fault!r}")
+                raise TypeError(f"faults must be asm_gym.faults.Fault objects, got {shown(fault)}")
             fault.check(inner)
             if fault.onset >= inner.horizon:
                 raise ValueError(f"{fault} starts at or after the horizon of {inner.horizon} steps")

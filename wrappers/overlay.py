@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_number, shown
 from asm_gym.evaluation.overlay import StripChart, compose
 
 
@@ -40,10 +41,12 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 f'SurpriseOverlay draws on pictures and needs render_mode="rgb_array", got {env.render_mode!r}: '
                 'make the environment with gym.make(..., render_mode="rgb_array")'
             )
-        if not seconds > 0:
-            raise ValueError(f"seconds must be > 0, got {seconds}")
+        if not isinstance(caption, str):
+            raise ValueError(f"caption must be a text, got {shown(caption)}")
         self.caption = caption
-        self._seconds = seconds
+        self._seconds = check_number("seconds", seconds, above=0, high=3600)
+        if chart_height is not None:
+            check_number("chart_height", chart_height, low=1, high=4096, whole=True)
         self._chart_height = chart_height
         self._dt = _control_period(env)
         self._chart: StripChart | None = None  # made at the first picture, whose width it needs

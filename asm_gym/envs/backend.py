@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_text, shown
 from asm_gym.choices import check_choice
 from asm_gym.extras import require
 from asm_gym.stream import Channel
@@ -58,11 +59,13 @@ def robots_for(task: TaskSpec, robot: str | Sequence[str] | None) -> tuple[str, 
     Raises:
         ValueError: an unknown robot, or the wrong number of them.
     """
+    if robot is not None and not isinstance(robot, Sequence):
+        raise ValueError(f"robot must be a name or a sequence of names, got {shown(robot)}")
     names = (
         ("Panda",) * task.arms if robot is None else (robot,) * task.arms if isinstance(robot, str) else tuple(robot)
     )
     for name in names:
-        check_choice("robot", name, ROBOTS)
+        check_choice("robot", check_text("robot", name), ROBOTS)
     if len(names) != task.arms:
         raise ValueError(f"{task.name} takes {task.arms} robot{'s' * (task.arms > 1)}, got {', '.join(names)}")
     return names
@@ -81,22 +84,29 @@ def make(
         ValueError: an unknown controller.
     """
     robosuite = import_robosuite()
+    if not isinstance(controller, str | dict):
+        raise ValueError(f"controller must be a name or a configuration, got {shown(controller)}")
     if isinstance(controller, str):
         check_choice("controller", controller, CONTROLLERS)
     unknown = [robot for robot in robots if robot not in IK_ROBOTS]
     if unknown and (controller == "IK_POSE" or (isinstance(controller, dict) and controller.get("type") == "IK_POSE")):
         raise ValueError(f"IK_POSE is for {', '.join(IK_ROBOTS)}, and not for {unknown[0]}")
-    return robosuite.make(
-        task.name,
-        robots=list(robots),
-        controller_configs=None if controller == "OSC_POSE" else [_configuration(controller, r) for r in robots],
-        has_renderer=False,
-        has_offscreen_renderer=False,
-        use_camera_obs=False,
-        control_freq=control_freq,
-        reward_shaping=reward_shaping,
-        ignore_done=True,
-    )
+    try:
+        return robosuite.make(
+            task.name,
+            robots=list(robots),
+            controller_configs=None if controller == "OSC_POSE" else [_configuration(controller, r) for r in robots],
+            has_renderer=False,
+            has_offscreen_renderer=False,
+            use_camera_obs=False,
+            control_freq=control_freq,
+            reward_shaping=reward_shaping,
+            ignore_done=True,
+        )
+    except Exception as error:
+        if isinstance(controller, str):
+            raise
+        raise ValueError(f"controller: robosuite cannot use {shown(controller)}: {error!r}") from error
 
 
 def _configuration(controller: str | dict[str, Any], robot: str) -> dict[str, Any]:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 Change = Callable[[Any], Any]
 
 
-class Hold:
-    """One party's change of one entry; made by ``SimulatorEdits.hold``."""
+class Edit:
+    """One party's change of one entry; made by ``SimulatorEdits.edit``."""
 
     def __init__(self, entry: _Entry) -> None:
         self._entry = entry
@@ -29,23 +29,23 @@ class Hold:
 
 
 class _Entry:
-    """A number, or a row of them, that somebody holds."""
+    """A number, or a row of them, that somebody edits."""
 
     def __init__(self, array: NDArray[Any], index: Any, forget: Callable[[], None]) -> None:
         self._array, self._index, self._forget = array, index, forget
         self._nominal = np.copy(array[index])
-        self.holds: list[Hold] = []
+        self.edits: list[Edit] = []
 
     def write(self) -> None:
         value = np.copy(self._nominal)
-        for hold in self.holds:
-            value = hold._change(value)
+        for edit in self.edits:
+            value = edit._change(value)
         self._array[self._index] = value
 
-    def leave(self, hold: Hold) -> None:
-        self.holds.remove(hold)
+    def leave(self, edit: Edit) -> None:
+        self.edits.remove(edit)
         self.write()
-        if not self.holds:
+        if not self.edits:
             self._forget()
 
 
@@ -59,7 +59,7 @@ class SimulatorEdits:
     def __init__(self) -> None:
         self._entries: dict[tuple[int, str], _Entry] = {}
 
-    def hold(self, array: NDArray[Any], index: Any) -> Hold:
+    def edit(self, array: NDArray[Any], index: Any) -> Edit:
         """A place in the queue of those who change ``array[index]``.
 
         Args:
@@ -69,9 +69,9 @@ class SimulatorEdits:
         if key not in self._entries:
             self._entries[key] = _Entry(array, index, lambda: self._entries.__delitem__(key))
         entry = self._entries[key]
-        hold = Hold(entry)
-        entry.holds.append(hold)
-        return hold
+        edit = Edit(entry)
+        entry.edits.append(edit)
+        return edit
 
     def __len__(self) -> int:
         return len(self._entries)

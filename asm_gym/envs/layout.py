@@ -61,7 +61,8 @@ class Layout:
 
     def stream(self, row: NDArray[np.float64]) -> NDArray[np.float32]:
         """(D,) what of a row the stream carries."""
-        return row[self._to_stream].astype(np.float32)
+        with np.errstate(over="ignore"):  # what is too large becomes infinite, which ends the episode
+            return row[self._to_stream].astype(np.float32)
 
 
 def _box(size: int) -> spaces.Space[Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import gymnasium as gym
 import mujoco
@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_flag, check_number, check_numbers, check_text, shown
 from asm_gym.choices import check_choice
 from asm_gym.envs import backend
 from asm_gym.envs.cameras import RENDER_MODES, Pictures
@@ -24,6 +25,10 @@ from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.tasks import task as task_spec
 
 _BAD = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+
+
+LARGEST_PICTURE = 4096
+"""Height or width [pixels]."""
 
 
 class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
@@ -93,22 +98,26 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.robots = backend.robots_for(self.task, robot)
         check_choice("render_mode", render_mode, (None, *RENDER_MODES))
         check_choice("observation", observation, ("flat", "dict"))
+        for name, names in (("stream", stream), ("cameras", cameras)):
+            if isinstance(names, str) or not isinstance(names, Sequence):
+                raise ValueError(f"{name} must be a sequence of names, got {shown(names)}")
         for group in stream:
-            check_choice("stream group", group, (*GROUPS, *EXTRA_GROUPS))
-        if control_freq <= 0 or backend.PHYSICS_FREQ % control_freq:
+            check_choice("stream group", check_text("stream group", group), (*GROUPS, *EXTRA_GROUPS))
+        if check_number("control_freq", control_freq, low=1, whole=True) and backend.PHYSICS_FREQ % control_freq:
             raise ValueError(
                 f"control_freq must divide the physics rate of {backend.PHYSICS_FREQ} Hz, got {control_freq}"
             )
+        if stream_freq is not None:
+            check_number("stream_freq", stream_freq, low=1, whole=True)
         self._row_substeps = _row_substeps(control_freq if stream_freq is None else stream_freq, control_freq)
-        if sensor_noise < 0:
-            raise ValueError(f"sensor_noise must be >= 0, got {sensor_noise}")
-        self.horizon = self.task.horizon if horizon is None else horizon
-        if self.horizon < 1:
-            raise ValueError(f"horizon must be at least 1, got {horizon}")
+        self.horizon = self.task.horizon if horizon is None else check_number("horizon", horizon, low=1, whole=True)
+        for name, size in (("camera_size", camera_size), ("render_size", render_size)):
+            if (check_numbers(name, size, 2, low=1, high=LARGEST_PICTURE) % 1).any():
+                raise ValueError(f"{name} must be two whole numbers, got {shown(size)}")
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": control_freq}
-        self.terminate_on_success = terminate_on_success
-        self.sensor_noise = sensor_noise
+        self.terminate_on_success = check_flag("terminate_on_success", terminate_on_success)
+        self.sensor_noise = check_number("sensor_noise", sensor_noise, low=0, high=1e3)
         self.corruptions: list[Callable[[NDArray[np.float64]], None]] = []
         """Sensor faults: each edits the measured row (channels of ``measured_spec``) in place, after the noise."""
         self.deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]] = []
@@ -133,10 +142,12 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
         self.controller = controller if isinstance(controller, str) else "custom"
         """Of the arms, by name."""
-        self.robosuite_env: Any = backend.make(self.task, self.robots, controller, control_freq, reward_shaping)
+        self.robosuite_env: Any = backend.make(
+            self.task, self.robots, controller, control_freq, check_flag("reward_shaping", reward_shaping)
+        )
         """The simulator underneath."""
         for name in (camera, *cameras):
-            check_choice("camera", name, self.robosuite_env.sim.model.camera_names)
+            check_choice("camera", check_text("camera", name), self.robosuite_env.sim.model.camera_names)
         self._pictures = Pictures(render_mode, camera, render_size, cameras, camera_size, 1.0 / control_freq)
         # Episodes are given their motion by the joints alone, so the initial noise is one number for every robot.
         self._qpos_noise = self.robosuite_env.robots[0].initialization_noise["magnitude"]
@@ -144,6 +155,14 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._build_spaces()
         self.gripper_actions = _gripper_actions(self.robosuite_env.robots)
         """Which numbers of the action command grippers."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
+        """Refused: robosuite's own goes on reading the simulator that it was made from."""
+        raise TypeError(f"{self} cannot be copied: make another, by gym.make(env.spec)")
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        """Refused: a simulator has no bytes of its own."""
+        raise TypeError(f"{self} cannot be pickled: send a function that makes it, lambda: gym.make(...)")
 
     # ------------------------------------------------------------------ spaces
 
@@ -208,11 +227,13 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             ValueError: an unknown option.
         """
         self._ended = True  # until it has worked
+        if options is not None and not isinstance(options, dict):
+            raise ValueError(f"options must be a dict, got {shown(options)}")
         super().reset(seed=seed)
         noise = self._qpos_noise
         for name, value in (options or {}).items():
             check_choice("reset option", name, ("qpos_noise",))
-            noise = float(value)
+            noise = check_number(name, value, low=0, high=np.pi)
         env = self.robosuite_env
         # A hard reset makes the robots anew from their configurations, a soft one keeps them.
         for robot, configuration in zip(env.robots, env.robot_configs, strict=True):
@@ -260,7 +281,10 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._steps += 1
         reward = self._rewards(self._action)
         self._row = self.measure()
-        if unstable := self._bad_count() != self._warnings or not np.isfinite(self._row).all():
+        # As float32, for a number that is too large for the stream is infinite there.
+        with np.errstate(over="ignore"):
+            rows = [*self._rows, self._row.astype(np.float32)]
+        if unstable := self._bad_count() != self._warnings or not all(np.isfinite(row).all() for row in rows):
             # What the simulation holds now, MuJoCo's initial state as a rule, is nothing that the robot could sense.
             self._row[:] = np.nan
             reward = RewardTerms(dict.fromkeys(reward.terms, 0.0), False)

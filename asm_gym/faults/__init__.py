@@ -10,9 +10,8 @@ from asm_gym.faults.action import (
     SignFlip,
 )
 from asm_gym.faults.actuator import Backlash, GripperOpens, JointFriction, StuckJoint, WeakGripper, WeakJoint
-from asm_gym.faults.base import Fault
+from asm_gym.faults.base import FAULTS, Fault, make_fault
 from asm_gym.faults.body import CablePull, Collision, HeldByPerson, Payload, Push
-from asm_gym.faults.catalogue import FAULTS, make_fault
 from asm_gym.faults.harmless import CameraShift, Lighting, NoisySensors, ObjectFriction, ObjectMass, Touch
 from asm_gym.faults.object import Heavy, Missing, Slip, Snatch, Teleport
 from asm_gym.faults.sensor import Bias, Delay, Drift, Dropout, Freeze, FrozenEncoder, Noise, Scale, Spikes

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Apply, Fault, group_labels, listed
+from asm_gym.faults.base import LONGEST, Apply, Fault, group_labels, listed, within
 
 Action = NDArray[np.float32]
 Deliver = Callable[[Action, float, int], Action]
@@ -70,7 +70,7 @@ class ActionDelay(ActionFault):
 
     graded = False
 
-    steps: int = 4
+    steps: int = within(4, low=1, high=LONGEST)
 
     def deliver(self, axes: NDArray[np.intp]) -> Deliver:
         queue: deque[Action] = deque()
@@ -90,12 +90,7 @@ class ActionDrop(ActionFault):
         probability: of each action.
     """
 
-    probability: float = 0.5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0.0 <= self.probability <= 1.0:
-            raise ValueError(f"probability must be in [0, 1], got {self.probability}")
+    probability: float = within(0.5, low=0, high=1)
 
     def deliver(self, axes: NDArray[np.intp]) -> Deliver:
         def drop(action: Action, intensity: float, k: int) -> Action:
@@ -116,7 +111,7 @@ class ActionBias(ActionFault):
     """
 
     axis: int = 0
-    amount: float = 0.3
+    amount: float = within(0.3, low=-2, high=2)
 
     def deliver(self, axes: NDArray[np.intp]) -> Deliver:
         where = axes[self.axis]
@@ -133,7 +128,7 @@ class ActionRepeat(ActionFault):
 
     graded = False
 
-    steps: int = 5
+    steps: int = within(5, low=1, high=LONGEST)
 
     def deliver(self, axes: NDArray[np.intp]) -> Deliver:
         held: list[Action] = []
@@ -172,8 +167,8 @@ class ActionNoise(ActionFault):
         std: standard deviation of the noise, in action units.
     """
 
-    share: float = 1.0
-    std: float = 0.5
+    share: float = within(1.0, low=0, high=1)
+    std: float = within(0.5, low=0, high=2)
 
     def deliver(self, axes: NDArray[np.intp]) -> Deliver:
         def noise(action: Action, intensity: float, k: int) -> Action:
@@ -192,7 +187,7 @@ class Adversary(ActionFault):
         size: of the disturbance in each axis, in action units.
     """
 
-    size: float = 0.4
+    size: float = within(0.4, low=0, high=2)
 
     def deliver(self, axes: NDArray[np.intp]) -> Deliver:
         return lambda action, intensity, _: _with(

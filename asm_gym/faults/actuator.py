@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Apply, Fault, check_joint, group_labels, held, joint_labels, listed, model_of
+from asm_gym.faults.base import Apply, Fault, check_joint, edited, group_labels, joint_labels, listed, model_of, within
 
 _TORQUES = ("measured_torque", "commanded_torque", "external_torque", "external_torque_peak")
 _MOTION = ("joint_velocity", "joint_position")
@@ -48,16 +48,11 @@ class WeakJoint(_OnJoint):
         strength: share of the commanded torque that arrives; 0 is a dead motor.
     """
 
-    strength: float = 0.5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0.0 <= self.strength <= 1.0:
-            raise ValueError(f"strength must be in [0, 1], got {self.strength}")
+    strength: float = within(0.5, low=0, high=1)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with held(env, model_of(env).actuator_gear, (int(env.motors[self.joint]), 0)) as change:
+        with edited(env, model_of(env).actuator_gear, (int(env.motors[self.joint]), 0)) as change:
             yield lambda i: change(lambda gear: gear * (1.0 - i * (1.0 - self.strength)))
 
 
@@ -72,7 +67,7 @@ class StuckJoint(_OnJoint):
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with held(env, model_of(env).dof_frictionloss, self.dof(env)) as change:
+        with edited(env, model_of(env).dof_frictionloss, self.dof(env)) as change:
             yield lambda _: change(lambda friction: friction + 1000.0)
 
 
@@ -86,13 +81,13 @@ class JointFriction(_OnJoint):
         viscous: friction that grows with speed [N m s/rad].
     """
 
-    newton_metres: float = 4.0
-    viscous: float = 2.0
+    newton_metres: float = within(4.0, low=0, high=1e4)
+    viscous: float = within(2.0, low=0, high=1e4)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
         model, dof = model_of(env), self.dof(env)
-        with held(env, model.dof_frictionloss, dof) as dry, held(env, model.dof_damping, dof) as wet:
+        with edited(env, model.dof_frictionloss, dof) as dry, edited(env, model.dof_damping, dof) as wet:
 
             def apply(i: float) -> None:
                 dry(lambda friction: friction + i * self.newton_metres)
@@ -110,7 +105,7 @@ class Backlash(_OnJoint):
         gap: half the play [rad].
     """
 
-    gap: float = 0.02
+    gap: float = within(0.02, low=0, high=3.2)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
@@ -177,12 +172,7 @@ class WeakGripper(_OnGripper):
         strength: the share that is left.
     """
 
-    strength: float = 0.2
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0.0 <= self.strength <= 1.0:
-            raise ValueError(f"strength must be in [0, 1], got {self.strength}")
+    strength: float = within(0.2, low=0, high=1)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
@@ -193,7 +183,7 @@ class WeakGripper(_OnGripper):
             for arm in robot.arms
             for m in robot._ref_joint_gripper_actuator_indexes[arm] or ()
         ]
-        with held(env, model.actuator_gainprm, *motors) as gain, held(env, model.actuator_biasprm, *motors) as bias:
+        with edited(env, model.actuator_gainprm, *motors) as gain, edited(env, model.actuator_biasprm, *motors) as bias:
 
             def apply(i: float) -> None:
                 left = 1.0 - i * (1.0 - self.strength)

@@ -3,22 +3,43 @@
 from __future__ import annotations
 
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from dataclasses import Field, dataclass, field, fields
+from typing import Any, ClassVar, cast
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_number, check_numbers, check_text, shown
+from asm_gym.choices import check_choice
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 
 SHAPES = ("constant", "pulse", "ramp", "periodic", "random_walk")
 
+Vector3 = tuple[float, float, float]
+"""In the world's axes."""
+
 Apply = Callable[[float], None]
 """Gives a fault an intensity in [0, 1] for the next control step."""
+
+
+FAULTS: dict[str, type[Fault]] = {}
+"""Every fault and harmless variation by its name in lower case; a class of yours is added where it is defined."""
+
+MOST = 1e9
+"""No parameter is larger, so that nothing overflows."""
+
+LONGEST = 10_000
+"""Control steps that something may be late by."""
+
+
+def within(default: Any, *, low: float | None = None, high: float | None = None, above: float | None = None) -> Any:
+    """A parameter of a fault, and its bounds."""
+    return field(default=default, metadata={"low": low, "high": high, "above": above})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,34 +57,29 @@ class Fault(ABC):
             with it and one without have the same sensor noise.
     """
 
-    onset: int = 40
-    duration: int | None = None
+    onset: int = within(40, low=0)
+    duration: int | None = within(None, low=1)
     shape: str = "constant"
-    period: int = 20
-    seed: int = 0
+    period: int = within(20, low=1)
+    seed: int = within(0, low=0, high=2**63)
 
     graded: ClassVar[bool] = True
     """Whether there is a little of it; what is all or nothing takes the shape ``constant`` alone."""
     harmless: ClassVar[bool] = False
     """A variation that should raise no alarm."""
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Every fault that can be made has a name: ``weak_joint`` is ``WeakJoint``."""
+        super().__init_subclass__(**kwargs)
+        # The list of abstract methods is not there yet.
+        abstract = any(getattr(getattr(cls, n, None), "__isabstractmethod__", False) for n in dir(cls))
+        if not abstract and not cls.__name__.startswith("_"):
+            FAULTS[re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()] = cls
+
     def __post_init__(self) -> None:
-        for name in ("onset", "duration", "joint", "period", "steps", "axis", "seed"):
-            value = getattr(self, name, None)
-            if value is not None and (isinstance(value, bool) or not isinstance(value, int | np.integer)):
-                raise ValueError(f"{name} must be a whole number, got {value!r}")
-        if self.onset < 0:
-            raise ValueError(f"onset must be >= 0, got {self.onset}")
-        for name in ("duration", "period", "steps"):
-            value = getattr(self, name, None)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.type == "float" and not (isinstance(value, int | float | np.number) and math.isfinite(value)):
-                raise ValueError(f"{field.name} must be a finite number, got {value!r}")
-        if self.shape not in SHAPES:
-            raise ValueError(f"unknown shape {self.shape!r}; known: {', '.join(SHAPES)}")
+        for parameter in fields(self):
+            _check(parameter, getattr(self, parameter.name))
+        check_choice("shape", self.shape, SHAPES)
         if self.shape != "constant" and not self.graded:
             raise ValueError(f"{self.name} is all or nothing: its shape must be 'constant', got {self.shape!r}")
         if self.shape == "pulse" and self.duration is None:
@@ -119,6 +135,49 @@ class Fault(ABC):
                 k += 1
 
 
+def make_fault(name: str, **parameters: Any) -> Fault:
+    """The fault called ``name``.
+
+    Raises:
+        ValueError: an unknown name or parameter; the message lists what exists.
+    """
+    check_choice("fault", check_text("fault", name), FAULTS)
+    known = [f.name for f in fields(FAULTS[name])]
+    for parameter in parameters:
+        if parameter not in known:
+            raise ValueError(f"fault {name!r} has no parameter {parameter!r}; it has: {', '.join(known)}")
+    return FAULTS[name](**parameters)
+
+
+def _check(parameter: Field[Any], value: object) -> None:
+    """Raises ValueError unless a parameter is of its type and within its bounds."""
+    low, high, above = (parameter.metadata.get(bound) for bound in ("low", "high", "above"))
+    low = -MOST if low is None and above is None else low
+    high = MOST if high is None else high
+    if value is None and parameter.type == "int | None":
+        return
+    match parameter.type:
+        case "float":
+            check_number(parameter.name, value, low=low, high=high, above=above)
+        case "int" | "int | None":
+            check_number(parameter.name, value, low=low, high=high, whole=True)
+        case "Vector3":
+            check_numbers(parameter.name, cast(Vector3, value), 3, low=low, high=high)
+        case "str":
+            if not isinstance(value, str):
+                raise ValueError(f"{parameter.name} must be a name, got {shown(value)}")
+
+
+def along(name: str, direction: Vector3) -> NDArray[np.float64]:
+    """(3,) of length 1. Raises ValueError for a direction that is none."""
+    way = np.asarray(direction, np.float64)
+    length = float(np.linalg.norm(way))
+    if not length > 0:
+        raise ValueError(f"{name} must not be all zero, got {direction}")
+    unit: NDArray[np.float64] = way / length
+    return unit
+
+
 def model_of(env: RobosuiteEnv) -> mujoco.MjModel:
     return env.simulation.model
 
@@ -128,19 +187,19 @@ def data_of(env: RobosuiteEnv) -> mujoco.MjData:
 
 
 @contextmanager
-def held(env: RobosuiteEnv, array: NDArray[Any], *indices: Any) -> Iterator[Callable[[Callable[[Any], Any]], None]]:
+def edited(env: RobosuiteEnv, array: NDArray[Any], *indices: Any) -> Iterator[Callable[[Callable[[Any], Any]], None]]:
     """Entries of an array that are changed alike; yields the function that says how."""
-    holds = [env.edits.hold(array, index) for index in indices]
+    edits = [env.edits.edit(array, index) for index in indices]
 
     def change(rule: Callable[[Any], Any]) -> None:
-        for hold in holds:
-            hold.change(rule)
+        for edit in edits:
+            edit.change(rule)
 
     try:
         yield change
     finally:
-        for hold in holds:
-            hold.release()
+        for edit in edits:
+            edit.release()
 
 
 @contextmanager
@@ -161,11 +220,10 @@ def body_id(env: RobosuiteEnv, name: str) -> int:
         ValueError: there is none; the message lists those that exist.
     """
     model = model_of(env)
-    found: int = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
-    if found < 0:
-        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i) for i in range(1, model.nbody)]
-        raise ValueError(f"unknown body {name!r}; known bodies: {', '.join(names)}")
-    return found
+    # By a table of our own: asked for what is no string, MuJoCo ends the process.
+    bodies = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i): i for i in range(1, model.nbody)}
+    check_choice("body", check_text("body", name), bodies)
+    return bodies[name]
 
 
 def check_joint(env: RobosuiteEnv, joint: int) -> None:

@@ -11,7 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Apply, Fault, body_id, data_of, group_labels, held, listed, model_of
+from asm_gym.faults.base import (
+    Apply,
+    Fault,
+    Vector3,
+    along,
+    body_id,
+    data_of,
+    edited,
+    group_labels,
+    listed,
+    model_of,
+    within,
+)
 
 Force = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """(3,) force on a body [N] from its position [m] and velocity [m/s]."""
@@ -39,7 +51,7 @@ def _force_field(env: RobosuiteEnv, body: int, force: Force) -> Iterator[None]:
     """A force that follows the body's position and velocity, brought up to date in every physics substep."""
     model, data = model_of(env), data_of(env)
     velocity = np.zeros(6)
-    with held(env, data.xfrc_applied, (body, slice(0, 3))) as change:
+    with edited(env, data.xfrc_applied, (body, slice(0, 3))) as change:
 
         def update(_: int = 0) -> None:
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
@@ -61,17 +73,17 @@ class Push(_OnBody):
         direction: in the world's axes; its length does not matter.
     """
 
-    newtons: float = 20.0
-    direction: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    newtons: float = within(20.0, low=-1e4, high=1e4)
+    direction: Vector3 = (0.0, 1.0, 0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_direction(self.direction)
+        along("direction", self.direction)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        force = self.newtons * np.asarray(self.direction) / np.linalg.norm(self.direction)
-        with held(env, data_of(env).xfrc_applied, (body_id(env, self.body), slice(0, 3))) as change:
+        force = self.newtons * along("direction", self.direction)
+        with edited(env, data_of(env).xfrc_applied, (body_id(env, self.body), slice(0, 3))) as change:
             yield lambda i: change(lambda others: others + i * force)
 
 
@@ -85,16 +97,11 @@ class Payload(_OnBody):
     """
 
     body: str = "robot0_right_hand"
-    kilograms: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.kilograms > 0:
-            raise ValueError(f"kilograms must be > 0, got {self.kilograms}")
+    kilograms: float = within(1.0, above=0, high=1e3)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with held(env, model_of(env).body_mass, body_id(env, self.body)) as change:
+        with edited(env, model_of(env).body_mass, body_id(env, self.body)) as change:
             yield lambda i: change(lambda mass: mass + i * self.kilograms)
 
 
@@ -116,10 +123,10 @@ class Collision(_OnBody):
     graded = False
 
     body: str = "robot0_right_hand"
-    gap: float = 0.005
-    stiffness: float = 3000.0
-    damping: float = 50.0
-    newtons: float = 150.0
+    gap: float = within(0.005, low=0, high=10)
+    stiffness: float = within(3000.0, low=0, high=1e5)
+    damping: float = within(50.0, low=0, high=1e4)
+    newtons: float = within(150.0, low=0, high=1e4)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
@@ -151,9 +158,9 @@ class CablePull(_OnBody):
     """
 
     body: str = "robot0_right_hand"
-    stiffness: float = 300.0
-    slack: float = 0.01
-    newtons: float = 60.0
+    stiffness: float = within(300.0, low=0, high=1e5)
+    slack: float = within(0.01, low=0, high=10)
+    newtons: float = within(60.0, low=0, high=1e4)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
@@ -187,10 +194,10 @@ class HeldByPerson(_OnBody):
         sway: how far the person's hand moves [m], at about half a hertz.
     """
 
-    stiffness: float = 500.0
-    damping: float = 20.0
-    newtons: float = 60.0
-    sway: float = 0.02
+    stiffness: float = within(500.0, low=0, high=1e5)
+    damping: float = within(20.0, low=0, high=1e4)
+    newtons: float = within(60.0, low=0, high=1e4)
+    sway: float = within(0.02, low=0, high=10)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
@@ -213,8 +220,3 @@ class HeldByPerson(_OnBody):
 
         with _force_field(env, body, force):
             yield apply
-
-
-def _check_direction(direction: tuple[float, float, float]) -> None:
-    if len(direction) != 3 or not 0 < np.linalg.norm(direction) < np.inf:
-        raise ValueError(f"direction must be three finite numbers, not all zero, got {direction}")

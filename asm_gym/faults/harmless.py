@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Apply, Fault, held, listed, model_of
+from asm_gym.faults.base import Apply, Fault, edited, listed, model_of, within
 from asm_gym.faults.body import Push
 from asm_gym.faults.object import ObjectFault
 
@@ -50,11 +50,11 @@ class ObjectMass(ObjectFault):
 
     harmless = True
 
-    factor: float = 1.1
+    factor: float = within(1.1, above=0, high=100)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with held(env, model_of(env).body_mass, self.body_of(env)) as change:
+        with edited(env, model_of(env).body_mass, self.body_of(env)) as change:
             yield lambda i: change(lambda mass: mass * (1.0 + i * (self.factor - 1.0)))
 
 
@@ -69,12 +69,12 @@ class ObjectFriction(ObjectFault):
 
     harmless = True
 
-    factor: float = 0.9
+    factor: float = within(0.9, low=0, high=100)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
         entries = [(g, slice(0, 1)) for g in self.geoms_of(env)]
-        with held(env, model_of(env).geom_friction, *entries) as change:
+        with edited(env, model_of(env).geom_friction, *entries) as change:
             yield lambda i: change(lambda mu: mu * (1.0 + i * (self.factor - 1.0)))
 
 
@@ -99,12 +99,7 @@ class NoisySensors(_Anywhere):
         factor: what the standard deviation of their noise is multiplied by.
     """
 
-    factor: float = 2.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.factor >= 1.0:
-            raise ValueError(f"factor must be at least 1, got {self.factor}")
+    factor: float = within(2.0, low=1, high=1e3)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
@@ -131,12 +126,12 @@ class Lighting(_Anywhere):
         factor: what their light is multiplied by.
     """
 
-    factor: float = 0.7
+    factor: float = within(0.7, low=0, high=100)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
         light = model_of(env).light_diffuse
-        with held(env, light, *range(len(light))) as change:
+        with edited(env, light, *range(len(light))) as change:
             yield lambda i: change(lambda colour: colour * (1.0 + i * (self.factor - 1.0)))
 
 
@@ -148,12 +143,12 @@ class CameraShift(_Anywhere):
         metres: how far, in a direction drawn from the seed [m].
     """
 
-    metres: float = 0.01
+    metres: float = within(0.01, low=-10, high=10)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
         cameras = model_of(env).cam_pos
         direction = self.rng().standard_normal(3)
         shift = self.metres * direction / np.linalg.norm(direction)
-        with held(env, cameras, *range(len(cameras))) as change:
+        with edited(env, cameras, *range(len(cameras))) as change:
             yield lambda i: change(lambda position: position + i * shift)

@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_numbers
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Apply, Fault, data_of, group_labels, held, model_of
+from asm_gym.faults.base import Apply, Fault, Vector3, along, data_of, edited, group_labels, model_of, within
 
 _AWAY = np.array([8.0, 8.0, 0.5])  # where a missing object lies [m]
 
@@ -90,19 +91,14 @@ class Slip(ObjectFault):
         friction: the coefficient that is left.
     """
 
-    friction: float = 0.05
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.friction > 0:
-            raise ValueError(f"friction must be > 0, got {self.friction}")
+    friction: float = within(0.05, above=0, high=10)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
         model, geoms = model_of(env), self.geoms_of(env)
         entries = [(g, slice(0, 1)) for g in geoms]
         # Between two surfaces the higher friction counts, unless one has priority.
-        with held(env, model.geom_friction, *entries) as change, held(env, model.geom_priority, *geoms) as first:
+        with edited(env, model.geom_friction, *entries) as change, edited(env, model.geom_priority, *geoms) as first:
             first(lambda priority: priority + 1)
             yield lambda i: change(lambda mu: mu * (self.friction / mu) ** i)
 
@@ -117,13 +113,17 @@ class Snatch(ObjectFault):
         direction: in the world's axes; its length does not matter.
     """
 
-    newtons: float = 15.0
-    direction: tuple[float, float, float] = (0.0, 1.0, 0.3)
+    newtons: float = within(15.0, low=-1e4, high=1e4)
+    direction: Vector3 = (0.0, 1.0, 0.3)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        along("direction", self.direction)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        force = self.newtons * np.asarray(self.direction) / np.linalg.norm(self.direction)
-        with held(env, data_of(env).xfrc_applied, (self.body_of(env), slice(0, 3))) as change:
+        force = self.newtons * along("direction", self.direction)
+        with edited(env, data_of(env).xfrc_applied, (self.body_of(env), slice(0, 3))) as change:
             yield lambda i: change(lambda others: others + i * force)
 
 
@@ -138,7 +138,11 @@ class Teleport(ObjectFault):
 
     graded = False
 
-    offset: tuple[float, float, float] = (0.05, 0.05, 0.0)
+    offset: Vector3 = (0.05, 0.05, 0.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_numbers("offset", self.offset, 3, low=-10, high=10)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
@@ -170,14 +174,9 @@ class Heavy(ObjectFault):
         kilograms: by how much [kg].
     """
 
-    kilograms: float = 0.5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.kilograms > 0:
-            raise ValueError(f"kilograms must be > 0, got {self.kilograms}")
+    kilograms: float = within(0.5, above=0, high=1e3)
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with held(env, model_of(env).body_mass, self.body_of(env)) as change:
+        with edited(env, model_of(env).body_mass, self.body_of(env)) as change:
             yield lambda i: change(lambda mass: mass + i * self.kilograms)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Apply, Fault, check_joint, joint_labels, listed
+from asm_gym.faults.base import LONGEST, Apply, Fault, check_joint, joint_labels, listed, within
 
 Row = NDArray[Any]
 Act = Callable[[Row, float, int], None]
@@ -81,7 +81,7 @@ class Bias(SensorFault):
         amount: [unit of the channel].
     """
 
-    amount: float = 0.05
+    amount: float = within(0.05, low=-1e6, high=1e6)
 
     def act(self, last: Row, where: NDArray[np.intp]) -> Act:
         def change(row: Row, intensity: float, k: int) -> None:
@@ -98,7 +98,7 @@ class Drift(SensorFault):
         rate: [unit of the channel per control step].
     """
 
-    rate: float = 0.002
+    rate: float = within(0.002, low=-1e6, high=1e6)
 
     def act(self, last: Row, where: NDArray[np.intp]) -> Act:
         def change(row: Row, intensity: float, k: int) -> None:
@@ -115,7 +115,7 @@ class Scale(SensorFault):
         factor: what the reading is multiplied by.
     """
 
-    factor: float = 1.2
+    factor: float = within(1.2, low=0, high=1e3)
 
     def act(self, last: Row, where: NDArray[np.intp]) -> Act:
         def change(row: Row, intensity: float, k: int) -> None:
@@ -132,7 +132,7 @@ class Noise(SensorFault):
         std: standard deviation of what is added [unit of the channel].
     """
 
-    std: float = 0.02
+    std: float = within(0.02, low=0, high=1e6)
 
     def act(self, last: Row, where: NDArray[np.intp]) -> Act:
         def change(row: Row, intensity: float, k: int) -> None:
@@ -150,12 +150,8 @@ class Spikes(SensorFault):
         probability: of each reading.
     """
 
-    amount: float = 0.5
-    probability: float = 0.2
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_probability(self.probability)
+    amount: float = within(0.5, low=-1e6, high=1e6)
+    probability: float = within(0.2, low=0, high=1)
 
     def act(self, last: Row, where: NDArray[np.intp]) -> Act:
         def change(row: Row, intensity: float, k: int) -> None:
@@ -176,11 +172,7 @@ class Dropout(SensorFault):
 
     graded = False
 
-    probability: float = 0.3
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_probability(self.probability)
+    probability: float = within(0.3, low=0, high=1)
 
     def act(self, last: Row, where: NDArray[np.intp]) -> Act:
         def change(row: Row, intensity: float, k: int) -> None:
@@ -216,7 +208,7 @@ class Delay(SensorFault):
 
     graded = False
 
-    steps: int = 3
+    steps: int = within(3, low=1, high=LONGEST)
 
     def act(self, last: Row, where: NDArray[np.intp]) -> Act:
         # What was sensed before the onset is on its way already, and arrives first.
@@ -264,8 +256,3 @@ class FrozenEncoder(Fault):
 
     def holds(self, env: RobosuiteEnv) -> frozenset[str]:
         return self.labels(env)
-
-
-def _check_probability(probability: float) -> None:
-    if not 0.0 <= probability <= 1.0:
-        raise ValueError(f"probability must be in [0, 1], got {probability}")

@@ -1,0 +1,306 @@
+"""Hostile arguments end in one of two ways: they are fine, or refused by an error that names argument or value."""
+
+import copy
+import dataclasses
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from asm_gym.envs.robosuite_env import RobosuiteEnv
+from asm_gym.faults import FAULTS, Bias, Drift, Push, Snatch, Teleport
+from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder, SurpriseOverlay, VectorNeuralASMSafety
+from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
+
+quickly = settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
+
+NASTY = (
+    None,
+    True,
+    False,
+    0,
+    1,
+    -1,
+    3,
+    10**9,
+    -(10**9),
+    10**400,
+    0.5,
+    1e-320,
+    1e300,
+    -1e300,
+    float("nan"),
+    float("inf"),
+    -float("inf"),
+    1j,
+    "",
+    "hold",
+    "no such thing",
+    "\x00",
+    "\ud800",
+    "x" * 10_000,
+    b"robot0_link5",
+    (),
+    [],
+    {},
+    set(),
+    (0, 0, 0),
+    (0.0, 1.0, 0.0),
+    (float("nan"), 0, 0),
+    (1e300, 1e300, 1e300),
+    ("a", "b", "c"),
+    [[1], [2, 3]],
+    np.zeros(3),
+    np.full(3, np.nan),
+    np.zeros((2, 2)),
+    np.array(None),
+    np.float64(0.5),
+    np.int64(2),
+    np.bool_(True),
+    object(),
+    int,
+    lambda: None,
+)
+nasty = st.sampled_from(range(len(NASTY))).map(NASTY.__getitem__)
+
+
+def assert_fine_or_refused(make, arguments):
+    """What ``make`` returns, or None where it refuses in words of its own."""
+    try:
+        return make(**arguments)
+    except (ValueError, TypeError) as error:
+        said = str(error)
+        words = [name.removesuffix("s") for name in arguments]
+        shown = [repr(value)[:20] for value in arguments.values()]
+        assert any(w in said or w.replace("_", " ") in said for w in words) or any(s in said for s in shown), said
+        return None
+
+
+@quickly
+@given(data=st.data())
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_described_well_or_refused(name, data):
+    field = data.draw(st.sampled_from([f.name for f in dataclasses.fields(FAULTS[name])]))
+    fault = assert_fine_or_refused(FAULTS[name], {field: data.draw(nasty)})
+    if fault is not None:
+        assert 0.0 <= fault.intensity(0) <= 1.0
+        fault.rng().random()
+
+
+@pytest.fixture(scope="module")
+def stack():
+    env = gym.make("asm_gym/Stack-v0", horizon=200)
+    yield env
+    env.close()
+
+
+@settings(quickly, max_examples=60)
+@given(data=st.data())
+def test_a_fault_that_is_accepted_runs_and_leaves_nothing_behind(stack, data):
+    kind = FAULTS[data.draw(st.sampled_from(sorted(FAULTS)))]
+    field = data.draw(st.sampled_from([f.name for f in dataclasses.fields(kind) if f.name != "onset"]))
+    fault = assert_fine_or_refused(kind, {field: data.draw(nasty), "onset": 1})
+    env = fault and assert_fine_or_refused(
+        lambda **more: FaultInjection(stack, [fault]), {field: None, kind.__name__: 1}
+    )
+    if not env:
+        return
+    env.reset(seed=0)
+    info = {}
+    for _ in range(3):
+        _, _, _, truncated, info = env.step(np.zeros(7, np.float32))
+        if truncated:
+            break
+    assert info["unstable"] or np.isfinite(info["stream"]).all()
+    env.undo_faults()
+    inner = stack.unwrapped
+    assert (len(inner.edits), inner.corruptions, inner.deliveries, inner.substep_hooks) == (0, [], [], [])
+
+
+WRAPPERS = {
+    "safety": (lambda **more: NeuralASMSafety(FakeEnv(), **({"monitor": CueMonitor()} | more)), (
+        "monitor", "on_alarm", "release_after", "release_below", "max_override", "try_after", "truncate",
+        "learning_rate", "monitor_freq", "on_overrun",
+    )),
+    "many": (lambda **more: VectorNeuralASMSafety(
+        gym.vector.SyncVectorEnv([FakeEnv]), **({"monitor": FadingMonitor()} | more)
+    ), ("monitor", "on_alarm", "release_after", "release_below", "max_override", "try_after", "truncate")),
+    "overlay": (
+        lambda **more: SurpriseOverlay(NeuralASMSafety(FakeEnv(), CueMonitor()), **more),
+        ("caption", "seconds", "chart_height"),
+    ),
+}  # fmt: skip
+
+
+@settings(quickly, max_examples=80)
+@given(data=st.data())
+@pytest.mark.parametrize(("make", "names"), WRAPPERS.values(), ids=WRAPPERS)
+def test_a_wrapper_is_made_or_refused(make, names, data):
+    name = data.draw(st.sampled_from(names))
+    env = assert_fine_or_refused(make, {name: data.draw(nasty)})
+    if env is not None and name != "on_alarm":
+        env.reset(seed=0)
+        env.step(np.zeros(env.action_space.shape, np.float32))
+
+
+@quickly
+@given(value=nasty)
+def test_faults_for_an_environment_are_a_sequence_of_them(lift, value):
+    assert_fine_or_refused(lambda faults: FaultInjection(lift, faults), {"faults": value})
+
+
+# Those that are checked before a simulator is made, which takes seconds.
+EARLY = (
+    "task", "robot", "render_mode", "observation", "camera_size", "render_size", "control_freq", "horizon", "stream",
+    "stream_freq", "sensor_noise", "terminate_on_success", "controller", "reward_shaping", "cameras", "camera",
+)  # fmt: skip
+
+
+@settings(quickly, max_examples=300)
+@given(data=st.data())
+def test_an_environment_is_made_or_refused(data):
+    name = data.draw(st.sampled_from(EARLY))
+
+    def checked(**arguments):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("asm_gym.envs.backend.import_robosuite", lambda: pytest.fail("made"))
+            try:
+                return RobosuiteEnv(**arguments)
+            except pytest.fail.Exception:
+                return None  # every argument that is looked at before was fine
+
+    assert_fine_or_refused(checked, {name: data.draw(nasty)})
+
+
+@quickly
+@given(value=nasty)
+def test_options_and_actions_are_taken_or_refused(lift, value):
+    inner = lift.unwrapped
+    if assert_fine_or_refused(
+        lambda qpos_noise: inner.reset(options={"qpos_noise": qpos_noise}), {"qpos_noise": value}
+    ):
+        assert np.isfinite(inner.simulation.data.qpos).all()
+    else:
+        with pytest.raises(gym.error.ResetNeeded):
+            inner.step(np.zeros(7, np.float32))
+
+
+# ---------------------------------------------------------------- each found once
+
+
+@pytest.mark.parametrize("body", [None, 5, b"robot0_link5", object(), ["robot0_link5"]])
+def test_no_body_of_any_type_ends_the_process(body):
+    with pytest.raises(ValueError, match="body"):
+        Push(body=body)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Snatch(direction=0), "direction"),
+        (lambda: Snatch(direction=(0, 0, 0)), "direction"),
+        (lambda: Teleport(offset=float("nan")), "offset"),
+        (lambda: FAULTS["scale"](factor=-1), "factor"),
+        (lambda: FAULTS["object_mass"](factor=-0.5), "factor"),
+        (lambda: FAULTS["lighting"](factor=-1), "factor"),
+        (lambda: Push(newtons=1e300), "newtons"),
+        (lambda: Push(seed=-1), "seed"),
+        (lambda: FAULTS["delay"](steps=10**9), "steps"),
+        (lambda: Push(newtons=True), "newtons"),
+        (lambda: FAULTS["noise"](std=-1), "std"),
+    ],
+)
+def test_what_breaks_the_simulator_is_refused_in_the_constructor(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"horizon": float("nan")}, "horizon"),
+        ({"horizon": True}, "horizon"),
+        ({"sensor_noise": float("nan")}, "sensor_noise"),
+        ({"reward_shaping": "no"}, "reward_shaping"),
+        ({"control_freq": True}, "control_freq"),
+        ({"task": "Door"}, "makes Lift, got task='Door'"),
+        ({"controller": {}}, "controller"),
+        ({"stream": "joint"}, "stream"),
+    ],
+)
+def test_no_number_no_flag_and_no_other_task_passes_for_one(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        gym.make("asm_gym/Lift-v0", **arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"release_after": float("nan")},
+        {"release_below": float("nan")},
+        {"max_override": float("nan")},
+        {"try_after": True},
+    ],
+)
+def test_no_patience_is_nan(arguments):
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        NeuralASMSafety(FakeEnv(), CueMonitor(), **arguments)
+
+
+def test_the_start_noise_is_a_number_and_a_failed_reset_runs_no_episode(lift):
+    lift.reset(seed=0)
+    with pytest.raises(ValueError, match="qpos_noise"):
+        lift.unwrapped.reset(options={"qpos_noise": float("nan")})
+    with pytest.raises(gym.error.ResetNeeded):
+        lift.unwrapped.step(np.zeros(7, np.float32))
+
+
+def test_a_stream_that_overflows_is_unstable(lift):
+    inner = lift.unwrapped
+    inner.reset(seed=0)
+    inner.corruptions.append(lambda row: row.__setitem__(0, 1e39))
+    try:
+        _, _, terminated, truncated, info = inner.step(np.zeros(7, np.float32))
+    finally:
+        inner.corruptions.clear()
+    assert (terminated, truncated, info["unstable"]) == (False, True, True)
+    assert np.isnan(info["stream"]).all()
+
+
+def test_the_largest_faults_that_are_accepted_end_in_a_stream_or_are_called_unstable(lift):
+    env = FaultInjection(lift, [Bias(amount=1e6, onset=0), Drift(rate=1e6, onset=0)])
+    env.reset(seed=0)
+    info = env.step(np.zeros(7, np.float32))[4]
+    assert np.isfinite(info["stream"]).all()
+    env.undo_faults()
+
+
+@pytest.mark.parametrize("how", [copy.deepcopy, pickle.dumps], ids=["copied", "pickled"])
+@pytest.mark.parametrize("wrap", [lambda e: e.unwrapped, StreamRecorder], ids=["bare", "wrapped"])
+def test_an_environment_is_neither_copied_nor_pickled_and_says_what_to_do(lift, how, wrap):
+    with pytest.raises(TypeError, match=r"cannot be (copied|pickled).*gym\.make"):
+        how(wrap(lift))
+
+
+def test_an_environment_is_made_anew_from_its_spec(lift):
+    again = gym.make(lift.spec)
+    assert again.unwrapped.task.name == "Lift"
+    again.close()
+    assert gym.make("asm_gym/Lift-v0", task="Lift").unwrapped.task.name == "Lift"
+
+
+def test_a_fault_of_ones_own_has_a_name_where_it_is_defined():
+    try:
+
+        class LooseScrew(Push):
+            """A fault."""
+
+        assert FAULTS["loose_screw"] is LooseScrew
+        assert "on_body" not in FAULTS
+        assert "sensor_fault" not in FAULTS
+        assert len(FAULTS) == 39
+    finally:
+        del FAULTS["loose_screw"]
