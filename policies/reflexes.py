@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.abilities import HasGrippers, HoldsItself, TurnsJoints
 from asm_gym.checks import check_number
-from asm_gym.envs.abilities import HasGrippers, HoldsItself, TurnsJoints
 from asm_gym.policies.base import Policy
 from asm_gym.stream import StreamSpec, control_period
 

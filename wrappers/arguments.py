@@ -7,8 +7,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 
+from asm_gym.abilities import SensesWithinSteps
 from asm_gym.checks import check_number, shown
-from asm_gym.envs.abilities import SensesWithinSteps
 from asm_gym.monitors import ExpectsActions, Monitor
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract, nearest_to_rest

@@ -10,8 +10,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
+from asm_gym.abilities import HoldsItself
 from asm_gym.checks import check_flag
-from asm_gym.envs.abilities import HoldsItself
 from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, Reflex, nearest_to_rest

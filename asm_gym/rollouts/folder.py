@@ -11,7 +11,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -30,7 +30,10 @@ NOMINAL_ROLES = ("fit", "calibration", "nominal")
 
 def versions() -> dict[str, str]:
     """Of what decides over an episode."""
-    others = {p: metadata.version(p) for p in ("robosuite", "mujoco", "gymnasium", "numpy")}
+    others = {}
+    for package in ("robosuite", "mujoco", "gymnasium", "numpy"):
+        with suppress(metadata.PackageNotFoundError):  # a light install may be without robosuite
+            others[package] = metadata.version(package)
     return {"asm_gym": asm_gym.__version__, **others}
 
 
