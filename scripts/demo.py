@@ -45,6 +45,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial, watch_pair
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
+from asm_gym.scripts.command import run
 from asm_gym.tasks import task
 
 WINDOW_S = 1.0
@@ -236,7 +237,7 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def run(args: Args, console: Console) -> list[DetectionMetrics]:
+def demonstrate(args: Args, console: Console) -> None:
     """The whole demo."""
     args = args.scaled()
     folder = args.out
@@ -285,18 +286,12 @@ def run(args: Args, console: Console) -> list[DetectionMetrics]:
         {"command": f"asm-gym demo --seed {args.seed}", **asdict(args), "observe() [µs]": latency},
     )
     console.print(f"Wrote {folder}/report.html" + (f" and {video}" if video else ""))
-    return rows
 
 
 def main(argv: list[str] | None = None) -> int:
-    try:
-        args = tyro.cli(Args, prog="asm-gym demo", args=argv)
-        run(args, Console())
-    except (ValueError, ImportError) as error:
-        print(f"asm-gym demo: {error}", file=sys.stderr)
-        return 1
-    return 0
+    """Runs the demo, and returns the exit code."""
+    return run("demo", Args, demonstrate, argv, __doc__)
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -35,7 +35,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, record
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
-from asm_gym.scripts.command import USAGE_ERRORS
+from asm_gym.scripts.command import run
 from asm_gym.tasks import task as task_spec
 
 _HARMLESS = (*HARMLESS, *EXECUTIONS)
@@ -202,19 +202,18 @@ def evaluate(args: Args, console: Console) -> BenchmarkResult:
     return result
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Runs the evaluation; 2 where the arguments make no sense."""
-    console = Console()
-    try:
-        args = tyro.cli(Args, args=argv, prog="asm-gym evaluate", description=__doc__).scaled()
-        result = evaluate(args, console)
-    except USAGE_ERRORS as error:
-        print(f"asm-gym evaluate: {error}", file=sys.stderr)
-        return 2
+def evaluate_and_report(args: Args, console: Console) -> None:
+    """Evaluates, and prints the tables in brief."""
+    args = args.scaled()
+    result = evaluate(args, console)
     for table in (brief_monitors_table(result), harmless_table(result, args.monitors[:1])):
         console.print(console_table(table))
     console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.parquet'}")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Evaluates, and returns the exit code."""
+    return run("evaluate", Args, evaluate_and_report, argv, __doc__)
 
 
 if __name__ == "__main__":

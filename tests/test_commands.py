@@ -22,20 +22,7 @@ from asm_gym.scripts import cli, command, reproduce
 ROOT = Path(__file__).resolve().parents[1]
 STUDIES = [f"reproduce {study}" for study in ("all", *reproduce.STUDIES)]
 MEASURES = [f"benchmark {what}" for what in ("env", "leaks", "experts", "memory", "fit", "safety")]
-THEIR_OWN = (
-    "demo",
-    "collect",
-    "evaluate",
-    "train",
-    "react",
-    "adopt",
-    "repertoire",
-    "train-safely",
-)  # parse for themselves
-THEIRS = ("transfer", "repertoire")
-EVERY_COMMAND = [
-    name for name in (*cli.COMMANDS, *STUDIES, *MEASURES) if name not in THEIR_OWN and name.split()[-1] not in THEIRS
-]
+EVERY_COMMAND = [*cli.COMMANDS, *STUDIES, *MEASURES]
 
 
 @dataclass(frozen=True)

@@ -175,11 +175,7 @@ def test_a_novice_is_untrained_and_hesitant():
     ],
 )
 def test_what_makes_no_sense_is_refused(arguments, message, tmp_path, capsys):
-    try:
-        code = main(["train-safely", *arguments, "--out", str(tmp_path / "out")])
-    except SystemExit as end:
-        code = end.code
-    assert code == 2
+    assert main(["train-safely", *arguments, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

@@ -239,9 +239,5 @@ def test_a_dataset_that_does_not_fit_is_refused_before_anything_is_learned(name,
     ],
 )
 def test_what_makes_no_sense_is_refused(arguments, message, tmp_path, capsys):
-    try:
-        code = main(["train", *arguments, "--out", str(tmp_path / "out")])
-    except SystemExit as end:
-        code = end.code
-    assert code == 2
+    assert main(["train", *arguments, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err

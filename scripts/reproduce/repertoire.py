@@ -29,7 +29,7 @@ from asm_gym.rollouts.benchmark import detectability_of, result_of
 from asm_gym.rollouts.folder import files_in, recorded, tasks_in
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import USAGE_ERRORS
+from asm_gym.scripts.command import run
 from asm_gym.scripts.reproduce.skill_recognition import (
     alarms_table,
     experienced,
@@ -235,19 +235,17 @@ def _write(args: Args, tables: Sequence[Table], seconds: dict[str, float]) -> No
     (args.out / "repertoire.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Runs the comparison; 2 where the arguments make no sense."""
-    console = Console()
-    try:
-        args = tyro.cli(Args, args=argv, prog="asm-gym repertoire", description=__doc__)
-        made = repertoire(args, console)
-    except USAGE_ERRORS as error:
-        print(f"asm-gym repertoire: {error}", file=sys.stderr)
-        return 2
+def compare_and_report(args: Args, console: Console) -> None:
+    """Compares, and prints the tables."""
+    made = repertoire(args, console)
     for table in made:
         console.print(console_table(table))
     console.print(f"Wrote {args.out / 'repertoire.md'} and {args.out / 'repertoire.json'}")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Compares, and returns the exit code."""
+    return run("reproduce repertoire", Args, compare_and_report, argv, __doc__)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from asm_gym.monitors import MONITORS
 from asm_gym.rollouts.benchmark import detectability_of, result_of
 from asm_gym.rollouts.folder import recorded, tasks_in
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import USAGE_ERRORS
+from asm_gym.scripts.command import run
 
 Roles = Mapping[str, Sequence[Episode]]
 
@@ -116,16 +116,10 @@ def table(found: Sequence[DetectionMetrics], args: Args) -> Table:
     )
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Compares; 2 where the arguments make no sense."""
-    console = Console()
-    try:
-        args = tyro.cli(Args, args=argv, prog="asm-gym adopt", description=__doc__)
-        with stage("fitting and judging", console, {}):
-            found = scores(args)
-    except USAGE_ERRORS as error:
-        print(f"asm-gym adopt: {error}", file=sys.stderr)
-        return 2
+def compare_and_report(args: Args, console: Console) -> None:
+    """Compares, writes the table and prints it."""
+    with stage("fitting and judging", console, {}):
+        found = scores(args)
     made = table(found, args)
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "adopt.md").write_text(markdown(made) + "\n", encoding="utf-8")
@@ -133,7 +127,11 @@ def main(argv: list[str] | None = None) -> int:
     (args.out / "adopt.json").write_text(json.dumps(content, indent=1, default=str) + "\n", encoding="utf-8")
     console.print(console_table(made))
     console.print(f"Wrote {args.out / 'adopt.md'} and {args.out / 'adopt.json'}")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Compares, and returns the exit code."""
+    return run("reproduce transfer", Args, compare_and_report, argv, __doc__)
 
 
 if __name__ == "__main__":
