@@ -49,7 +49,8 @@ def guarded(env, **more):
 
 
 def assert_stays(controller, speed, farthest, last):
-    # Critically damped at ω a joint goes v₀/(e ω) further, and motors at their limits a little more. OSC only damps, and goes on keeping its posture meanwhile.
+    # Critically damped at ω a joint goes v₀/(e ω) further, and a little more where its motor is at its limit. OSC only
+    # damps, and goes on keeping its posture meanwhile.
     assert farthest < (0.02 + 0.5 * speed if controller.startswith(FEEDBACK) else 0.005 + 0.08 * speed)
     assert last < 0.25 if controller == "OSC_POSE" else last < 0.02
 
