@@ -13,7 +13,19 @@ import tyro
 from asm_gym.scripts.cli import main
 from tests import documents
 
-PYTHON = [p for p in documents.written() if any(b.language == "python" for b in documents.blocks(p))]
+README = documents.ROOT / "README.md"
+
+
+def takes_long(page: Path) -> bool:
+    """It records robots and fits memories; README does so too, and is what people try first."""
+    return page != README and any("collect(" in b.text for b in documents.blocks(page) if b.language == "python")
+
+
+PYTHON = [
+    pytest.param(page, marks=pytest.mark.slow if takes_long(page) else (), id=documents.name(page))
+    for page in documents.written()
+    if any(block.language == "python" for block in documents.blocks(page))
+]
 SHELL = [p for p in documents.written() if any(b.language == "sh" for b in documents.blocks(p))]
 RESULTS = [p for p in documents.written() if p.parent.name == "results" and p.name != "index.md"]
 
@@ -25,7 +37,7 @@ class Parsed(Exception):  # noqa: N818 (it is no error)
     """The arguments make sense; nothing need run."""
 
 
-@pytest.mark.parametrize("page", PYTHON, ids=documents.name)
+@pytest.mark.parametrize("page", PYTHON)
 def test_the_code_of_a_page_runs_from_top_to_bottom(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {"__name__": "page"}
