@@ -10,12 +10,13 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from asm_gym.episodes import Episode
-from asm_gym.evaluation.safe_training import COUNTED, Outcome, count, counts_table, learning_figure, worth, worth_table
 from asm_gym.rollouts.training.exploration import Explorer, Gentle, until_contact
 from asm_gym.rollouts.training.learners import NOVICE_LOG_STD, make_learner, make_novice
+from asm_gym.rollouts.training.outcome import COUNTED, TrainingOutcome, count
 from asm_gym.rollouts.training.safe_run import AT_LIMIT, read_outcome
 from asm_gym.rollouts.training.violations import TorqueWatch
 from asm_gym.scripts.cli import main
+from asm_gym.scripts.reproduce.training_report import counts_table, learning_figure, worth, worth_table
 from asm_gym.stream import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from tests.fakes import CueMonitor, FakeEnv
@@ -24,7 +25,7 @@ from tests.fakes import CueMonitor, FakeEnv
 def outcome(condition="alone", seed=0, success=0.5, **counts):
     zeros = dict.fromkeys(COUNTED, (0, 0))
     curve = ((500, 0.2), (1000, success))
-    return Outcome(condition, seed, 1000, 500, **(zeros | counts), curve=curve, success=success, episodes=10)
+    return TrainingOutcome(condition, seed, 1000, 500, **(zeros | counts), curve=curve, success=success, episodes=10)
 
 
 def test_steps_and_contacts_are_counted_span_by_span():

@@ -24,7 +24,6 @@ from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode, load_episode
 from asm_gym.evaluation import figures
-from asm_gym.evaluation.safe_training import COUNTED, Outcome, counts_table, learning_figure, worth_table
 from asm_gym.evaluation.tables import Table, console_table, markdown
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.collect import collect_to
@@ -33,9 +32,11 @@ from asm_gym.rollouts.parallel import THIS_PROCESS, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.exploration import Gentle, explore, harmless
+from asm_gym.rollouts.training.outcome import COUNTED, TrainingOutcome
 from asm_gym.rollouts.training.safe_run import ALONE, CONDITIONS, Setting, outcome_file, read_outcome, run
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts import command
+from asm_gym.scripts.reproduce.training_report import counts_table, learning_figure, worth_table
 from asm_gym.tasks import task as task_spec
 
 DEMONSTRATIONS, FITTING, TESTING = 11, 12, 13
@@ -240,7 +241,7 @@ def _train_safely(args: Args, console: Console) -> list[Table]:
 
 
 def _write(
-    args: Args, outcomes: Mapping[str, Sequence[Outcome]], tables: Sequence[Table], seconds: Mapping[str, float]
+    args: Args, outcomes: Mapping[str, Sequence[TrainingOutcome]], tables: Sequence[Table], seconds: Mapping[str, float]
 ) -> None:
     (args.out / "training.md").write_text("\n\n".join(map(markdown, tables)) + "\n", encoding="utf-8")
     every = [o for runs in outcomes.values() for o in runs]

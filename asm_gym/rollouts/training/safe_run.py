@@ -21,11 +21,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor as EpisodeMonitor
 
 from asm_gym.episodes import Episode, load_episode
-from asm_gym.evaluation.safe_training import Outcome, count
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
 from asm_gym.rollouts.training.learners import export, make_novice
+from asm_gym.rollouts.training.outcome import TrainingOutcome, count
 from asm_gym.rollouts.training.run import Standard, success_rate
 from asm_gym.rollouts.training.violations import TorqueWatch
 from asm_gym.wrappers import NeuralASMSafety
@@ -125,7 +125,7 @@ def run(job: tuple[str, int], setting: Setting, memory: Path, demonstrations: Se
     flags = {name: np.array(kept) for name, kept in violations.flags.items()}
     counts = count(np.array(violations.forces), setting.force_limit, flags, setting.span)
     steps, curve = len(violations.forces), tuple(violations.curve)
-    outcome = Outcome(
+    outcome = TrainingOutcome(
         condition, seed, steps, setting.span, **counts, curve=curve, success=success, episodes=setting.final_episodes
     )
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -140,8 +140,8 @@ def outcome_file(folder: Path, job: tuple[str, int]) -> Path:
     return folder / f"{job[0]}-{job[1]}.json"
 
 
-def read_outcome(path: Path) -> Outcome:
+def read_outcome(path: Path) -> TrainingOutcome:
     """What ``run`` wrote."""
     fields = json.loads(path.read_text(encoding="utf-8"))
     lists = {k: tuple(tuple(x) if isinstance(x, list) else x for x in v) for k, v in fields.items() if type(v) is list}
-    return Outcome(**(fields | lists))
+    return TrainingOutcome(**(fields | lists))
