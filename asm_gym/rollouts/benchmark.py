@@ -33,7 +33,7 @@ def benchmark(
     rate: float,
     window_s: float,
     seed: int,
-    crew: ParallelConfig,
+    parallel: ParallelConfig,
     progress: Progress,
 ) -> BenchmarkResult:
     """Reads the recordings, and lets every monitor judge them.
@@ -44,7 +44,7 @@ def benchmark(
         rate: share of nominal episodes that may raise an alarm.
         window_s: how soon an alarm must come to count as detection [s].
         seed: of the monitors.
-        crew: who judges; each monitor is one task.
+        parallel: who judges; each monitor is one task.
     """
     progress(0, len(monitors))
     # One that is judged in two ways is fitted once.
@@ -52,7 +52,9 @@ def benchmark(
     for name in monitors:
         models.setdefault(name.removesuffix(EVIDENCE), []).append(name)
     ask = partial(_results, folder=folder.resolve(), labels=tuple(labels), rate=rate, seed=seed)
-    made = parallel_map(ask, list(models.values()), crew, lambda k, n: progress(k * len(monitors) // n, len(monitors)))
+    made = parallel_map(
+        ask, list(models.values()), parallel, lambda k, n: progress(k * len(monitors) // n, len(monitors))
+    )
     found = {name: result for results in made for name, result in results.items()}
     by_role, failed, twins = Recordings.of(labelled(folder, labels))
     return BenchmarkResult(
