@@ -26,10 +26,17 @@ def _plain(line: str) -> str:
     return "``".join(part if n % 2 else part.replace("|", r"\|") for n, part in enumerate(parts))
 
 
-def _process(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    lines[:] = literal_blocks(lines)
-
-
 def setup(app: Sphinx) -> dict[str, bool]:
-    app.connect("autodoc-process-docstring", _process, priority=400)  # before napoleon reads the sections
+    kept: dict[str, list[str]] = {}
+
+    def before(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+        lines[:] = literal_blocks(lines)
+        kept[name] = list(lines)
+
+    def after(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+        if what in ("attribute", "data", "property"):  # napoleon takes what stands before a colon for a type
+            lines[:] = kept[name]
+
+    app.connect("autodoc-process-docstring", before, priority=400)
+    app.connect("autodoc-process-docstring", after, priority=600)  # napoleon reads the sections between them
     return {"parallel_read_safe": True, "parallel_write_safe": True}
