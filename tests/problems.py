@@ -11,11 +11,10 @@ CHANGES = slice(5, 10)
 
 
 def problem(seed: int, batch: int = 3, hidden: int = 8, sensory: int = 5, scale: float = 1.0, dtype=np.float32):
-    """Random (z, mu, x, W_F, b_F, pi_z, pi_x) of an energy."""
+    """Random (z, mu, x, W_F, pi_z, pi_x) of an energy."""
     rng = np.random.default_rng(seed)
     arrays = [
-        rng.normal(size=s) * scale
-        for s in ((batch, hidden), (batch, hidden), (batch, sensory), (sensory, hidden), (sensory,))
+        rng.normal(size=s) * scale for s in ((batch, hidden), (batch, hidden), (batch, sensory), (sensory, hidden))
     ]
     pi_x = rng.uniform(0.0, 3.0, size=(batch, sensory))
     return *(a.astype(dtype) for a in arrays), 1.5, pi_x.astype(dtype)

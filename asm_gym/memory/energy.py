@@ -1,6 +1,6 @@
 """The energy that inference descends and learning lowers, and its gradient.
 
-    F = ½ Π_z ‖z - μ‖² + ½ Σ_i Π_x,i (x_i - x̂_i)²,    x̂ = W_F f(z) + b_F,    f = tanh
+    F = ½ Π_z ‖z - μ‖² + ½ Σ_i Π_x,i (x_i - x̂_i)²,    x̂ = W_F f(z),    f = tanh
     ∂F/∂z = Π_z (z - μ) - f'(z) ⊙ W_Fᵀ Π_x ε_x,        f' = 1 - f²
 
 Source: Millidge et al. 2024 (PLOS Comput Biol), with f = tanh. Everything is in units of the
@@ -72,25 +72,24 @@ def outward(a: Array, W: Array) -> Array:
     return out
 
 
-def energy(z: Array, mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: Scalar, pi_x: Array) -> Array:
+def energy(z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array) -> Array:
     """F for each of the batch: (B,).
 
     Args:
         z: (B, H) hidden state.
         mu: (B, H) what was expected of it.
-        x: (B, X) what is sensed.
-        W_F: (X, H) from hidden to sensory units.
-        b_F: (X,) bias of the sensory units.
+        x: (B, X) what is sensed and done, less what is expected of it past the state.
+        W_F: (X, H) from hidden units to these.
         pi_z: Π_z, precision of the hidden units.
         pi_x: (B, X) Π_x, precision of the sensory units; 0 where a number was not sensed.
     """
-    error = x - np.tanh(z) @ W_F.T - b_F  # (B, X)
+    error = x - np.tanh(z) @ W_F.T  # (B, X)
     total: Array = 0.5 * pi_z * np.sum((z - mu) ** 2, axis=1) + 0.5 * np.sum(pi_x * error**2, axis=1)
     return total
 
 
 @kernel
-def feedback(f: Array, x: Array, W_F: Array, b_F: Array, pi_x: Array) -> Array:
+def feedback(f: Array, x: Array, W_F: Array, pi_x: Array) -> Array:
     """W_Fᵀ Π_x ε_x (B, H) for firing rates ``f`` (B, H): what the senses ask of the hidden units.
 
     Of a single row four synapses at a time are read once, forth and back: the weights come from the second level of
@@ -103,7 +102,7 @@ def feedback(f: Array, x: Array, W_F: Array, b_F: Array, pi_x: Array) -> Array:
         np.dot(f, W_F.T, error)
         for n in range(x.shape[0]):
             for i in range(X):
-                error[n, i] = pi_x[n, i] * (x[n, i] - b_F[i] - error[n, i])
+                error[n, i] = pi_x[n, i] * (x[n, i] - error[n, i])
         np.dot(error, W_F, out)
         return out
     whole = X - X % 4
@@ -114,29 +113,27 @@ def feedback(f: Array, x: Array, W_F: Array, b_F: Array, pi_x: Array) -> Array:
             b += f[0, j] * W_F[i + 1, j]
             c += f[0, j] * W_F[i + 2, j]
             d += f[0, j] * W_F[i + 3, j]
-        a = pi_x[0, i] * (x[0, i] - b_F[i] - a)
-        b = pi_x[0, i + 1] * (x[0, i + 1] - b_F[i + 1] - b)
-        c = pi_x[0, i + 2] * (x[0, i + 2] - b_F[i + 2] - c)
-        d = pi_x[0, i + 3] * (x[0, i + 3] - b_F[i + 3] - d)
+        a = pi_x[0, i] * (x[0, i] - a)
+        b = pi_x[0, i + 1] * (x[0, i + 1] - b)
+        c = pi_x[0, i + 2] * (x[0, i + 2] - c)
+        d = pi_x[0, i + 3] * (x[0, i + 3] - d)
         for j in range(H):
             out[0, j] += a * W_F[i, j] + b * W_F[i + 1, j] + c * W_F[i + 2, j] + d * W_F[i + 3, j]
     for i in range(whole, X):
         a = np.float32(0)
         for j in range(H):
             a += f[0, j] * W_F[i, j]
-        a = pi_x[0, i] * (x[0, i] - b_F[i] - a)
+        a = pi_x[0, i] * (x[0, i] - a)
         for j in range(H):
             out[0, j] += a * W_F[i, j]
     return out
 
 
 @kernel
-def energy_gradient(
-    z: Array, mu: Array, x: Array, W_F: Array, b_F: Array, pi_z: Scalar, pi_x: Array
-) -> tuple[Array, Array]:
+def energy_gradient(z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array) -> tuple[Array, Array]:
     """∂F/∂z (B, H), and what the bend of f can add to the curvature of F at most (B,); arguments as in ``energy``."""
     f = activate(z)  # (B, H)
-    gradient = feedback(f, x, W_F, b_F, pi_x)
+    gradient = feedback(f, x, W_F, pi_x)
     bend = np.empty(z.shape[0], z.dtype)
     for n in range(z.shape[0]):
         steepest = np.float32(0)

@@ -1,24 +1,26 @@
 """Learning: every synapse changes by what its own two ends do, and by nothing else.
 
-    ΔW_H ∝ Π_z ε_z f(z_{t-1})ᵀ    ΔW_U ∝ Π_z ε_z u_tᵀ    ΔW_F ∝ Π_x ε_x f(z_t)ᵀ    ΔW_A ∝ ε_a f(h_t)ᵀ
-    ε_z = z_t - μ_t    ε_x = x_t - x̂_t    ε_a = a_t - W_A f(h_t),  h_t = μ_t without the part of the action
+    ΔW_C ∝ Π_z ε_z c_{t-1}ᵀ    ΔW_F ∝ Π_x ε_x f(z_t)ᵀ    ΔW_D ∝ Π_x ε_x [c_{t-1}, a_t, 1]ᵀ
+    ε_z = z_t - μ_t    ε_x = [x_t, a_t] - [x̂_t, â_t]
 
-Each synapse scales its step by running moments of its own change (the rule of Adam), so that stays local too. Nothing
-is propagated through time: the state is handed from step to step, the errors are not.
+z_t is where inference settles, given the senses and the action. Each synapse scales its step by running moments of its
+own change (the rule of Adam), so that stays local too. Nothing is propagated through time: the traces that are handed
+from step to step have no synapses to be taught. With Π_z large against Π_x, ε_z is the error that backpropagation
+would send to the state (Whittington and Bogacz 2017); it comes by the transpose of W_F, as inference itself does.
 
 Source: Millidge et al. 2024 (PLOS Comput Biol); Kingma and Ba 2015 for the step size.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.memory.energy import Array, activate, energy, kernel
-from asm_gym.memory.inference import Weights, expect, infer, sense
+from asm_gym.memory.inference import Weights, direct, direct_synapses, expect, infer, sense
 
 UPDATES = 50_000
 """Steps of a batch that are learned from at most: with very many episodes fewer passes over them are enough."""
@@ -127,41 +129,26 @@ def power_iteration(W: Array, v: Array) -> tuple[float, Array]:
 class Change(NamedTuple):
     """What one control step asks of each weight array (the sum of local products, averaged over the batch)."""
 
-    W_H: Array
-    W_U: Array
+    W_C: Array
     W_F: Array
-    b_F: Array  # noqa: N815
-    W_A: Array
+    W_D: Array
 
 
-def hebbian_change(
-    weights: Weights,
-    before: Array,
-    mu: Array,
-    after: Array,
-    u: Array,
-    x: Array,
-    pi_z: float,
-    pi_x: float,
-    drive: Array | None = None,
-) -> Change:
-    """The local learning rules, for states ``before`` and ``after`` (B, H) and the expected ``mu`` (B, H).
+def hebbian_change(c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: float) -> Change:
+    """The local learning rules.
 
-    ``drive`` (B, A + 1) is what ``mu`` was expected by, where that was not the commanded ``u``.
+    Args:
+        c: (B, I) the traces before.
+        u: (B, A + 1) the action, and a constant 1.
+        mu, z: (B, H) the expected state, and the inferred one.
+        error: (B, S + A) Π_x ε_x at ``z``.
+        pi_z: Π_z.
     """
-    A = u.shape[1] - 1
-    drive = u if drive is None else drive
-    error_z = pi_z * (after - mu)  # (B, H)
-    error_x = pi_x * (x - sense(after, weights.W_F, weights.b_F))  # (B, X)
-    # The motor prediction must not see the action it predicts, only the constant that came with it.
-    expected = activate(mu - drive[:, :A] @ weights.W_U[:, :A].T)  # (B, H)
-    error_a = u[:, :A] - expected @ weights.W_A.T  # (B, A)
+    motor = u.shape[1] - 1
     return Change(
-        W_H=coincidence(error_z, activate(before)),
-        W_U=coincidence(error_z, drive),
-        W_F=coincidence(error_x, activate(after)),
-        b_F=error_x.mean(axis=0),
-        W_A=coincidence(np.ascontiguousarray(error_a), expected),
+        W_C=coincidence(np.float32(pi_z) * (z - mu), c),
+        W_F=coincidence(error, activate(z)),
+        W_D=coincidence(error, np.hstack([c, u])) * direct_synapses(error.shape[1] - motor, motor),
     )
 
 
@@ -180,8 +167,7 @@ class Schedule(NamedTuple):
 class Step(NamedTuple):
     """What a control step of learning came to."""
 
-    expected: Array  # (B, H) μ_t
-    inferred: Array  # (B, H) z_t
+    expected: Array  # (B, S + A) x̂_t and â_t, before anything was read
     energy: float  # the sum over the batch
 
 
@@ -195,39 +181,32 @@ class Learner:
         for _ in range(20):
             self._norm, self._direction = power_iteration(weights.W_F, self._direction)
 
-    def step(self, before: Array, u: Array, x: Array, rate: float, drive: Array | None = None) -> Step:
+    def step(self, c: Array, u: Array, x: Array, rate: float, taken: Array | None = None) -> Step:
         """One control step of a batch.
 
         Args:
-            before: (B, H) z_{t-1}.
+            c: (B, I) the traces before.
             u: (B, A + 1) the action as commanded, and a constant 1.
             x: (B, S) what is sensed.
             rate: of the synapses.
-            drive: (B, A + 1) what is taken for the action; ``u`` where None.
+            taken: (B, A + 1) what is taken for the action in predicting the senses; ``u`` where None.
         """
         w, pi_z, pi_x = self.weights, self.schedule.prior_precision, self.schedule.sensory_precision
-        precision = np.full_like(x, pi_x)
-        drive = u if drive is None else drive
-        mu = expect(before, drive, w.W_H, w.W_U)
-        curvature = pi_z + pi_x * self._norm
-        after = infer(mu, x, w.W_F, w.b_F, pi_z, precision, curvature, self.schedule.iterations)
-        change = hebbian_change(w, before, mu, after, u, x, pi_z, pi_x, drive)
-        total = float(energy(after, mu, x, w.W_F, w.b_F, pi_z, precision).sum())
+        taken = u if taken is None else taken
+        past = direct(c, taken, w.W_D)
+        left = np.hstack([x, u[:, :-1]]) - past  # (B, S + A)
+        precision = np.full_like(left, pi_x)
+        mu = expect(c, w.W_C)
+        z = infer(mu, left, w.W_F, pi_z, precision, pi_z + pi_x * self._norm, self.schedule.iterations)
+        error = np.float32(pi_x) * (left - sense(z, w.W_F))
+        change = hebbian_change(c, taken, mu, z, error, pi_z)
+        total = float(energy(z, mu, left, w.W_F, pi_z, precision).sum())
+        expected = past + sense(mu, w.W_F)
         for name, synapse in self.synapses.items():
             synapse.learn(getattr(change, name), rate)
         # W_F moves little in a step, so one iteration keeps the norm up to date.
         self._norm, self._direction = power_iteration(w.W_F, self._direction)
-        return Step(mu, after, total)
-
-    def run(self, batch: Batch, rate: float) -> float:
-        """Learns through a batch of episodes, handing the inferred state on; the sum of all energies."""
-        z = np.zeros((batch.senses.shape[1], self.weights.W_H.shape[0]), np.float32)
-        total = 0.0
-        for x, u, n in zip(batch.senses, batch.commands, batch.active, strict=True):
-            step = self.step(z[:n], u[:n], x[:n], rate)
-            total += step.energy
-            z = step.inferred
-        return total
+        return Step(expected, total)
 
 
 def passes(trajectories: Sequence[Trajectory], schedule: Schedule) -> int:
@@ -238,26 +217,4 @@ def passes(trajectories: Sequence[Trajectory], schedule: Schedule) -> int:
 
 def largest_rate(weights: Weights, schedule: Schedule) -> float:
     """The learning rate to begin with."""
-    return schedule.learning_rate * min(1.0, REFERENCE_WIDTH / weights.W_H.shape[0])
-
-
-def learn(
-    weights: Weights,
-    trajectories: Sequence[Trajectory],
-    schedule: Schedule,
-    rng: np.random.Generator,
-    tick: Callable[[], None],
-) -> NDArray[np.float64]:
-    """Learns in place; the mean energy of each epoch. Calls ``tick`` after each, of which many data need fewer."""
-    learner = Learner(weights, schedule, rng)
-    widest = largest_rate(weights, schedule)
-    steps = sum(len(t.senses) for t in trajectories)
-    epochs = passes(trajectories, schedule)
-    curve = np.zeros(epochs)
-    for epoch in range(epochs):
-        progress = epoch / epochs
-        rate = cosine_decay(widest, progress)
-        for batch in batches(trajectories, schedule.batch_size, rng):
-            curve[epoch] += learner.run(batch, rate) / steps
-        tick()
-    return curve
+    return schedule.learning_rate * min(1.0, REFERENCE_WIDTH / weights.W_C.shape[0])

@@ -1,6 +1,6 @@
 """The network as a whole: two ways to expect, one memory.
 
-time          μ_t → z_t            what is going on: a state that carries on from step to step, and infers its skill
+time          c_t → μ_t → z_t      what is going on: traces of what was sensed and done, and the state they lead to
 association   a_t → Δ̂_t, σ_t       what each sense should do: from what came before and what the others do now
 """
 
@@ -14,21 +14,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.memory.association import TICKS, Association, learn_association, normalised_errors
-from asm_gym.memory.energy import Array
-from asm_gym.memory.inference import Weights, expect, infer, weight_shapes
-from asm_gym.memory.learning import Schedule, Trajectory, learn, passes
+from asm_gym.memory.energy import Array, activate
+from asm_gym.memory.inference import Weights, direct, expect, infer, sense, weight_shapes
+from asm_gym.memory.learning import Schedule, Trajectory, passes
 from asm_gym.memory.precision import PRECISION_EPOCHS
-from asm_gym.memory.scheduled_sampling import learn_scheduled
+from asm_gym.memory.scheduled_sampling import learn
+from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
 from asm_gym.scaling import ScaledRows
 
 
 def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> Weights:
-    """Random weights of about unit gain; no biases."""
+    """Random weights of about unit gain into the state, faint ones out of it; none past it, and traces as they are."""
     weights = {n: np.zeros(shape, np.float32) for n, shape in weight_shapes(hidden, sensory, motor).items()}
-    for name in ("W_H", "W_U", "W_F", "W_A"):
+    for name, gain in (("W_C", 1.0), ("W_F", 0.1)):
         W = weights[name]
-        W[:] = rng.standard_normal(W.shape) / np.sqrt(W.shape[1])
+        W[:] = gain * rng.standard_normal(W.shape) / np.sqrt(W.shape[1])
+    weights["gains"][:] = np.float32(1) - DECAYS
     return Weights(**weights)
+
+
+class Step(NamedTuple):
+    """What the network made of a row."""
+
+    mu: Array  # (B, H) the state expected before it was read
+    expected: Array  # (B, S + A) x̂_t and â_t, expected then
+    z: Array  # (B, H) the state inferred from what was read of it
+    traces: Array  # (B, I) c_t, in which what was unseen is as the rest has it
 
 
 class Network:
@@ -65,26 +76,58 @@ class Network:
 
     @property
     def hidden_size(self) -> int:
-        return self.weights.W_H.shape[0]
+        return self.weights.W_C.shape[0]
 
     def associate(self, reading: ScaledRows) -> tuple[Array, Array]:
         """(Δ_t - Δ̂_t)/σ_t (B, X), 0 where a row was not whole; and f(h_t) (B, M) of association."""
         error, units = normalised_errors(reading.inputs, reading.changes, reading.whole, *self.association)
         return error, units
 
-    def follow(self, z: Array, u: Array, x: Array, seen: Array) -> tuple[Array, Array]:
-        """μ_t, expected before the row was seen, and z_t, the state to carry on with; (B, H).
+    def at_rest(self, batch: int) -> NDArray[np.float32]:
+        """c_0 (B, I), the traces before the first row."""
+        return at_rest(batch, self.weights.W_F.shape[0] + 1)
+
+    def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
+        """A row is expected, then read, and its state inferred.
 
         Args:
-            z: (B, H) the state carried so far.
+            c: (B, I) the traces so far.
             u: (B, A + 1) the action as commanded, standardised, and a constant 1.
             x: (B, S) what was sensed, standardised.
             seen: (B, S) 1 where ``x`` is a measurement, 0 where it is to be ignored.
         """
         w = self.weights
-        mu = expect(z, u, w.W_H, w.W_U)
-        precision = self.sensory_precision * seen
-        return mu, infer(mu, x, w.W_F, w.b_F, self.prior_precision, precision, self.curvature, self.iterations)
+        mu, past = expect(c, w.W_C), direct(c, u, w.W_D)
+        precision = self.sensory_precision * np.hstack([seen, np.ones_like(u[:, :-1])])
+        left = np.hstack([x, u[:, :-1]]) - past
+        z = infer(mu, left, w.W_F, self.prior_precision, precision, self.curvature, self.iterations)
+        whole = np.where(seen > 0, x, (past + sense(z, w.W_F))[:, : x.shape[1]])
+        return Step(mu, past + sense(mu, w.W_F), z, advance(c, np.hstack([whole, u]), w.gains))
+
+    def carry_on(self, c: Array, u: Array, x: Array, seen: Array) -> tuple[Array, Array]:
+        """f(μ_t) (B, H) and c_t (B, I): what of ``follow`` is needed to watch. Only what is unseen must be inferred."""
+        if seen.all():
+            return activate(expect(c, self.weights.W_C)), advance(c, np.hstack([x, u]), self.weights.gains)
+        step = self.follow(c, u, x, seen)
+        return activate(step.mu), step.traces
+
+    def run_on(self, c: Array) -> Step:
+        """A row that is not read: the action is the network's own, and so are the senses it leads to."""
+        w = self.weights
+        S, A = w.W_F.shape[0] - self.motor, self.motor
+        mu = expect(c, w.W_C)
+        state = sense(mu, w.W_F)
+        u = np.zeros((len(c), A + 1), np.float32)
+        u[:, -1] = 1.0
+        u[:, :A] = (direct(c, u, w.W_D) + state)[:, S:]  # no synapse leads from an action to itself
+        expected = direct(c, u, w.W_D) + state
+        return Step(mu, expected, mu, advance(c, np.hstack([expected[:, :S], u]), w.gains))
+
+    @property
+    def motor(self) -> int:
+        """A."""
+        w = self.weights
+        return w.W_D.shape[1] - w.W_C.shape[1] - 1
 
 
 class Trained(NamedTuple):
@@ -123,8 +166,8 @@ def train(
     sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
     weights = initial_weights(hidden, sensory, commands - 1, rng)
     total = passes(trajectories, schedule) + TICKS + PRECISION_EPOCHS
-    how_to = learn_scheduled if schedule.free_running_probability > 0 else learn
-    energy = how_to(weights, trajectories, schedule, rng, tick)
+    weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in trajectories])
+    energy = learn(weights, trajectories, schedule, rng, tick)
     inputs = np.concatenate([t.inputs for t in trajectories])
     association = learn_association(inputs, np.ascontiguousarray(inputs[:, changes]), groups, changes, units, rng, tick)
     how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision

@@ -1,11 +1,12 @@
 """Recall: a skill is expressed from a cue, along with the senses or from memory alone.
 
-    h_t = W_H f(z_{t-1}) + b_U,   â_t = W_A f(h_t)                        the action that belongs to the state
-    online    μ_t = h_t + W_U a_t,   x̂_t = W_F f(μ_t) + b_F,   z_t inferred from the true x_t
-    offline   μ_t = h_t + W_U â_t,   x̂_t = W_F f(μ_t) + b_F,   z_t = μ_t
+    μ_t = W_C c_{t-1},   â_t = W_A f(μ_t) + D_A c_{t-1},   x̂_t = W_S f(μ_t) + D_S [c_{t-1}, a_t, 1]
+    online    a_t as commanded,   c_t takes up the true x_t, and where it is unseen what the rest of the row infers
+    offline   a_t = â_t,          c_t takes up x̂_t
 
 Offline the predictions stand in for what is not sensed. An x̂_t that is fed back is what μ_t predicts, so that its error
-is 0 and inference leaves the state where it is: z_t = μ_t is the fixed point, not a short cut.
+is 0 and inference leaves the state where it is: z_t = μ_t is the fixed point, not a short cut. (W_S, W_A are rows of
+W_F, and D_S, D_A of W_D: see ``inference``.)
 
 Sources: Tang, Barron and Bogacz 2023 (NeurIPS) for online and offline recall by temporal predictive coding; Mahajan et
 al. 2025 (Neural Computation 38(1)) for skills.
@@ -13,14 +14,14 @@ al. 2025 (Neural Computation 38(1)) for skills.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, outward
-from asm_gym.memory.inference import motor_prediction, sense
-from asm_gym.memory.network import Network
+from asm_gym.memory.energy import Array
+from asm_gym.memory.network import Network, Step
 from asm_gym.scaling import StreamScaler
 
 
@@ -29,39 +30,33 @@ class Recalled(NamedTuple):
 
     senses: Array  # (T, B, S) x̂_t, expected before x_t was sensed
     commands: Array  # (T, B, A) â_t, expected before a_t was commanded
-    hidden: Array  # (T, B, H) z_t, the state carried on
+    hidden: Array  # (T, B, H) z_t, the state inferred
+    traces: Array  # (B, I) c_T, to carry on with
 
 
-def at_rest(network: Network, batch: int) -> Array:
-    """The state (B, H) before the first row."""
-    return np.zeros((batch, network.hidden_size), np.float32)
-
-
-def follow(network: Network, z: Array, senses: Array, commands: Array) -> Recalled:
+def follow(network: Network, c: Array, senses: Array, commands: Array) -> Recalled:
     """Online recall: every row is expected, then sensed.
 
     Args:
-        z: (B, H) the state before the first row.
-        senses: (T, B, S) as a ``ScaledRows`` has them; not a number where unseen.
+        c: (B, I) the traces before the first row.
+        senses: (T, B, S) as ``ScaledRows`` have them; not a number where unseen.
         commands: (T, B, A + 1), the last one a constant 1.
     """
-    w, steps = network.weights, []
+    steps = []
     for x, u in zip(senses, commands, strict=True):
         seen = np.isfinite(x)
-        _, action = motor_prediction(z, w)
-        mu, z = network.follow(z, u, np.where(seen, x, np.float32(0)), seen.astype(np.float32))
-        steps.append((sense(mu, w.W_F, w.b_F), action, z))
-    return _stacked(steps)
+        steps.append(network.follow(c, u, np.where(seen, x, np.float32(0)), seen.astype(np.float32)))
+        c = steps[-1].traces
+    return _stacked(steps, network)
 
 
-def run_on(network: Network, z: Array, steps: int) -> Recalled:
-    """Offline recall: ``steps`` rows from the state ``z`` (B, H) on, each from what was expected of the one before."""
-    w, made = network.weights, []
+def run_on(network: Network, c: Array, steps: int) -> Recalled:
+    """Offline recall: ``steps`` rows from the traces ``c`` (B, I) on, each from what was expected of those before."""
+    made = []
     for _ in range(steps):
-        h, action = motor_prediction(z, w)
-        z = h + outward(action, np.ascontiguousarray(w.W_U[:, :-1]))
-        made.append((sense(z, w.W_F, w.b_F), action, z))
-    return _stacked(made)
+        made.append(network.run_on(c))
+        c = made[-1].traces
+    return _stacked(made, network)
 
 
 def to_rows(reader: StreamScaler, recalled: Recalled) -> NDArray[np.float64]:
@@ -83,8 +78,8 @@ def continued(
     # Every l-th row follows from those l apart: as many threads of rows, recalled side by side.
     reading = reader.read_episode(rows[len(rows) % lag :])
     senses, commands = (x.reshape(-1, lag, x.shape[1]) for x in (reading.senses, reading.commands))
-    cued = follow(network, at_rest(network, lag), senses, commands)
-    recalled = to_rows(reader, run_on(network, cued.hidden[-1], -(-steps // lag)))
+    cued = follow(network, network.at_rest(lag), senses, commands)
+    recalled = to_rows(reader, run_on(network, cued.traces, -(-steps // lag)))
     return recalled.reshape(-1, reader.spec.size)[:steps]
 
 
@@ -105,5 +100,7 @@ def check_cue(reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int) 
     return rows
 
 
-def _stacked(steps: list[tuple[Array, Array, Array]]) -> Recalled:
-    return Recalled(*(np.stack(parts) for parts in zip(*steps, strict=True)))
+def _stacked(steps: Sequence[Step], network: Network) -> Recalled:
+    expected = np.stack([s.expected for s in steps])
+    S = expected.shape[2] - network.motor
+    return Recalled(expected[:, :, :S], expected[:, :, S:], np.stack([s.z for s in steps]), steps[-1].traces)

@@ -1,10 +1,10 @@
-"""Scheduled sampling: learning to run on alone, so that a skill can be recalled when the senses are gone.
+"""Learning from streams of episodes, also to run on alone, so that a skill can be recalled when the senses are gone.
 
-    after a random cue:    z_t ← μ_t, a_t ← â_t     with a probability that rises as learning goes on
+    after a random cue:    r_t ← [x̂_t, â_t, 1]     with a probability that rises as learning goes on
 
-Every synapse changes as in ``learning``; only what is handed on from step to step differs. Where the state carried is
-always the inferred one, a memory learns to predict one step and is lost after a few without senses; where the commanded
-action is always given, it need not know what comes next.
+Every synapse changes as in ``learning``; only what the traces take up differs. Where they take up what was read at all
+times, a memory learns to predict one step and is lost after a few without senses; where the commanded action is always
+given, it need not know what comes next.
 
 Sources: Tang et al. 2023 (NeurIPS) for offline recall; Bengio et al. 2015 (NeurIPS) for learning from own predictions.
 """
@@ -13,14 +13,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.memory.energy import Array
-from asm_gym.memory.inference import Weights, motor_prediction
+from asm_gym.memory.inference import Weights, direct, expect, sense
 from asm_gym.memory.learning import Learner, Schedule, Trajectory, cosine_decay, largest_rate, passes, shuffled
+from asm_gym.memory.traces import advance, at_rest
 
 LONGEST_CUE = 30
 """An episode runs on alone after fewer steps than this."""
@@ -54,71 +55,68 @@ def one_after_another(trajectories: Sequence[Trajectory], size: int, rng: np.ran
             episode[n], step[n] = next(order)[0], 0
 
 
-class Carried(NamedTuple):
-    """What streams that are learned from carry on from step to step."""
-
-    z: Array  # (B, H)
-    alone: NDArray[np.bool_]  # (B, 1) z is the expected state
-    steps: NDArray[np.intp]  # (B, 1) since the episode began
-    cue: NDArray[np.intp]  # (B, 1) how many of them must be read
-
-    @classmethod
-    def at_rest(cls, batch: int, hidden: int) -> Self:
-        """Before the first step; a stream that begins in mid-episode counts its steps from there."""
-        none = np.zeros((batch, 1), np.intp)
-        return cls(np.zeros((batch, hidden), np.float32), none > 0, none, none + LONGEST_CUE)
-
-
 class ScheduledSampling:
     """Streams that a learner follows and runs on from, and where they are.
 
     Args:
         learner: whose synapses change.
         size: B, streams side by side.
+
+    Attributes:
+        traces: (B, I).
+        steps: (B, 1) since the episode began; a stream that begins in mid-episode counts from there.
+        cue: (B, 1) how many of them must be read.
     """
 
     def __init__(self, learner: Learner, size: int) -> None:
         self.learner = learner
-        self.carried = Carried.at_rest(size, learner.weights.W_H.shape[0])
+        sensory = learner.weights.W_F.shape[0]
+        self.traces: Array = at_rest(size, sensory + 1)
+        self.steps = np.zeros((size, 1), np.intp)
+        self.cue = np.full((size, 1), LONGEST_CUE)
 
     def run(self, moments: Iterable[Moment], rate: float, free: float) -> float:
         """Learns from the moments that come next; the sum of all energies.
 
         Args:
-            free: probability, in each step after a random cue, that a stream runs on alone: the state handed on is the
-                expected one and not the inferred one, and so is the action that comes with the next.
+            free: probability, in each step after a random cue, that a stream runs on alone: the action taken is its
+                own, and what the traces take up is what was expected.
         """
-        learner, total = self.learner, 0.0
+        learner, w, total = self.learner, self.learner.weights, 0.0
         for now in moments:
-            last = self.carried
-            z = np.where(now.begins, np.float32(0), last.z)
-            steps = np.where(now.begins, 0, last.steps) + 1
-            cue = np.where(now.begins, learner.rng.integers(1, LONGEST_CUE, steps.shape), last.cue)
-            _, action = motor_prediction(z, learner.weights)
-            taken = np.where(last.alone & ~now.begins, action, now.commands[:, :-1])
-            step = learner.step(z, now.commands, now.senses, rate, np.hstack([taken, now.commands[:, -1:]]))
+            c = np.where(now.begins, np.float32(0), self.traces)
+            self.steps = np.where(now.begins, 0, self.steps) + 1
+            self.cue = np.where(now.begins, learner.rng.integers(1, LONGEST_CUE, self.cue.shape), self.cue)
+            alone = (self.steps > self.cue) & (learner.rng.random(self.cue.shape) < free)
+            taken = now.commands
+            if alone.any():
+                S = now.senses.shape[1]
+                action = (direct(c, now.commands, w.W_D) + sense(expect(c, w.W_C), w.W_F))[:, S:]
+                taken = np.hstack([np.where(alone, action, now.commands[:, :-1]), now.commands[:, -1:]])
+            step = learner.step(c, now.commands, now.senses, rate, taken)
+            senses = np.where(alone, step.expected[:, : now.senses.shape[1]], now.senses)
+            self.traces = advance(c, np.hstack([senses, taken]), w.gains)
             total += step.energy
-            alone = (steps >= cue) & (learner.rng.random(steps.shape) < free)
-            self.carried = Carried(np.where(alone, step.expected, step.inferred), alone, steps, cue)
         return total
 
 
-def learn_scheduled(
+def learn(
     weights: Weights,
     trajectories: Sequence[Trajectory],
     schedule: Schedule,
     rng: np.random.Generator,
     tick: Callable[[], None],
 ) -> NDArray[np.float64]:
-    """Learns in place, as ``learning.learn`` does, but to run on alone; the mean energy of each epoch."""
+    """Learns in place; the mean energy of each epoch. Calls ``tick`` after each, of which many data need fewer."""
     epochs, widest = passes(trajectories, schedule), largest_rate(weights, schedule)
-    sampling = ScheduledSampling(Learner(weights, schedule, rng), schedule.batch_size)
-    streams = one_after_another(trajectories, schedule.batch_size, rng)
+    streams = ScheduledSampling(Learner(weights, schedule, rng), schedule.batch_size)
+    moments = one_after_another(trajectories, schedule.batch_size, rng)
     steps = -(-sum(len(t.senses) for t in trajectories) // schedule.batch_size)
     curve = np.zeros(epochs)
     for epoch in range(epochs):
         progress = epoch / epochs
-        rate, free = cosine_decay(widest, progress), schedule.free_running_probability * progress
-        curve[epoch] = sampling.run(islice(streams, steps), rate, free) / (steps * schedule.batch_size)
+        free = schedule.free_running_probability * min(1.0, 2 * progress)
+        energy = streams.run(islice(moments, steps), cosine_decay(widest, progress), free)
+        curve[epoch] = energy / (steps * schedule.batch_size)
         tick()
     return curve

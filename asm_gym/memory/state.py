@@ -1,7 +1,7 @@
 """What the memory carries from row to row.
 
-Association compares each row with that of l rows before, so that l rows and those before them are kept; the state of
-the temporal network is inferred anew every l rows, and carried in between. l is 1 at a control rate (``senses``).
+Association compares each row with that of l rows before, so that l rows and those before them are kept; the traces
+of the temporal network take up every l-th row. l is 1 at a control rate (``senses``).
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import activate
 from asm_gym.memory.network import Network
 from asm_gym.scaling import ScaledRows
 
@@ -21,7 +20,7 @@ Rows = NDArray[np.float64]
 class MemoryState(NamedTuple):
     """Where the memory is, one entry a stream; a value, never changed in place."""
 
-    hidden: NDArray[np.float32]  # (B, H) the inferred state z
+    traces: NDArray[np.float32]  # (B, I) c, of what was sensed and done
     expected: NDArray[np.float32]  # (B, H) f(μ), of the state that was expected then
     before: Rows  # (B, l, D) the rows seen last, the oldest first
     earlier: Rows  # (B, l, D) those before
@@ -29,10 +28,11 @@ class MemoryState(NamedTuple):
     skill: NDArray[np.float32]  # (B, K) L, what speaks for each skill; K is 0 where none has a name
 
 
-def at_start(batch: int, hidden: int, lag: int, size: int, skills: int) -> MemoryState:
+def at_start(batch: int, network: Network, lag: int, size: int, skills: int) -> MemoryState:
     """Before the first row, of ``size`` numbers."""
-    z, rows = np.zeros((batch, hidden), np.float32), np.zeros((batch, lag, size))
-    return MemoryState(z, z, rows, rows, np.zeros(batch, np.int64), np.zeros((batch, skills), np.float32))
+    state, rows = np.zeros((batch, network.hidden_size), np.float32), np.zeros((batch, lag, size))
+    named = np.zeros((batch, skills), np.float32)
+    return MemoryState(network.at_rest(batch), state, rows, rows, np.zeros(batch, np.int64), named)
 
 
 def past(state: MemoryState, rows: Rows) -> tuple[Rows, Rows]:
@@ -44,20 +44,17 @@ def past(state: MemoryState, rows: Rows) -> tuple[Rows, Rows]:
     return before, earlier
 
 
-def carry_on(
-    network: Network, state: MemoryState, reading: ScaledRows
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """z and f(μ) (B, H) after a row, which are as they were in streams whose turn it is not."""
+def carry_on(network: Network, state: MemoryState, row: ScaledRows) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """c and f(μ) after a row, which are as they were in streams whose turn it is not."""
     due = state.steps % state.before.shape[1] == 0
     if not due.any():
-        return state.hidden, state.expected
+        return state.traces, state.expected
     if due.all():
-        mu, z = network.follow(state.hidden, reading.commands, reading.senses, reading.seen)
-        return z, activate(mu)
-    hidden, expected = state.hidden.copy(), state.expected.copy()
-    mu, hidden[due] = network.follow(hidden[due], reading.commands[due], reading.senses[due], reading.seen[due])
-    expected[due] = activate(mu)
-    return hidden, expected
+        expected, traces = network.carry_on(state.traces, row.commands, row.senses, row.seen)
+        return traces, expected
+    traces, expected = state.traces.copy(), state.expected.copy()
+    expected[due], traces[due] = network.carry_on(traces[due], row.commands[due], row.senses[due], row.seen[due])
+    return traces, expected
 
 
 def newest(rows: Rows, row: Rows) -> Rows:

@@ -16,12 +16,13 @@ from asm_gym.detection.base import Arrays
 from asm_gym.episodes import Episode
 from asm_gym.memory.adaptation import followed
 from asm_gym.memory.association import Association, association_shapes, hidden_units, synapses
-from asm_gym.memory.inference import Weights, motor_prediction, weight_shapes
+from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
 from asm_gym.memory.network import Network, train
 from asm_gym.memory.readout import add_up, learn_readout, running
 from asm_gym.memory.recall import continued
+from asm_gym.memory.recurrent import RecurrentNetwork, RecurrentWeights, recurrent_shapes
 from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.model import StreamModel, skills_of
@@ -69,27 +70,31 @@ class MemoryModel(StreamModel):
         senses = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
         X, A = len(self.spec.sensory), len(self.spec.motor)
         units = self._units_each(senses) * (int(senses.groups.max()) + 1)
-        shapes = weight_shapes(self.hidden_size, senses.size, A) | association_shapes(senses.inputs, units, X)
+        older = "W_H" in learned  # saved before there were traces
+        temporal = (recurrent_shapes if older else weight_shapes)(self.hidden_size, senses.size, A)
+        shapes = temporal | association_shapes(senses.inputs, units, X)
         if skills:
             shapes |= {"W_K": (len(skills), units), "b_K": (len(skills),)}
         for name, shape in shapes.items():
             if learned[name].shape != shape:
                 raise ValueError(f"{name} should be of shape {shape}, found {learned[name].shape}")
         arrays = {name: np.ascontiguousarray(learned[name], np.float32) for name in shapes}
-        weights = Weights(**{n: arrays[n] for n in Weights._fields})
         association = Association(**{n: arrays[n] for n in Association._fields})
-        how = self.schedule
-        self.network_ = Network(weights, association, how.iterations, how.prior_precision, how.sensory_precision)
+        how = self.schedule.iterations, self.schedule.prior_precision, self.schedule.sensory_precision
+        if older:
+            self.network_ = RecurrentNetwork(RecurrentWeights(**{n: arrays[n] for n in temporal}), association, *how)
+        else:
+            self.network_ = Network(Weights(**{n: arrays[n] for n in temporal}), association, *how)
         self.senses_, self.motor_ = senses, Motor.found(learned, senses)
         return super().restore(learned, skills)
 
     def start(self, batch: int, skills: Sequence[str] = ()) -> MemoryState:
-        return at_start(batch, self.hidden_size, self.lag, self.spec.size, len(self.skills_))
+        return at_start(batch, self.network, self.lag, self.spec.size, len(self.skills_))
 
     def predict(self, state: MemoryState, rows: NDArray[np.float64]) -> tuple[MemoryState, ModelOutput]:
         before, earlier = past(state, rows)
         reading = self.senses_.read(rows, before, earlier)
-        hidden, expected = carry_on(self.network, state, reading)
+        traces, expected = carry_on(self.network, state, reading)
         error, units = self.network.associate(reading)
         if state.steps.min() < self.lag:
             error[state.steps < self.lag] = 0.0  # nothing came before, so that no change is known
@@ -97,7 +102,7 @@ class MemoryModel(StreamModel):
         if self.skills_:
             skill = add_up(skill, units, self.learned_["W_K"], self.learned_["b_K"])
         seen = newest(state.before, rows), newest(state.earlier, before), state.steps + 1
-        return MemoryState(hidden, expected, *seen, skill), ModelOutput(error, expected)
+        return MemoryState(traces, expected, *seen, skill), ModelOutput(error, expected)
 
     @property
     def network(self) -> Network:
@@ -149,7 +154,7 @@ class MemoryModel(StreamModel):
         if self.motor_ is not None:
             return self.motor_.command(situation(self.senses_, state.before[:, -1]))
         motor, senses = self.spec.motor, self.senses_
-        _, action = motor_prediction(state.hidden, self.network.weights)
+        action = self.network.run_on(state.traces).expected[:, senses.size :]
         return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
 
     def recall(self, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:

@@ -17,8 +17,9 @@ from asm_gym.episodes import Episode
 from asm_gym.memory.association import Association, association_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, initial_weights
-from asm_gym.memory.recall import Recalled, at_rest, follow, run_on, to_rows
-from asm_gym.memory.scheduled_sampling import learn_scheduled
+from asm_gym.memory.recall import Recalled, follow, run_on, to_rows
+from asm_gym.memory.scheduled_sampling import learn
+from asm_gym.memory.traces import fit_gains
 from asm_gym.monitors import CalibratedMonitor, make_monitor
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import recurrent
@@ -60,36 +61,37 @@ class Memory:
         hidden: int,
         rng: np.random.Generator,
         steps: int,
-        free_running_probability: float = 0.95,
-        iterations: int = 10,
-        rate: float = 1e-3,
+        free: float = 0.6,
+        iterations: int = 5,
+        rate: float = 3e-3,
+        prior_precision: float = 30.0,
     ) -> Memory:
         """From whole episodes, no labels.
 
         Args:
-            steps: in which its synapses change, with 32 episodes side by side.
-            free_running_probability, iterations, rate: as in ``NeuralASM``.
+            steps: in which its synapses change, with 64 episodes side by side.
+            free: ``free_running_probability`` of ``NeuralASM``, which explains the others too.
         """
         reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
         learned = trajectories(reader, episodes)
         weights = initial_weights(hidden, reader.size, len(reader.spec.motor), rng)
-        size = 32
+        weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in learned])
+        size = 64
         epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
-        schedule = Schedule(epochs, size, rate, iterations, 1.0, 1.0, free_running_probability)
-        learn_scheduled(weights, learned, schedule, rng, lambda: None)
-        return cls(reader, Network(weights, unassociated(), iterations, 1.0, 1.0))
+        learn(weights, learned, Schedule(epochs, size, rate, iterations, prior_precision, 1.0, free), rng, lambda: None)
+        return cls(reader, Network(weights, unassociated(), iterations, prior_precision, 1.0))
 
     def hidden(self, streams: Rows) -> NDArray[np.float32]:
         """The inferred states (T, B, H) of streams (T, B, D)."""
-        return follow(self.network, at_rest(self.network, streams.shape[1]), *read(self.reader, streams)).hidden
+        return follow(self.network, self.network.at_rest(streams.shape[1]), *read(self.reader, streams)).hidden
 
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = read(self.reader, streams[:cue])
-        cued = follow(self.network, at_rest(self.network, streams.shape[1]), senses, commands)
+        cued = follow(self.network, self.network.at_rest(streams.shape[1]), senses, commands)
         rows = to_rows(self.reader, cued)
         if cue == len(streams):
             return rows
-        return np.concatenate([rows, to_rows(self.reader, run_on(self.network, cued.hidden[-1], len(streams) - cue))])
+        return np.concatenate([rows, to_rows(self.reader, run_on(self.network, cued.traces, len(streams) - cue))])
 
 
 def unassociated() -> Association:
@@ -122,7 +124,7 @@ class Backpropagated:
 
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = recurrent.expected(self.network, *read(self.reader, streams), cue)
-        return to_rows(self.reader, Recalled(senses, commands, commands))
+        return to_rows(self.reader, Recalled(senses, commands, commands, commands[-1]))
 
 
 @dataclass(frozen=True)

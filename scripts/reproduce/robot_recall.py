@@ -32,7 +32,7 @@ def learned(
     """
     rng = np.random.default_rng(seed)
     models: dict[str, Expresser] = {
-        "memory": Memory.learned(train, hidden, rng, steps, free_running_probability=0.98),
+        "memory": Memory.learned(train, hidden, rng, steps),
         # Of noise from 0 to 1, a standard deviation was best here; less was better for letters.
         "gru": Backpropagated.learned(train, "gru", hidden, rng, updates, noise=1.0, rate=3e-3),
         "rnn": Backpropagated.learned(train, "rnn", hidden, rng, updates, noise=1.0, rate=3e-3),

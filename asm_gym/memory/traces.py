@@ -1,0 +1,55 @@
+"""Traces: what was sensed and done, remembered over many spans of time.
+
+    c^k_t = λ_k c^k_{t-1} + g_k r_t          r_t = [x_t, a_t, 1], standardised;  c_0 = 0
+
+λ runs from nothing, the row itself, to 0.995, half of which is left after 140 steps. A trace has no weight that is to
+be learned, so that no error has to travel back through time to teach it what to keep. g makes all of them vary alike.
+
+Sources: de Vries and Principe 1992 (Neural Networks 5(4)) for a memory of leaky integrators; Shankar and Howard 2012
+(Neural Computation 24(1)) for a spectrum of them as a timeline of the past.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.memory.energy import Array, kernel
+
+DECAYS = np.array([0.0, 0.5, 0.75, 0.875, 0.9375, 0.97, 0.985, 0.995], np.float32)
+"""λ (K,)."""
+
+FAINTEST = 1e-3
+"""Smallest spread of a trace, for one that hardly varies."""
+
+
+@kernel
+def advance(traces: Array, rows: Array, gains: Array) -> Array:
+    """c_t (B, K R) from c_{t-1} and the rows r_t (B, R)."""
+    B, R = rows.shape
+    out = np.empty_like(traces)
+    for n in range(B):
+        for k in range(len(gains)):
+            for i in range(R):
+                out[n, k * R + i] = DECAYS[k] * traces[n, k * R + i] + gains[k] * rows[n, i]
+    return out
+
+
+def at_rest(batch: int, row: int) -> NDArray[np.float32]:
+    """c_0 of rows of ``row`` numbers."""
+    return np.zeros((batch, len(DECAYS) * row), np.float32)
+
+
+def fit_gains(episodes: Sequence[Array]) -> NDArray[np.float32]:
+    """g (K,): such that each trace of these rows, (T, R) an episode, has a mean square of 1."""
+    plain = np.float32(1) - DECAYS
+    squares, count = np.zeros(len(DECAYS)), 0
+    for rows in episodes:
+        traces = at_rest(1, rows.shape[1])
+        for row in np.ascontiguousarray(rows, np.float32):
+            traces = advance(traces, row[None], plain)
+            squares += np.mean(traces.reshape(len(DECAYS), -1) ** 2, axis=1, dtype=np.float64)
+            count += 1
+    return (plain / np.maximum(np.sqrt(squares / count), FAINTEST)).astype(np.float32)
