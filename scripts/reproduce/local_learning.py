@@ -3,8 +3,8 @@
 A memory learns letters by its local rules. On the way, with the weights held still, the local change summed along a
 batch is compared with three gradients of the same network: of the energy, of the error of predicting the next row, and
 of the error of running on alone after a cue, in which each prediction leads to the next. An angle below 90° lowers what
-the gradient descends. Then the same network learns from the same letters by either, and the time and the memory of a change
-are measured, by length of the episode.
+the gradient descends. Then the same network learns from the same letters by either, and the time and the memory of a
+change are measured, by length of the episode.
 """
 
 from __future__ import annotations
