@@ -116,11 +116,12 @@ class Backpropagated:
         updates: int,
         noise: float = 0.3,
         rate: float = 1e-2,
+        truncated: bool = False,
     ) -> Backpropagated:
         """From whole episodes; the other arguments are those of ``recurrent.train``."""
         reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
         learned = trajectories(reader, episodes)
-        return cls(reader, recurrent.train(learned, cell, hidden, updates, rng, noise, rate))
+        return cls(reader, recurrent.train(learned, cell, hidden, updates, rng, noise, rate, truncated=truncated))
 
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = recurrent.expected(self.network, *read(self.reader, streams), cue)

@@ -12,6 +12,7 @@ Source: the sigma-lognormal model of Plamondon, for its form O'Reilly and Plamon
 from __future__ import annotations
 
 import math
+import string
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -23,7 +24,7 @@ from asm_gym.choices import check_choice
 from asm_gym.episodes import Episode
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 
-NAMES = "abcdefghijklmnop"
+NAMES = string.ascii_lowercase + string.ascii_uppercase[:6]
 """Of the letters; they look like none of the alphabet."""
 
 STEPS = 60

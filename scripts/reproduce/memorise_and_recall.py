@@ -1,8 +1,8 @@
 """Memorise and recall: one network learns a repertoire without labels, and expresses each skill from a cue.
 
 Repertoires of handwriting-like movements in two and three dimensions, and three robosuite skills. The temporal
-predictive coding network, learned by local rules, against a GRU and a plain RNN of the same width trained by
-backpropagation through time, a modern continuous Hopfield network, which keeps every window, and a library of movement
+predictive coding network on traces, learned by local rules, against a GRU and a plain RNN of the same width trained by
+backpropagation through time, the GRU with errors that go back one step, which is as local, a modern continuous Hopfield network, which keeps every window, and a library of movement
 primitives, which is told the skill. Online, every row is read after it was expected; offline, none after the cue.
 """
 
@@ -50,11 +50,12 @@ from asm_gym.scripts.reproduce.expression import (
 from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, copybook, repertoire
 from asm_gym.scripts.reproduce.robot_recall import RECALLED, ROBOT_CUE
 
-MODELS = ("memory", "gru", "rnn", "hopfield", "library")
+MODELS = ("memory", "gru", "rnn", "gru_one_step", "hopfield", "library")
 CALLED = {
-    "memory": "temporal predictive coding",
+    "memory": "temporal predictive coding, local",
     "gru": "GRU, BPTT",
     "rnn": "RNN, BPTT",
+    "gru_one_step": "GRU, BPTT of one step",
     "hopfield": "modern Hopfield",
     "library": "primitives, told the skill",
 }
@@ -64,15 +65,15 @@ CALLED = {
 class Args(Common):
     """Recall from a cue, against what else can recall."""
 
-    repertoires: tuple[int, ...] = (1, 2, 4, 8, 16)
+    repertoires: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
     """How many letters one network learns."""
-    widths: tuple[int, ...] = (16, 32, 64, 128)
+    widths: tuple[int, ...] = (16, 32, 64, 128, 256, 512)
     """Hidden units, for a repertoire of eight."""
     hidden: int = 64
     """Hidden units for the other repertoires."""
     robot_hidden: int = 256
     """Hidden units for the robosuite skills."""
-    cues: tuple[int, ...] = (5, 10, 20, 30)
+    cues: tuple[int, ...] = (1, 2, 5, 10, 20, 30)
     """Steps that are read before recall begins."""
     writings: int = 8
     """Writings of each letter to learn from."""
@@ -80,8 +81,8 @@ class Args(Common):
     """Episodes of each robosuite skill to learn from; 0 leaves them out."""
     steps: int = 16000
     """Steps in which the synapses of the memory change."""
-    updates: int = 400
-    """Updates of the networks trained by backpropagation through time, a batch of 16 letters each."""
+    updates: int = 1200
+    """Updates of the networks trained by backpropagation through time, by 16 letters each."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -136,6 +137,7 @@ def letters(condition: Condition, args: Args) -> list[Record]:
         "memory": Memory.learned(train, hidden, rng, args.steps),
         "gru": Backpropagated.learned(train, "gru", hidden, rng, args.updates),
         "rnn": Backpropagated.learned(train, "rnn", hidden, rng, args.updates),
+        "gru_one_step": Backpropagated.learned(train, "gru", hidden, rng, args.updates, truncated=True),
         "hopfield": Hopfield.learned(train),
         "library": Library.learned(train, told),
     }

@@ -1,5 +1,7 @@
 """The recurrent rivals of recall: a GRU and a plain RNN, trained by backpropagation through time.
 
+Truncated to one step, an error changes what that step alone did, as local as the memory's own rules are.
+
     h_t = cell(h_{t-1}, [x_{t-1}, a_{t-1}, 1])     â_t = A h_t     x̂_t = F h_t + G a_t + b       Σ ‖x - x̂‖² + ‖a - â‖²
 
 They read what the memory reads, and are asked the same: the action before it is commanded, the senses before they are
@@ -73,6 +75,7 @@ def train(
     noise: float = 0.3,
     rate: float = 1e-2,
     batch_size: int = 16,
+    truncated: bool = False,
 ) -> Recurrent:
     """A network that has learned from whole episodes.
 
@@ -80,6 +83,7 @@ def train(
         updates: batches learned from.
         noise: standard deviation of what is added to the rows it reads.
         rate: of Adam, with a cosine decay.
+        truncated: errors go back one step, and no further.
     """
     torch.set_num_threads(1)
     with torch.random.fork_rng(devices=[]):
@@ -94,11 +98,22 @@ def train(
             x, a = torch.from_numpy(batch.senses), torch.from_numpy(batch.commands[:, :, :-1])
             real = torch.from_numpy(batch.active[:, None] > np.arange(x.shape[1])).float()[:, :, None]
             rows = shifted(x, a)
-            sensed, acted, _ = network(rows + noise * torch.randn(rows.shape, generator=own), a)
+            noisy = rows + noise * torch.randn(rows.shape, generator=own)
+            sensed, acted, _ = step_by_step(network, noisy, a) if truncated else network(noisy, a)
             error = ((x - sensed) ** 2).sum(-1, keepdim=True) + ((a - acted) ** 2).sum(-1, keepdim=True)
             descend((error * real).sum() / real.sum(), optimiser, schedule)
             done += 1
     return network.eval().requires_grad_(False)
+
+
+def step_by_step(network: Recurrent, rows: Tensor, commands: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """What the network makes of all rows, with no way back from a step to the one before."""
+    state, sensed, acted = None, [], []
+    for t in range(len(rows)):
+        x, a, state = network(rows[t : t + 1], commands[t : t + 1], None if state is None else state.detach())
+        sensed.append(x)
+        acted.append(a)
+    return torch.cat(sensed), torch.cat(acted), state
 
 
 def shifted(senses: Tensor, commands: Tensor) -> Tensor:
