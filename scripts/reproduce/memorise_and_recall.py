@@ -2,8 +2,9 @@
 
 Repertoires of handwriting-like movements in two and three dimensions, and three robosuite skills. The temporal
 predictive coding network on traces, learned by local rules, against a GRU and a plain RNN of the same width trained by
-backpropagation through time, the GRU with errors that go back one step, which is as local, a modern continuous Hopfield network, which keeps every window, and a library of movement
-primitives, which is told the skill. Online, every row is read after it was expected; offline, none after the cue.
+backpropagation through time; the GRU with errors that go back one step, which is as local; a modern continuous Hopfield
+network, which keeps every window; and a library of movement primitives, which is told the skill. Online, every row is
+read after it was expected; offline, none after the cue.
 """
 
 from __future__ import annotations
@@ -226,8 +227,8 @@ def _robot(ax: Any, records: Sequence[Record]) -> None:
     for i, model in enumerate(names):
         mean, spread = np.array([over_seeds(records, "error_cm", domain=t, model=model) for t in RECALLED]).T
         colour = look(i)[0] if model != "mean" else "#999999"
-        x = np.arange(len(RECALLED)) + 0.14 * (i - 2.5)
-        ax.bar(x, mean, 0.13, yerr=spread, color=colour, error_kw={"linewidth": 1})
+        x = np.arange(len(RECALLED)) + 0.12 * (i - 3)
+        ax.bar(x, mean, 0.11, yerr=spread, color=colour, error_kw={"linewidth": 1})
     ax.set_xticks(range(len(RECALLED)), [task.replace("Place", "Place\n") for task in RECALLED])
     ax.set(ylabel="offline hand error [cm]", title="robosuite; grey: the mean")
 

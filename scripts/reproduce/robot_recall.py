@@ -36,6 +36,9 @@ def learned(
         # Of noise from 0 to 1, a standard deviation was best here; less was better for letters.
         "gru": Backpropagated.learned(train, "gru", hidden, rng, updates, noise=1.0, rate=3e-3),
         "rnn": Backpropagated.learned(train, "rnn", hidden, rng, updates, noise=1.0, rate=3e-3),
+        "gru_one_step": Backpropagated.learned(
+            train, "gru", hidden, rng, updates, noise=1.0, rate=3e-3, truncated=True
+        ),
     }
     hand = train[0].spec.slices["hand_position"]
     expressed = {name: partial(_hand, model, hand) for name, model in models.items()}
