@@ -2,7 +2,7 @@
 
     μ_t = W_H f(z_{t-1}) + W_U u_t,   x̂_t = W_F f(μ_t) + b_F,   â_t = W_A f(h_t),  h_t = W_H f(z_{t-1}) + W_U[0, 1]
 
-Its state itself is carried on; nothing learns it any more. What is carried takes the place of the traces of ``Network``.
+Its state itself is carried on, in the place of the traces of ``Network``; nothing learns it any more.
 
 Source: Millidge et al. 2024 (PLOS Comput Biol); Tang et al. 2023 (NeurIPS).
 """

@@ -52,4 +52,5 @@ def fit_gains(episodes: Sequence[Array]) -> NDArray[np.float32]:
             traces = advance(traces, row[None], plain)
             squares += np.mean(traces.reshape(len(DECAYS), -1) ** 2, axis=1, dtype=np.float64)
             count += 1
-    return (plain / np.maximum(np.sqrt(squares / count), FAINTEST)).astype(np.float32)
+    gains: NDArray[np.float32] = (plain / np.maximum(np.sqrt(squares / count), FAINTEST)).astype(np.float32)
+    return gains

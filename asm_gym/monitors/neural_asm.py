@@ -41,16 +41,16 @@ class NeuralASM(CalibratedMonitor):
         spec: the stream it watches.
         hidden_size: H, hidden units of the temporal network.
         association_size: hidden units of association, shared out among the groups of senses.
-        iterations: inference steps per control step.
+        iterations: inference steps while learning, and where a sense is missing; a row that is seen needs none.
         learning_rate: largest change of a synapse in one step, decaying to 0 along a cosine; scaled by 256 / H where H
             is larger, so that a unit's input does not change more for having more synapses.
         epochs: passes of the temporal network over the training episodes; fewer where they are very many.
         batch_size: episodes it learns from side by side.
-        prior_precision: Π_z, trust in what was expected.
+        prior_precision: Π_z, trust in what was expected; the firmer, the closer local learning is to the gradient.
         sensory_precision: Π_x, trust in what is sensed.
-        free_running_probability: reached linearly by the end of training; with it, after a random cue, the state
-            carried on while learning is the expected one rather than the inferred one, and so is the action. Above 0
-            the memory learns to run on without senses (``recall``, best at 0.95 with a learning rate of 1e-3).
+        free_running_probability: reached half-way through training; with it, after a random cue, a stream runs on
+            alone for a step: the action is the memory's own, and it goes on from what it expected. Above 0 the memory
+            learns to run on without senses (``recall``, best at 0.6).
         gains: a in (0, 1], weights of the newest step in the accumulated evidence; several, for faults that come as
             a knock and faults that creep.
         bound: ν > 0, how many standard deviations an error counts at most, so that a knock that is soon over counts
@@ -71,11 +71,11 @@ class NeuralASM(CalibratedMonitor):
         spec: StreamSpec,
         hidden_size: int = 256,
         association_size: int = 960,
-        iterations: int = 20,
+        iterations: int = 5,
         learning_rate: float = 3e-3,
         epochs: int = 40,
-        batch_size: int = 32,
-        prior_precision: float = 1.0,
+        batch_size: int = 64,
+        prior_precision: float = 30.0,
         sensory_precision: float = 1.0,
         free_running_probability: float = 0.0,
         gains: Sequence[float] = GAINS,

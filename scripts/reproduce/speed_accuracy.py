@@ -5,8 +5,8 @@ is not seen. One memory of letters is asked where the pen is on one axis, in row
 along it is read, with 1 to 200 steps of inference. The steps of this package are nearly as long as they can be and
 settle in a few; neurons integrate slowly, so steps a twentieth as long are asked for too. The error is fitted by two
 laws of the time that was taken, steps times their length: an exponential approach to a limit, as Fitts' law has it
-(n = a + b log2 1/e), and a power law. Another memory learns letters at several speeds and writes them at each: its error
-is fitted by the linear law of movements.
+(n = a + b log2 1/e), and a power law. Another memory learns letters at several speeds and writes them at each: its
+error is fitted by the linear law of movements.
 
 Sources: Fitts 1954 (J. Exp. Psychol. 47(6)); Wickelgren 1977 (Acta Psychologica 41(1)) for the approach to a limit;
 Schmidt et al. 1979 (Psychological Review 86(5)) for error = a + b speed; Akaike 1974 for the comparison.
