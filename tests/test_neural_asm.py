@@ -250,7 +250,7 @@ def tampered(asm, path, arrays=None, **header):
         ({"ceiling": lambda a: -a}, r"ceiling of evidence must be in \(0, inf\]"),
         ({"tail": lambda a: 0 * a}, r"tail of evidence must be in \(0, 1\]"),
         ({"context_quantile": lambda a: a + 1000.0}, "no error can add up to evidence"),
-        ({"W_H": lambda a: a * np.nan}, "W_H should be finite"),
+        ({"W_C": lambda a: a * np.nan}, "W_C should be finite"),
         ({"extra": lambda _: np.zeros(3)}, "declares no extra"),
     ],
 )
@@ -287,7 +287,7 @@ def test_an_interrupted_fit_leaves_the_memory_as_it_was():
     assert (asm.score(episode).value.tobytes(), learned_bytes(asm)) == (before, weights)
 
 
-@pytest.mark.parametrize("member", ["W_H.npy", "whitening.npy", "mean.npy"])
+@pytest.mark.parametrize("member", ["W_C.npy", "whitening.npy", "mean.npy"])
 def test_a_checkpoint_with_a_missing_or_misshapen_array_is_refused(asm, tmp_path, member):
     asm.save(tmp_path / "m.asm")
     rewritten(tmp_path / "m.asm", tmp_path / "missing.asm", lambda m: m.pop(member))
