@@ -68,4 +68,15 @@ def test_every_room_of_the_package_has_a_page_of_reference():
 def test_equations_in_docstrings_stay_as_they_are():
     lines = ["What it is, |x|.", "", "    y = |x| + 1", "", "Args:", "    x: a ``a|b`` number."]
     made = docstrings.literal_blocks(lines)
-    assert made == [r"What it is, \|x\|.", "", "::", "", "    y = |x| + 1", "", "Args:", "    x: a ``a|b`` number."]
+    assert made == [
+        *(r"What it is, \|x\|.", "", "::", "", "    y = |x| + 1", ""),
+        *("Args:", "    x: a ``a|b`` number.", ""),
+    ]
+
+
+def test_columns_in_docstrings_stay_as_they_are():
+    made = docstrings.literal_blocks(["The detector.", "", "value      s / |q|", "           see there", "", "So."])
+    assert made == [
+        *("The detector.", "", "::", "", "    value      s / |q|", "               see there", ""),
+        *("So.", ""),
+    ]

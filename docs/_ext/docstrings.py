@@ -3,21 +3,29 @@ bars are absolute values, not substitutions."""
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from sphinx.application import Sphinx
 
+COLUMNS = re.compile(r"\S {3,}\S")
+
 
 def literal_blocks(lines: list[str]) -> list[str]:
-    """``lines``, with ``::`` before each block that is indented below a blank line and a line that is not."""
+    """``lines``, with ``::`` before each block that is set in columns, or indented below one that is not."""
     out: list[str] = []
-    left = ""  # the last line with text
-    for n, line in enumerate(lines):
-        below_a_gap = n > 0 and not lines[n - 1].strip()
-        if line.startswith(" ") and below_a_gap and left and not left.startswith(" "):
-            out += ["::", ""]
-        out.append(line if line.startswith(" ") else _plain(line))
-        left = line if line.strip() else left
+    left = ""  # the last line before
+    for block in "\n".join(lines).strip("\n").split("\n\n"):
+        part = block.strip("\n").split("\n")
+        indented = part[0].startswith(" ")
+        if not indented and any(COLUMNS.search(line) for line in part):
+            part = ["::", "", *(f"    {line}" for line in part)]
+        elif indented and left and not left.startswith(" "):
+            part = ["::", "", *part]
+        else:
+            part = [line if line.startswith(" ") else _plain(line) for line in part]
+        left = block.strip("\n").split("\n")[-1]
+        out += [*part, ""]
     return out
 
 
