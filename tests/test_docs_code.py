@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 import subprocess
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 import tyro
 
+from asm_gym.faults import FAULTS
+from asm_gym.monitors import MONITORS
 from asm_gym.scripts.cli import main
 from tests import documents
 
@@ -37,14 +41,26 @@ class Parsed(Exception):  # noqa: N818 (it is no error)
     """The arguments make sense; nothing need run."""
 
 
+@pytest.fixture
+def registries():
+    """Faults and monitors that a page adds are gone afterwards."""
+    kept = [(registry, dict(registry)) for registry in (FAULTS, MONITORS)]
+    yield
+    for registry, before in kept:
+        registry.clear()
+        registry.update(before)
+
+
 @pytest.mark.parametrize("page", PYTHON)
+@pytest.mark.usefixtures("registries")
 def test_the_code_of_a_page_runs_from_top_to_bottom(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {"__name__": "page"}
+    module = ModuleType("page")
+    monkeypatch.setitem(sys.modules, "page", module)
     for block in documents.blocks(page):
         if block.language == "python":
-            code = compile("\n" * (block.line - 1) + block.text, str(page), "exec")  # tracebacks name the page's lines
-            exec(code, names)
+            below = "\n" * (block.line - 1) + block.text  # so that tracebacks name the lines of the page
+            exec(compile(below, str(page), "exec", dont_inherit=True), vars(module))
 
 
 def commands(script: str) -> list[str]:
