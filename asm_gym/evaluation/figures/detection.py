@@ -26,7 +26,7 @@ def roc_figure(groups: Sequence[DetectionMetrics]) -> Figure:
     faulty = _with_faults(groups)
     if not all(g.nominal for g in faulty):
         raise ValueError("a ROC curve needs nominal traces")
-    with figure(height=5.0, width=7.6) as fig:
+    with figure(height=4.6, width=8.4) as fig:
         ax = fig.subplots()
         ax.plot([0, 100], [0, 100], color="#999999", linewidth=1)
         for i, group in enumerate(faulty):
@@ -36,8 +36,10 @@ def roc_figure(groups: Sequence[DetectionMetrics]) -> Figure:
             colour, line, _ = look(i)
             x, y = np.concatenate([[0], u, [1]]), np.concatenate([[0], np.arange(u.size) + 1, [u.size]]) / u.size
             label = f"{group.name}: {1 - u.mean():.3f}"
-            ax.step(100 * x, 100 * y, where="post", color=colour, linestyle=line, linewidth=2, label=label)
-        ax.set(xlim=(0, 100), ylim=(0, 100), aspect="equal")
+            ax.step(
+                100 * x, 100 * y, where="post", color=colour, linestyle=line, linewidth=2, label=label, clip_on=False
+            )
+        ax.set(xlim=(0, 100), ylim=(0, 100), box_aspect=1)
         ax.set_xlabel("nominal episodes above [%]")
         ax.set_ylabel("faulty episodes above [%]")
         ax.grid(color="#dddddd", linewidth=0.6)
