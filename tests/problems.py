@@ -22,4 +22,5 @@ def problem(seed: int, batch: int = 3, hidden: int = 8, sensory: int = 5, scale:
 
 def some_association(rng: np.random.Generator, inputs: int, units: int, changes: int) -> Association:
     shapes = association_shapes(inputs, units, changes).values()
-    return Association(*(rng.normal(scale=0.3, size=s).astype(np.float32) for s in shapes))
+    drawn = Association(*(rng.normal(scale=0.3, size=s).astype(np.float32) for s in shapes))
+    return drawn._replace(remainder=np.exp(drawn.remainder))

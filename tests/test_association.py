@@ -11,6 +11,7 @@ from asm_gym.memory.association import (
     hidden_units,
     learn_association,
     synapses,
+    trust,
 )
 from asm_gym.memory.network import Network, initial_weights
 from asm_gym.memory.precision import LARGEST, SMALLEST, learn_precision, log_variance
@@ -46,9 +47,9 @@ def test_network_reports_the_errors_of_association_in_the_spread_that_is_expecte
     seen[1, 3] = 0
     whole = seen.min(axis=1, keepdims=True)
     found, units = network.associate(ScaledRows(x, seen, u, inputs, inputs[:, CHANGES], whole, np.ones((2, 7), bool)))
-    V, U, D, W_S, b_S = association
+    V, U, D, W_S, b_S, remainder = association
     f = np.tanh(inputs @ V.T)
-    error = inputs[:, CHANGES] - f @ U.T - inputs @ D.T
+    error = (inputs[:, CHANGES] - f @ U.T - inputs @ D.T) / remainder
     np.testing.assert_allclose(units, f, atol=1e-5)
     np.testing.assert_allclose(found, whole * error * np.exp(-0.5 * (f @ W_S.T + b_S)), atol=1e-4)
 
@@ -60,6 +61,27 @@ def test_nothing_is_predicted_from_its_own_group():
     assert np.array_equal(reaches[:, CHANGES], groups[:, None] != groups)
     assert reaches[:, :5].all()
     assert reaches[:, 10:].all()
+
+
+def test_hidden_units_are_believed_as_far_as_fresh_rows_bear_them_out():
+    rng = np.random.default_rng(4)
+    expected = rng.normal(size=(4000, 4)).astype(np.float32)
+    left = expected * np.array([1.0, 0.5, 0.0, -1.0], np.float32) + 0.1 * rng.normal(size=expected.shape)
+    np.testing.assert_allclose(trust(left, expected), [1.0, 0.5, 0.0, 0.0], atol=0.02)
+    assert np.array_equal(trust(left, np.zeros_like(expected)), np.zeros(4))
+
+
+def test_what_is_linear_is_known_exactly_and_noise_is_not_learned_by_heart():
+    rng = np.random.default_rng(5)
+    N = 400
+    cause = rng.normal(size=(N, 2))
+    delta = np.column_stack([cause, cause @ [0.6, -0.8], rng.normal(size=N)]).astype(np.float32)
+    inputs = np.hstack([delta, np.ones((N, 1), np.float32)])
+    w = learn_association(inputs, delta, np.array([0, 0, 1, 2]), slice(0, 4), 32, rng, updates=100)
+    np.testing.assert_allclose(w.D[2, :2], [0.6, -0.8], atol=1e-4)
+    assert w.remainder[2] < 2e-4  # tied to the others exactly
+    error = inputs[:, 3] - complete(hidden_units(inputs, w.V), inputs, w.U, w.D)[:, 3]
+    assert error.std() > 0.9 * delta[:, 3].std()  # tied to nothing
 
 
 def test_association_changes_are_the_gradient_of_half_the_squared_error():
@@ -94,8 +116,8 @@ def test_association_learns_what_ties_the_senses_together_and_how_sure_that_is()
     w = learn_association(inputs, delta, np.array([0, 0, 1, 1]), slice(0, 4), 32, rng)
     f = hidden_units(inputs, w.V)
     error = (delta - complete(f, inputs, w.U, w.D))[:, 2:]
-    deviation = np.exp(0.5 * log_variance(f, w.W_S, w.b_S))[:, 2:]
+    deviation = (w.remainder * np.exp(0.5 * log_variance(f, w.W_S, w.b_S)))[:, 2:]
     assert error.std() < 0.25  # 0.15 is the noise alone, 0.66 the best that a line could do
     rough = cause[:, 0] > 0.5
     calm = cause[:, 0] < -0.5
-    assert deviation[rough].mean() > 2 * deviation[calm].mean()
+    assert deviation[rough].mean() > 1.8 * deviation[calm].mean()

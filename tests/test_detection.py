@@ -20,7 +20,7 @@ from asm_gym.detection import (
     whitening,
     worst_case,
 )
-from asm_gym.detection.habituation import USUAL, habituate
+from asm_gym.detection.habituation import USUAL, Habituation, habituate, usual, usual_levels
 from asm_gym.detection.tails import TAIL_INDEX
 
 
@@ -143,6 +143,41 @@ def test_habituation_finds_the_quantile_of_each_context():
         assert below == pytest.approx(USUAL, abs=0.015)
 
 
+def levels(rng: np.random.Generator, episodes: int, told: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Contexts (100, 40) and log s (100,), of which the first number of the context tells as much as ``told``."""
+    contexts = [rng.normal(size=(100, 40)).astype(np.float32) for _ in range(episodes)]
+    return contexts, [told * c[:, 0] + rng.normal(size=100) for c in contexts]
+
+
+def test_what_a_context_tells_is_taken_from_it_and_what_it_does_not_is_left_out():
+    rng = np.random.default_rng(1)
+    helped, idle = usual_levels(*levels(rng, 90, 0.5), rng), usual_levels(*levels(rng, 6, 0.0), rng)
+    context = np.zeros((2, 40), np.float32)
+    context[1, 0] = 1.0
+    low, high = usual(helped, context)
+    assert high - low == pytest.approx(0.5, abs=0.1)
+    assert np.abs(idle.weights[:-1]).max() < 0.02
+
+
+def test_no_context_excuses_more_than_nominal_ones_did():
+    rng = np.random.default_rng(2)
+    contexts, surprises = levels(rng, 90, 2.0)
+    found = usual_levels(contexts, surprises, rng)
+    nominal = usual(found, np.concatenate(contexts))
+    wild = usual(found, 1e3 * contexts[0])
+    assert wild.min() == nominal.min()
+    assert wild.max() == nominal.max()
+    assert nominal.max() < 2.0 * 3.5 + 2.0  # the largest of so many normal numbers, and the quantile of the noise
+
+
+@pytest.mark.parametrize("episodes", [1, 2])
+def test_of_too_few_episodes_one_level_is_taken_to_be_usual_everywhere(episodes):
+    rng = np.random.default_rng(3)
+    contexts, surprises = levels(rng, episodes, 2.0)
+    found = usual_levels(contexts, surprises, rng)
+    assert np.unique(usual(found, contexts[0])) == pytest.approx([np.quantile(np.concatenate(surprises), USUAL)])
+
+
 def runs(rng: np.random.Generator, count: int, steps: int = 200) -> list[ModelOutput]:
     """Errors four times as large in one of two contexts, between which an episode goes to and fro."""
     made = []
@@ -231,10 +266,9 @@ def test_the_compiled_step_is_the_same_equations_put_together():
         plain = accumulate(plain, bounded(errors, 5.0) @ detector.whitening, context, gains)
         ratios = (strength(plain, gains) / detector.ceiling) ** detector.tail
         pooled, _ = pool(ratios.reshape(2, -1))
-        usual = np.exp(
-            np.hstack([context, plain.context]) @ detector.context_quantile[:-1] + detector.context_quantile[-1]
-        )
-        np.testing.assert_allclose(value, pooled / usual, rtol=1e-9)
+        habituated = Habituation(detector.context_quantile, detector.context_range)
+        log_usual = usual(habituated, np.hstack([context, plain.context]))
+        np.testing.assert_allclose(value, pooled / np.exp(log_usual), rtol=1e-9)
         np.testing.assert_allclose(parts.sum(axis=1), value, rtol=1e-9)
         for a, b in zip(evidence, plain, strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)

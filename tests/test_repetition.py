@@ -37,9 +37,11 @@ def test_repetitions_are_counted_after_none_and_after_one():
     np.testing.assert_allclose(np.exp(-found[:, 0]), [first, (1 + first) / (2 + 1)])
 
 
-def test_a_sense_without_noise_may_stand_still():
-    found = count_repetitions([np.random.default_rng(0).normal(size=(100, 2))], np.array([True, False]))
-    assert (found[:, 0] > 4.0).all()
+def test_a_sense_without_declared_noise_is_watched_unless_it_stood_still_before():
+    streams = [np.random.default_rng(seed).normal(size=(100, 3)) for seed in range(2)]
+    streams[1][50, 1] = streams[1][49, 1]
+    found = count_repetitions(streams, np.array([True, False, False]))
+    assert (found[:, [0, 2]] > 4.0).all()
     assert (found[:, 1] == 0.0).all()
 
 
@@ -65,13 +67,13 @@ def test_what_was_repeated_adds_up_and_fades():
 
 @pytest.fixture(scope="module")
 def asm() -> NeuralASM:
-    noisy = replace(sine_spec(), channels=tuple(replace(c, noise=0.02) for c in sine_spec().channels))
-    asm = NeuralASM(noisy, hidden_size=16, association_size=40, epochs=2)
-    return asm.fit(sine_episodes(30, spec=noisy)).calibrate(sine_episodes(30, seed=1, spec=noisy), 0.05)
+    noisy = replace(sine_spec(), channels=tuple(replace(c, noise=0.5) for c in sine_spec().channels))
+    fit, others = (sine_episodes(30, seed=seed, spec=noisy, noise=0.5) for seed in (0, 1))
+    return NeuralASM(noisy, hidden_size=16, association_size=40, epochs=2).fit(fit).calibrate(others, 0.05)
 
 
 def test_a_frozen_sense_alarms_within_three_rows_however_poor_the_prediction(asm):
-    for n, episode in enumerate(sine_episodes(12, seed=2, spec=asm.spec)):
+    for n, episode in enumerate(sine_episodes(12, seed=2, spec=asm.spec, noise=0.5)):
         surprise = asm.score(frozen(episode, n, onset=20))
         np.testing.assert_allclose(surprise.attribution.sum(axis=1), surprise.value)
         assert surprise.value[23] > asm.threshold

@@ -21,14 +21,17 @@ from asm_gym.checks import check_number
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Array, Arrays, ModelOutput, Nominal, Place
 from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, accumulate, no_evidence, pool, strength
-from asm_gym.detection.habituation import habituate
+from asm_gym.detection.habituation import usual_levels
 from asm_gym.detection.repetition import Repetition, count_repetitions, improbability, repeated, unrepeated
 from asm_gym.detection.tails import worst_case
 from asm_gym.detection.whitening import bounded, whitening
 from asm_gym.stream import StreamSpec
 
 GAINS = (0.8, 0.2, 0.05)
-BOUND = 20.0
+BOUND = 100.0
+
+ANYTHING = np.array([-700.0, 700.0])
+"""A range of logarithms that bounds nothing, as in monitors saved before there was one."""
 
 FAINTEST = 1e-9
 """Lower bound of s where its logarithm is taken."""
@@ -45,6 +48,7 @@ def _step(
     ceiling: Any,
     tail: Any,
     context_quantile: Any,
+    context_range: Any,
     gains: Any,
     bound: float,
 ) -> Any:
@@ -74,7 +78,7 @@ def _step(
         for c in range(C):
             recent[n, c] = lately[n, c] + CONTEXT_GAIN * (context[n, c] - lately[n, c])
             drive += context[n, c] * context_quantile[c] + recent[n, c] * context_quantile[C + c]
-        value[n] = greatest * total ** (1.0 / POWER) / np.exp(drive)
+        value[n] = greatest * total ** (1.0 / POWER) / np.exp(min(max(drive, context_range[0]), context_range[1]))
         for i in range(X):
             shares[n, i] *= value[n] / max(total, TINY)
     return (new, recent, steps + 1), value, shares
@@ -89,6 +93,7 @@ class Detector:
         ceiling: (G, X) q.
         tail: (G, X) κ, in (0, 1].
         context_quantile: (2 C + 1,) weights of ŝ, on the context now and lately, and its bias.
+        context_range: (2,) what log ŝ stays within, whatever the context.
         gains: (G,) a, each in (0, 1].
         bound: ν > 0.
     """
@@ -97,6 +102,7 @@ class Detector:
     ceiling: NDArray[np.float64]
     tail: NDArray[np.float64]
     context_quantile: NDArray[np.float64]
+    context_range: NDArray[np.float64]
     gains: NDArray[np.float64]
     bound: float
 
@@ -117,7 +123,7 @@ class Detector:
         matrix = whitening(bounded(np.concatenate([r.errors for r in learned]), bound), shrinkage)
         a = np.asarray(gains, np.float64)
         ones = np.ones((len(a), len(matrix)))
-        plain = cls(matrix, ones, ones, np.zeros(1), a, bound)
+        plain = cls(matrix, ones, ones, np.zeros(1), ANYTHING, a, bound)
         ceiling, tail = worst_case(np.array([plain._strengths(r)[0].max(axis=0) for r in (*learned, *held_out)]))
         contexts, levels = [], []
         for r in held_out or learned:
@@ -125,8 +131,8 @@ class Detector:
             contexts.append(np.hstack([r.contexts, lately]).astype(np.float32))
             ratios = ((strengths / ceiling) ** tail).reshape(len(lately), -1)
             levels.append(np.log(np.maximum(pool(ratios)[0], FAINTEST)))
-        usual = habituate(np.concatenate(contexts), np.concatenate(levels), rng)
-        return cls(matrix, ceiling, tail, usual.astype(np.float64), a, bound)
+        usual = usual_levels(contexts, levels, rng)
+        return cls(matrix, ceiling, tail, usual.weights, usual.span, a, bound)
 
     @property
     def reach(self) -> float:
@@ -161,6 +167,7 @@ class Detector:
             self.ceiling,
             self.tail,
             self.context_quantile,
+            self.context_range,
             self.gains,
             self.bound,
         )
@@ -201,7 +208,7 @@ class EvidenceDetection:
     """
 
     name = "evidence"
-    arrays: tuple[str, ...] = ("whitening", "ceiling", "tail", "context_quantile", "repetition")
+    arrays: tuple[str, ...] = ("whitening", "ceiling", "tail", "context_quantile", "context_range", "repetition")
 
     def __init__(
         self, spec: StreamSpec, gains: Sequence[float] = GAINS, bound: float = BOUND, shrinkage: float = 1e-3

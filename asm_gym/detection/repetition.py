@@ -6,7 +6,8 @@
 
 What predicts a change finds nothing odd in one that is just 0. Yet where the senses are noisy, the density of what
 comes next has no mass on any one number, and a repetition is as surprising as it was rare. A sense that is read more
-slowly than the stream, or rounded, repeats itself in nominal episodes too, and then counts for nothing.
+slowly than the stream, or rounded, repeats itself in nominal episodes too, and then counts for nothing. One whose noise
+nobody declared is watched where it never repeated itself in any nominal episode.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ def unrepeated(batch: int, size: int) -> Repetition:
 
 
 def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(2, X) -log p of a repetition, after none and after one; 0 for senses that are not ``noisy`` (X,).
+    """(2, X) -log p of a repetition, after none and after one; 0 for senses that may well stand still.
 
     Args:
         streams: (T, X) the senses in nominal episodes.
-        noisy: which senses have noise. One that has none may well stand still.
+        noisy: (X,) which are known to have noise. Of the others, one that ever repeats itself may well stand still.
     """
     chances, happened = np.zeros((2, len(noisy))), np.zeros((2, len(noisy)))
     for stream in streams:
@@ -57,7 +58,7 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
     first = (happened[0] + 0.5) / (chances[0] + 1.0)
     # As rare after a repetition as after none, until seen to be otherwise.
     p = np.array([first, (happened[1] + first) / (chances[1] + 1.0)])
-    counted: NDArray[np.float64] = np.where(noisy, -np.log(p), 0.0)
+    counted: NDArray[np.float64] = np.where(noisy | (happened.sum(axis=0) == 0), -np.log(p), 0.0)
     return counted
 
 

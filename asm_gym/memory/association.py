@@ -2,15 +2,19 @@
 
     a_t = [v_{t-1}, Δ_t, Δ_{t-1}, u_t, 1]          values before, changes now and before, the action as commanded
     h_t = V a_t                                    units of group g have no synapse from its own Δ_t
-    Δ̂_t = U f(h_t) + D a_t                         what predicts g has synapses from units of g alone
-    log σ²_t = W_S f(h_t) + b_S                    how large an error is to be expected: see ``precision``
-    ε_t = ψ((Δ_t - Δ̂_t)/σ),  ψ(ε) = min(max(ε, -1), 1)
-    ΔU ∝ ε_t f(h_t)ᵀ    ΔD ∝ ε_t a_tᵀ    ΔV ∝ ε_h a_tᵀ,  ε_h = f'(h_t) ⊙ Uᵀ ε_t
+    Δ̂_t = D a_t + U f(h_t)                         what predicts g has synapses from units of g alone
+    log σ²_t = W_S f(h_t) + b_S                    how large an error is to be expected, in s: see ``precision``
+    D: in closed form, see ``linear``              s: the spread of what it leaves, r_t = (Δ_t - D a_t)/s
+    ε_t = ψ((r_t - U f(h_t)/s)/σ),  ψ(ε) = min(max(ε, -1), 1)
+    ΔU ∝ ε_t f(h_t)ᵀ    ΔV ∝ ε_h a_tᵀ,  ε_h = f'(h_t) ⊙ Uᵀ ε_t
 
 A joint that moves and a hand that does not, a torque commanded and none measured: each group is completed from the
-rest, so that what a body cannot do is an error, in whatever skill. ε_h is what one step of inference moves the hidden
-units by. The rule equals the gradient of a Huber loss, and Uᵀ is the transpose of the weights that predict (weight
-transport): this is backpropagation through one layer, at one moment, and only ΔU and ΔD are local.
+rest, so that what a body cannot do is an error, in whatever skill. What is linear is solved at once; the hidden units
+learn what is left of it, and are believed as far as rows that they have not learned bear them out.
+
+The rule equals the gradient of a Huber loss, and Uᵀ is the transpose of the weights that predict (weight transport):
+this is backpropagation through one layer, at one moment, and only ΔU is local. Nor is D, from the inverse of what all
+inputs have in common.
 
 Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning by prediction errors; Salvatori et al. 2021
 (NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest; Huber 1964 for ψ.
@@ -26,6 +30,7 @@ from numpy.typing import NDArray
 
 from asm_gym.memory.energy import Array, activate, kernel, outward
 from asm_gym.memory.learning import Synapse, coincidence, cosine_decay, shuffled
+from asm_gym.memory.linear import learn_linear, tried_on
 from asm_gym.memory.precision import learn_precision, log_variance
 
 UPDATES, PASSES = 6000, 40
@@ -39,7 +44,11 @@ WARM_UP = 0.1
 TICKS = 20
 """How often learning tells of its progress."""
 
-SMALLEST_SPREAD = np.float32(1e-6)
+SMALLEST_SPREAD = np.float32(1e-4)
+"""Of what is left of a change: below it, single precision is what is heard."""
+
+DOUBTED = 3.0
+"""Standard deviations that an error counts at most where the hidden units are tried."""
 
 TRACKING = np.float32(0.01)
 """Weight of the newest batch in the running spread σ of each error."""
@@ -53,12 +62,13 @@ class Association(NamedTuple):
     D: Array  # (X, I)
     W_S: Array  # (X, M)
     b_S: Array  # noqa: N815 (X,)
+    remainder: Array  # (X,) s, the spread that the linear part leaves; 1 in memories that learned both parts at once
 
 
 def association_shapes(inputs: int, units: int, changes: int) -> dict[str, tuple[int, ...]]:
     """The shape of each array in ``Association``, by name."""
     M, X = units, changes
-    return {"V": (M, inputs), "U": (X, M), "D": (X, inputs), "W_S": (X, M), "b_S": (X,)}
+    return {"V": (M, inputs), "U": (X, M), "D": (X, inputs), "W_S": (X, M), "b_S": (X,), "remainder": (X,)}
 
 
 class Change(NamedTuple):
@@ -100,15 +110,24 @@ def complete(f: Array, a: Array, U: Array, D: Array) -> Array:
 
 @kernel
 def normalised_errors(
-    inputs: Array, changes: Array, whole: Array, V: Array, U: Array, D: Array, W_S: Array, b_S: Array
+    inputs: Array,
+    changes: Array,
+    whole: Array,
+    V: Array,
+    U: Array,
+    D: Array,
+    W_S: Array,
+    b_S: Array,
+    remainder: Array,
 ) -> tuple[Array, Array]:
-    """(Δ - Δ̂)/σ (B, X) for inputs (B, I) and changes (B, X); 0 where ``whole`` (B, 1) is. And f(h) (B, M)."""
+    """(Δ - Δ̂)/(s σ) (B, X) for inputs (B, I) and changes (B, X); 0 where ``whole`` (B, 1) is. And f(h) (B, M)."""
     f = hidden_units(inputs, V)
     out = complete(f, inputs, U, D)
     spread = log_variance(f, W_S, b_S)
     for n in range(out.shape[0]):
         for i in range(out.shape[1]):
-            out[n, i] = whole[n, 0] * (changes[n, i] - out[n, i]) * np.exp(np.float32(-0.5) * spread[n, i])
+            error = (changes[n, i] - out[n, i]) / remainder[i]
+            out[n, i] = whole[n, 0] * error * np.exp(np.float32(-0.5) * spread[n, i])
     return out, f
 
 
@@ -134,35 +153,64 @@ def learn_association(
     updates: int = UPDATES,
     passes: int = PASSES,
 ) -> Association:
-    """Synapses learned from N steps, in random order; those of the precision last.
+    """What is linear in closed form; what remains by the hidden units, in random order; how sure it is last.
 
     Args:
-        a: (N, I) inputs.
+        a: (N, I) inputs of whole episodes, one after another, the last input a constant 1. The last fifth of the rows
+            is not learned by the hidden units: it shows how far they are to be trusted, and how sure they may be.
         delta: (N, X) changes, standardised.
         groups, changes, size: as in ``synapses``.
         tick: called ``TICKS`` times on the way, and once after each of ``PRECISION_EPOCHS``.
         updates, passes: over batches and over the N steps, at most.
     """
+    D = learn_linear(a, groups, changes)
+    remainder = np.maximum(np.sqrt(np.mean((delta - a @ D.T) ** 2, axis=0)), SMALLEST_SPREAD)  # (X,)
+    left = (delta - a @ D.T) / remainder
+    fresh = len(tried_on(a))
+    shown = max(len(a) - fresh, 1)
+    V, U = _learn_hidden(
+        a[:shown], left[:shown], synapses(groups, changes, a.shape[1], size), rng, tick, updates, passes
+    )
+    # How far it goes wrong in rows that it has learned says too little of how far it will.
+    f, left = hidden_units(a[-fresh:], V), left[-fresh:]
+    U *= trust(left, f @ U.T)[:, None]
+    W_S, b_S = np.zeros_like(U), np.zeros(len(U), np.float32)
+    learn_precision(f, left - f @ U.T, W_S, b_S, rng, tick)
+    return Association(V, U * remainder[:, None], D, W_S, b_S, remainder)
+
+
+def trust(left: Array, expected: Array) -> Array:
+    """(X,) in [0, 1]: what share of the ``expected`` (N, X) leaves the least of what was ``left`` (N, X) to expect."""
+    known = np.sum(expected**2, axis=0)
+    share: Array = np.sum(np.clip(left, -DOUBTED, DOUBTED) * expected, axis=0) / np.maximum(known, SMALLEST_SPREAD)
+    return np.clip(share, 0.0, 1.0).astype(np.float32)
+
+
+def _learn_hidden(
+    a: Array,
+    left: Array,
+    exists: Change,
+    rng: np.random.Generator,
+    tick: Callable[[], None],
+    updates: int,
+    passes: int,
+) -> tuple[Array, Array]:
+    """V and U from N rows (N, I) and what the linear part leaves of them (N, X), standardised."""
     updates = max(TICKS, min(updates, passes * len(a) // BATCH))
-    exists = synapses(groups, changes, a.shape[1], size)
     V = rng.standard_normal(exists.V.shape).astype(np.float32) / np.float32(np.sqrt(a.shape[1])) * exists.V
-    weights = Change(V, np.zeros_like(exists.U), np.zeros_like(exists.D))
-    synapse = [Synapse(W) for W in weights]
-    spread = np.maximum(delta.std(axis=0), SMALLEST_SPREAD)
+    U, nothing = np.zeros_like(exists.U), np.zeros_like(exists.D)
+    into, out_of = Synapse(V), Synapse(U)
+    spread = np.ones(left.shape[1], np.float32)
     for n, chosen in zip(range(updates), shuffled(len(a), BATCH, rng), strict=False):
-        change, error = association_change(a[chosen], delta[chosen], spread, *weights)
+        change, error = association_change(a[chosen], left[chosen], spread, V, U, nothing)
         rate = _rate(n / updates)
-        for s, product, real in zip(synapse, change, exists, strict=True):
-            s.learn(product * real, rate)
+        into.learn(change.V * exists.V, rate)
+        out_of.learn(change.U * exists.U, rate)
         now = np.sqrt(np.mean(np.minimum(error**2, 9 * spread**2), axis=0))
         spread += TRACKING * (np.maximum(now, SMALLEST_SPREAD) - spread)
         if (n + 1) * TICKS // updates > n * TICKS // updates:
             tick()
-    f = hidden_units(a, weights.V)
-    error = delta - complete(f, a, weights.U, weights.D)
-    W_S, b_S = np.zeros_like(weights.U), np.zeros(len(weights.U), np.float32)
-    learn_precision(f, error, W_S, b_S, rng, tick)
-    return Association(*weights, W_S, b_S)
+    return V, U
 
 
 def _rate(progress: float) -> float:

@@ -6,7 +6,7 @@ of the temporal network take up every l-th row. l is 1 at a control rate (``sens
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,23 @@ def at_start(batch: int, network: Network, lag: int, size: int, skills: int) -> 
     return MemoryState(network.at_rest(batch), state, rows, rows, np.zeros(batch, np.int64), named)
 
 
-def past(state: MemoryState, rows: Rows) -> tuple[Rows, Rows]:
+class Remembers(Protocol):
+    """Any state that holds the rows before."""
+
+    @property
+    def before(self) -> Rows:
+        """(B, l, D) the rows seen last, the oldest first."""
+
+    @property
+    def earlier(self) -> Rows:
+        """(B, l, D) those before."""
+
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """(B,) how many rows were seen."""
+
+
+def past(state: Remembers, rows: Rows) -> tuple[Rows, Rows]:
     """What ``rows`` (B, D) are compared with: those l rows before, and as long before those. At first nothing moves."""
     before, earlier, lag = state.before[:, 0], state.earlier[:, 0], state.before.shape[1]
     if state.steps.min() < 2 * lag:

@@ -18,6 +18,7 @@ from asm_gym.memory.adaptation import followed
 from asm_gym.memory.association import Association, association_shapes, hidden_units, synapses
 from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.linear import check_inputs
 from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
 from asm_gym.memory.network import Network, train
 from asm_gym.memory.readout import add_up, learn_readout, running
@@ -58,8 +59,10 @@ class MemoryModel(StreamModel):
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams, lag = [e.stream for e in episodes], self.lag
         senses = StreamScaler.fit(self.spec, streams, lag)
+        check_inputs(senses.inputs)
         readings = [senses.read_episode(s) for s in streams]
-        trajectories = [Trajectory(r.senses[::lag], r.commands[::lag], r.inputs) for r in readings]
+        # Nothing came before the first ``lag`` rows, so that no change in them is known.
+        trajectories = [Trajectory(r.senses[::lag], r.commands[::lag], r.inputs[lag:]) for r in readings]
         sizes = self.hidden_size, self._units_each(senses)
         trained = train(trajectories, senses.groups, senses.changes, *sizes, self.schedule, rng, progress)
         standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change, "energy": trained.energy}
@@ -69,6 +72,8 @@ class MemoryModel(StreamModel):
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         senses = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
         X, A = len(self.spec.sensory), len(self.spec.motor)
+        if "remainder" not in learned:  # saved before it was known apart what is linear
+            learned = {**learned, "remainder": np.ones(X, np.float32)}
         units = self._units_each(senses) * (int(senses.groups.max()) + 1)
         older = "W_H" in learned  # saved before there were traces
         temporal = (recurrent_shapes if older else weight_shapes)(self.hidden_size, senses.size, A)

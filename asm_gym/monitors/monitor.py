@@ -16,6 +16,7 @@ from asm_gym.checkpoint import Checkpoint, write_checkpoint
 from asm_gym.checks import check_number
 from asm_gym.choices import check_choice
 from asm_gym.detection import Detection, ModelOutput, Nominal, conformal_episodes, conformal_threshold
+from asm_gym.detection.detector import ANYTHING
 from asm_gym.episodes import Episode
 from asm_gym.monitors.base import Model, Progress, State, Surprise
 from asm_gym.monitors.model import batch_of, model_outputs, parameter_names, side_by_side
@@ -263,6 +264,8 @@ class CalibratedMonitor:
         names = {n: n if new else RENAMED.get(n, n) for n in header["shapes"]}
         arrays = {now: saved.array(n, *header["shapes"][n]) for n, now in names.items()}
         maxima = arrays.pop(MAXIMA, None)
+        if "context_quantile" in arrays:
+            arrays.setdefault("context_range", ANYTHING)
         theirs = {n for d in self.detections.values() for n in d.arrays}
         missing = [n for n in self.detection.arrays if n not in arrays]
         if missing:

@@ -181,7 +181,7 @@ class NeuralASM(CalibratedMonitor):
         before: MonitorState,
         stream: NDArray[np.floating[Any]],
         surprise: Surprise,
-        rate: float = 5e-3,
+        rate: float = 0.1,
         below: float = 0.5,
     ) -> NDArray[np.bool_]:
         """Learns from rows that were just observed, where they were not surprising: for a body that slowly wears.

@@ -101,6 +101,9 @@ _BASELINES = {
     "lstm_vae": _row("lstm_vae:LSTMVAE", "latent_threshold"),
     "gru": _row("gru:GRU", "mahalanobis"),
     "kalman": _row("kalman:Kalman", "mahalanobis"),
+    "association_linear": _row("association_linear:LinearAssociation", "mahalanobis"),
+    "association_mlp": _row("association_mlp:MLPAssociation", "mahalanobis"),
+    "window_pca": _row("window_pca:WindowPCA", "squares"),
     "autoregression": _row("autoregression:Autoregression", "mahalanobis"),
     "elapsed_time": _row("elapsed_time:ElapsedTime", "squares"),
 }

@@ -46,6 +46,7 @@ class PlainTorch:
         found = d.whitening, d.ceiling, d.tail, d.gains
         self.M, self.q, self.kappa, self.gains = (torch.tensor(x, dtype=torch.float32) for x in found)
         self.usual, self.bound = torch.tensor(d.context_quantile, dtype=torch.float32), d.bound
+        self.lowest, self.highest = map(float, d.context_range)
         self.mean, self.spread, self.change = (torch.tensor(x) for x in (s.mean, s.spread, s.change))
         self.sensory, self.motor, self.slow = (torch.tensor(i) for i in (asm.spec.sensory, asm.spec.motor, s.slow))
         self.decays = torch.tensor(DECAYS)
@@ -74,7 +75,7 @@ class PlainTorch:
         self.traces = self.decays[:, None] * self.traces + w["gains"][:, None] * torch.cat([senses, u])
         units = torch.tanh(a["V"] @ inputs)
         error = delta - a["U"] @ units - a["D"] @ inputs
-        error = error * torch.exp(-0.5 * (a["W_S"] @ units + a["b_S"]).clamp(-12.0, 8.0))
+        error = error / a["remainder"] * torch.exp(-0.5 * (a["W_S"] @ units + a["b_S"]).clamp(-12.0, 8.0))
         again = x[self.sensory] == before[self.sensory]
         if self.before is None:
             error, again = torch.zeros_like(error), torch.zeros_like(again)
@@ -88,7 +89,8 @@ class PlainTorch:
         pooled = (ratios**POWER).sum() ** (1 / POWER)
         context = torch.tanh(mu)
         self.lately = self.lately + CONTEXT_GAIN * (context - self.lately)
-        usual = torch.exp(self.usual[:-1] @ torch.cat([context, self.lately]) + self.usual[-1])
+        drive = self.usual[:-1] @ torch.cat([context, self.lately]) + self.usual[-1]
+        usual = torch.exp(drive.clamp(self.lowest, self.highest))
         self.before, self.earlier = x, before
         repeated = (self.unlikely > 0) * torch.exp(TAIL_INDEX * (self.unlikely - REPETITION_OFFSET))
         return float(((pooled / usual) ** POWER + (repeated**POWER).sum()) ** (1 / POWER))

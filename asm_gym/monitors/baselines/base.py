@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.base import Arrays
+from asm_gym.memory.state import newest, past
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.stream import StreamSpec
 
@@ -59,6 +60,31 @@ def read(senses: StreamScaler, seen: Rows, rows: NDArray[np.float64]) -> ScaledR
     """The next rows, as the Neural ASM reads them; before the first nothing has moved."""
     before = np.where(seen.steps[:, None] > 0, seen.before, rows)
     return senses.read(rows, before, before)
+
+
+class Lagged(NamedTuple):
+    """The rows that the next ones are compared with, as the memory's association does; l is the scaler's lag."""
+
+    before: NDArray[np.float64]  # (B, l, D) the rows seen last, the oldest first
+    earlier: NDArray[np.float64]  # (B, l, D) those before
+    steps: NDArray[np.int64]  # (B,) how many were seen
+
+
+def nothing_before(batch: int, lag: int, size: int) -> Lagged:
+    """Before the first row."""
+    rows = np.zeros((batch, lag, size))
+    return Lagged(rows, rows, np.zeros(batch, np.int64))
+
+
+def associated(
+    senses: StreamScaler, seen: Lagged, rows: NDArray[np.float64]
+) -> tuple[Lagged, ScaledRows, NDArray[np.float32]]:
+    """The next rows read, and 1 (B, 1) where all is known that a change is expected from, else 0."""
+    before, earlier = past(seen, rows)
+    reading = senses.read(rows, before, earlier)
+    known = (reading.whole * (seen.steps >= senses.lag)[:, None]).astype(np.float32)
+    now = Lagged(newest(seen.before, rows), newest(seen.earlier, before), seen.steps + 1)
+    return now, reading, known
 
 
 def no_context(rows: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -27,6 +27,9 @@ class TorchModel(StreamModel):
         module_: the network, once it is fitted.
     """
 
+    lag: int = 1
+    """How many rows later the change of a row is taken."""
+
     senses_: StreamScaler
     module_: nn.Module
 
@@ -42,7 +45,7 @@ class TorchModel(StreamModel):
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams = [e.stream for e in episodes]
-        senses = StreamScaler.fit(self.spec, streams)
+        senses = StreamScaler.fit(self.spec, streams, self.lag)
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # as for every other monitor, so that times compare
         try:
@@ -56,7 +59,7 @@ class TorchModel(StreamModel):
         return self.restore({**standard, **{name: tensor.numpy() for name, tensor in module.state_dict().items()}})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        senses = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"])
+        senses = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
         with torch.random.fork_rng(devices=[]):
             module = self.module(senses)
         state = {name: torch.from_numpy(np.array(learned[name], np.float32)) for name in module.state_dict()}
