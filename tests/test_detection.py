@@ -149,16 +149,6 @@ def levels(rng: np.random.Generator, episodes: int, told: float) -> tuple[list[n
     return contexts, [told * c[:, 0] + rng.normal(size=100) for c in contexts]
 
 
-def test_what_a_context_tells_is_taken_from_it_and_what_it_does_not_is_left_out():
-    rng = np.random.default_rng(1)
-    helped, idle = usual_levels(*levels(rng, 90, 0.5), rng), usual_levels(*levels(rng, 6, 0.0), rng)
-    context = np.zeros((2, 40), np.float32)
-    context[1, 0] = 1.0
-    low, high = usual(helped, context)
-    assert high - low == pytest.approx(0.5, abs=0.1)
-    assert np.abs(idle.weights[:-1]).max() < 0.02
-
-
 def test_no_context_excuses_more_than_nominal_ones_did():
     rng = np.random.default_rng(2)
     contexts, surprises = levels(rng, 90, 2.0)
@@ -168,14 +158,6 @@ def test_no_context_excuses_more_than_nominal_ones_did():
     assert wild.min() == nominal.min()
     assert wild.max() == nominal.max()
     assert nominal.max() < 2.0 * 3.5 + 2.0  # the largest of so many normal numbers, and the quantile of the noise
-
-
-@pytest.mark.parametrize("episodes", [1, 2])
-def test_of_too_few_episodes_one_level_is_taken_to_be_usual_everywhere(episodes):
-    rng = np.random.default_rng(3)
-    contexts, surprises = levels(rng, episodes, 2.0)
-    found = usual_levels(contexts, surprises, rng)
-    assert np.unique(usual(found, contexts[0])) == pytest.approx([np.quantile(np.concatenate(surprises), USUAL)])
 
 
 def runs(rng: np.random.Generator, count: int, steps: int = 200) -> list[ModelOutput]:

@@ -33,6 +33,9 @@ BOUND = 100.0
 ANYTHING = np.array([-700.0, 700.0])
 """A range of logarithms that bounds nothing, as in monitors saved before there was one."""
 
+MOST_ROWS = 60_000
+"""What is usual in a context is learned from so many rows at most, evenly spaced: more would fill the memory."""
+
 FAINTEST = 1e-9
 """Lower bound of s where its logarithm is taken."""
 
@@ -116,21 +119,20 @@ class Detector:
         shrinkage: float,
         rng: np.random.Generator,
     ) -> Self:
-        """From nominal episodes that the model has learned, and others that it has not.
-
-        How surprise depends on context is taken from those held out, for a model is too sure of what it has seen.
-        """
+        """From nominal episodes that the model has learned, and others that it has not."""
         matrix = whitening(bounded(np.concatenate([r.errors for r in learned]), bound), shrinkage)
         a = np.asarray(gains, np.float64)
         ones = np.ones((len(a), len(matrix)))
         plain = cls(matrix, ones, ones, np.zeros(1), ANYTHING, a, bound)
-        ceiling, tail = worst_case(np.array([plain._strengths(r)[0].max(axis=0) for r in (*learned, *held_out)]))
+        everything = [*learned, *held_out]
+        ceiling, tail = worst_case(np.array([plain._strengths(r)[0].max(axis=0) for r in everything]))
+        apart = -(-sum(len(r.errors) for r in everything) // MOST_ROWS)
         contexts, levels = [], []
-        for r in held_out or learned:
+        for r in everything:
             strengths, lately = plain._strengths(r)
-            contexts.append(np.hstack([r.contexts, lately]).astype(np.float32))
+            contexts.append(np.hstack([r.contexts, lately])[::apart].astype(np.float32))
             ratios = ((strengths / ceiling) ** tail).reshape(len(lately), -1)
-            levels.append(np.log(np.maximum(pool(ratios)[0], FAINTEST)))
+            levels.append(np.log(np.maximum(pool(ratios)[0], FAINTEST))[::apart])
         usual = usual_levels(contexts, levels, rng)
         return cls(matrix, ceiling, tail, usual.weights, usual.span, a, bound)
 
@@ -222,10 +224,9 @@ class EvidenceDetection:
         self.detector_: Detector | None = None
 
     def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
-        """Whitening from what the model has learned; from what it has not, how surprise depends on context."""
-        certain = [ModelOutput(r.errors, r.contexts[:, :0]) for r in nominal.outputs(nominal.learned)]
-        surprised = nominal.outputs(nominal.held_out)
-        detector = Detector.fit(certain, surprised, self.gains, self.bound, self.shrinkage, rng)
+        """Whitening from what the model has learned; its ceilings, and what is usual in a context, from all."""
+        learned, fresh = nominal.outputs(nominal.learned), nominal.outputs(nominal.held_out)
+        detector = Detector.fit(learned, fresh, self.gains, self.bound, self.shrinkage, rng)
         senses = self.spec.sensory
         counted = count_repetitions([e.stream[:, senses] for e in nominal.episodes], self.spec.noise[senses] > 0)
         return self.restore({name: getattr(detector, name) for name in self.arrays[:-1]} | {"repetition": counted})

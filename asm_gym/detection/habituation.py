@@ -6,9 +6,7 @@ A hand that meets an object is often wrong about when; one that moves freely har
 share τ of nominal steps in a context like this one stays below. The rule is local, and follows the gradient of the
 quantile loss.
 
-Few episodes tell little of so many numbers: w is shrunk to the share of it that loses least in episodes that it was not
-learned from, down to none. And what a fault does to the context must not excuse the fault: l and h are how far nominal
-episodes went.
+What a fault does to the context must not excuse the fault: l and h are how far nominal episodes went.
 
 Sources: Yu and Dayan 2005 (Neuron 46(4)) for surprise relative to expected uncertainty; Koenker and Bassett 1978 for
 the quantile loss; Romano et al. 2019 (NeurIPS) for quantiles of a context under a conformal threshold.
@@ -35,10 +33,6 @@ FEWEST = 40
 BATCH = 512
 RATE = 1e-2
 
-FOLDS = 3
-SHARES = np.linspace(0.0, 1.0, 6)
-"""Of w, that are tried."""
-
 EXTREME = 0.005
 """Share of nominal steps beyond l, and beyond h."""
 
@@ -51,49 +45,24 @@ class Habituation(NamedTuple):
 
 
 def usual_levels(contexts: Sequence[Array], levels: Sequence[Array], rng: np.random.Generator) -> Habituation:
-    """From nominal episodes that the model has not learned; of fewer than ``FOLDS`` nothing is known of contexts.
+    """From nominal episodes.
 
     Args:
         contexts: (T, C) each.
         levels: (T,) log s.
     """
-    size, share = contexts[0].shape[1], 0.0
-    if size and len(contexts) >= FOLDS:
-        lost = np.zeros(len(SHARES))
-        for fold in range(FOLDS):
-            others = [i for i in range(len(contexts)) if i % FOLDS != fold]
-            w = habituate(*_joined(contexts, levels, others), rng)[:-1]
-            mine = _joined(contexts, levels, range(fold, len(contexts), FOLDS))
-            for n, part in enumerate(SHARES):
-                found = _bounded(part * w, *_joined(contexts, levels, others))
-                lost[n] += _quantile_loss(mine[1], usual(found, mine[0]))
-        share = float(SHARES[np.argmin(lost)])
-    context, level = _joined(contexts, levels, range(len(contexts)))
-    w = habituate(context, level, rng)[:-1] if share else np.zeros(size, np.float32)
-    return _bounded(share * w, context, level)
-
-
-def usual(found: Habituation, context: Array) -> NDArray[np.float64]:
-    """log ŝ (N,) in contexts (N, C)."""
-    level: NDArray[np.float64] = np.clip(context @ found.weights[:-1] + found.weights[-1], *found.span)
-    return level
-
-
-def _bounded(w: Array, context: Array, level: Array) -> Habituation:
-    """With b and the span that go with ``w`` (C,) in N nominal steps."""
+    context, level = np.concatenate(contexts), np.concatenate(levels)
+    w, _ = np.split(habituate(context, level, rng), [-1])
     drive = context @ w
     low, high = np.quantile(drive, (EXTREME, 1.0 - EXTREME))
     b = np.quantile(level - np.clip(drive, low, high), USUAL)
     return Habituation(np.append(w, b).astype(np.float64), np.array([low + b, high + b]))
 
 
-def _quantile_loss(level: Array, quantile: Array) -> float:
-    above = level - quantile
-    return float(np.mean(np.maximum(USUAL * above, (USUAL - 1.0) * above)))
-
-
-def _joined(contexts: Sequence[Array], levels: Sequence[Array], which: Sequence[int]) -> tuple[Array, Array]:
-    return np.concatenate([contexts[i] for i in which]), np.concatenate([levels[i] for i in which])
+def usual(found: Habituation, context: Array) -> NDArray[np.float64]:
+    """log ŝ (N,) in contexts (N, C)."""
+    level: NDArray[np.float64] = np.clip(context @ found.weights[:-1] + found.weights[-1], *found.span)
+    return level
 
 
 def habituate(context: Array, level: Array, rng: np.random.Generator) -> NDArray[np.float32]:
