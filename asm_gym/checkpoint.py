@@ -192,4 +192,5 @@ def _read(file: zipfile.ZipFile, name: str, kinds: str = "biuf") -> NDArray[Any]
     if any(n < 0 for n in shape) or math.prod(shape) * dtype.itemsize != found:
         raise ValueError(f"{name} has {found} bytes, which are no {dtype} {shape}")
     array: NDArray[Any] = np.frombuffer(data, dtype, offset=start.tell()) if found else np.zeros(0, dtype)
-    return array.reshape(shape, order="F" if fortran else "C").copy()
+    # Laid out as it was, or products of it would be rounded otherwise.
+    return array.reshape(shape, order="F" if fortran else "C").copy(order="K")

@@ -147,8 +147,9 @@ def test_the_signal_handler_of_a_caller_is_left_as_it_was():
 
 
 INTERRUPTED = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell in the background ignores it
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.scripts import command
 from tests.test_commands import Options, wait

@@ -136,7 +136,7 @@ def test_the_policy_called_hold_holds_under_inverse_kinematics():
     env.close()
 
 
-def test_what_pushes_an_arm_that_is_braked_meets_a_spring_and_it_comes_back():
+def test_what_pushes_an_arm_that_is_braked_moves_it_little_and_it_rests_again():
     env = FaultInjection(made(controller="IK_POSE"), [Push(newtons=20.0, onset=AT + 5, duration=10)])
     env = guarded(env)
     env.reset(seed=0)
@@ -146,8 +146,8 @@ def test_what_pushes_an_arm_that_is_braked_meets_a_spring_and_it_comes_back():
     for _ in range(30):
         env.step(np.zeros(7, np.float32))
         moved.append(np.abs(joints(env)[0] - start).max())
-    assert 0.003 < max(moved) < 0.2
-    assert moved[-1] < 0.5 * max(moved)  # but for dry friction
+    assert 0.003 < max(moved) < 0.05  # 20 N against the brake's spring; dry friction keeps it where it was pushed to
+    assert moved[-1] - moved[-10] < 1e-3
     env.close()
 
 

@@ -14,8 +14,9 @@ import pytest
 from asm_gym.rollouts import ParallelConfig, collect, parallel_map
 
 PARENT = """
-import os, sys, threading, time
+import os, signal, sys, threading, time
 from pathlib import Path
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell in the background ignores it
 from asm_gym.rollouts.parallel import parallel_map
 
 def work(folder):

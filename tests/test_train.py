@@ -205,6 +205,7 @@ def datasets(tmp_path_factory):
             del about["stream_spec"]
         about["env_spec"] = json.dumps(json.loads(about["env_spec"]) | {"id": env_id})
         data.write_text(json.dumps(about))
+        data.with_name("SHA256SUMS").unlink()  # changed on purpose
     env.close()
     (damaged,) = (folder / "damaged").rglob("main_data.hdf5")
     damaged.write_bytes(damaged.read_bytes()[:1000])
