@@ -271,7 +271,8 @@ def test_a_damaged_motor_association_is_refused(pilot, tmp_path):
     pilot.save(tmp_path / "broken.asm")
     saved = read_checkpoint(tmp_path / "broken.asm", pilot.kind)
     arrays = saved.arrays | {"motor_D": np.zeros((3, 1), np.float32)}
-    write_checkpoint(tmp_path / "broken.asm", pilot.kind, saved.header, arrays)
+    header = saved.header | {"shapes": {name: list(array.shape) for name, array in arrays.items()}}
+    write_checkpoint(tmp_path / "broken.asm", pilot.kind, header, arrays)
     with pytest.raises(ValueError, match="motor_D should be of shape"):
         NeuralASM.load(tmp_path / "broken.asm")
 
@@ -280,6 +281,7 @@ def test_a_motor_association_that_read_its_senses_otherwise_is_refused(pilot, tm
     pilot.save(tmp_path / "before.asm")
     saved = read_checkpoint(tmp_path / "before.asm", pilot.kind)
     arrays = {name: array for name, array in saved.arrays.items() if name != "motor_kappa"}
-    write_checkpoint(tmp_path / "before.asm", pilot.kind, saved.header, arrays)
+    header = saved.header | {"shapes": {name: list(array.shape) for name, array in arrays.items()}}
+    write_checkpoint(tmp_path / "before.asm", pilot.kind, header, arrays)
     with pytest.raises(ValueError, match="call learn_to_act with this one"):
         NeuralASM.load(tmp_path / "before.asm")

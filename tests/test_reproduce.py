@@ -224,12 +224,13 @@ def test_a_law_is_found_again_within_its_intervals(law, true):
         assert found.aic < other.aic
 
 
-def test_more_inference_completes_an_unseen_axis_better():
+def test_an_unseen_axis_is_completed_to_about_the_noise_with_however_little_inference():
     args = speed_accuracy.Args(skills=2, hidden=32, writings=4, steps=2000, iterations=(1, 5, 30, 200))
     rng = np.random.default_rng(0)
     records = speed_accuracy.by_iterations(0, repertoire(2, 2, rng), args, rng)
-    slow = [r["completed_cm"] for r in records if r["shorter"] == speed_accuracy.SHORTER[0]]
-    assert slow[0] > 1.05 * slow[-1]
+    errors = [r["completed_cm"] for r in records]
+    assert max(errors) < 3 * NOISE  # the traces lead there; the state adds little
+    assert max(errors) < 1.1 * min(errors)
 
 
 def test_a_slip_is_one_of_so_many_centimetres_from_its_onset_on():
