@@ -22,6 +22,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -151,7 +152,8 @@ def run(page: Page) -> Page:
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
     there = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
     command = ["bash", "-e", "-c", page.meta["command"]]
-    out = subprocess.run(command, cwd=ROOT, env=there, stdout=subprocess.PIPE, text=True, check=True).stdout
+    said = subprocess.run(command, cwd=ROOT, env=there, stdout=subprocess.PIPE, text=True, check=True).stdout
+    out = re.sub(r"(?m)^.*: (\d+ of \d+, )?(done in )?\d+ s\n", "", said)  # how far it had come is no result
     for made, kept in page.meta.get("figures", {}).items():
         shutil.copyfile(ROOT / made, ROOT / kept)
     if "printed" in page.meta:
