@@ -25,7 +25,7 @@ from asm_gym.episodes import EpisodeLabel
 from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.report import publish
 from asm_gym.evaluation.tables import brief_monitors_table, console_table, harmless_table
-from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, possible
+from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of, possible
 from asm_gym.monitors import MONITORS
 from asm_gym.policies import make_policy
 from asm_gym.rollouts.benchmark import benchmark, calibrated
@@ -59,7 +59,7 @@ class Args:
     monitors: tuple[str, ...] = tuple(MONITORS)
     """Names of monitors."""
     faults: tuple[str, ...] = tuple(KINDS)
-    """Kinds of fault."""
+    """Kinds of fault; development or test for those to choose settings by, or to report."""
     severities: tuple[str, ...] = SEVERITIES
     """How bad each is."""
     harmless: tuple[str, ...] = _HARMLESS
@@ -94,12 +94,12 @@ class Args:
             task_spec(name)
         for what, names, known in (
             ("monitor", self.monitors, MONITORS),
-            ("kind of fault", self.faults, KINDS),
             ("severity", self.severities, SEVERITIES),
             ("harmless variation", self.harmless, _HARMLESS),
         ):
             for name in names:
                 check_choice(what, name, known)
+        kinds_of(self.faults)
         for field in fields(self):
             if field.name.endswith("_episodes") and getattr(self, field.name) < 1:
                 raise ValueError(f"{field.name} must be at least 1, got {getattr(self, field.name)}")
@@ -148,7 +148,7 @@ def labels(args: Args) -> list[EpisodeLabel]:
         made_env = gym.make(f"asm_gym/{task}-v0", robot=args.robot)
         make_policy(args.policy, made_env, seed=0)  # what does not fit is refused before anything is recorded
         env: Any = made_env.unwrapped
-        faults = [k for k in args.faults if possible(k, env)]
+        faults = [k for k in kinds_of(args.faults) if possible(k, env)]
         harmless = [k for k in args.harmless if k in EXECUTIONS or possible(k, env)]
         horizon = env.horizon
         env.close()

@@ -24,13 +24,10 @@ from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode
 from asm_gym.logs import Layout, Log, read_logs
-from asm_gym.monitors import EVIDENCE, MONITORS, make_monitor, monitor_class
+from asm_gym.monitors import MONITORS, make_monitor, monitor_class
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
-
-FITTED = tuple(name for name in MONITORS if not name.endswith(EVIDENCE))
-"""What a file alone says how to read."""
 
 _QUICK = {"episodes": 20, "epochs": 5}
 
@@ -63,7 +60,7 @@ class Args:
     """Learn little, from few episodes: to see that everything runs."""
 
     def __post_init__(self) -> None:
-        check_choice("monitor", self.monitor, FITTED)
+        check_choice("monitor", self.monitor, MONITORS)
         conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
         check_number("calibration_share", self.calibration_share, above=0, below=1)
         for name in ("rate", "split"):

@@ -18,11 +18,11 @@ from asm_gym.scripts.evaluate import Args, labels, main
 
 MONITORS = ("neural_asm", "kalman+evidence", "autoregression", "force_limit")
 SMALL = [
-    *("--tasks", "Stack", "--faults", "push", "frozen_encoder", "gripper_opens", "--severities", "mild", "strong"),
+    *("--tasks", "Lift", "--faults", "push", "frozen_encoder", "gripper_opens", "--severities", "mild", "strong"),
     *("--harmless", "touch", "slower", "--fit-episodes", "4", "--calibration-episodes", "24"),
     *("--monitors", *MONITORS),
     *("--nominal-episodes", "4", "--faulty-episodes", "2", "--harmless-episodes", "1"),
-    *("--false-alarm-rate", "0.05", "--workers", "1"),
+    *("--false-alarm-rate", "0.05", "--workers", "1", "--no-video"),
 ]
 
 
@@ -49,11 +49,11 @@ def test_it_writes_what_it_promises(run):
 
 
 def test_faulty_episodes_are_twins_until_the_onset(run):
-    faulty = [load_episode(p) for p in sorted((run / "episodes/Stack/faulty").glob("*.npz"))]
+    faulty = [load_episode(p) for p in sorted((run / "episodes/Lift/faulty").glob("*.npz"))]
     assert len(faulty) == 12
     for episode in faulty:
         label = episode.label
-        twin = load_episode(run / EpisodeLabel("Stack", "nominal", seed=label.seed).path).stream
+        twin = load_episode(run / EpisodeLabel("Lift", "nominal", seed=label.seed).path).stream
         onset = label.onset
         np.testing.assert_array_equal(episode.stream[:onset], twin[:onset])
         assert episode.faults.argmax() == onset
@@ -121,7 +121,7 @@ def test_onsets_leave_room_before_and_after():
 
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_makes_the_same_recordings(tmp_path):
-    wanted = [EpisodeLabel("Stack", "fit", seed=s) for s in range(12)]
+    wanted = [EpisodeLabel("Lift", "fit", seed=s) for s in range(12)]
     distributed = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
     file = tmp_path / "scheduler.json"
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}

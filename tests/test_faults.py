@@ -10,7 +10,16 @@ from asm_gym import faults
 from asm_gym.envs.edits import SimulatorEdits
 from asm_gym.faults import Bias, FrozenEncoder, GripperOpens, Push, StuckJoint, WeakJoint, make_fault
 from asm_gym.faults.base import SHAPES
-from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, harmless_variation, possible, suite_fault
+from asm_gym.faults.suite import (
+    FAMILIES,
+    HARMLESS,
+    KINDS,
+    SEVERITIES,
+    harmless_variation,
+    kinds_of,
+    possible,
+    suite_fault,
+)
 from asm_gym.policies import make_policy
 from asm_gym.wrappers import FaultInjection
 from tests.fakes import FakeEnv
@@ -111,6 +120,17 @@ def test_severities_grow(stack, course):
             stream, _ = play(FaultInjection(stack, [fault]), actions)
             sizes.append(np.abs((stream - healthy)[ONSET : ONSET + 8, :14]).max())
         assert sizes[0] < sizes[1] < sizes[2], kind
+
+
+def test_half_of_each_family_is_kept_for_testing_and_nothing_is_in_both():
+    development, test = (set(kinds_of([group])) for group in ("development", "test"))
+    assert not development & test
+    assert development | test == set(KINDS)
+    for family in FAMILIES.values():
+        assert 0 <= len(test & set(family)) - len(development & set(family)) <= 1
+    assert kinds_of(["test", "push"]) == (*kinds_of(["test"]), "push")
+    with pytest.raises(ValueError, match=r"'flood'.*push"):
+        kinds_of(["flood"])
 
 
 def test_edits_of_one_number_compose_and_end_in_any_order():

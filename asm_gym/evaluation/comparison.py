@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 from asm_gym.evaluation.ideal import auroc_bound, power_bound
 from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Kind, KindMetrics, false_alarms, in_words
-from asm_gym.evaluation.statistics import Share
+from asm_gym.evaluation.statistics import Floats, Share
 from asm_gym.evaluation.trace import NOMINAL, Trace
 
 IDEAL = "ideal observer"
@@ -57,12 +57,14 @@ class MonitorResult:
         harmless: of harmless variations, likewise.
         thresholds: by the false-alarm rate they were set for.
         examples: typical faulty episodes with all that figures need.
+        maxima: (n,) the greatest surprise in each calibration episode.
     """
 
     traces: Sequence[Trace]
     harmless: Sequence[Trace]
     thresholds: Mapping[float, float]
     examples: Sequence[Trace] = ()
+    maxima: Floats = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +160,7 @@ def monitor_metrics(
     faulty = [t for t in result.traces if t.onset is not None]
     if visible is not None:
         faulty = [t for t in faulty if visible.get((t.kind, t.severity), False)]
-    return DetectionMetrics(name, faulty, nominal, window_s, result.thresholds)
+    return DetectionMetrics(name, faulty, nominal, window_s, result.thresholds, result.maxima)
 
 
 def _mean_power(detectability: Sequence[Detectability], rate: float) -> float:

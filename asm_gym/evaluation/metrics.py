@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.evaluation.resampling import Draws, drawn_anew
 from asm_gym.evaluation.statistics import Floats, Share, auroc
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace, window_steps
 
@@ -194,6 +195,7 @@ class DetectionMetrics:
         nominal: traces that the faulty ones are compared with.
         window_s: how soon an alarm must come to count as detection [s].
         thresholds: others to detect by, by the false-alarm rate that each was set for.
+        maxima: (n,) the greatest surprise in each calibration episode, from which thresholds are set.
     """
 
     name: str
@@ -201,6 +203,12 @@ class DetectionMetrics:
     nominal: Sequence[Trace]
     window_s: float
     thresholds: Mapping[float, float] = field(default_factory=dict)
+    maxima: Floats = field(default_factory=lambda: np.zeros(0))
+
+    @cached_property
+    def draws(self) -> Draws:
+        """The same figures over scenes and calibration episodes drawn anew."""
+        return drawn_anew(self.faulty, self.nominal, self.maxima, list(self.thresholds), self.window_s)
 
     @cached_property
     def watched(self) -> list[Trace]:
@@ -233,6 +241,15 @@ class DetectionMetrics:
     def auroc(self) -> float:
         """Mean over kinds; NaN without faults."""
         return float(np.mean([k.auroc for k in self.kinds.values()])) if self.kinds else math.nan
+
+    @property
+    def unmatched_auroc(self) -> float:
+        """As an alarm sees it: the peak in the window against the peak of whole nominal episodes; mean over kinds."""
+        nominal = [t.surprise.max() for t in self.nominal]
+        peaks: dict[Kind, list[float]] = {}
+        for t in self.faulty:
+            peaks.setdefault((t.kind, t.severity), []).append(t.surprise[t.window(self.window_s)].max(initial=0.0))
+        return float(np.mean([auroc(own, nominal) for own in peaks.values()])) if peaks and nominal else math.nan
 
     @property
     def average_precision(self) -> float:

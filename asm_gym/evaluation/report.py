@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability
-from asm_gym.evaluation.tables import Table, harmless_table, kinds_table, markdown, monitors_table
+from asm_gym.evaluation.tables import Table, harmless_table, kinds_table, lead_table, markdown, monitors_table
 from asm_gym.evaluation.trace import Trace, window_steps
 from asm_gym.extras import needed_for
 
@@ -163,7 +163,10 @@ def _uri(kind: str, content: bytes) -> str:
 def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any], video: Path | None = None) -> None:
     """Writes ``results.parquet``, ``results.json``, ``results.md`` and ``report.html``."""
     _write_parquet(folder / "results.parquet", result)
-    tables = [monitors_table(result), kinds_table(result), harmless_table(result, list(result.monitors))]
+    tables = [monitors_table(result)]
+    if len(result.monitors) > 1:
+        tables.append(lead_table(result))
+    tables += [kinds_table(result), harmless_table(result, list(result.monitors))]
     (folder / "results.md").write_text("\n\n".join(map(markdown, tables)) + "\n", encoding="utf-8")
     summary = {"settings": details, "tables": [{"headings": t.headings, "rows": t.rows} for t in tables]}
     (folder / "results.json").write_text(json.dumps(summary, indent=1, default=str) + "\n", encoding="utf-8")

@@ -16,7 +16,8 @@ from rich.table import Table as ConsoleTable
 from asm_gym.evaluation import metrics
 from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.metrics import ActingMetrics, Delays, DetectionMetrics, KindMetrics, in_words
-from asm_gym.evaluation.statistics import Share
+from asm_gym.evaluation.resampling import interval
+from asm_gym.evaluation.statistics import Estimate, Share
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE
 
 Subject = TypeVar("Subject")
@@ -192,7 +193,28 @@ def _of_monitor(cell: Callable[[DetectionMetrics], str]) -> Callable[[Compared],
 
 
 def _found(rate: float) -> Callable[[Compared], str]:
-    return lambda m: percent_within(m.found.get(rate))
+    def cell(m: Compared) -> str:
+        share = m.found.get(rate)
+        if share is None or not share.n or not isinstance(m, DetectionMetrics) or rate not in m.draws.found:
+            return percent(share)
+        return _percent(interval(share.value, m.draws.found[rate]))
+
+    return cell
+
+
+def _percent(estimate: Estimate) -> str:
+    return f"{100 * estimate.value:.0f} % ({100 * estimate.low:.0f}–{100 * estimate.high:.0f})"
+
+
+def _points(estimate: Estimate) -> str:
+    return f"{100 * estimate.value:+.1f} ({100 * estimate.low:+.1f} to {100 * estimate.high:+.1f})"
+
+
+def _auroc(m: Compared) -> str:
+    if not isinstance(m, DetectionMetrics):
+        return f"{m.auroc:.3f}"
+    found = interval(m.auroc, m.draws.auroc)
+    return f"{found.value:.3f} ({found.low:.3f}–{found.high:.3f})"
 
 
 _alarms_per_hour = _of_monitor(lambda m: f"{metrics.false_alarms_per_hour(m.nominal):.1f}")
@@ -200,7 +222,8 @@ _right_channel = _of_monitor(lambda m: percent(metrics.attribution_accuracy(m.fa
 
 MONITOR_COLUMNS: Sequence[Column[Compared]] = (
     Column("Monitor", lambda m: m.name),
-    Column("AUROC", lambda m: f"{m.auroc:.3f}"),
+    Column("AUROC, same steps", _auroc),
+    Column("AUROC, whole episodes", _of_monitor(lambda m: number(m.unmatched_auroc, 3))),
     Column("AP", lambda m: number(m.average_precision, 3)),
     Column("Found at 0.5 %", _found(0.005)),
     Column("at 1 %", _found(0.01)),
@@ -231,8 +254,10 @@ def monitors_table(result: BenchmarkResult) -> Table:
     return tabulate(
         f"Detection within {1e3 * result.window_s:.0f} ms of the onset, over kinds of fault and severities that an "
         f"ideal observer can see; thresholds from separate nominal episodes, delays and accuracies at a false-alarm "
-        f"rate of {100 * result.rate:g} % of episodes; 95 % Wilson intervals in brackets. Nominal episodes that did "
-        f"not succeed, {result.failed} in all, are left out.{left_out}",
+        f"rate of {100 * result.rate:g} % of episodes; in brackets 95 % intervals, from scenes and calibration "
+        f"episodes drawn anew. AUROC: against nominal episodes over the same steps, and against the greatest surprise "
+        f"of whole ones, as a threshold sees it. Nominal episodes that did not succeed, {result.failed} in all, are "
+        f"left out.{left_out}",
         MONITOR_COLUMNS,
         _compared(result),
     )
@@ -250,6 +275,24 @@ def brief_monitors_table(result: BenchmarkResult) -> Table:
     )
     caption = f"found within {result.window_s:g} s at a false-alarm rate of {100 * result.rate:g} %"
     return tabulate(caption, columns, _compared(result))
+
+
+def lead_table(result: BenchmarkResult) -> Table:
+    """How far the first monitor is ahead of each other, on the same scenes and calibration episodes."""
+    first, *others = result.on_visible
+    rows = []
+    for other in others:
+        auroc = interval(first.auroc - other.auroc, first.draws.auroc - other.draws.auroc)
+        cells = [f"{auroc.value:+.3f} ({auroc.low:+.3f} to {auroc.high:+.3f})", ""]
+        if result.rate in first.draws.found.keys() & other.draws.found.keys():
+            ahead = first.found[result.rate].value - other.found[result.rate].value
+            cells[1] = _points(interval(ahead, first.draws.found[result.rate] - other.draws.found[result.rate]))
+        rows.append((other.name, *cells))
+    return Table(
+        f"How far {first.name} is ahead of each other monitor; 95 % intervals of the paired difference.",
+        ("Monitor", "AUROC", f"Found at {100 * result.rate:g} % [points]"),
+        rows,
+    )
 
 
 def kinds_table(result: BenchmarkResult) -> Table:

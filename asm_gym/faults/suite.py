@@ -5,7 +5,7 @@ Which joint, axis, direction or reading is concerned is drawn from the episode's
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,59 +50,96 @@ def _at(level: int, *values: float) -> float:
     return values[level]
 
 
-KINDS: dict[str, Kind] = {
-    # body
-    "push": lambda d, s: body.Push(body=d.link, newtons=_PUSH[s], direction=d.direction, duration=10, **d.when),
-    "payload": lambda d, s: body.Payload(body=d.hand, kilograms=_at(s, 0.25, 0.75, 2.0), **d.when),
-    "collision": lambda d, s: body.Collision(body=d.hand, stiffness=_at(s, 500, 2000, 8000), duration=20, **d.when),
-    "cable_pull": lambda d, s: body.CablePull(body=d.hand, stiffness=_at(s, 50, 150, 400), **d.when),
-    "held_by_person": lambda d, s: body.HeldByPerson(
-        body=d.link, stiffness=_at(s, 100, 300, 800), duration=30, **d.when
-    ),
-    # actuator
-    "weak_joint": lambda d, s: actuator.WeakJoint(joint=d.joint, strength=_at(s, 0.9, 0.7, 0.4), **d.when),
-    "stuck_joint": lambda d, s: actuator.StuckJoint(joint=d.joint, duration=(4, 12, None)[s], **d.when),
-    "joint_friction": lambda d, s: actuator.JointFriction(
-        joint=d.joint, newton_metres=_at(s, 0.5, 2, 6), viscous=_at(s, 0.5, 2, 6), **d.when
-    ),
-    "backlash": lambda d, s: actuator.Backlash(joint=d.joint, gap=_at(s, 0.003, 0.01, 0.03), **d.when),
-    "gripper_opens": lambda d, s: actuator.GripperOpens(duration=(2, 8, None)[s], **d.when),
-    "weak_gripper": lambda d, s: actuator.WeakGripper(strength=_at(s, 0.5, 0.2, 0.05), **d.when),
-    # sensor
-    "encoder_bias": lambda d, s: sensor.Bias(**d.encoder, amount=_at(s, 0.01, 0.03, 0.1), **d.when),
-    "encoder_drift": lambda d, s: sensor.Drift(**d.encoder, rate=_at(s, 5e-4, 2e-3, 8e-3), **d.when),
-    "frozen_encoder": lambda d, s: sensor.FrozenEncoder(joint=d.joint, duration=(5, 15, None)[s], **d.when),
-    "encoder_noise": lambda d, s: sensor.Noise(**d.encoder, std=_at(s, 2e-3, 1e-2, 5e-2), **d.when),
-    "encoder_spikes": lambda d, s: sensor.Spikes(**d.encoder, amount=_at(s, 0.02, 0.1, 0.5), **d.when),
-    "encoder_delay": lambda d, s: sensor.Delay(**d.encoder, steps=(1, 2, 5)[s], **d.when),
-    "encoder_dropout": lambda d, s: sensor.Dropout(**d.encoder, probability=_at(s, 0.05, 0.2, 0.5), **d.when),
-    "torque_scale": lambda d, s: sensor.Scale(
-        channel=d.prefix + "measured_torque", element=d.joint, factor=_at(s, 1.05, 1.15, 1.5), **d.when
-    ),
-    "wrist_bias": lambda d, s: sensor.Bias(
-        channel=d.prefix + "wrist_force", element=d.translation, amount=_at(s, 0.5, 2.0, 8.0), **d.when
-    ),
-    "frozen_wrist": lambda d, s: sensor.Freeze(
-        channel="wrist_force", element=None, duration=(5, 15, None)[s], **d.when
-    ),
-    # action
-    "action_delay": lambda d, s: action.ActionDelay(steps=(1, 3, 6)[s], **d.when),
-    "action_drop": lambda d, s: action.ActionDrop(probability=_at(s, 0.1, 0.3, 0.7), **d.when),
-    "action_bias": lambda d, s: action.ActionBias(axis=d.axis, amount=_at(s, 0.05, 0.15, 0.4), **d.when),
-    "action_repeat": lambda d, s: action.ActionRepeat(steps=(2, 4, 8)[s], **d.when),
-    "sign_flip": lambda d, s: action.SignFlip(axis=d.translation, duration=(3, 10, None)[s], **d.when),
-    "action_noise": lambda d, s: action.ActionNoise(share=_at(s, 0.15, 0.4, 1.0), **d.when),
-    "adversary": lambda d, s: action.Adversary(size=_at(s, 0.05, 0.15, 0.4), **d.when),
-    # object
-    "slip": lambda d, s: object.Slip(friction=_at(s, 0.4, 0.15, 0.03), **d.when),
-    "snatch": lambda d, s: object.Snatch(newtons=_at(s, 3, 10, 30), direction=d.direction, duration=10, **d.when),
-    "teleport": lambda d, s: object.Teleport(
-        offset=(_at(s, 0.01, 0.03, 0.08), _at(s, 0.01, 0.03, 0.08), 0.0), **d.when
-    ),
-    "heavy_object": lambda d, s: object.Heavy(kilograms=_at(s, 0.1, 0.4, 1.5), **d.when),
-    "missing_object": lambda d, _: object.Missing(**d.when),
+FAMILIES: dict[str, dict[str, Kind]] = {
+    "body": {
+        "push": lambda d, s: body.Push(body=d.link, newtons=_PUSH[s], direction=d.direction, duration=10, **d.when),
+        "payload": lambda d, s: body.Payload(body=d.hand, kilograms=_at(s, 0.25, 0.75, 2.0), **d.when),
+        "collision": lambda d, s: body.Collision(body=d.hand, stiffness=_at(s, 500, 2000, 8000), duration=20, **d.when),
+        "cable_pull": lambda d, s: body.CablePull(body=d.hand, stiffness=_at(s, 50, 150, 400), **d.when),
+        "held_by_person": lambda d, s: body.HeldByPerson(
+            body=d.link, stiffness=_at(s, 100, 300, 800), duration=30, **d.when
+        ),
+    },
+    "actuator": {
+        "weak_joint": lambda d, s: actuator.WeakJoint(joint=d.joint, strength=_at(s, 0.9, 0.7, 0.4), **d.when),
+        "stuck_joint": lambda d, s: actuator.StuckJoint(joint=d.joint, duration=(4, 12, None)[s], **d.when),
+        "joint_friction": lambda d, s: actuator.JointFriction(
+            joint=d.joint, newton_metres=_at(s, 0.5, 2, 6), viscous=_at(s, 0.5, 2, 6), **d.when
+        ),
+        "backlash": lambda d, s: actuator.Backlash(joint=d.joint, gap=_at(s, 0.003, 0.01, 0.03), **d.when),
+        "gripper_opens": lambda d, s: actuator.GripperOpens(duration=(2, 8, None)[s], **d.when),
+        "weak_gripper": lambda d, s: actuator.WeakGripper(strength=_at(s, 0.5, 0.2, 0.05), **d.when),
+    },
+    "sensor": {
+        "encoder_bias": lambda d, s: sensor.Bias(**d.encoder, amount=_at(s, 0.01, 0.03, 0.1), **d.when),
+        "encoder_drift": lambda d, s: sensor.Drift(**d.encoder, rate=_at(s, 5e-4, 2e-3, 8e-3), **d.when),
+        "frozen_encoder": lambda d, s: sensor.FrozenEncoder(joint=d.joint, duration=(5, 15, None)[s], **d.when),
+        "encoder_noise": lambda d, s: sensor.Noise(**d.encoder, std=_at(s, 2e-3, 1e-2, 5e-2), **d.when),
+        "encoder_spikes": lambda d, s: sensor.Spikes(**d.encoder, amount=_at(s, 0.02, 0.1, 0.5), **d.when),
+        "encoder_delay": lambda d, s: sensor.Delay(**d.encoder, steps=(1, 2, 5)[s], **d.when),
+        "encoder_dropout": lambda d, s: sensor.Dropout(**d.encoder, probability=_at(s, 0.05, 0.2, 0.5), **d.when),
+        "torque_scale": lambda d, s: sensor.Scale(
+            channel=d.prefix + "measured_torque", element=d.joint, factor=_at(s, 1.05, 1.15, 1.5), **d.when
+        ),
+        "wrist_bias": lambda d, s: sensor.Bias(
+            channel=d.prefix + "wrist_force", element=d.translation, amount=_at(s, 0.5, 2.0, 8.0), **d.when
+        ),
+        "frozen_wrist": lambda d, s: sensor.Freeze(
+            channel="wrist_force", element=None, duration=(5, 15, None)[s], **d.when
+        ),
+    },
+    "action": {
+        "action_delay": lambda d, s: action.ActionDelay(steps=(1, 3, 6)[s], **d.when),
+        "action_drop": lambda d, s: action.ActionDrop(probability=_at(s, 0.1, 0.3, 0.7), **d.when),
+        "action_bias": lambda d, s: action.ActionBias(axis=d.axis, amount=_at(s, 0.05, 0.15, 0.4), **d.when),
+        "action_repeat": lambda d, s: action.ActionRepeat(steps=(2, 4, 8)[s], **d.when),
+        "sign_flip": lambda d, s: action.SignFlip(axis=d.translation, duration=(3, 10, None)[s], **d.when),
+        "action_noise": lambda d, s: action.ActionNoise(share=_at(s, 0.15, 0.4, 1.0), **d.when),
+        "adversary": lambda d, s: action.Adversary(size=_at(s, 0.05, 0.15, 0.4), **d.when),
+    },
+    "object": {
+        "slip": lambda d, s: object.Slip(friction=_at(s, 0.4, 0.15, 0.03), **d.when),
+        "snatch": lambda d, s: object.Snatch(newtons=_at(s, 3, 10, 30), direction=d.direction, duration=10, **d.when),
+        "teleport": lambda d, s: object.Teleport(
+            offset=(_at(s, 0.01, 0.03, 0.08), _at(s, 0.01, 0.03, 0.08), 0.0), **d.when
+        ),
+        "heavy_object": lambda d, s: object.Heavy(kilograms=_at(s, 0.1, 0.4, 1.5), **d.when),
+        "missing_object": lambda d, _: object.Missing(**d.when),
+    },
 }
-"""A fault of each kind for an episode, at severity 0 to 2."""
+"""A fault of each kind for an episode, at severity 0 to 2, by what it acts on."""
+
+KINDS: dict[str, Kind] = {name: make for family in FAMILIES.values() for name, make in family.items()}
+
+DEVELOPMENT, TEST = "development", "test"
+
+
+def _split() -> dict[str, tuple[str, ...]]:
+    """Half of the kinds of each family to choose settings by, and the others to report: drawn once, by a seed."""
+    rng = np.random.default_rng(0)
+    drawn = (rng.permutation(list(family))[: (len(family) + 1) // 2] for family in FAMILIES.values())
+    tested = {str(name) for names in drawn for name in names}
+    return {
+        DEVELOPMENT: tuple(n for n in KINDS if n not in tested),
+        TEST: tuple(n for n in KINDS if n in tested),
+    }
+
+
+GROUPS = _split()
+"""Kinds to develop on, and kinds to test on. Settings that were chosen before 2026-11-22 had seen them all."""
+
+
+def kinds_of(names: Sequence[str]) -> tuple[str, ...]:
+    """Kinds by name, in order; ``development`` and ``test`` stand for those of the group.
+
+    Raises:
+        ValueError: an unknown name; the message lists what exists.
+    """
+    for name in names:
+        if name not in GROUPS:
+            check_choice("kind of fault", name, KINDS)
+    return tuple(dict.fromkeys(kind for name in names for kind in GROUPS.get(name, (name,))))
+
 
 HARMLESS: dict[str, Callable[[Drawn], Fault]] = {
     "lighter_object": lambda d: harmless.ObjectMass(factor=0.9, **_always(d)),

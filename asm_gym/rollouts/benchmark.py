@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import asm_gym
 from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode, EpisodeLabel
@@ -94,6 +96,7 @@ def result_of(
         _traces(name, monitor, by_role.get("harmless", []), thresholds[rate]),
         thresholds,
         _examples(monitor, traces, tested),
+        np.zeros(0) if monitor.maxima_ is None else monitor.maxima_,
     )
 
 
