@@ -108,6 +108,12 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
     return Checkpoint(header, arrays)
 
 
+def read_header(path: str | Path) -> dict[str, Any]:
+    """The JSON values of a checkpoint alone. Raises FileNotFoundError, or ValueError where the file is damaged."""
+    with _opened(path, "is damaged or not a checkpoint of asm-gym", expanded=1) as file:
+        return _header(file)
+
+
 def kind_of(path: str | Path) -> str:
     """What a file is a checkpoint of. Raises FileNotFoundError, or ValueError where it is none."""
     try:

@@ -25,6 +25,7 @@ GROUPS: dict[str, dict[str, Command]] = {
         "collect": Command("asm_gym.scripts.collect", "record episodes of a policy, as a Minari dataset"),
         "import": Command("asm_gym.scripts.import_demonstrations", "read robosuite's or robomimic's HDF5 likewise"),
         "fit": Command("asm_gym.scripts.fit", "a memory from recorded episodes or logs"),
+        "babble": Command("asm_gym.scripts.babble", "one memory of a body, for any policy"),
         "evaluate": Command("asm_gym.scripts.evaluate", "tasks x monitors x faults: who notices what"),
         "watch": Command("asm_gym.scripts.watch", "a log, or rows as they come: when, where, how surprising"),
         "train": Command("asm_gym.scripts.train", "an agent: cloned, then improved by SAC, TD3 or PPO"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
@@ -9,11 +10,13 @@ import gymnasium as gym
 
 from asm_gym.abilities import SensesWithinSteps
 from asm_gym.checks import check_number, shown
-from asm_gym.monitors import ExpectsActions, Monitor
+from asm_gym.monitors import ExpectsActions, Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract, nearest_to_rest
 from asm_gym.stream import StreamSpec, control_period
 from asm_gym.wrappers.arbitration import Patience
+
+LOG = logging.getLogger("asm_gym.safety")
 
 REFLEXES: dict[str, Callable[[gym.Env[Any, Any]], Policy]] = {
     "hold": Hold,
@@ -47,6 +50,18 @@ def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
         raise TypeError(f"monitor must have initial_state() and observe(), got {shown(monitor)}")
     monitor.spec.require(watched, "the monitor")
     return check_number("the monitor's threshold", monitor.threshold)
+
+
+def body_memory(env: gym.Env[Any, Any], watched: StreamSpec) -> NeuralASM:
+    """The shipped memory of the body that ``env`` moves; which one it is goes to the log.
+
+    Raises:
+        ValueError: none fits; the message lists those that there are.
+    """
+    inner: Any = env.unwrapped
+    memory = NeuralASM.pretrained(pretrained_for(watched, getattr(inner, "controller", "")))
+    LOG.info("watching %s with %r", inner, memory)
+    return memory
 
 
 def make_reflex(on_alarm: str | Policy, env: gym.Env[Any, Any]) -> Policy | None:

@@ -17,6 +17,7 @@ from asm_gym.monitors import LearnsOnTheJob, Monitor, Surprise
 from asm_gym.policies.base import Policy
 from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Decision
 from asm_gym.wrappers.arguments import (
+    body_memory,
     check_expectation,
     check_monitor,
     check_rate,
@@ -62,7 +63,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Args:
         env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream.
-        monitor: a fitted and calibrated monitor.
+        monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that ``env`` moves.
         on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip, in environments of this package under
             every controller and wrapper; ``"retract"`` goes back along the path; ``"comply"`` yields to what presses;
             ``"recall"`` goes on as the memory expects; ``"graded"`` stays, yields to what keeps pressing, hands back on
@@ -86,15 +87,16 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Raises:
         ValueError: an unknown ``on_alarm``, a monitor fitted for another stream or rate (the message names what
-            differs), a rate that does not fit, ``"recall"`` with a monitor that expects no action, or a wrapper inside
-            that changes actions, where the reflex cannot know what reaches the robot. Nothing is changed then.
+            differs), no monitor where no shipped memory fits (the message lists them), a rate that does not fit,
+            ``"recall"`` with a monitor that expects no action, or a wrapper inside that changes actions, where the
+            reflex cannot know what reaches the robot. Nothing is changed then.
         RuntimeError: the monitor is not calibrated.
     """
 
     def __init__(
         self,
         env: gym.Env[Any, Any],
-        monitor: Monitor,
+        monitor: Monitor | None = None,
         on_alarm: str | Policy = "hold",
         *,
         release_after: int = 10,
@@ -125,13 +127,14 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             raise TypeError(f"NeuralASMSafety needs a Box action space, got {env.action_space}")
         check_choice("on_overrun", on_overrun, ("warn", "alarm", "ignore"))
         self.learning_rate = check_number("learning_rate", learning_rate, low=0, high=1)
-        if learning_rate > 0 and not isinstance(monitor, LearnsOnTheJob):
-            raise ValueError(f"{type(monitor).__name__} cannot learn on the job: learning_rate must be 0")
         self._source = StreamSource(env)
         watched = self._source.spec
         if monitor_freq is not None:
             sensing = check_rate(env, monitor_freq)
             watched = sensing.stream_spec_at(monitor_freq)
+        monitor = body_memory(env, watched) if monitor is None else monitor
+        if learning_rate > 0 and not isinstance(monitor, LearnsOnTheJob):
+            raise ValueError(f"{type(monitor).__name__} cannot learn on the job: learning_rate must be 0")
         self.threshold = check_monitor(monitor, watched)
         self.monitor = monitor
         self._ends = "truncated" if check_flag("truncate", truncate) else "terminated"

@@ -16,7 +16,14 @@ from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, Reflex, nearest_to_rest
 from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Command, Decision
-from asm_gym.wrappers.arguments import check_expectation, check_monitor, make_fallback, make_patience, make_reflex
+from asm_gym.wrappers.arguments import (
+    body_memory,
+    check_expectation,
+    check_monitor,
+    make_fallback,
+    make_patience,
+    make_reflex,
+)
 from asm_gym.wrappers.batches import Mask, Member, final, members, refuse_changes, replace, set_attribute
 from asm_gym.wrappers.observer import Observer, joined
 from asm_gym.wrappers.recording import StreamSource
@@ -36,7 +43,7 @@ class VectorNeuralASMSafety(VectorWrapper):
 
     Args:
         env: of ``gym.make_vec``; where ``info`` has no ``"stream"``, observation and action are the stream.
-        monitor: a fitted and calibrated monitor.
+        monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that they move.
         on_alarm: as in ``NeuralASMSafety``; a policy of yours is shared, and must keep what it knows in its state.
         release_after, release_below, max_override, try_after, truncate: as in ``NeuralASMSafety``.
 
@@ -50,7 +57,7 @@ class VectorNeuralASMSafety(VectorWrapper):
     def __init__(
         self,
         env: VectorEnv[Any, Any, Any],
-        monitor: Monitor,
+        monitor: Monitor | None = None,
         on_alarm: str | Policy = "hold",
         *,
         release_after: int = 10,
@@ -67,6 +74,9 @@ class VectorNeuralASMSafety(VectorWrapper):
             raise ValueError(f"one {type(on_alarm).__name__} cannot act in several environments: give its name instead")
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self._members = members(env)
+        if monitor is None:
+            first = self._members[0]
+            monitor = body_memory(first, StreamSource(first).spec)
         self._own_stream = self._members[0].has_wrapper_attr("stream_spec")
         for member in self._members:
             source = StreamSource(member)

@@ -22,6 +22,7 @@ from asm_gym.monitors.registry import (
     monitor_class,
     register_monitor,
 )
+from asm_gym.monitors.shipped import pretrained, pretrained_for
 
 __all__ = [
     "DETECTIONS",
@@ -39,5 +40,7 @@ __all__ = [
     "load_monitor",
     "make_monitor",
     "monitor_class",
+    "pretrained",
+    "pretrained_for",
     "register_monitor",
 ]

@@ -50,6 +50,7 @@ class CalibratedMonitor:
     Attributes:
         threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
         maxima_: (n,) largest surprise in each episode that ``calibrate`` was given; None before.
+        about: whatever else is worth knowing, such as its ``name``; JSON-serialisable, and saved with it.
     """
 
     model: Model
@@ -62,6 +63,13 @@ class CalibratedMonitor:
         self.detections = {d.name: d for d in detections}
         self.threshold_: float | None = None
         self.maxima_: NDArray[np.float64] | None = None
+        self.about: dict[str, Any] = {}
+
+    def __repr__(self) -> str:
+        """Whose it is, and at which threshold it alarms."""
+        name = f"{self.about['name']!r}, " if "name" in self.about else ""
+        limit = "no threshold" if self.threshold_ is None else f"threshold {self.threshold_:.4g}"
+        return f"<{type(self).__name__} {name}{self.spec.source or 'a stream'} at {1 / self.spec.dt:g} Hz, {limit}>"
 
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
@@ -245,6 +253,7 @@ class CalibratedMonitor:
             "detection": self.detection.name,
             "threshold": self.threshold_,
             "skills": list(self.skills_),
+            "about": self.about,
             "shapes": {name: list(array.shape) for name, array in arrays.items()},
         }
         write_checkpoint(path, self.model.kind, header, arrays)
@@ -275,6 +284,7 @@ class CalibratedMonitor:
         for detection in self.detections.values():
             if arrays.keys() >= set(detection.arrays):
                 detection.restore({n: arrays[n] for n in detection.arrays})
+        self.about = dict(header.get("about", {}))  # an older asm-gym kept nothing
         if not new or header["detection"] == self.detection.name:
             self.threshold_, self.maxima_ = self._reachable(header["threshold"]), maxima
         return self

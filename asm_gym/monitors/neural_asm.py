@@ -27,6 +27,7 @@ from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState, restored
 from asm_gym.monitors.nominal import check_nominal
+from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.scaling import StreamScaler
 from asm_gym.stream import StreamSpec
 
@@ -146,6 +147,17 @@ class NeuralASM(CalibratedMonitor):
             ValueError: the file is damaged, from a newer version, or something else.
         """
         return restored(path, read_checkpoint(path, cls.kind), cls)
+
+    @classmethod
+    def pretrained(cls, name: str) -> Self:
+        """A memory of a body that comes with the package, calibrated: ``NeuralASM.pretrained("panda")``.
+
+        It has learned what an arm does under any policy, from motor babbling; ``about`` says from which.
+
+        Raises:
+            ValueError: there is none of that name; the message lists those that there are.
+        """
+        return cls.load(pretrained_file(name))
 
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
         state, surprise = super().observe(state, stream)

@@ -90,10 +90,10 @@ def result_of(
     rates = sorted({rate, *(r for r in RATES if len(by_role["calibration"]) >= conformal_episodes(r))})
     thresholds = {r: monitor.threshold_at(r) for r in rates}
     tested = [*by_role["nominal"], *by_role.get("faulty", [])]
-    traces = _traces(name, monitor, tested, thresholds[rate])
+    traces = traces_of(name, monitor, tested, thresholds[rate])
     return MonitorResult(
         traces,
-        _traces(name, monitor, by_role.get("harmless", []), thresholds[rate]),
+        traces_of(name, monitor, by_role.get("harmless", []), thresholds[rate]),
         thresholds,
         _examples(monitor, traces, tested),
         np.zeros(0) if monitor.maxima_ is None else monitor.maxima_,
@@ -129,7 +129,8 @@ def _scores(monitor: CalibratedMonitor, recordings: Sequence[Episode]) -> list[A
     return list(monitor.score_episodes(recordings)) if recordings else []
 
 
-def _traces(name: str, monitor: CalibratedMonitor, episodes: Sequence[Episode], threshold: float) -> list[Trace]:
+def traces_of(name: str, monitor: CalibratedMonitor, episodes: Sequence[Episode], threshold: float) -> list[Trace]:
+    """What a monitor made of recordings, judged at this threshold."""
     made = []
     for episode, surprise in zip(episodes, _scores(monitor, episodes), strict=True):
         label = episode.labelled

@@ -1,0 +1,67 @@
+"""Memories of a body that come with the package: one for each arm and rate, fitted on motor babbling.
+
+A file's header says whose body it is; nothing else is read to find the one that fits.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from asm_gym.checkpoint import read_header
+from asm_gym.choices import check_choice
+from asm_gym.stream import StreamSpec
+
+SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
+"""Where they lie."""
+MAKE = "asm-gym babble"
+"""The command that makes one."""
+
+
+def pretrained() -> dict[str, Path]:
+    """The file of each shipped memory, by name."""
+    return {path.stem: path for path in sorted(SHIPPED.glob("*.asm"))}
+
+
+def pretrained_file(name: str) -> Path:
+    """The file of the memory called ``name``, such as ``"panda"``.
+
+    Raises:
+        ValueError: there is none; the message lists those that there are.
+    """
+    known = pretrained()
+    check_choice("pretrained memory", name, known)
+    return known[name]
+
+
+def pretrained_for(spec: StreamSpec, controller: str = "") -> str:
+    """The name of the shipped memory of this body.
+
+    Args:
+        spec: of the stream to be watched; its source says whose body it is.
+        controller: of the body, by name.
+
+    Raises:
+        ValueError: none fits; the message says why each does not, and how to fit one of one's own.
+    """
+    lines = []
+    for name, path in pretrained().items():
+        header = read_header(path)
+        known, about = StreamSpec.from_json(header["spec"]), header["about"]
+        misfits = [f"{what}: {mine} against {theirs}" for what, mine, theirs in _named(known, about, spec, controller)]
+        misfits += known.difference(spec)
+        if not misfits:
+            return name
+        lines.append(f"  {name}: {'; '.join(misfits)}")
+    raise ValueError(
+        f"no shipped memory fits this stream of {spec.source or 'an unnamed body'} at {1 / spec.dt:g} Hz"
+        f"{f' under {controller}' if controller else ''}. There are:\n" + "\n".join(lines) + f"\nFit one of your own: "
+        f"{MAKE} --robot {spec.source or 'ROBOT'} for an arm of robosuite, asm-gym fit DATA for recordings, and hand "
+        "it over as monitor"
+    )
+
+
+def _named(known: StreamSpec, about: dict[str, Any], spec: StreamSpec, controller: str) -> list[tuple[str, str, str]]:
+    """What differs by name where channels need not."""
+    pairs = [("robot", known.source, spec.source), ("controller", str(about.get("controller", "")), controller)]
+    return [pair for pair in pairs if pair[1] != pair[2]]

@@ -1,0 +1,184 @@
+"""Motor babbling: a curriculum that teaches what a body does, not how one policy does a task.
+
+    a_t = clip(e_t + s x_t),   x_t = ρ x_{t-1} + √(1 - ρ²) ξ_t      e the guide's action, 0 without one; ξ white
+
+Each lesson is one episode. Half of them are led by an expert that noise drives off its course, from hardly to
+thoroughly, in jerks or slowly; a quarter are the expert's own, at many speeds; in a quarter noise alone moves the arm.
+In half of all the arm stops now and then, whatever it holds or leans on, and in half a thing weighs more or less.
+
+Sources: Laskey et al. 2017 (CoRL, DART) for noise on an expert's commands; Saegusa et al. 2009 (ROBIO) for babbling.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.episodes import Episode, EpisodeLabel, save_episode
+from asm_gym.faults.harmless import ObjectMass
+from asm_gym.faults.object import movable
+from asm_gym.policies import Policy, make_policy
+from asm_gym.policies.scripted.base import Style
+from asm_gym.rollouts.seeds import role_seeds
+from asm_gym.rollouts.trial import RolloutConfig, Trial, environment, play, staged
+from asm_gym.tasks import task as task_spec
+from asm_gym.wrappers import StreamRecorder
+
+ALONE, LED, DRIVEN = "noise", "expert", "disturbed"
+LEADING = (LED, DRIVEN, ALONE, DRIVEN)
+"""What leads, lesson by lesson of a task."""
+SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
+"""ρ: from the noise by which agents explore to pushing on in one direction, as half-trained ones do."""
+NOISE = 0.05, 1.0
+"""s, from hardly to thoroughly [action units]."""
+SPEED = 0.5, 1.5
+"""Of the expert, relative to its usual one."""
+WEIGHT = 0.7, 1.4
+"""What the mass of a thing is multiplied by."""
+PAUSE, PAUSED = 0.01, (5, 60)
+"""Probability in a step that the arm stops, and for how many steps."""
+
+
+class Lesson(NamedTuple):
+    """One episode of babbling.
+
+    Attributes:
+        task: its name.
+        number: among the lessons of its task.
+        seed: of the environment, of the guide and of the noise.
+        guide: what leads, a policy's name; noise alone where empty.
+        noise: s, standard deviation of the noise [action units].
+        smoothness: ρ.
+        speed: of a scripted guide, relative to its usual one.
+        pause: probability in a step that the arm stops for a while.
+        weight: what the mass of the task's thing is multiplied by.
+    """
+
+    task: str
+    number: int
+    seed: int
+    guide: str = "scripted"
+    noise: float = 0.0
+    smoothness: float = 0.0
+    speed: float = 1.0
+    pause: float = 0.0
+    weight: float = 1.0
+
+    @property
+    def path(self) -> Path:
+        """Where in a run's folder its recording lies."""
+        return self.label.path
+
+    @property
+    def label(self) -> EpisodeLabel:
+        """What it is recorded as."""
+        return EpisodeLabel(self.task, "babble", seed=self.seed)
+
+
+def curriculum(tasks: Sequence[str], episodes: int, seed: int, guides: Sequence[str] = ()) -> list[Lesson]:
+    """Lessons, task by task; all of them follow from ``seed``, and fewer ``episodes`` are the first of more.
+
+    Args:
+        tasks: their names.
+        episodes: of each task.
+        guides: agents that take turns with the experts, in the tasks that each was trained in.
+
+    Raises:
+        ValueError: fewer than one episode.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    return [
+        _lesson(task, number, drawn, ["scripted", *(g for g in guides if g.split("_")[0] == task.lower())])
+        for task in tasks
+        for number, drawn in enumerate(role_seeds(seed, task, "babble", episodes))
+    ]
+
+
+def _lesson(task: str, number: int, seed: int, guides: Sequence[str]) -> Lesson:
+    rng, leads = np.random.default_rng([seed, 3]), LEADING[number % len(LEADING)]
+    return Lesson(
+        task,
+        number,
+        seed,
+        guide="" if leads == ALONE else guides[number // len(LEADING) % len(guides)],
+        noise=0.0 if leads == LED else float(np.exp(rng.uniform(*np.log(NOISE)))),
+        smoothness=float(rng.choice(SMOOTHNESS)),
+        speed=float(rng.uniform(*SPEED)),
+        pause=PAUSE * float(rng.random() < 0.5),
+        weight=float(np.exp(rng.uniform(*np.log(WEIGHT)))) if rng.random() < 0.5 else 1.0,
+    )
+
+
+class Babbler:
+    """Acts as a lesson says.
+
+    Args:
+        env: one of the lesson's task.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], lesson: Lesson) -> None:
+        style = {"style": Style(speed=lesson.speed)} if lesson.guide == "scripted" else {}
+        self._guide: Policy | None = make_policy(lesson.guide, env, seed=lesson.seed, **style) if lesson.guide else None
+        self._lesson, self._rng = lesson, np.random.default_rng([lesson.seed, 1])
+        self._noise = self._rng.standard_normal(env.action_space.shape or ())
+        self._grip = np.isin(np.arange(len(self._noise)), list(getattr(env.unwrapped, "gripper_actions", ())))
+        self._fumbles = bool(self._rng.random() < 0.5)
+        self._left = 0
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], Any]:
+        """The next action (A,)."""
+        lesson, rng = self._lesson, self._rng
+        fresh = rng.standard_normal(self._noise.shape)
+        self._noise = lesson.smoothness * self._noise + np.sqrt(1.0 - lesson.smoothness**2) * fresh
+        action = lesson.noise * self._noise  # (A,)
+        if self._guide is not None:
+            meant, state = self._guide.predict(observation, state, episode_start)
+            # A hand that never keeps hold would never learn what holding feels like.
+            action = np.where(self._grip & (not self._fumbles), 0.0, action) + meant
+        self._left = self._left - 1 if self._left else int(rng.integers(*PAUSED)) * (rng.random() < lesson.pause)
+        if self._left:  # it keeps its grip
+            action = np.where(self._grip, action, 0.0)
+        return np.clip(action, -1.0, 1.0).astype(np.float32), state
+
+
+def record_lesson(lesson: Lesson, config: RolloutConfig, folder: Path) -> Path:
+    """Records the episode of a lesson, and writes it to its place under ``folder``.
+
+    Args:
+        config: how; what acts is the lesson's to say.
+    """
+    forces: list[float] = []
+    config = replace(config, policy=partial(Babbler, lesson=lesson))
+    env_id = task_spec(lesson.task).id
+    base: Any = environment(env_id, config.settings).unwrapped
+    heavy = lesson.weight != 1.0 and bool(movable(base))
+    faults = (ObjectMass(factor=lesson.weight, onset=0, seed=lesson.seed),) if heavy else ()
+    trial = Trial(env_id, lesson.seed, "babble", faults=faults)
+    with staged(trial, config) as env:
+        recorder = StreamRecorder(env)
+        play(trial, config, recorder, lambda info: forces.append(info["contact_force"]))
+    recorded = recorder.finish()
+    kept = Episode(
+        stream=recorded.stream,
+        spec=recorded.spec,
+        success=recorded.success,
+        seed=lesson.seed,
+        contact_force=np.asarray(forces, np.float32),
+        label=lesson.label,
+        info={"skill": lesson.task, "lesson": lesson._asdict()},
+    )
+    return save_episode(folder / lesson.path, kept)

@@ -1,0 +1,242 @@
+"""One memory of a body, for any policy: records motor babbling, learns from it, and examines what came of it.
+
+The memory alarms at what no body does, whatever the policy wants. It is examined on policies and on tasks that babbling
+never showed. A run lives in one folder and can be killed at any time: what was recorded is not recorded again.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from asm_gym.choices import check_choice
+from asm_gym.detection import conformal_episodes
+from asm_gym.episodes import EpisodeLabel, load_episode
+from asm_gym.evaluation.metrics import false_alarms, false_alarms_per_hour
+from asm_gym.evaluation.statistics import Share
+from asm_gym.evaluation.tables import Column, Table, console_table, count, markdown, milliseconds, percent, tabulate
+from asm_gym.faults.suite import possible
+from asm_gym.monitors import NeuralASM
+from asm_gym.policies.registry import EXPERTS, agents
+from asm_gym.rollouts.babbling import curriculum, record_lesson
+from asm_gym.rollouts.body import CALIBRATED_ON, Exam, Marks, examine, healthy, learn_body
+from asm_gym.rollouts.folder import claimed, make_missing, versions
+from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
+from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.trial import RolloutConfig, environment, record
+from asm_gym.scripts.command import run
+from asm_gym.tasks import ROBOTS, TASKS
+from asm_gym.tasks import task as task_spec
+
+SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
+LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
+_GRIPPED = tuple(name for name, task in TASKS.items() if task.arms == 1 and name in EXPERTS and name != "Wipe")
+"""Tasks of one arm with a gripper, whose streams are alike."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """A memory of a body, from motor babbling."""
+
+    robot: str = "Panda"
+    """The arm."""
+    tasks: tuple[str, ...] = SHOWN
+    """Tasks to babble in."""
+    guides: tuple[str, ...] = ()
+    """Shipped agents that lead in turn with the experts; none by default, so that the examination meets them first."""
+    episodes: int = 36
+    """Lessons in each task; a second call with more of them goes on."""
+    stream_freq: int | None = None
+    """Rows of the stream a second [Hz]; one each control step by default."""
+    false_alarm_rate: float = 0.02
+    """Share of healthy lessons that may raise an alarm."""
+    exam_tasks: tuple[str, ...] = LEFT_OUT
+    """Further tasks to examine in, which the memory never met."""
+    exam_policies: tuple[str, ...] | None = None
+    """Agents to examine under; by default all that are shipped and fit this arm."""
+    exam_episodes: int = 20
+    """Healthy episodes of each examination; 0 examines nothing."""
+    exam_faults: int = 1
+    """Episodes of each examination for each kind of fault and severity."""
+    window: float = 1.0
+    """How soon after its onset a fault must be noticed [s]."""
+    parallel: tyro.conf.OmitArgPrefixes[ParallelConfig] = TWO_PROCESSES
+    """Who does the work."""
+    seed: int = 0
+    """Seed of all that is drawn."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/babble")
+    """Folder of the run."""
+    quick: bool = False
+    """Two tasks and few lessons: to see that everything runs, not to judge the figures."""
+
+    def __post_init__(self) -> None:
+        check_choice("robot", self.robot, ROBOTS)
+        for name in (*self.tasks, *self.exam_tasks):
+            check_choice("task of one arm with a gripper", name, _GRIPPED)
+        for name in (*self.guides, *(self.exam_policies or ())):
+            check_choice("agent", name, agents())
+        if not self.tasks:
+            raise ValueError("there must be at least one task to babble in")
+        if self.exam_episodes < 0 or not 0 <= self.exam_faults <= self.exam_episodes:
+            raise ValueError(
+                "every faulty episode is the twin of a healthy one: exam_faults must be in 0 to exam_episodes, got "
+                f"{self.exam_faults} and {self.exam_episodes}"
+            )
+        if not self.window > 0:
+            raise ValueError(f"window must be > 0 s, got {self.window}")
+        needed, there = conformal_episodes(self.false_alarm_rate), len(self.tasks) * (self.episodes // CALIBRATED_ON)
+        if there < needed:
+            raise ValueError(
+                f"a false-alarm rate of {self.false_alarm_rate:g} needs {needed} lessons to calibrate on, one in "
+                f"{CALIBRATED_ON}, got {there} of {self.episodes} lessons in each of {len(self.tasks)} tasks"
+            )
+
+    def scaled(self) -> Args:
+        """With ``quick``, little of everything."""
+        if not self.quick:
+            return self
+        return replace(
+            self,
+            tasks=self.tasks[:2],
+            episodes=12,
+            exam_tasks=(),
+            exam_policies=(),
+            exam_episodes=min(2, self.exam_episodes),
+            exam_faults=0,
+            false_alarm_rate=0.2,
+        )
+
+    @property
+    def config(self) -> RolloutConfig:
+        return RolloutConfig(robot=self.robot, stream_freq=self.stream_freq)
+
+    @property
+    def name(self) -> str:
+        """Of the memory."""
+        return self.robot.lower() + (f"_{self.stream_freq}hz" if self.stream_freq else "")
+
+    @property
+    def exams(self) -> list[Exam]:
+        """What to examine it on."""
+        policies = agents() if self.exam_policies is None else self.exam_policies
+        trained_in = {p: next(t for t in TASKS if t.lower() == p.split("_")[0]) for p in policies}
+        if self.robot != "Panda":  # which all of them were trained with
+            trained_in = {}
+        return [
+            *(Exam(t, "scripted", known=True) for t in self.tasks),
+            *(Exam(t, "scripted", known=False) for t in self.exam_tasks if t not in self.tasks),
+            *(Exam(t, p, known=p in self.guides) for p, t in trained_in.items()),
+        ]
+
+
+def learn(args: Args, console: Console) -> NeuralASM:
+    """Records what is missing, and fits, calibrates and saves the memory."""
+    wanted = curriculum(args.tasks, args.episodes, args.seed, args.guides)
+    with stage("babbling", console, {}) as progress:
+        make = partial(record_lesson, config=args.config, folder=args.out.resolve())
+        files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, args.parallel, progress)
+    lessons = healthy([load_episode(file) for file in files])
+    with stage("learning", console, {}) as progress:
+        memory = learn_body(lessons, args.false_alarm_rate, args.seed, progress)
+    inner: Any = environment(task_spec(args.tasks[0]).id, args.config.settings).unwrapped
+    curriculum_of = {n: getattr(args, n) for n in ("tasks", "guides", "episodes", "seed", "false_alarm_rate")}
+    counts = {
+        "lessons": len(lessons.fit),
+        "rows": sum(map(len, lessons.fit)),
+        "calibrated_on": len(lessons.calibration),
+    }
+    memory.about = {"name": args.name, "controller": inner.controller, **curriculum_of, **counts, **versions()}
+    memory.save(args.out / f"{args.name}.asm")
+    return memory
+
+
+def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
+    """What the memory made of each exam, whose missing episodes are recorded."""
+    marks = []
+    for exam in args.exams:
+        config = replace(args.config, policy=exam.policy)
+        folder = (args.out / "exams" / exam.policy).resolve()
+        inner: Any = environment(task_spec(exam.task).id, config.settings).unwrapped
+        labels = exam.labels(args.exam_episodes, args.exam_faults, args.seed)
+        labels = [label for label in labels if label.role == "nominal" or possible(label.kind, inner)]
+        with stage(exam.name, console, {}) as progress:
+            make = partial(record, config=config, folder=folder)
+            make_missing(make, labels, partial(_place, folder=folder), args.parallel, progress)
+            marks.append(examine(memory, exam, folder, labels, args.window))
+    return marks
+
+
+def _place(label: EpisodeLabel, folder: Path) -> Path:
+    return folder / label.path
+
+
+COLUMNS: Sequence[Column[Marks]] = (
+    Column("", lambda m: m.name),
+    Column("healthy, alarm", lambda m: count(false_alarms(m.solved))),
+    Column("per hour", lambda m: f"{false_alarms_per_hour(m.solved):.1f}"),
+    Column("failed, alarm", lambda m: count(false_alarms(m.failed)) if m.failed else ""),
+    Column("AUROC", lambda m: f"{m.metrics.auroc:.3f}" if m.metrics.faulty else ""),
+    Column("found", lambda m: f"{percent(m.metrics.detected)} of {m.metrics.detected.n}" if m.metrics.faulty else ""),
+    Column("median [ms]", lambda m: milliseconds(m.metrics.delays, "median_ms") if m.metrics.faulty else ""),
+)
+
+
+def card(marks: Sequence[Marks], memory: NeuralASM, window: float) -> Table:
+    """A row for each exam."""
+    about = memory.about
+    learned = f"learned from {about['lessons']} lessons of {', '.join(about['tasks'])} ({about['rows']} rows)"
+    limit = f"threshold {memory.threshold:.3g} from {about['calibrated_on']} others at {about['false_alarm_rate']:g}"
+    return tabulate(
+        f"{about['name']}: {learned}, {limit}. Episodes with an alarm, apart those that solved the task and those that "
+        "failed; faults of medium and strong severity that an ideal observer could see, found within "
+        f"{window:g} s.",
+        COLUMNS,
+        marks,
+    )
+
+
+def summary(marks: Sequence[Marks]) -> str:
+    """Alarms and faults found in all exams together."""
+    solved = Share.of([bool(t.false_alarms) for m in marks for t in m.solved])
+    found = Share(sum(m.metrics.detected.k for m in marks), sum(m.metrics.detected.n for m in marks))
+    pushes = [t.delay for m in marks for t in m.metrics.faulty if (t.kind, t.severity) == ("push", "medium")]
+    prompt = Share.of([delay is not None and delay <= PROMPT_S + 1e-9 for delay in pushes])
+    return (
+        f"In all: {count(solved)} healthy episodes alarm, {count(found)} faults found, {count(prompt)} pushes of 20 N "
+        f"noticed within {1e3 * PROMPT_S:.0f} ms."
+    )
+
+
+PROMPT_S = 0.1
+"""How soon a push should be noticed [s]."""
+
+
+def babble(args: Args, console: Console) -> None:
+    """Records, learns, examines, and says what came of it."""
+    args = args.scaled()
+    claim = {n: getattr(args, n) for n in ("robot", "guides", "stream_freq", "seed")}
+    with claimed(args.out, "babble.json", claim):
+        memory = learn(args, console)
+        marks = examined(args, memory, console) if args.exam_episodes else []
+        if marks:
+            table = card(marks, memory, args.window)
+            (args.out / "card.md").write_text(f"{markdown(table)}\n\n{summary(marks)}\n", encoding="utf-8")
+            console.print(console_table(table))
+            console.print(summary(marks))
+    console.print(f"Wrote {args.out / args.name}.asm: NeuralASMSafety(env, NeuralASM.load(...)) watches with it")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Babbles, and returns the exit code."""
+    return run("babble", Args, babble, argv, __doc__)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

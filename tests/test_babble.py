@@ -1,0 +1,121 @@
+"""Motor babbling: what its curriculum holds, how it acts, and what of it a memory may take for healthy."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from asm_gym.episodes import Episode, EpisodeLabel, load_episode
+from asm_gym.rollouts.babbling import ALONE, DRIVEN, LEADING, LED, Babbler, Lesson, curriculum, record_lesson
+from asm_gym.rollouts.body import Exam, healthy
+from asm_gym.rollouts.folder import make_missing
+from asm_gym.rollouts.trial import RolloutConfig
+from asm_gym.stream import Channel, StreamSpec
+from tests.fakes import FakeEnv
+
+ARM = StreamSpec((Channel("external_torque_peak", 2, "N m"), Channel("action", 1, group="action")), dt=0.05)
+
+
+def lesson_of(forces, torques, noise=0.0, number=0, task="Lift", rows=1):
+    """A recorded lesson that felt these forces [N] in its steps, and these torques [N m] in its rows."""
+    stream = np.zeros((len(torques), 3), np.float32)
+    stream[:, 0] = np.negative(torques)
+    assert len(stream) == rows * len(forces)
+    lesson = Lesson(task, number, seed=number, noise=noise)
+    about = {"skill": task, "lesson": lesson._asdict()}
+    return Episode(stream, ARM, contact_force=np.array(forces, np.float32), label=lesson.label, info=about)
+
+
+def test_fewer_lessons_are_the_first_of_more():
+    few, many = curriculum(["Lift", "Door"], 5, seed=3), curriculum(["Door", "Lift"], 9, seed=3)
+    assert set(few) <= set(many)
+    assert len({lesson.seed for lesson in many}) == len(many)
+    assert not set(few) & set(curriculum(["Lift", "Door"], 5, seed=4))
+
+
+def test_each_task_has_the_experts_own_course_disturbed_courses_and_noise_alone():
+    for task in ("Lift", "Door"):
+        lessons = [lesson for lesson in curriculum(["Lift", "Door"], 40, seed=0) if lesson.task == task]
+        kinds = [ALONE if not n.guide else LED if n.noise == 0 else DRIVEN for n in lessons]
+        assert kinds == list(LEADING) * 10
+        driven = [n.noise for n in lessons if n.noise]
+        assert min(driven) < 0.1
+        assert max(driven) > 0.7
+        assert {n.pause > 0 for n in lessons} == {n.weight == 1 for n in lessons} == {True, False}
+
+
+def test_agents_take_turns_with_the_expert_of_their_own_task():
+    lessons = curriculum(["Lift", "Door"], 40, seed=0, guides=["lift_sac"])
+    guides = {task: {n.guide for n in lessons if n.task == task} for task in ("Lift", "Door")}
+    assert guides == {"Lift": {"scripted", "lift_sac", ""}, "Door": {"scripted", ""}}
+    with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
+        curriculum(["Lift"], 0, seed=0)
+
+
+@pytest.mark.parametrize("smoothness", [0.0, 0.9])
+def test_noise_is_as_strong_and_as_smooth_as_the_lesson_says(smoothness):
+    env = FakeEnv()
+    babbler = Babbler(env, Lesson("Lift", 0, seed=1, guide="", noise=0.1, smoothness=smoothness))
+    actions = np.array([babbler.predict(None)[0] for _ in range(20_000)])
+    assert actions.std() == pytest.approx(0.1, rel=0.05)
+    assert np.corrcoef(actions[1:, 0], actions[:-1, 0])[0, 1] == pytest.approx(smoothness, abs=0.02)
+
+
+def test_an_arm_that_pauses_keeps_its_grip():
+    babbler = Babbler(FakeEnv(), Lesson("Lift", 0, seed=2, guide="", noise=0.5, pause=1.0))
+    actions = np.array([babbler.predict(None)[0] for _ in range(200)])
+    resting = (actions[:, :2] == 0).all(axis=1)
+    assert 0.8 < resting.mean() < 1.0  # between two pauses it moves
+    assert (actions[:, 2] != 0).all()  # the gripper of a FakeEnv
+
+
+def test_what_presses_harder_than_any_undisturbed_expert_is_cut_off():
+    calm = [lesson_of([5, 9, 0] * 10, [1, 2, 3] * 10, number=n) for n in (0, 4)]
+    hits = lesson_of([9] * 24 + [9.1] + [0] * 5, [3] * 30, noise=0.5, number=1)
+    at_stop = lesson_of([0] * 30, [3] * 22 + [3.1] + [0] * 7, noise=0.5, number=2)
+    found = healthy([*calm, hits, at_stop])
+    assert [len(e) for e in found.fit] == [30, 30, 24]
+    assert [len(e) for e in found.calibration] == [22]  # one in three lessons
+
+
+def test_forces_of_steps_cut_streams_of_many_rows_a_step():
+    calm = [lesson_of([5] * 30, [1] * 90, number=n, rows=3) for n in (0, 2)]
+    hits = lesson_of([0] * 25 + [6] * 5, [1] * 90, noise=0.5, number=1, rows=3)
+    turned = lesson_of([0] * 30, [1] * 80 + [2] * 10, noise=0.5, number=4, rows=3)
+    assert [len(e) for e in healthy([*calm, hits, turned]).fit] == [90, 75, 78]
+
+
+def test_a_task_needs_a_lesson_without_noise_and_something_must_be_left():
+    with pytest.raises(ValueError, match="no undisturbed lesson of Door"):
+        healthy([lesson_of([1] * 30, [1] * 30), lesson_of([1] * 30, [1] * 30, noise=0.1, task="Door")])
+    with pytest.raises(ValueError, match="leave too little"):
+        healthy([lesson_of([1] * 30, [1] * 30)])
+
+
+def test_an_exam_pairs_every_fault_with_a_healthy_twin():
+    labels = Exam("Lift", "scripted", known=False).labels(episodes=3, faults=2, seed=5)
+    nominal = [n for n in labels if n.role == "nominal"]
+    assert [n.seed for n in nominal] == [n.seed for n in Exam("Lift", "lift_sac", known=True).labels(3, 0, 5)]
+    faulty = [n for n in labels if n.role == "faulty"]
+    assert {n.seed for n in faulty} == {n.seed for n in nominal[:2]}
+    assert all(n.onset is not None and n.onset >= 10 for n in faulty)
+
+
+def test_a_recorded_lesson_is_the_same_again_and_leaves_the_simulator_as_it_was(tmp_path):
+    lesson = next(n for n in curriculum(["Lift"], 40, seed=0) if n.noise and n.guide and n.weight != 1)
+    make = partial(record_lesson, config=RolloutConfig())
+    first = load_episode(make(lesson, folder=tmp_path / "a"))
+    make(replace_weight(lesson), folder=tmp_path / "b")
+    again = load_episode(make(lesson, folder=tmp_path / "c"))
+    np.testing.assert_array_equal(first.stream, again.stream)
+    assert first.contact_force.shape == (len(first),)
+    assert first.label == EpisodeLabel("Lift", "babble", seed=lesson.seed)
+    assert not first.faults.size
+    made = []
+    make_missing(made.append, [lesson], lambda n: tmp_path / "a" / n.path, 1)
+    assert made == []  # it is there already
+
+
+def replace_weight(lesson):
+    """The lesson with a heavier thing."""
+    return lesson._replace(weight=1.4, seed=lesson.seed + 1)

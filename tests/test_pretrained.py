@@ -1,0 +1,82 @@
+"""Memories that come with the package: found by name and by the body they know, and refused where they do not fit."""
+
+from dataclasses import replace
+
+import gymnasium as gym
+import pytest
+
+from asm_gym.checkpoint import read_header
+from asm_gym.monitors import NeuralASM, make_monitor, pretrained, pretrained_for
+from asm_gym.wrappers import NeuralASMSafety
+from tests.fakes import FakeEnv
+from tests.streams import sine_episodes, sine_spec
+
+SIZES = {"hidden_size": 4, "association_size": 4, "epochs": 1}
+
+
+@pytest.fixture
+def shelf(tmp_path, monkeypatch):
+    """A room with one memory, of a body called sines under the controller SWING."""
+    memory = NeuralASM(sine_spec(), **SIZES).fit(sine_episodes(4)).calibrate(sine_episodes(4, seed=1), 0.5)
+    memory.about = {"name": "sines", "controller": "SWING"}
+    memory.save(tmp_path / "sines.asm")
+    monkeypatch.setattr("asm_gym.monitors.shipped.SHIPPED", tmp_path)
+    return memory
+
+
+def test_a_shipped_memory_is_loaded_by_name_with_its_threshold_and_what_is_known_of_it(shelf):
+    assert list(pretrained()) == ["sines"]
+    memory = NeuralASM.pretrained("sines")
+    assert memory.threshold == shelf.threshold
+    assert memory.about == {"name": "sines", "controller": "SWING"}
+    assert repr(memory) == f"<NeuralASM 'sines', sines at 20 Hz, threshold {shelf.threshold:.4g}>"
+    with pytest.raises(ValueError, match=r"unknown pretrained memory 'cosines'; known: sines; did you mean 'sines'\?"):
+        NeuralASM.pretrained("cosines")
+
+
+def test_the_memory_of_the_same_body_is_found(shelf):
+    assert pretrained_for(sine_spec(), "SWING") == "sines"
+
+
+@pytest.mark.parametrize(
+    ("spec", "controller", "why"),
+    [
+        (replace(sine_spec(), source="cosines"), "SWING", "robot: sines against cosines"),
+        (sine_spec(), "SLIDE", "controller: SWING against SLIDE"),
+        (replace(sine_spec(), dt=0.01), "SWING", "dt: 0.05 s against 0.01 s"),
+        (replace(sine_spec(sensory=11), source="sines"), "SWING", "joint_position: size 12 against 11"),
+    ],
+)
+def test_another_body_is_refused_with_what_there_is_and_what_to_do(shelf, spec, controller, why):
+    with pytest.raises(ValueError, match="no shipped memory fits") as refused:
+        pretrained_for(spec, controller)
+    assert f"sines: {why}" in str(refused.value)
+    assert "asm-gym babble --robot" in str(refused.value)
+
+
+def test_the_wrapper_without_a_monitor_says_what_there_is_where_none_fits(shelf):
+    with pytest.raises(ValueError, match=r"no shipped memory fits this stream of an unnamed body at 20 Hz"):
+        NeuralASMSafety(FakeEnv())
+
+
+def test_older_files_say_nothing_of_themselves_and_load(tmp_path):
+    monitor = make_monitor("kalman", sine_spec()).fit(sine_episodes(4)).calibrate(sine_episodes(4, seed=1), 0.5)
+    monitor.save(tmp_path / "k.asm")
+    assert read_header(tmp_path / "k.asm")["about"] == {}
+    assert NeuralASM.load("tests/data/neural_asm.asm").about == {}
+
+
+@pytest.mark.parametrize("name", list(pretrained()))
+def test_every_shipped_memory_is_what_its_name_says(name):
+    memory = NeuralASM.pretrained(name)
+    assert memory.about["name"] == name
+    assert memory.threshold > 0
+    assert pretrained_for(memory.spec, memory.about["controller"]) == name
+    assert pretrained()[name].stat().st_size < 8e6
+
+
+@pytest.mark.skipif("panda" not in pretrained(), reason="no memory of the Panda is shipped")
+def test_an_environment_of_the_panda_is_watched_by_the_memory_of_its_body():
+    env = NeuralASMSafety(gym.make("asm_gym/Lift-v0"))
+    assert env.monitor.about["name"] == "panda"
+    env.close()
