@@ -26,7 +26,7 @@ from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.report import publish
 from asm_gym.evaluation.tables import brief_monitors_table, console_table, harmless_table
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of, possible
-from asm_gym.monitors import MONITORS
+from asm_gym.monitors import MONITORS, PARTS
 from asm_gym.policies import make_policy
 from asm_gym.rollouts.benchmark import benchmark, calibrated
 from asm_gym.rollouts.folder import claimed, make_missing
@@ -56,7 +56,7 @@ class Args:
     """The arm."""
     policy: str = "scripted"
     """What acts: scripted, or the path of an agent."""
-    monitors: tuple[str, ...] = tuple(MONITORS)
+    monitors: tuple[str, ...] = tuple(name for name in MONITORS if name not in PARTS)
     """Names of monitors."""
     faults: tuple[str, ...] = tuple(KINDS)
     """Kinds of fault; development or test for those to choose settings by, or to report."""

@@ -148,3 +148,23 @@ def test_unknown_names_and_hyperparameters_list_the_known():
         make_monitor("oracle", SPEC)
     with pytest.raises(ValueError, match=r"'hiden_size'.*did you mean 'hidden_size'"):
         make_monitor("neural_asm", SPEC, hiden_size=3)
+
+
+def test_the_parts_of_the_memory_expect_what_it_does():
+    whole, association, temporal = map(fitted, ("neural_asm", "memory_association", "memory_temporal"))
+    rows = episodes(1, seed=6)[0].stream.astype(np.float64)
+    both = [association.model.memory, temporal.model.memory]
+    assert all(np.array_equal(m.network.weights.W_C, both[0].network.weights.W_C) for m in both)  # learned alike
+    assert temporal.detection.detector_.context_quantile.any()
+    assert len(association.detection.detector_.context_quantile) == 1  # no context: only a bias
+    # What the temporal network expects is better than nothing expected at all, on episodes that it has not seen.
+    state, left, all_of_it = temporal.model.start(1), [], []
+    spread = temporal.model.learned_["temporal_spread"]
+    for row in rows:
+        reading = temporal.model.memory.senses_.read(row[None], row[None], row[None])
+        state, output = temporal.model.predict(state, row[None])
+        left.append(output.errors * spread)
+        all_of_it.append(reading.senses)
+    X = len(SPEC.sensory)
+    assert np.square(left)[20:, 0, :X].mean() < 0.5 * np.square(all_of_it)[20:, 0, :X].mean()
+    assert whole.model.kind == "neural_asm"

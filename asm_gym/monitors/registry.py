@@ -108,11 +108,18 @@ _BASELINES = {
     "elapsed_time": _row("elapsed_time:ElapsedTime", "squares"),
 }
 
+PARTS = {
+    name: MonitorKind(f"asm_gym.monitors.baselines.memory_parts:{part}")
+    for name, part in {"memory_temporal": "TemporalPart", "memory_association": "AssociationPart"}.items()
+}
+"""Of the Neural ASM, each alone: for an ablation."""
+
 MONITORS: dict[str, MonitorKind] = {
     "neural_asm": MonitorKind("asm_gym.monitors.neural_asm:NeuralASM"),
     **{n: k for name, row in _BASELINES.items() for n, k in ((name, row), (name + EVIDENCE, row.under("evidence")))},
     "external_torque_limit": _row("limits:ExternalTorqueLimit", "largest"),
     "force_limit": _row("limits:ForceLimit", "squares"),
+    **PARTS,
 }
 """Every monitor by name. A baseline's plain name scores as its authors did; with ``+evidence``, its errors are judged
 as those of the Neural ASM are. ``+`` and the name of any other detection will do as well."""
