@@ -149,6 +149,29 @@ class StreamSpec:
         if lines:
             raise ValueError(f"{whose} does not fit this stream:\n  " + "\n  ".join(lines))
 
+    def columns_in(self, known: StreamSpec) -> NDArray[np.intp]:
+        """(D,) where each number of this stream stands in one that is ``known``; -1 for commands that are not.
+
+        Raises:
+            ValueError: a sense that is not known, by name, size, unit and group; another rate; no sense at all.
+        """
+        theirs = {c.name: c for c in known.channels}
+        columns, never = np.full(self.size, -1, np.intp), []
+        for c in self.channels:
+            same = theirs.get(c.name)
+            if same is not None and (c.size, c.unit, c.group) == (same.size, same.unit, same.group):
+                columns[self.slices[c.name]] = np.arange(known.size)[known.slices[c.name]]
+            elif c.group != MOTOR:
+                never.append(c.name if same is None else f"{c.name} of size {c.size}, unit {c.unit}, group {c.group}")
+        if never:
+            raise ValueError(
+                f"the memory never met {', '.join(never)}; it knows {', '.join(theirs)}. Leave the others out of the "
+                "stream, or fit a memory of your own"
+            )
+        if abs(self.dt - known.dt) > 1e-9:
+            raise ValueError(f"the memory knows rows every {known.dt} s, and this stream has one every {self.dt} s")
+        return columns
+
     def to_json(self) -> str:
         return json.dumps(asdict(self))
 

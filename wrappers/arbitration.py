@@ -110,14 +110,17 @@ class Arbiter:
     def __init__(
         self, reflex: Policy | None, threshold: float, patience: Patience, fallback: Hold, space: gym.spaces.Box
     ) -> None:
-        self._reflex, self._threshold, self._patience, self._fallback = reflex, threshold, patience, fallback
-        self._space = space
+        self._reflex, self._patience, self._fallback, self._space = reflex, patience, fallback, space
+        self.threshold = threshold
+        """May be set between episodes."""
         self.reset()
 
     def reset(self) -> None:
         """A new episode begins."""
         self.overriding = False
         """The reflex acts next."""
+        self.confirmed = False
+        """What alarmed in this episode went on while the reflex acted, and so was no habit of the policy."""
         self._quiet = self._acted = self._held = 0
         self._wait: float = self._patience.try_after or math.inf
         self._handed_back: int | None = None  # so many rows ago, as long as it may turn out too early
@@ -197,24 +200,26 @@ class Arbiter:
             feel: lets the reflex feel the row: once a control step.
             expected: (A,) what the memory expects to be commanded next, for reflexes that go on with it.
         """
-        alarm, intervened = not surprise <= self._threshold, self.overriding or self._refused
+        alarm, intervened = not surprise <= self.threshold, self.overriding or self._refused
         begun, self._refused = self._refused, False
         if self._reflex is None:
             return Decision(alarm, intervened, False, False)
         failure = self._tell(row, executed, intervened) if feel and isinstance(self._reflex, Reflex) else ""
         if expected is not None and isinstance(self._reflex, Recall):
             self._reflex.expects(expected)
-        quiet = surprise <= self._threshold * (self._patience.release_below if intervened else 1.0)
+        quiet = surprise <= self.threshold * (self._patience.release_below if intervened else 1.0)
         self._quiet = self._quiet + 1 if quiet else 0
         if intervened:
             self._acted, self._held = self._acted + 1, self._held + 1
+            # What the arm feels when it changes over to the reflex confirms nothing yet.
+            self.confirmed = self.confirmed or (alarm and self._held > self._patience.release_after)
         elif self._handed_back is not None:
             self._handed_back += 1
             if self._handed_back > self._patience.release_after:
                 self._handed_back = None
         transition = self._next(alarm, executed) or ("override" if begun else "")
         if transition:
-            _log.info("%s: surprise %.3g, threshold %.3g", transition, surprise, self._threshold)
+            _log.info("%s: surprise %.3g, threshold %.3g", transition, surprise, self.threshold)
         acted_on = alarm or transition == "trial"
         return Decision(alarm, intervened, transition == "give_up", acted_on, failure, transition)
 

@@ -39,6 +39,34 @@ class Watches(Protocol):
     def observe(self, state: Any, stream: Any) -> Any: ...
 
 
+@runtime_checkable
+class DoesWithFewerSenses(Protocol):
+    """A monitor that can do without some of the channels it knows."""
+
+    spec: StreamSpec
+
+    def for_stream(self, spec: StreamSpec) -> Monitor:
+        """The monitor for a stream that lacks some. Raises ValueError where it has others."""
+        ...
+
+
+def fitted_to(monitor: Monitor, watched: StreamSpec) -> Monitor:
+    """The monitor itself where it reads such a stream, or else what it makes of itself with fewer senses, said aloud.
+
+    Raises:
+        ValueError: the stream has senses that it never met, by name.
+    """
+    if not isinstance(monitor, DoesWithFewerSenses) or not monitor.spec.difference(watched):
+        return monitor
+    fewer = monitor.for_stream(watched)
+    lacks = "; ".join(monitor.spec.difference(watched))
+    gym.logger.warn(
+        f"the monitor does without what this stream lacks ({lacks}); its threshold was set with all its senses: "
+        "for_stream(spec).calibrate(episodes) sets it anew"
+    )
+    return fewer
+
+
 def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
     """The monitor's threshold, once it can watch such a stream.
 

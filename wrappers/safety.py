@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from asm_gym.checks import check_flag, check_number
 from asm_gym.choices import check_choice
+from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import LearnsOnTheJob, Monitor, Surprise
 from asm_gym.policies.base import Policy
 from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Decision
@@ -21,6 +22,7 @@ from asm_gym.wrappers.arguments import (
     check_expectation,
     check_monitor,
     check_rate,
+    fitted_to,
     make_fallback,
     make_patience,
     make_reflex,
@@ -84,6 +86,10 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         on_overrun: where the monitor takes longer for a row than a row lasts, ``"warn"`` says so once, ``"alarm"``
             takes it for infinite surprise, and ``"ignore"`` is for simulations, which wait. The first row does not
             count.
+        adapt: how the threshold follows a policy that changes, from episode to episode; ``info["asm"]`` then holds the
+            ``threshold`` of this episode, its ``ceiling``, and ``level``, the share of episodes so far with a false
+            alarm. Not counted are alarms above the ceiling, those that went on while the reflex acted, and those that
+            ``confirm_alarm`` was called for. None for a threshold that stays.
 
     Raises:
         ValueError: an unknown ``on_alarm``, a monitor fitted for another stream or rate (the message names what
@@ -107,6 +113,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         learning_rate: float = 0.0,
         monitor_freq: int | None = None,
         on_overrun: Literal["warn", "alarm", "ignore"] = "warn",
+        adapt: AdaptiveThreshold | None = None,
     ) -> None:
         RecordConstructorArgs.__init__(
             self,
@@ -121,6 +128,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             learning_rate=learning_rate,
             monitor_freq=monitor_freq,
             on_overrun=on_overrun,
+            adapt=adapt,
         )
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
@@ -132,10 +140,11 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if monitor_freq is not None:
             sensing = check_rate(env, monitor_freq)
             watched = sensing.stream_spec_at(monitor_freq)
-        monitor = body_memory(env, watched) if monitor is None else monitor
+        monitor = body_memory(env, watched) if monitor is None else fitted_to(monitor, watched)
         if learning_rate > 0 and not isinstance(monitor, LearnsOnTheJob):
             raise ValueError(f"{type(monitor).__name__} cannot learn on the job: learning_rate must be 0")
-        self.threshold = check_monitor(monitor, watched)
+        threshold = check_monitor(monitor, watched)
+        self._running = None if adapt is None else adapt.start(threshold)
         self.monitor = monitor
         self._ends = "truncated" if check_flag("truncate", truncate) else "terminated"
         self._on_alarm = on_alarm if isinstance(on_alarm, str) else "policy"
@@ -146,18 +155,28 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if monitor_freq is not None:
             sensing.stream_freq = monitor_freq  # nothing changes before everything is known to fit
         self._rows_per_step = self._source.rows_per_step
-        self._arbiter = Arbiter(
-            reflex, self.threshold, patience.in_rows(self._rows_per_step), fallback, env.action_space
-        )
+        self._arbiter = Arbiter(reflex, threshold, patience.in_rows(self._rows_per_step), fallback, env.action_space)
+        self._largest: float | None = None  # surprise in this episode, while the policy acted
+        self._confirmed = False
         self._on_overrun: str = on_overrun
         self._warm = self._warned = False
         self._ended = True
+
+    @property
+    def threshold(self) -> float:
+        """What surprise must exceed for an alarm in this episode."""
+        return self._arbiter.threshold
+
+    def confirm_alarm(self) -> None:
+        """Says that what has alarmed in this episode was real, so that ``adapt`` does not take it for a false alarm."""
+        self._confirmed = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._ended = True  # until it has worked
         observation, info = self.env.reset(seed=seed, options=options)
         self._observer.begin()
         self._observation = observation
+        self._follow()
         self._arbiter.reset()
         none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))
         self._ended = False
@@ -182,6 +201,14 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             terminated, truncated = terminated or self._ends == "terminated", truncated or self._ends == "truncated"
         self._ended = bool(terminated or truncated)
         return observation, reward, terminated, truncated, info
+
+    def _follow(self) -> None:
+        """Moves the threshold by the episode that has ended."""
+        if self._running is not None and self._largest is not None:
+            confirmed = self._confirmed or self._arbiter.confirmed
+            self._running.follow(self._largest, self._arbiter.threshold, confirmed)
+            self._arbiter.threshold = self._running.value
+        self._largest, self._confirmed = None, False
 
     def _command(self, action: NDArray[np.float32]) -> None:
         """Says what is to be done next: the policy's ``action`` (A,), or something else."""
@@ -226,6 +253,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         decision = self._arbiter.decide(
             float(surprise.value[0]), row, self._executed, ends_step, None if expected is None else expected[0]
         )
+        if not decision.intervened:
+            self._largest = max(self._largest or 0.0, float(surprise.value[0]))
         forgot = self._observer.forget(np.array([decision.acted_on]))
         self._rows.append(RowReport(surprise, decision, latency, joined(failure, decision.failure, forgot)))
         if self._arbiter.overriding and not decision.intervened and not ends_step:
@@ -263,6 +292,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             "surprises": surprises,
             "latency_us": 1e6 * max(row.latency for row in rows),
         }
+        if self._running is not None:
+            info["asm"] |= {"ceiling": self._running.ceiling, "level": self._running.level}
         info["asm_surprise"], info["asm_alarm"] = np.float64(worst.value[0]), np.bool_(alarm)
         info["asm_intervened"], info["cost"] = np.bool_(intervened), np.float64(alarm)
         return info

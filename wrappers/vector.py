@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from asm_gym.abilities import HoldsItself
 from asm_gym.checks import check_flag
+from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, Reflex, nearest_to_rest
@@ -20,6 +21,7 @@ from asm_gym.wrappers.arguments import (
     body_memory,
     check_expectation,
     check_monitor,
+    fitted_to,
     make_fallback,
     make_patience,
     make_reflex,
@@ -46,6 +48,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that they move.
         on_alarm: as in ``NeuralASMSafety``; a policy of yours is shared, and must keep what it knows in its state.
         release_after, release_below, max_override, try_after, truncate: as in ``NeuralASMSafety``.
+        adapt: as there; all environments share one running threshold, and an episode keeps what it began with.
 
     Raises:
         TypeError: ``env`` is no vector environment, cannot be asked for what its members are, or takes no Box actions.
@@ -65,6 +68,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         max_override: int | None = None,
         try_after: int | None = None,
         truncate: bool = False,
+        adapt: AdaptiveThreshold | None = None,
     ) -> None:
         super().__init__(env)
         if not isinstance(env.single_action_space, gym.spaces.Box):
@@ -82,24 +86,37 @@ class VectorNeuralASMSafety(VectorWrapper):
             source = StreamSource(member)
             if source.rows_per_step > 1:
                 raise ValueError("many environments are watched at their control rate: make them without stream_freq")
-            self.threshold = check_monitor(monitor, source.spec)
+            monitor = fitted_to(monitor, source.spec)
+            threshold = check_monitor(monitor, source.spec)
         self.monitor = monitor
+        self._running = None if adapt is None else adapt.start(threshold)
         self._ends_truncated = check_flag("truncate", truncate)
         self._terminates = on_alarm == "terminate"
         limits = release_after, release_below, max_override, try_after
-        self._arbiters = [self._arbiter(on_alarm, member, limits) for member in self._members]
+        self._arbiters = [self._arbiter(on_alarm, member, threshold, limits) for member in self._members]
+        self._largest = np.full(env.num_envs, np.nan)  # surprise in each episode, while the policy acted
+        self._confirmed = np.zeros(env.num_envs, bool)
         self._failures = [""] * env.num_envs
         self._ended: Mask | None = None
         self._forced = np.zeros(env.num_envs, bool)  # ended by this wrapper, which the environment does not know yet
 
-    def _arbiter(self, on_alarm: str | Policy, env: Member, limits: tuple[Any, ...]) -> Arbiter:
+    @property
+    def threshold(self) -> NDArray[np.float64]:
+        """(n,) what surprise must exceed for an alarm in the episodes that run."""
+        return np.array([arbiter.threshold for arbiter in self._arbiters])
+
+    def confirm_alarm(self, which: Mask | None = None) -> None:
+        """As in ``NeuralASMSafety``, of ``which`` (n,) environments; of all by default."""
+        self._confirmed |= np.ones(self.num_envs, bool) if which is None else which
+
+    def _arbiter(self, on_alarm: str | Policy, env: Member, threshold: float, limits: tuple[Any, ...]) -> Arbiter:
         reflex = make_reflex(on_alarm, env)
         holds = type(reflex) is Hold and (reflex.explicit or isinstance(env, HoldsItself))
         if isinstance(reflex, Reflex) and not holds:
             refuse_changes(self.env)
         self._observer = Observer(self.monitor, self.num_envs, check_expectation(reflex, self.monitor))
         patience = make_patience(reflex, env, *limits)
-        return Arbiter(reflex, self.threshold, patience, make_fallback(env), self._space)
+        return Arbiter(reflex, threshold, patience, make_fallback(env), self._space)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         n = self.num_envs
@@ -221,6 +238,8 @@ class VectorNeuralASMSafety(VectorWrapper):
                 arbiter.warn(failed[i], "which counts as an alarm")
             said = None if expected is None else expected[i]
             decisions.append(arbiter.decide(float(value[i]), rows[i], executed[i], expected=said))
+            if not decisions[i].intervened:
+                self._largest[i] = np.fmax(self._largest[i], value[i])
             self._failures[i] = joined(commands[i].failure, failed[i], decisions[i].failure)
         forgot = self._observer.forget(np.array([d.acted_on for d in decisions]))
         for i in np.flatnonzero([d.acted_on for d in decisions]):
@@ -233,7 +252,13 @@ class VectorNeuralASMSafety(VectorWrapper):
         self._ended[begun] = self._forced[begun] = False
         self._observer.begin_in(begun)
         for i in np.flatnonzero(begun):
-            self._arbiters[i].reset()
+            arbiter = self._arbiters[i]
+            if self._running is not None and not np.isnan(self._largest[i]):
+                confirmed = arbiter.confirmed or bool(self._confirmed[i])
+                self._running.follow(float(self._largest[i]), arbiter.threshold, confirmed)
+                arbiter.threshold = self._running.value
+            arbiter.reset()
+        self._largest[begun], self._confirmed[begun] = np.nan, False
 
     def _restart(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Begins anew what this wrapper has ended, in the same step."""
@@ -270,12 +295,13 @@ class VectorNeuralASMSafety(VectorWrapper):
         present: Mask,
     ) -> None:
         """Adds ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
-        alarm = surprise.value > self.threshold
+        threshold = self.threshold
+        alarm = surprise.value > threshold
         decisions = decisions or [NOTHING] * self.num_envs
         intervened = np.array([d.intervened for d in decisions])
         infos["asm"] = {
             "surprise": surprise.value,
-            "threshold": np.full(self.num_envs, self.threshold),
+            "threshold": threshold,
             "alarm": alarm,
             "intervened": intervened,
             "gave_up": np.array([d.gave_up for d in decisions]),
@@ -284,6 +310,9 @@ class VectorNeuralASMSafety(VectorWrapper):
             "executed_action": executed,
             "attribution": dict(zip(self.monitor.spec.labels, surprise.attribution.T, strict=True)),
         }
+        if self._running is not None:
+            both = {"ceiling": self._running.ceiling, "level": self._running.level}
+            infos["asm"] |= {name: np.full(self.num_envs, value) for name, value in both.items()}
         flat = {"asm_surprise": surprise.value, "asm_alarm": alarm, "asm_intervened": intervened}
         infos.update(flat, cost=alarm.astype(np.float64))
         infos.update({f"_{key}": present for key in ("asm", "cost", *flat)})

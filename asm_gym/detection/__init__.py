@@ -6,6 +6,7 @@ import warnings
 from typing import Any
 
 from asm_gym.detection import evidence, repetition, tails
+from asm_gym.detection.adaptive import AdaptiveThreshold, RunningThreshold
 from asm_gym.detection.base import Detection, ModelOutput, Nominal
 from asm_gym.detection.conformal import conformal_episodes, conformal_threshold
 from asm_gym.detection.detector import Detector, EvidenceDetection, EvidenceState
@@ -14,6 +15,7 @@ from asm_gym.detection.tails import worst_case
 from asm_gym.detection.whitening import bounded, whitening
 
 __all__ = [
+    "AdaptiveThreshold",
     "Detection",
     "Detector",
     "Evidence",
@@ -21,6 +23,7 @@ __all__ = [
     "EvidenceState",
     "ModelOutput",
     "Nominal",
+    "RunningThreshold",
     "accumulate",
     "bounded",
     "conformal_episodes",

@@ -231,6 +231,20 @@ class EvidenceDetection:
         counted = count_repetitions([e.stream[:, senses] for e in nominal.episodes], self.spec.noise[senses] > 0)
         return self.restore({name: getattr(detector, name) for name in self.arrays[:-1]} | {"repetition": counted})
 
+    def fewer(
+        self, spec: StreamSpec, left: NDArray[np.intp], widened: NDArray[np.float64], narrower: NDArray[np.float64]
+    ) -> EvidenceDetection:
+        """The detection on what is ``left`` (X',) of the errors, which became E' = (E + widened) narrower narrowerᵀ."""
+        old = self.learned_
+        E = np.linalg.inv(old["whitening"] @ old["whitening"])[np.ix_(left, left)]  # ZCA: M = E^(-1/2)
+        values, vectors = np.linalg.eigh((E + widened) * np.outer(narrower, narrower))
+        kept = {name: old[name][:, left] for name in ("ceiling", "tail", "repetition")}
+        usual = {name: old[name] for name in ("context_quantile", "context_range")}
+        matrix = (vectors / np.sqrt(values)) @ vectors.T
+        return EvidenceDetection(spec, self.gains, self.bound, self.shrinkage).restore(
+            {"whitening": matrix, **usual, **kept}
+        )
+
     def restore(self, learned: Arrays) -> Self:
         found = {name: learned[name] for name in self.arrays[:-1]}
         X = len(found["whitening"])

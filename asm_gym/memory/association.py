@@ -94,6 +94,11 @@ def synapses(groups: NDArray[np.intp], changes: slice, inputs: int, size: int) -
     return Change(V, (groups[:, None] == unit_group).astype(np.float32), D)
 
 
+def existing(association: Association) -> Change:
+    """1 where a memory has a synapse, 0 elsewhere."""
+    return Change(*((W != 0).astype(np.float32) for W in (association.V, association.U, association.D)))
+
+
 @kernel
 def hidden_units(a: Array, V: Array) -> Array:
     """f(h) (B, M) for inputs ``a`` (B, I)."""

@@ -15,7 +15,8 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episodes import Episode
 from asm_gym.memory.adaptation import followed
-from asm_gym.memory.association import Association, association_shapes, hidden_units, synapses
+from asm_gym.memory.association import Association, association_shapes, existing, hidden_units
+from asm_gym.memory.fewer import MOST_INPUTS, Kept, fewer_changes, fewer_traces, moments
 from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs
@@ -66,15 +67,43 @@ class MemoryModel(StreamModel):
         sizes = self.hidden_size, self._units_each(senses)
         trained = train(trajectories, senses.groups, senses.changes, *sizes, self.schedule, rng, progress)
         standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change, "energy": trained.energy}
+        if senses.inputs <= MOST_INPUTS:
+            standard["moments"] = moments(np.concatenate([t.inputs for t in trajectories]))
         network = trained.network
         return self.restore({**standard, **network.weights._asdict(), **network.association._asdict()})
+
+    def fewer(self, spec: StreamSpec) -> tuple[MemoryModel, Kept]:
+        """The model of a stream that lacks senses of this one, and what became of its errors.
+
+        Raises:
+            ValueError: the stream has senses that this memory never met, or the memory does not know what its own have
+                in common.
+        """
+        columns = spec.columns_in(self.spec)
+        if "moments" not in self.learned_ or not isinstance(self.network.weights, Weights):
+            raise ValueError(
+                "this memory does not keep what its senses have in common (it was saved by an older asm-gym, has lost "
+                f"senses before, or has more than {MOST_INPUTS} inputs), so that none of them can be left out"
+            )
+        C, old, known = self.learned_["moments"], self.senses_, columns >= 0
+        standard = {
+            name: np.where(known, getattr(old, name)[columns], nothing)
+            for name, nothing in (("mean", 0.0), ("spread", 1.0), ("change", 1.0))
+        }
+        new = StreamScaler(spec, **standard, lag=self.lag)
+        kept = fewer_changes(self.network.association, C, old, new, columns)
+        weights = fewer_traces(self.network.weights, C, old, new, columns)
+        skills = {name: self.learned_[name] for name in ("W_K", "b_K") if self.skills_}
+        learned = {**standard, **skills, "energy": self.learned_["energy"]}
+        model = MemoryModel(spec, self.hidden_size, self.association_size, self.schedule)
+        return model.restore({**learned, **weights._asdict(), **kept.association._asdict()}, self.skills_), kept
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         senses = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
         X, A = len(self.spec.sensory), len(self.spec.motor)
         if "remainder" not in learned:  # saved before it was known apart what is linear
             learned = {**learned, "remainder": np.ones(X, np.float32)}
-        units = self._units_each(senses) * (int(senses.groups.max()) + 1)
+        units = len(learned["V"])
         older = "W_H" in learned  # saved before there were traces
         temporal = (recurrent_shapes if older else weight_shapes)(self.hidden_size, senses.size, A)
         shapes = temporal | association_shapes(senses.inputs, units, X)
@@ -141,10 +170,8 @@ class MemoryModel(StreamModel):
         reading = self.senses_.read(rows, before.before[:, 0], before.earlier[:, 0])
         learned: NDArray[np.bool_] = quiet & (before.steps >= 2 * self.lag) & (reading.whole[:, 0] > 0)
         if learned.any():
-            senses = self.senses_
-            exists = synapses(senses.groups, senses.changes, senses.inputs, self._units_each(senses))
-            inputs, changes = reading.inputs[learned], reading.changes[learned]
-            now = followed(self.network.association, exists, inputs, changes, rate)
+            association = self.network.association
+            now = followed(association, existing(association), reading.inputs[learned], reading.changes[learned], rate)
             self.network_ = self.network.with_association(now)
             self.learned_ = {**self.learned_, "U": now.U, "D": now.D}
         return learned

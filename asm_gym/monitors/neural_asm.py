@@ -165,6 +165,31 @@ class NeuralASM(CalibratedMonitor):
             surprise = surprise._replace(skill=np.array(self.skills_)[state.model.skill.argmax(axis=1)])
         return state, surprise
 
+    def for_stream(self, spec: StreamSpec) -> Self:
+        """A smaller memory, for a stream that lacks channels of this one; those that are left stand in for them.
+
+        Commands that it does not know, as those of another controller, are not looked at. The threshold is this one's,
+        whose promise was not made for fewer senses: ``calibrate`` makes it anew.
+
+        Args:
+            spec: of that stream; its channels may stand in another order.
+
+        Raises:
+            ValueError: it has senses that this memory never met (the message names them), or another rate; the memory
+                was saved by an older asm-gym, or has lost channels before.
+            RuntimeError: the memory has not learned anything yet.
+        """
+        self._fitted()
+        evidence = self.detections["evidence"]
+        assert isinstance(evidence, EvidenceDetection)
+        other = type(self)(spec, **self.get_params())
+        other.model, kept = self.model.fewer(spec)
+        other.detection = evidence.fewer(spec, kept.left, kept.widened, kept.narrower)
+        other.detections = {other.detection.name: other.detection}
+        other.threshold_ = self.threshold_
+        other._prepare()
+        return other
+
     def name_skills(self, episodes: Sequence[Episode]) -> Self:
         """Learns to tell which skill is running, from episodes whose ``info["skill"]`` says it.
 

@@ -1,0 +1,89 @@
+"""A running threshold: the promised share of nominal episodes in alarm is kept while the policy changes.
+
+    log q_{k+1} = log q_k + η (err_k - α)        err_k = 1 where episode k had a false alarm, else 0
+    threshold   min(q_k, c)                      c: what exceeds it is an alarm, and never counts
+
+α is the promised rate, and η how far one false alarm raises q. Each raises it by η (1 - α), each quiet episode lowers
+it by η α: only where one in 1/α alarms does q stay. Whatever the episodes are, of K that count at most
+
+    α K + log(c/q_1)/η + 1
+
+have an alarm, for from c on q can rise no further. What is learned is drift, not faults: an alarm above c, and one that
+somebody or something has confirmed, tells nothing of what is usual.
+
+Sources: Angelopoulos et al. 2023 (NeurIPS, arXiv 2307.16895), its P control, on log q for surprise spans decades; Gibbs
+and Candès 2021 (NeurIPS, arXiv 2106.00170), which moves the level instead of the threshold: at a level of 1 % one
+alarm would send it to infinity.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from asm_gym.checks import check_number
+
+
+@dataclass(frozen=True)
+class AdaptiveThreshold:
+    """How a threshold follows a policy that changes.
+
+    Args:
+        rate: α in (0, 1), share of nominal episodes that may raise an alarm.
+        step: η > 0; a false alarm raises the threshold by a factor of exp(η), about.
+        ceiling: > 1, how many times the calibrated threshold it may come to; above that anything is an alarm.
+    """
+
+    rate: float = 0.01
+    step: float = 0.3
+    ceiling: float = 4.0
+
+    def __post_init__(self) -> None:
+        check_number("rate", self.rate, above=0.0, below=1.0)
+        check_number("step", self.step, above=0.0)
+        check_number("ceiling", self.ceiling, above=1.0)
+
+    def start(self, threshold: float) -> RunningThreshold:
+        """The running threshold, which begins at a calibrated one."""
+        return RunningThreshold(self, check_number("threshold", threshold, above=0.0))
+
+
+class RunningThreshold:
+    """A threshold that is moved at the end of every episode.
+
+    Args:
+        how: it follows.
+        threshold: q_1, the calibrated one.
+
+    Attributes:
+        ceiling: c.
+    """
+
+    def __init__(self, how: AdaptiveThreshold, threshold: float) -> None:
+        self._how, self.ceiling = how, how.ceiling * threshold
+        self._log = math.log(threshold)  # of q
+        self._episodes = self._alarms = 0
+
+    @property
+    def value(self) -> float:
+        """The threshold as it is now."""
+        return min(math.exp(self._log), self.ceiling)
+
+    @property
+    def level(self) -> float:
+        """Share of the episodes so far that had a false alarm, of those that counted; NaN before the first."""
+        return self._alarms / self._episodes if self._episodes else math.nan
+
+    def follow(self, largest: float, judged_by: float | None = None, confirmed: bool = False) -> None:
+        """Takes account of an episode that has ended.
+
+        Args:
+            largest: its greatest surprise.
+            judged_by: the threshold that it began with; the present one by default.
+            confirmed: an alarm in it was no false one.
+        """
+        alarm = not largest <= (self.value if judged_by is None else judged_by)
+        if alarm and (confirmed or not largest <= self.ceiling):
+            return
+        self._episodes, self._alarms = self._episodes + 1, self._alarms + alarm
+        self._log += self._how.step * (alarm - self._how.rate)
