@@ -1,20 +1,23 @@
 """The evaluation goes on after a kill, refuses to mix runs, and gives the same table every time."""
 
+import csv
 import json
 import re
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from asm_gym.episodes import EpisodeLabel, load_episode
+from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 from asm_gym.rollouts.seeds import draw_onset
 from asm_gym.rollouts.trial import RolloutConfig, record
 from asm_gym.scripts.evaluate import Args, labels, main
+from asm_gym.stream import Channel, StreamSpec
 
 MONITORS = ("neural_asm", "kalman+evidence", "autoregression", "force_limit")
 SMALL = [
@@ -158,3 +161,39 @@ class _Recorder:
 
     def __call__(self, label):
         return record(label, RolloutConfig(), self.folder)
+
+
+def test_a_learning_curve_learns_from_few_of_the_many(run, tmp_path):
+    from asm_gym.scripts.reproduce import learning_curve
+
+    asked = [
+        "--run",
+        str(run),
+        "--monitors",
+        "kalman+evidence",
+        "force_limit",
+        "--episodes",
+        "2",
+        "1000",
+        "--seeds",
+        "2",
+    ]
+    assert learning_curve.main([*asked, "--workers", "1", "--out", str(tmp_path)]) == 0
+    rows = list(csv.DictReader((tmp_path / "learning_curve.csv").open()))
+    assert [(r["monitor"], r["episodes"], r["seed"]) for r in rows] == [
+        (m, n, s) for n in ("2", "4") for m in ("kalman+evidence", "force_limit") for s in ("0", "1")
+    ]  # the run has 4 episodes to learn from
+    assert all(0 <= float(r[key]) <= 1 for r in rows for key in ("auroc", "whole", "found", "false_alarms"))
+    limits = {r["auroc"] for r in rows if r["monitor"] == "force_limit"}
+    assert len(limits) == 1  # it learns nothing
+    first, second = (in_turn for in_turn in (learning_curve.in_turn(_labelled(), seed) for seed in (0, 1)))
+    assert [e.labelled.task for e in first] == ["Lift", "Stack"] * 2 + ["Stack"]
+    assert [e.labelled.seed for e in first] != [e.labelled.seed for e in second]
+
+
+def _labelled():
+    """Two episodes of one task, and three of another."""
+    spec = StreamSpec((Channel("a", 1),), 0.05)
+    tasks = ["Lift"] * 2 + ["Stack"] * 3
+    made = (Episode.from_stream(np.zeros((3, 1)), spec, success=True) for _ in tasks)
+    return [replace(e, label=EpisodeLabel(t, "fit", seed=n)) for n, (e, t) in enumerate(zip(made, tasks, strict=True))]

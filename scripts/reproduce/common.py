@@ -110,7 +110,7 @@ def publish(name: str, found: Findings, args: Common, seconds: dict[str, float])
     (args.out / f"{name}.md").write_text(text + "\n", encoding="utf-8")
     packages = ("numpy", "scipy", "torch", "mujoco", "robosuite", "matplotlib")
     details = {
-        "arguments": {**asdict(args), "out": str(args.out)},
+        "arguments": json.loads(json.dumps(asdict(args), default=str)),
         "seed": args.seed,
         "versions": {"asm_gym": asm_gym.__version__, **{p: metadata.version(p) for p in packages}},
         "python": platform.python_version(),
