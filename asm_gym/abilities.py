@@ -51,3 +51,20 @@ class SensesWithinSteps(Protocol):
     def command(self, action: NDArray[np.float32]) -> None:
         """From within a hook: another action for the rest of the control step."""
         ...
+
+
+@runtime_checkable
+class LaysOutObservations(Protocol):
+    """It says what its observations are made of."""
+
+    observation_layout: dict[str, int]
+    """Their parts in order, by the names of channels, and how many numbers each has."""
+
+
+@runtime_checkable
+class LocatesForces(Protocol):
+    """It knows the geometry of its arm, and so what force would cause given torques in its joints."""
+
+    def force_behind(self, torques: NDArray[np.floating[Any]]) -> tuple[str, NDArray[np.float64]]:
+        """The link on which a force would explain external torques (J,) best [N m], and that force (3,) [N]."""
+        ...

@@ -1,19 +1,30 @@
-"""What to do on an alarm. A reflex is an ordinary policy, which the safety wrapper lets feel every row."""
+"""What to do on an alarm, beside staying: go on as expected, go back, give way, or what its cause asks for."""
 
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.abilities import HasGrippers, HoldsItself, TurnsJoints
+from asm_gym.abilities import TurnsJoints
 from asm_gym.checks import check_number
-from asm_gym.policies.base import Policy
+from asm_gym.policies.holding import Begun, Hold, Reflex, nearest_to_rest, require_unchanged, resting_action
 from asm_gym.stream import StreamSpec, control_period
+
+__all__ = [
+    "Begun",
+    "Comply",
+    "Graded",
+    "Hold",
+    "Recall",
+    "Reflex",
+    "Retract",
+    "nearest_to_rest",
+    "resting_action",
+]
 
 USUAL_GAIN = 0.1
 """Weight of the newest step in the external torque that is taken to be usual."""
@@ -21,101 +32,8 @@ USUAL_GAIN = 0.1
 DELTAS = ("OSC_POSE", "JOINT_POSITION")
 """Controllers whose actions are changes, of pose or of joint angles."""
 
-
-class Begun(NamedTuple):
-    """Where a reflex is."""
-
-    executed: NDArray[np.float32]  # (A,) the action executed last before it began; its grip is kept
-    steps: int  # that it has acted
-
-
-@runtime_checkable
-class Reflex(Policy, Protocol):
-    """A policy that is told of every step, and starts from what was done last."""
-
-    def reset(self) -> None:
-        """A new episode begins."""
-        ...
-
-    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
-        """What was sensed in a step, and what was done.
-
-        Args:
-            row: (D,) of the stream; NaN where it is missing.
-            executed: (A,).
-            acting: whether this reflex did it.
-        """
-        ...
-
-    def begin(self, executed: NDArray[np.float32]) -> Any:
-        """The state to start from, after ``executed`` (A,)."""
-        ...
-
-
-class Hold:
-    """Stay, and keep the grip, so that nothing is dropped.
-
-    An environment that can hold itself, as all of this package can, is told to: it stays under any controller and with
-    any wrapper in between. Each ``predict`` speaks for the next step, whatever action that is then given. In any other
-    environment a zero action is taken to mean "stay".
-
-    Args:
-        env: one with a Box action space.
-        safe_action: what to do instead, where a zero action does not mean "stay"; it goes through all wrappers.
-
-    Raises:
-        TypeError: the action space is no Box.
-        ValueError: ``safe_action`` does not fit the action space, or no action is known that arrives as zero.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any], safe_action: NDArray[np.float32] | None = None) -> None:
-        space = env.action_space
-        if not isinstance(space, spaces.Box):
-            raise TypeError(f"a reflex needs a Box action space, got {space}")
-        inner = env.unwrapped
-        self.explicit = safe_action is not None
-        """It does ``safe_action``, and knows of no environment."""
-        self._robot = inner if isinstance(inner, HoldsItself) and not self.explicit else None
-        if safe_action is not None:
-            self._rest = np.asarray(safe_action, np.float32)
-        else:
-            self._rest = nearest_to_rest(space) if self._robot else resting_action(env)
-        if not space.contains(self._rest):
-            raise ValueError(f"safe_action {self._rest} is not in {space}")
-        self._grip = np.asarray(inner.gripper_actions if isinstance(inner, HasGrippers) else (), dtype=int)
-        if self._grip.size and self._grip.max() >= self._rest.size:  # a wrapper inside takes other numbers
-            self._grip = self._grip[:0]
-
-    def reset(self) -> None:
-        """A new episode begins."""
-
-    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
-        """What was sensed in a step (D,), what was done (A,), and whether this reflex did it."""
-
-    def begin(self, executed: NDArray[np.float32]) -> Begun:
-        """The state to start from, after ``executed`` (A,)."""
-        return Begun(np.asarray(executed, np.float32), 0)
-
-    def predict(
-        self,
-        observation: Any,
-        state: Begun | None = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], Begun | None]:
-        """The next action (A,)."""
-        action = self._rest.copy() if self.explicit else self.move()
-        if state is None:
-            return action, None
-        if not self.explicit:
-            action[self._grip] = state.executed[self._grip]
-        return action, Begun(state.executed, state.steps + 1)
-
-    def move(self) -> NDArray[np.float32]:
-        """The next action (A,); the gripper's part of it does not count."""
-        if self._robot is not None:
-            self._robot.holding = True
-        return self._rest.copy()
+SLOWLY = 0.5
+"""Share of a change that is done under ``slow``."""
 
 
 class Recall(Hold):
@@ -133,7 +51,7 @@ class Recall(Hold):
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
         if env.has_wrapper_attr("stream_spec"):
-            _require_unchanged(env, "recall")
+            require_unchanged(env, "recall")
 
     def reset(self) -> None:
         self.expects(self._rest)
@@ -234,74 +152,56 @@ class Comply(Hold):
         return self._joints.action_for(self._each_step * self.load)
 
 
-class Graded(Comply):
-    """Stays; yields while something keeps pressing.
+class Graded(Hold):
+    """Does what is asked for: stays, gives way, or goes back; and slows the policy down where that is enough.
 
-    The wrapper hands back when surprise is quiet, and on trial after ``TRY_AFTER_S`` where it is not, for a robot that
-    holds still where it never did may surprise itself; after ``GIVE_UP_AFTER_S`` in all it ends the episode.
+    The wrapper says which, by the cause of the alarm. What the environment does not allow is replaced by staying, and
+    going slowly by going on. The wrapper hands back when surprise is quiet, and on trial after ``TRY_AFTER_S`` where it
+    is not, for a robot that holds still where it never did may surprise itself; after ``GIVE_UP_AFTER_S`` in all it
+    ends the episode.
 
-    The arguments are those of ``Comply``, with more torque tolerated.
+    Args:
+        env: one with a Box action space.
+        compliance, tolerated: of ``Comply``.
     """
 
     TRY_AFTER_S, GIVE_UP_AFTER_S = 0.5, 3.0
 
     def __init__(self, env: gym.Env[Any, Any], compliance: float = 0.05, tolerated: float = 4.0) -> None:
-        super().__init__(env, compliance, tolerated)
+        super().__init__(env)
+        self._reflexes: dict[str, Hold] = {"hold": Hold(env)}
+        for name, make in (("yield", lambda: Comply(env, compliance, tolerated)), ("retract", lambda: Retract(env))):
+            try:
+                self._reflexes[name] = make()
+            except ValueError:  # the environment does not allow it
+                self._reflexes[name] = self._reflexes["hold"]
+        inner = env.unwrapped
+        self._changes = isinstance(inner, TurnsJoints) and inner.controller in DELTAS
+        self.choose("hold")
 
+    def choose(self, name: str) -> None:
+        """What to do from now on: ``"hold"``, ``"yield"`` or ``"retract"``; anything else is staying."""
+        self._chosen = self._reflexes.get(name, self._reflexes["hold"])
 
-def nearest_to_rest(space: spaces.Box) -> NDArray[np.float32]:
-    """(A,) the action of a space that comes nearest to none."""
-    nearest: NDArray[np.float32] = np.clip(np.zeros(space.shape), space.low, space.high).astype(np.float32)
-    return nearest
+    def reset(self) -> None:
+        for reflex in self._reflexes.values():
+            reflex.reset()
+        self.choose("hold")
 
+    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
+        for reflex in self._reflexes.values():
+            reflex.feel(row, executed, acting)
 
-def resting_action(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
-    """(A,) the action that reaches the innermost environment as zero.
+    def move(self) -> NDArray[np.float32]:
+        return self._chosen.move()
 
-    Raises:
-        ValueError: a wrapper inside changes actions so that none is known.
-    """
-    space: Any = env.action_space
-    bounded = np.isfinite(space.low) & np.isfinite(space.high)
-    middle = 0.5 * (np.where(bounded, space.low, 0.0) + np.where(bounded, space.high, 0.0))
-    for candidate in (nearest_to_rest(space), middle.astype(np.float32)):
-        arrives, wrapper = candidate, env
-        while isinstance(wrapper, gym.Wrapper):
-            if isinstance(wrapper, gym.wrappers.TransformAction):  # a function of the action alone, so it may be asked
-                arrives = np.asarray(wrapper.action(arrives))
-            elif isinstance(wrapper, gym.ActionWrapper):
-                raise ValueError(_say_outside(wrapper, "hold"))
-            wrapper = wrapper.env
-        if not np.any(arrives):
-            return candidate
-    changed = _changing(env)
-    raise ValueError(
-        _say_outside(changed, "hold")
-        if changed
-        else f"hold takes a zero action for rest, which is not in {space}: use Hold(env, safe_action=...)"
-    )
-
-
-def _changing(env: gym.Env[Any, Any]) -> gym.ActionWrapper[Any, Any, Any] | None:
-    """The outermost wrapper that changes actions; None where there is none."""
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, gym.ActionWrapper) and not isinstance(env, gym.wrappers.ClipAction):
-            return env
-        env = env.env
-    return None
-
-
-def _say_outside(wrapper: gym.Env[Any, Any], reflex: str) -> str:
-    return (
-        f"{type(wrapper).__name__} changes actions, so that {reflex} cannot know what reaches the robot: "
-        "put it outside of NeuralASMSafety, or use Hold(env, safe_action=...)"
-    )
-
-
-def _require_unchanged(env: gym.Env[Any, Any], name: str) -> None:
-    changed = _changing(env)
-    if changed is not None:
-        raise ValueError(_say_outside(changed, name))
+    def slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(A,) the policy's action at half speed, its grip as it is; the same where actions are no changes."""
+        if not self._changes:
+            return action
+        slow = np.float32(SLOWLY) * action
+        slow[self._grip] = action[self._grip]
+        return slow
 
 
 def _require_deltas(env: gym.Env[Any, Any], name: str) -> TurnsJoints:
@@ -312,5 +212,5 @@ def _require_deltas(env: gym.Env[Any, Any], name: str) -> TurnsJoints:
             f"{name} needs an environment whose controller is {' or '.join(DELTAS)}, got {controller}: "
             "use hold with a safe_action of your own, or name any policy"
         )
-    _require_unchanged(env, name)
+    require_unchanged(env, name)
     return inner

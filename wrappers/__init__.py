@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from asm_gym.extras import needed_for
+from asm_gym.wrappers.completion import CompletedObservation
 from asm_gym.wrappers.recording import StreamRecorder
 from asm_gym.wrappers.safety import NeuralASMSafety
 from asm_gym.wrappers.vector import VectorNeuralASMSafety
@@ -12,7 +13,14 @@ if TYPE_CHECKING:
     from asm_gym.wrappers.faults import FaultInjection
     from asm_gym.wrappers.overlay import SurpriseOverlay
 
-__all__ = ["FaultInjection", "NeuralASMSafety", "StreamRecorder", "SurpriseOverlay", "VectorNeuralASMSafety"]
+__all__ = [
+    "CompletedObservation",
+    "FaultInjection",
+    "NeuralASMSafety",
+    "StreamRecorder",
+    "SurpriseOverlay",
+    "VectorNeuralASMSafety",
+]
 
 _NEED_MORE = {"FaultInjection": "faults", "SurpriseOverlay": "overlay"}
 """Those that need more than watching a stream does, and are imported when they are asked for."""

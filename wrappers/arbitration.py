@@ -17,9 +17,15 @@ from numpy.typing import NDArray
 
 from asm_gym.checks import check_number, shown
 from asm_gym.policies.base import Policy
-from asm_gym.policies.reflexes import Hold, Recall, Reflex
+from asm_gym.policies.reflexes import Graded, Hold, Recall, Reflex
 
 _log = logging.getLogger("asm_gym.safety")
+
+GOING_ON = ("go on", "complete", "slow")
+"""Responses to an alarm under which the policy acts."""
+
+OVER_AFTER = 3
+"""Rows for which a contact must be over before control goes back, though surprise is not quiet."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +87,8 @@ class Decision(NamedTuple):
         acted_on: the surprise has had its consequence, so that its evidence is not to be counted again.
         failure: what failed in the reflex when it was told of the row; empty where nothing did.
         transition: ``"override"`` where the reflex takes over, ``"release"`` where the policy goes on next,
-            ``"trial"`` where it does though surprise is not quiet, ``"give_up"``; empty where nothing changes.
+            ``"trial"`` where it does though surprise is not quiet, ``"give_up"``; ``"go on"``, ``"complete"`` or
+            ``"slow"`` where it stays with the policy; empty where nothing changes.
     """
 
     alarm: bool
@@ -127,6 +134,9 @@ class Arbiter:
         self._tried = False  # and it was on trial
         self._state: Any = None
         self._fresh = self._refused = False
+        self._slowed = False  # the policy acts slowly
+        self._response = ""  # to the last alarm
+        self._past = 0  # rows for which what was responded to has been over
         self._warned: set[str] = set()
         self._last = np.zeros(self._space.shape, np.float32)  # (A,) executed last
         self._before = self._last  # (A,) executed last before the override
@@ -150,6 +160,8 @@ class Arbiter:
         if self.overriding:
             return self._reaction(observation)
         if np.isfinite(action).all():
+            if self._slowed and isinstance(self._reflex, Graded):
+                return Command(self._reflex.slowed(action))
             return Command(action)
         self._refused = True
         said = f"policy: the action must be finite, got {shown(action.tolist())}"
@@ -192,6 +204,9 @@ class Arbiter:
         executed: NDArray[np.float32],
         feel: bool = True,
         expected: NDArray[np.float32] | None = None,
+        response: str = "",
+        over: bool = False,
+        why: str = "",
     ) -> Decision:
         """Decides who acts next, after ``executed`` (A,) was done and ``row`` (D,) was sensed.
 
@@ -199,8 +214,12 @@ class Arbiter:
             surprise: infinite where something has failed.
             feel: lets the reflex feel the row: once a control step.
             expected: (A,) what the memory expects to be commanded next, for reflexes that go on with it.
+            response: what a ``Graded`` reflex is to do about an alarm, in place of taking over as it did last.
+            over: what was responded to is over, so that control may go back though it was not quiet for long.
+            why: the cause, for the log.
         """
         alarm, intervened = not surprise <= self.threshold, self.overriding or self._refused
+        slowed = self._slowed
         begun, self._refused = self._refused, False
         if self._reflex is None:
             return Decision(alarm, intervened, False, False)
@@ -217,11 +236,13 @@ class Arbiter:
             self._handed_back += 1
             if self._handed_back > self._patience.release_after:
                 self._handed_back = None
-        transition = self._next(alarm, executed) or ("override" if begun else "")
+        self._past = self._past + 1 if over and intervened else 0
+        transition = self._next(alarm, executed, response) or ("override" if begun else "")
         if transition:
-            _log.info("%s: surprise %.3g, threshold %.3g", transition, surprise, self.threshold)
+            because = f" ({why})" if why else ""
+            _log.info("%s: surprise %.3g, threshold %.3g%s", transition, surprise, self.threshold, because)
         acted_on = alarm or transition == "trial"
-        return Decision(alarm, intervened, transition == "give_up", acted_on, failure, transition)
+        return Decision(alarm, intervened or slowed, transition == "give_up", acted_on, failure, transition)
 
     def _tell(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], intervened: bool) -> str:
         """Lets the reflex feel the row; what failed at that."""
@@ -234,21 +255,42 @@ class Arbiter:
             return failure
         return ""
 
-    def _next(self, alarm: bool, executed: NDArray[np.float32]) -> str:
+    def _next(self, alarm: bool, executed: NDArray[np.float32], response: str) -> str:
         """Who acts next, as a transition."""
         if not self.overriding:
-            if alarm:
-                self._take_over(executed)
-            return "override" if alarm else ""
-        if self._quiet >= self._patience.release_after:
+            return self._begin(alarm, executed, response)
+        if alarm and response not in ("", *GOING_ON):
+            self._choose(response)
+        if self._quiet >= self._patience.release_after or (self._past >= OVER_AFTER and self._response != "stop"):
             self.overriding, self._handed_back, self._tried = False, 0, False
             return "release"
-        if self._acted >= (self._patience.max_override or math.inf):
+        stopped = self._response == "stop" and self._held >= (self._patience.try_after or self._patience.release_after)
+        if stopped or self._acted >= (self._patience.max_override or math.inf):
             return "give_up"
         if self._held >= self._wait:
             self.overriding, self._handed_back, self._tried = False, 0, True
             return "trial"
         return ""
+
+    def _begin(self, alarm: bool, executed: NDArray[np.float32], response: str) -> str:
+        """What becomes of the policy that acts."""
+        if alarm and response in GOING_ON:
+            self._slowed = response == "slow"
+            return response
+        if alarm:
+            self._slowed = False
+            self._choose(response)
+            self._take_over(executed)
+            return "override"
+        if self._slowed and self._quiet >= self._patience.release_after:
+            self._slowed = False
+            return "release"
+        return ""
+
+    def _choose(self, response: str) -> None:
+        self._response = response
+        if isinstance(self._reflex, Graded):
+            self._reflex.choose(response)
 
     def _take_over(self, executed: NDArray[np.float32]) -> None:
         if self._handed_back is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Literal, NamedTuple, SupportsFloat
 
@@ -29,6 +29,7 @@ from asm_gym.wrappers.arguments import (
 )
 from asm_gym.wrappers.observer import Observer, joined
 from asm_gym.wrappers.recording import StreamSource
+from asm_gym.wrappers.responses import NO_RESPONSE, Responder, Response, responses_from
 
 
 class RowReport(NamedTuple):
@@ -38,6 +39,7 @@ class RowReport(NamedTuple):
     decision: Decision
     latency: float = 0.0  # of the monitor [s]
     failure: str = ""
+    response: Response = NO_RESPONSE
 
 
 class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -114,6 +116,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         monitor_freq: int | None = None,
         on_overrun: Literal["warn", "alarm", "ignore"] = "warn",
         adapt: AdaptiveThreshold | None = None,
+        responses: Mapping[str, str] | None = None,
     ) -> None:
         RecordConstructorArgs.__init__(
             self,
@@ -129,6 +132,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             monitor_freq=monitor_freq,
             on_overrun=on_overrun,
             adapt=adapt,
+            responses=responses,
         )
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.action_space, gym.spaces.Box):
@@ -150,6 +154,10 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._on_alarm = on_alarm if isinstance(on_alarm, str) else "policy"
         reflex = make_reflex(on_alarm, env)
         self._observer = Observer(monitor, recalls=check_expectation(reflex, monitor))
+        table = responses_from(responses)
+        if responses is not None and on_alarm != "graded":
+            raise ValueError(f"responses are those of on_alarm='graded', got on_alarm={on_alarm!r}")
+        self._responder = Responder(env, monitor, table, repairs=on_alarm == "graded")
         patience = make_patience(reflex, env, release_after, release_below, max_override, try_after)
         fallback = make_fallback(env)
         if monitor_freq is not None:
@@ -178,6 +186,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._observation = observation
         self._follow()
         self._arbiter.reset()
+        self._responder.reset()
         none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))
         self._ended = False
         return observation, self._report(info, [RowReport(none, NOTHING)], None)
@@ -194,8 +203,11 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._rows: list[RowReport] = []
         with self._within_steps():
             observation, reward, terminated, truncated, info = self.env.step(self._executed)
-        self._observation = observation
         self._look(*self._sensed(observation, info), ends_step=True)
+        self._observation = observation = self._responder.observed(observation)
+        repaired = self._responder.row()
+        if repaired is not None and "stream" in info:
+            info["stream"] = repaired
         asm = self._report(info, self._rows, self._executed)["asm"]
         if asm["gave_up"] or (asm["alarm"] and self._on_alarm == "terminate"):
             terminated, truncated = terminated or self._ends == "terminated", truncated or self._ends == "truncated"
@@ -242,21 +254,34 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """One row: what the monitor makes of it, and who acts next."""
         if self._refused:
             failure, self._refused = joined(self._failed, failure), False
+        row = self._responder.read(row)
+        failure = joined(failure, self._responder.doubt)
         surprise, expected, (failure,), latency = self._observer.observe(row[None], (failure,))
         if self._late(latency):
             surprise = surprise._replace(value=np.full(1, np.inf))
+        if self._responder.settling and not failure:
+            surprise = Surprise(np.zeros(1), np.zeros_like(surprise.attribution))
         if self.learning_rate > 0 and not self._arbiter.overriding and not failure:
             failure = self._observer.learn(row[None], surprise, self.learning_rate)
             surprise = surprise if not failure else surprise._replace(value=np.full(1, np.inf))
         if failure:
             self._arbiter.warn(failure, "which counts as an alarm")
+        response = self._responder.respond(not surprise.value[0] <= self.threshold, bool(failure))
         decision = self._arbiter.decide(
-            float(surprise.value[0]), row, self._executed, ends_step, None if expected is None else expected[0]
+            float(surprise.value[0]),
+            row,
+            self._executed,
+            ends_step,
+            None if expected is None else expected[0],
+            response.name,
+            response.over,
+            response.why,
         )
         if not decision.intervened:
             self._largest = max(self._largest or 0.0, float(surprise.value[0]))
-        forgot = self._observer.forget(np.array([decision.acted_on]))
-        self._rows.append(RowReport(surprise, decision, latency, joined(failure, decision.failure, forgot)))
+        forgot = self._observer.forget(np.array([decision.acted_on or self._responder.settling]))
+        failure = joined(failure, decision.failure, forgot)
+        self._rows.append(RowReport(surprise, decision, latency, failure, response))
         if self._arbiter.overriding and not decision.intervened and not ends_step:
             self._command(self._executed)
             self.env.get_wrapper_attr("command")(self._executed)
@@ -287,6 +312,9 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             "gave_up": any(row.decision.gave_up for row in rows),
             "transition": next((t for row in reversed(rows) if (t := row.decision.transition)), ""),
             "failure": joined(*failed, *(row.failure for row in rows)),
+            "cause": next((r.response.cause for r in reversed(rows) if r.response.why), NO_RESPONSE.cause),
+            "response": next((r.response.name for r in reversed(rows) if r.response.name), ""),
+            "completed": self._responder.completed,
             "executed_action": executed,
             "attribution": dict(zip(self.monitor.spec.labels, worst.attribution[0].tolist(), strict=True)),
             "surprises": surprises,

@@ -417,6 +417,10 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """The row measured last, laid out as ``measured_spec`` says; a copy."""
         return self._row.copy()
 
+    def force_behind(self, torques: NDArray[np.floating[Any]]) -> tuple[str, NDArray[np.float64]]:
+        """The link on which a force would explain external torques (J,) [N m] best, and that force (3,) [N]."""
+        return self.simulation.force_behind(np.asarray(torques, np.float64))
+
     @property
     def motors(self) -> NDArray[np.intp]:
         """The actuators of the arms' joints, from the base on."""

@@ -211,6 +211,24 @@ class Simulation:
             start += robot.action_dim
         return found
 
+    def force_behind(self, torques: NDArray[np.float64]) -> tuple[str, NDArray[np.float64]]:
+        """The link on which a force would explain external torques (J,) [N m] best, and that force (3,) [N].
+
+        For a force F on link k, τ = J_kᵀ F, and no joint beyond k feels it: of all links the one that leaves the least.
+        """
+        best: tuple[float, str, NDArray[np.float64]] = (np.inf, "", np.zeros(3))
+        jacobian = np.zeros((3, self.model.nv))
+        joints = self.model.actuator_trnid[self.motors, 0]
+        for joint in joints:
+            link = int(self.model.jnt_bodyid[joint])
+            mujoco.mj_jacBodyCom(self.model, self.data, jacobian, None, link)
+            J = jacobian[:, self._dofs]
+            force = np.linalg.lstsq(J.T, torques, rcond=1e-2)[0]
+            left = float(np.sum((torques - J.T @ force) ** 2))
+            if left < best[0]:
+                best = left, self.model.body(link).name, force
+        return best[1], best[2]
+
     def _nominal(self) -> Nominal:
         """The dynamics the robot believes in: the live ones, until somebody edits its masses."""
         if not any(kernels.edited(self._live[n], self._frozen[n], self._robots) for n in _INERTIA):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from asm_gym.monitors.base import (
     ExpectsActions,
+    ExplainsItself,
     ForgetsEvidence,
     LearnsOnTheJob,
     Model,
@@ -32,6 +33,7 @@ __all__ = [
     "PARTS",
     "CalibratedMonitor",
     "ExpectsActions",
+    "ExplainsItself",
     "ForgetsEvidence",
     "LearnsOnTheJob",
     "Model",

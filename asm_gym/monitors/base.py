@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episodes import Episode
+from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.stream import StreamSpec
 
 Progress = Callable[[int, int], object]
@@ -117,6 +118,16 @@ class ExpectsActions(Protocol):
 
     def expected_action(self, state: State) -> NDArray[np.float32]:
         """(B, A) in the units of the action, of the state as ``observe`` handed it back."""
+        ...
+
+
+@runtime_checkable
+class ExplainsItself(Protocol):
+    """A monitor that can say what causes its surprise, and complete what a faulty sense should say."""
+
+    @property
+    def diagnosis_(self) -> Diagnosis | None:
+        """None where it was not learned."""
         ...
 
 

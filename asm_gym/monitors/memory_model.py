@@ -16,6 +16,7 @@ from asm_gym.detection.base import Arrays
 from asm_gym.episodes import Episode
 from asm_gym.memory.adaptation import followed
 from asm_gym.memory.association import Association, association_shapes, existing, hidden_units
+from asm_gym.memory.completion import Completion
 from asm_gym.memory.fewer import MOST_INPUTS, Kept, fewer_changes, fewer_traces, moments
 from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
@@ -45,6 +46,7 @@ class MemoryModel(StreamModel):
         senses_: how it reads a row.
         network_: the weights; None before ``fit``.
         motor_: the motor association; None before ``learn_to_act``.
+        completion_: what completes missing senses; None in memories that were saved before there was any.
     """
 
     kind = "neural_asm"
@@ -56,6 +58,7 @@ class MemoryModel(StreamModel):
         self.shortest = 1 + self.lag
         self.network_: Network | None = None
         self.motor_: Motor | None = None
+        self.completion_: Completion | None = None
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams, lag = [e.stream for e in episodes], self.lag
@@ -69,8 +72,9 @@ class MemoryModel(StreamModel):
         standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change, "energy": trained.energy}
         if senses.inputs <= MOST_INPUTS:
             standard["moments"] = moments(np.concatenate([t.inputs for t in trajectories]))
-        network = trained.network
-        return self.restore({**standard, **network.weights._asdict(), **network.association._asdict()})
+        network, completion = trained.network, Completion.fit(senses, streams)
+        filled = completion.named() if completion is not None else {}
+        return self.restore({**standard, **network.weights._asdict(), **network.association._asdict(), **filled})
 
     def fewer(self, spec: StreamSpec) -> tuple[MemoryModel, Kept]:
         """The model of a stream that lacks senses of this one, and what became of its errors.
@@ -120,6 +124,7 @@ class MemoryModel(StreamModel):
         else:
             self.network_ = Network(Weights(**{n: arrays[n] for n in temporal}), association, *how)
         self.senses_, self.motor_ = senses, Motor.found(learned, senses)
+        self.completion_ = Completion.found(learned, senses)
         return super().restore(learned, skills)
 
     def start(self, batch: int, skills: Sequence[str] = ()) -> MemoryState:

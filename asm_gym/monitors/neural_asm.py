@@ -23,6 +23,7 @@ from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
 from asm_gym.memory.network import Network
 from asm_gym.monitors.base import Surprise
+from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState, restored
@@ -104,6 +105,7 @@ class NeuralASM(CalibratedMonitor):
         schedule = Schedule(**{name: getattr(self, name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule)
         super().__init__(model, EvidenceDetection(spec, gains, bound, shrinkage), seed=seed)
+        self._diagnosis: Diagnosis | None = None
 
     @property
     def network_(self) -> Network | None:
@@ -114,6 +116,16 @@ class NeuralASM(CalibratedMonitor):
     def motor_(self) -> Motor | None:
         """The motor association; None before ``learn_to_act``."""
         return self.model.motor_
+
+    @property
+    def diagnosis_(self) -> Diagnosis | None:
+        """What names the cause of a surprise, and completes senses; None in memories saved before there was any."""
+        completion = self.model.completion_
+        if completion is None:
+            return None
+        if self._diagnosis is None or self._diagnosis.completion is not completion:
+            self._diagnosis = Diagnosis(completion, Readout.shipped())
+        return self._diagnosis
 
     @property
     def senses_(self) -> StreamScaler:

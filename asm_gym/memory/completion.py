@@ -1,0 +1,219 @@
+"""Completion: what a sense should say, from all other senses, the command and what went before.
+
+    y_t = [v_t, v_{t-1}, u_t, p_t]      values now and before, the command, products of two slow values
+    C   = ⟨y_t y_tᵀ⟩                    learned by coincidence alone (Hebb): how often two things go together
+    v̂_M = C_MO (C_OO + λ)⁻¹ y_O         minimises the energy ½ yᵀ (C + λ)⁻¹ y over what is missing: precision 0
+
+O is everything in which no missing sense takes part, so that any set of senses can be missing at once. Products make
+what is curved between senses, such as a joint's angle and where its hand is, linear enough.
+
+Sources: Kohonen 1972 (IEEE Trans. Comput. 21(4)) for correlation matrix memories; Lauritzen 1996 for the conditionals
+of a Gaussian. The inverse is no local rule; C is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.scaling import StreamScaler
+from asm_gym.stream import StreamSpec
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+PAIRED = 18
+"""So many of the slowest senses go into products, two at a time: an arm's joints and its hand."""
+
+PENALTY = 1e-4
+"""λ, in units of the variance of a standardised number."""
+
+MOST_ENTRIES = 2048
+"""Of y: a stream of more is not completed, for C would outgrow the rest of the memory."""
+
+FARTHEST = 30.0
+"""Standardised numbers are cut off here, lest one broken sense that nobody knows of spoil all that is completed."""
+
+ARRAYS = ("completion_products", "completion_covariance", "completion_centre", "completion_error")
+
+
+class Filling(NamedTuple):
+    """How missing senses are completed.
+
+    Attributes:
+        columns: (M,) of the stream.
+        weights: (M, Y) from y, centred.
+        error: (M,) standard deviation of what this leaves where nothing is wrong [unit of each].
+    """
+
+    columns: NDArray[np.intp]
+    weights: Floats
+    error: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Completion:
+    """A correlation memory of a stream.
+
+    Args:
+        senses: how it reads a row.
+        products: (P, 2) which columns are multiplied.
+        covariance: (Y, Y) C, of centred y.
+        centre: (Y,) mean of y.
+        error: (D,) standard deviation of what is left of a column when its sensor is completed, in spreads; 1 for
+            actions.
+    """
+
+    senses: StreamScaler
+    products: NDArray[np.intp]
+    covariance: Floats
+    centre: Floats
+    error: Floats
+
+    @classmethod
+    def fit(cls, senses: StreamScaler, streams: Sequence[NDArray[np.floating[Any]]]) -> Self | None:
+        """From training episodes (T, D) each; None where a stream is too wide."""
+        spec, D = senses.spec, senses.spec.size
+        slowest = senses.slow[np.argsort((senses.change / senses.spread)[senses.slow], kind="stable")][:PAIRED]
+        first, second = np.triu_indices(len(slowest))
+        products = np.stack([slowest[first], slowest[second]], axis=1)
+        Y = 2 * len(spec.sensory) + len(spec.motor) + len(products)
+        if Y > MOST_ENTRIES:
+            return None
+        blank = cls(senses, products, np.eye(Y), np.zeros(Y), np.ones(D))
+        rows = sum(map(len, streams))
+
+        def mean(part: Callable[[Floats], Floats]) -> Floats:
+            return np.asarray(sum(part(blank.lift(s)) for s in streams)) / rows
+
+        centre = mean(lambda y: y.sum(axis=0))
+        covariance = mean(lambda y: (y - centre).T @ (y - centre))
+        learned = cls(senses, products, covariance, centre, np.ones(D))
+        error = np.ones(D)
+        error[spec.sensory] = np.sqrt(mean(lambda y: np.sum(learned.unexplained(y) ** 2, axis=0)))
+        return cls(senses, products, covariance, centre, error)
+
+    @classmethod
+    def found(cls, learned: Mapping[str, NDArray[Any]], senses: StreamScaler) -> Self | None:
+        """What ``named`` wrote; None where a memory was saved before there was completion.
+
+        Raises:
+            ValueError: something does not fit together.
+        """
+        if not all(name in learned for name in ARRAYS):
+            return None
+        products, covariance, centre, error = (np.asarray(learned[name], np.float64) for name in ARRAYS)
+        spec, P = senses.spec, len(products)
+        Y = 2 * len(spec.sensory) + len(spec.motor) + P
+        shapes = (P, 2), (Y, Y), (Y,), (spec.size,)
+        for name, array, shape in zip(ARRAYS, (products, covariance, centre, error), shapes, strict=True):
+            if array.shape != shape:
+                raise ValueError(f"{name} should be of shape {shape}, found {array.shape}")
+        if P and not (products.min() >= 0 and products.max() < spec.size):
+            raise ValueError("completion_products should be columns of the stream")
+        return cls(senses, products.astype(np.intp), covariance, centre, error)
+
+    def named(self) -> dict[str, NDArray[Any]]:
+        """What it has learned, by name."""
+        arrays = self.products.astype(np.float32), self.covariance.astype(np.float32), self.centre, self.error
+        return dict(zip(ARRAYS, arrays, strict=True))
+
+    @property
+    def spec(self) -> StreamSpec:
+        return self.senses.spec
+
+    @cached_property
+    def sensors(self) -> tuple[tuple[str, NDArray[np.intp]], ...]:
+        """What fails together, by name: the columns of each sensor."""
+        return sensors_of(self.spec)
+
+    def lift(self, stream: NDArray[np.floating[Any]]) -> Floats:
+        """(T, Y) y of the rows (T, D) of an episode, not centred; what is not finite counts as usual."""
+        x = (np.asarray(stream, np.float64) - self.senses.mean) / self.senses.spread
+        x = np.clip(np.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0), -FARTHEST, FARTHEST)
+        sensory, motor = x[:, self.spec.sensory], x[:, self.spec.motor]
+        before = np.concatenate([sensory[:1], sensory[:-1]])
+        return np.hstack([sensory, before, motor, x[:, self.products[:, 0]] * x[:, self.products[:, 1]]])
+
+    def involved(self, missing: Mask) -> Mask:
+        """(Y,) the entries of y in which columns of ``missing`` (D,) take part."""
+        sensory = missing[self.spec.sensory]
+        return np.concatenate([sensory, sensory, missing[self.spec.motor], missing[self.products].any(axis=1)])
+
+    def filling(self, missing: Mask) -> Filling:
+        """What completes the senses of ``missing`` (D,), none of which takes part in it."""
+        known = ~self.involved(missing)
+        wanted = np.flatnonzero(missing[self.spec.sensory])  # sensory entries come first in y
+        C = self.covariance
+        W = np.zeros((len(wanted), len(C)))
+        ridge = C[np.ix_(known, known)] + PENALTY * np.eye(int(known.sum()))
+        W[:, known] = np.linalg.solve(ridge, C[np.ix_(known, wanted)]).T
+        left = C[wanted, wanted] - np.einsum("my,ym->m", W, C[:, wanted])
+        columns = self.spec.sensory[wanted]
+        # Of a sensor that fails alone it is known how much is left; of several it follows from C.
+        error = np.sqrt(np.maximum(left, 0.0))
+        return Filling(columns, W, np.maximum(error, self.error[columns]) * self.senses.spread[columns])
+
+    def complete(self, filling: Filling, lifted: Floats) -> Floats:
+        """(T, M) what the missing senses should say in rows of y (T, Y) [unit of each]."""
+        scaler = self.senses
+        return scaler.mean[filling.columns] + scaler.spread[filling.columns] * (
+            self.centre[self._places(filling.columns)] + (lifted - self.centre) @ filling.weights.T
+        )
+
+    def _places(self, columns: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Where sensory columns stand in y."""
+        return np.searchsorted(self.spec.sensory, columns)
+
+    @cached_property
+    def each_alone(self) -> Floats:
+        """(S, Y) the weights that complete each sensor alone, for all sensors; by one inverse."""
+        Y, sensory = len(self.covariance), self.spec.sensory
+        P = np.linalg.inv(self.covariance + PENALTY * np.eye(Y))
+        W = np.zeros((len(sensory), Y))
+        for _, columns in self.sensors:
+            missing = np.zeros(self.spec.size, bool)
+            missing[columns] = True
+            E = np.flatnonzero(self.involved(missing))
+            solved = -np.linalg.solve(P[np.ix_(E, E)], P[E])
+            solved[:, E] = 0.0
+            places = self._places(columns)
+            W[places] = solved[np.searchsorted(E, places)]
+        return W
+
+    def unexplained(self, lifted: Floats) -> Floats:
+        """(T, S) what of each sense its sensor's completion from all else leaves, in spreads, for y (T, Y)."""
+        centred = lifted - self.centre
+        return centred[:, : len(self.spec.sensory)] - centred @ self.each_alone.T
+
+
+def sensors_of(spec: StreamSpec) -> tuple[tuple[str, NDArray[np.intp]], ...]:
+    """What fails together, by name: a joint's position and velocity, the wrist's forces and torques, a mean and its
+    peak; else every number by itself."""
+    found: dict[str, list[int]] = {}
+    for channel in spec.channels:
+        start = spec.slices[channel.name].start
+        if start not in spec.sensory:
+            continue
+        prefix, name = _split(channel.name)
+        for i, label in enumerate(channel.labels):
+            element = label[len(channel.name) :]
+            if channel.group == "wrench":
+                key = f"{prefix}wrist"
+            elif name in ("joint_position", "joint_velocity"):
+                key = f"{prefix}encoder{element}"
+            else:
+                key = prefix + name.removesuffix("_peak") + element
+            found.setdefault(key, []).append(start + i)
+    return tuple((name, np.array(columns, np.intp)) for name, columns in found.items())
+
+
+def _split(name: str) -> tuple[str, str]:
+    """The arm's prefix, where there are two, and the rest."""
+    head, _, tail = name.partition("_")
+    return (f"{head}_", tail) if head.startswith("robot") and head[5:].isdigit() else ("", name)

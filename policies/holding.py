@@ -1,0 +1,164 @@
+"""Staying where one is, and what all reflexes share: they are policies that the safety wrapper lets feel every row."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from asm_gym.abilities import HasGrippers, HoldsItself
+from asm_gym.policies.base import Policy
+
+
+class Begun(NamedTuple):
+    """Where a reflex is."""
+
+    executed: NDArray[np.float32]  # (A,) the action executed last before it began; its grip is kept
+    steps: int  # that it has acted
+
+
+@runtime_checkable
+class Reflex(Policy, Protocol):
+    """A policy that is told of every step, and starts from what was done last."""
+
+    def reset(self) -> None:
+        """A new episode begins."""
+        ...
+
+    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
+        """What was sensed in a step, and what was done.
+
+        Args:
+            row: (D,) of the stream; NaN where it is missing.
+            executed: (A,).
+            acting: whether this reflex did it.
+        """
+        ...
+
+    def begin(self, executed: NDArray[np.float32]) -> Any:
+        """The state to start from, after ``executed`` (A,)."""
+        ...
+
+
+class Hold:
+    """Stay, and keep the grip, so that nothing is dropped.
+
+    An environment that can hold itself, as all of this package can, is told to: it stays under any controller and with
+    any wrapper in between. Each ``predict`` speaks for the next step, whatever action that is then given. In any other
+    environment a zero action is taken to mean "stay".
+
+    Args:
+        env: one with a Box action space.
+        safe_action: what to do instead, where a zero action does not mean "stay"; it goes through all wrappers.
+
+    Raises:
+        TypeError: the action space is no Box.
+        ValueError: ``safe_action`` does not fit the action space, or no action is known that arrives as zero.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], safe_action: NDArray[np.float32] | None = None) -> None:
+        space = env.action_space
+        if not isinstance(space, spaces.Box):
+            raise TypeError(f"a reflex needs a Box action space, got {space}")
+        inner = env.unwrapped
+        self.explicit = safe_action is not None
+        """It does ``safe_action``, and knows of no environment."""
+        self._robot = inner if isinstance(inner, HoldsItself) and not self.explicit else None
+        if safe_action is not None:
+            self._rest = np.asarray(safe_action, np.float32)
+        else:
+            self._rest = nearest_to_rest(space) if self._robot else resting_action(env)
+        if not space.contains(self._rest):
+            raise ValueError(f"safe_action {self._rest} is not in {space}")
+        self._grip = np.asarray(inner.gripper_actions if isinstance(inner, HasGrippers) else (), dtype=int)
+        if self._grip.size and self._grip.max() >= self._rest.size:  # a wrapper inside takes other numbers
+            self._grip = self._grip[:0]
+
+    def reset(self) -> None:
+        """A new episode begins."""
+
+    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
+        """What was sensed in a step (D,), what was done (A,), and whether this reflex did it."""
+
+    def begin(self, executed: NDArray[np.float32]) -> Begun:
+        """The state to start from, after ``executed`` (A,)."""
+        return Begun(np.asarray(executed, np.float32), 0)
+
+    def predict(
+        self,
+        observation: Any,
+        state: Begun | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], Begun | None]:
+        """The next action (A,)."""
+        action = self._rest.copy() if self.explicit else self.move()
+        if state is None:
+            return action, None
+        if not self.explicit:
+            action[self._grip] = state.executed[self._grip]
+        return action, Begun(state.executed, state.steps + 1)
+
+    def move(self) -> NDArray[np.float32]:
+        """The next action (A,); the gripper's part of it does not count."""
+        if self._robot is not None:
+            self._robot.holding = True
+        return self._rest.copy()
+
+
+def nearest_to_rest(space: spaces.Box) -> NDArray[np.float32]:
+    """(A,) the action of a space that comes nearest to none."""
+    nearest: NDArray[np.float32] = np.clip(np.zeros(space.shape), space.low, space.high).astype(np.float32)
+    return nearest
+
+
+def resting_action(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
+    """(A,) the action that reaches the innermost environment as zero.
+
+    Raises:
+        ValueError: a wrapper inside changes actions so that none is known.
+    """
+    space: Any = env.action_space
+    bounded = np.isfinite(space.low) & np.isfinite(space.high)
+    middle = 0.5 * (np.where(bounded, space.low, 0.0) + np.where(bounded, space.high, 0.0))
+    for candidate in (nearest_to_rest(space), middle.astype(np.float32)):
+        arrives, wrapper = candidate, env
+        while isinstance(wrapper, gym.Wrapper):
+            if isinstance(wrapper, gym.wrappers.TransformAction):  # a function of the action alone, so it may be asked
+                arrives = np.asarray(wrapper.action(arrives))
+            elif isinstance(wrapper, gym.ActionWrapper):
+                raise ValueError(_say_outside(wrapper, "hold"))
+            wrapper = wrapper.env
+        if not np.any(arrives):
+            return candidate
+    changed = _changing(env)
+    raise ValueError(
+        _say_outside(changed, "hold")
+        if changed
+        else f"hold takes a zero action for rest, which is not in {space}: use Hold(env, safe_action=...)"
+    )
+
+
+def _changing(env: gym.Env[Any, Any]) -> gym.ActionWrapper[Any, Any, Any] | None:
+    """The outermost wrapper that changes actions; None where there is none."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.ActionWrapper) and not isinstance(env, gym.wrappers.ClipAction):
+            return env
+        env = env.env
+    return None
+
+
+def _say_outside(wrapper: gym.Env[Any, Any], reflex: str) -> str:
+    return (
+        f"{type(wrapper).__name__} changes actions, so that {reflex} cannot know what reaches the robot: "
+        "put it outside of NeuralASMSafety, or use Hold(env, safe_action=...)"
+    )
+
+
+def require_unchanged(env: gym.Env[Any, Any], name: str) -> None:
+    changed = _changing(env)
+    if changed is not None:
+        raise ValueError(_say_outside(changed, name))

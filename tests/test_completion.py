@@ -1,0 +1,269 @@
+"""Missing senses are completed from all others, any set of them, and a policy sees what is completed."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from asm_gym.episodes import Episode
+from asm_gym.memory.completion import Completion, sensors_of
+from asm_gym.monitors import NeuralASM, Surprise
+from asm_gym.monitors.diagnosis import FAMILIES, Diagnosis, Readout
+from asm_gym.scaling import StreamScaler
+from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.wrappers import CompletedObservation, NeuralASMSafety
+from asm_gym.wrappers.completion import ObservationMap, Repair
+
+SPEC = StreamSpec(
+    (
+        Channel("joint_position", 2, "rad", 0.001, "joint"),
+        Channel("hand_position", 2, "m", 0.001, "hand"),
+        Channel("lone", 1, "1", 0.001, "alone"),
+        Channel("action", 2, group=MOTOR),
+    ),
+    dt=0.05,
+)
+"""A planar arm of two joints: the hand is bent by sines and cosines; nothing tells of ``lone``."""
+
+
+def arm(steps: int, seed: int) -> np.ndarray:
+    """(T, 7) an episode of it: joints swing, and the hand is where they say."""
+    rng = np.random.default_rng(seed)
+    t = 0.05 * np.arange(steps)[:, None] + rng.uniform(0, 6, 2)
+    q = np.array([0.4, 0.9]) + 0.35 * np.sin(t * np.array([1.0, 1.6]))
+    hand = np.stack([np.cos(q[:, 0]) + np.cos(q.sum(axis=1)), np.sin(q[:, 0]) + np.sin(q.sum(axis=1))], axis=1)
+    lone = np.cumsum(0.1 * rng.standard_normal((steps, 1)), axis=0)
+    sensed = np.hstack([q, hand, lone]) + 0.001 * rng.standard_normal((steps, 5))
+    return np.hstack([sensed, np.cos(t)]).astype(np.float32)
+
+
+STREAMS = [arm(120, seed) for seed in range(12)]
+SENSES = StreamScaler.fit(SPEC, STREAMS)
+MEMORY = Completion.fit(SENSES, STREAMS)
+
+
+def missing(*columns: int) -> np.ndarray:
+    mask = np.zeros(SPEC.size, bool)
+    mask[list(columns)] = True
+    return mask
+
+
+@pytest.mark.parametrize("columns", [(0,), (1,), (2,), (0, 1), (2, 3)])
+def test_whatever_is_missing_is_completed_from_the_rest_as_well_as_it_says(columns):
+    filling, fresh = MEMORY.filling(missing(*columns)), arm(200, 99)
+    broken = fresh.copy()
+    broken[:, list(columns)] = 5.0  # what a missing sense says does not matter
+    completed = MEMORY.complete(filling, MEMORY.lift(broken))
+    left = np.sqrt(np.mean((completed - fresh[:, list(columns)]) ** 2, axis=0))
+    assert (left < 2.0 * filling.error).all()
+    assert (left < 0.1 * SENSES.spread[list(columns)]).all()
+
+
+def test_completion_is_the_conditional_mean_of_a_gaussian():
+    filling, y = MEMORY.filling(missing(0)), MEMORY.lift(STREAMS[0])[5]
+    involved = MEMORY.involved(missing(0))
+    P = np.linalg.inv(MEMORY.covariance + 1e-4 * np.eye(len(y)))
+    # The energy ½ yᵀPy is least, over all that involves the missing sense, where its gradient there is 0.
+    centred = y - MEMORY.centre
+    inside = np.linalg.solve(P[np.ix_(involved, involved)], -P[np.ix_(involved, ~involved)] @ centred[~involved])
+    expected = SENSES.mean[0] + SENSES.spread[0] * (MEMORY.centre[0] + inside[0])
+    np.testing.assert_allclose(MEMORY.complete(filling, y[None])[0, 0], expected, rtol=1e-6)
+    alone = MEMORY.unexplained(y[None])[0, 0]
+    np.testing.assert_allclose(centred[0] - alone, inside[0], rtol=1e-6)
+
+
+def test_what_a_memory_saves_completes_the_same():
+    again = Completion.found(MEMORY.named(), SENSES)
+    values = [c.complete(c.filling(missing(0)), c.lift(STREAMS[1])) for c in (MEMORY, again)]
+    np.testing.assert_allclose(*values, atol=1e-3)
+    assert Completion.found({}, SENSES) is None
+    with pytest.raises(ValueError, match="completion_centre"):
+        Completion.found({**MEMORY.named(), "completion_centre": np.zeros(3)}, SENSES)
+
+
+def test_a_joint_and_the_wrist_are_one_sensor_each():
+    spec = gym.make("asm_gym/Lift-v0").unwrapped.stream_spec
+    named = {name: [spec.labels[c] for c in columns] for name, columns in sensors_of(spec)}
+    assert named["encoder[3]"] == ["joint_position[3]", "joint_velocity[3]"]
+    assert len(named["wrist"]) == 12
+    assert sorted(c for columns in dict(sensors_of(spec)).values() for c in columns) == spec.sensory.tolist()
+
+
+def test_a_sense_is_repaired_until_it_is_well_again():
+    repair, rows = Repair(MEMORY), arm(120, 7)
+    for t, row in enumerate(rows):
+        faulty = row.copy()
+        faulty[0] += 0.3 * (20 <= t < 60)
+        seen = repair.read(faulty)
+        if t == 22:
+            seen = repair.suspect(np.array([0]))
+        expected = 0.3 if 20 <= t < 22 else 0.0
+        assert abs(seen[0] - row[0] - expected) < 0.05, t
+        np.testing.assert_array_equal(seen[1:], row[1:])  # whatever else is sensed is handed on to the bit
+        assert repair.names == (("encoder[0]",) if 22 <= t < 79 else ()), t
+    repair.reset()
+    assert not repair.missing.any()
+
+
+def test_numbers_that_are_none_are_completed_at_once_and_several_together():
+    repair, rows = Repair(MEMORY), arm(30, 8)
+    for t, row in enumerate(rows):
+        faulty = row.copy()
+        if t >= 10:
+            faulty[[0, 3]] = np.nan
+        seen = repair.read(faulty)
+        assert np.isfinite(seen).all()
+        np.testing.assert_allclose(seen, row, atol=0.06)
+    lost = np.full(SPEC.size, np.nan, np.float32)
+    assert not np.isfinite(Repair(MEMORY).read(lost)).all()  # nothing is left to go by, and nobody pretends
+
+
+def test_what_nothing_else_tells_of_is_trusted_for_a_second_only():
+    repair, rows = Repair(MEMORY, trust_s=1.0), arm(60, 9)
+    trusted = []
+    for t, row in enumerate(rows):
+        faulty = row.copy()
+        if t >= 10:
+            faulty[4] = np.nan
+        seen = repair.read(faulty)
+        trusted.append(repair.trusted)
+        if t >= 10:
+            assert seen[4] == rows[9, 4]
+    assert trusted == [True] * 30 + [False] * 30
+
+
+class Arm(gym.Env):
+    """Plays an episode of the arm back; what is sensed is the observation, and there is no stream."""
+
+    metadata = {"render_fps": 20}  # noqa: RUF012
+
+    def __init__(self, broken=lambda t, row: None):
+        self.observation_space = spaces.Box(-50, 50, (5,), np.float32)
+        self.action_space = spaces.Box(-1, 1, (2,), np.float32)
+        self.broken = broken
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self._observe(), {}
+
+    def step(self, action):
+        self.t += 1
+        return self._observe(), 0.0, False, False, {}
+
+    def _observe(self):
+        row = arm(120, 31)[self.t, :5].copy()
+        self.broken(self.t, row)
+        return row
+
+
+class Named:
+    """Says which family it was; a read-out that needs no learning."""
+
+    def __init__(self, family):
+        self.p = 0.9 * np.eye(len(FAMILIES))[FAMILIES.index(family)] + 0.1 / len(FAMILIES)
+
+    def __call__(self, evidence):
+        return self.p[None]
+
+
+GENERIC = StreamSpec.from_spaces(Arm().observation_space, Arm().action_space, 0.05)
+
+
+class Judge:
+    """Surprised in the steps of ``cue``; its diagnosis is that of the family it is given."""
+
+    threshold = 1.0
+
+    def __init__(self, cue, family="sensor"):
+        streams = STREAMS
+        self.spec, self.cue = GENERIC, cue
+        self.diagnosis_ = Diagnosis(Completion.fit(StreamScaler.fit(GENERIC, streams), streams), Named(family))
+
+    def initial_state(self, batch=1):
+        return 0
+
+    def observe(self, state, stream):
+        attribution = np.zeros((1, 7))
+        attribution[0, 0] = 10.0 if state in self.cue else 0.1
+        return state + 1, Surprise(attribution.sum(axis=1), attribution)
+
+
+def offset(t, row):
+    row[0] += 0.3 * (t >= 20)
+
+
+def played(env, steps):
+    out = [env.reset(seed=0)]
+    for _ in range(steps):
+        observation, *_, info = env.step(np.zeros(2, np.float32))
+        out.append((observation, info))
+    return out
+
+
+def test_a_policy_under_the_wrapper_sees_what_a_faulty_sense_should_say():
+    truth = arm(120, 31)
+    for env in (
+        CompletedObservation(Arm(offset), Judge({21})),
+        NeuralASMSafety(Arm(offset), Judge({21}), on_alarm="graded"),
+    ):
+        for t, (observation, info) in enumerate(played(env, 60)):
+            expected = 0.3 if 20 <= t < 22 else 0.0
+            assert abs(observation[0] - truth[t, 0] - expected) < 0.05, t
+            np.testing.assert_array_equal(observation[1:], truth[t, 1:5])
+        said = info.get("completed") or info["asm"]["completed"]
+        assert said == ("observation[0]",)
+
+
+def test_a_named_sensor_is_never_believed_and_an_unknown_one_is_refused():
+    truth = arm(120, 31)
+    env = CompletedObservation(Arm(offset), Judge(()), sensors=["observation[0]"])
+    for t, (observation, _) in enumerate(played(env, 40)):
+        assert abs(observation[0] - truth[t, 0]) < 0.05
+    with pytest.raises(ValueError, match=r"elbow.*observation\[0\]"):
+        CompletedObservation(Arm(), Judge(()), sensors=["elbow"])
+
+
+def test_an_observation_that_a_wrapper_has_changed_is_refused():
+    env = gym.make("asm_gym/Lift-v0")
+    shorter = gym.wrappers.TransformObservation(env, lambda o: o[:5], spaces.Box(-100, 100, (5,), np.float32))
+    with pytest.raises(ValueError, match="has changed the observation"):
+        ObservationMap(shorter, env.unwrapped.stream_spec)
+    env.close()
+
+
+@pytest.mark.parametrize("observation", ["flat", "dict"])
+def test_the_numbers_of_an_observation_are_found_in_the_stream(observation):
+    env = gym.make("asm_gym/Lift-v0", observation=observation, horizon=5)
+    spec = env.unwrapped.stream_spec
+    seen, info = env.reset(seed=0)
+    everything = np.ones(spec.size, bool)
+    same = ObservationMap(env, spec).repaired(seen, info["stream"], everything)
+    other = ObservationMap(env, spec).repaired(seen, info["stream"] + 1, everything)
+    if observation == "flat":
+        np.testing.assert_array_equal(same, seen)
+        assert (other != seen).sum() == 7 + 7 + 3 + 6 + 2 + 2
+    else:
+        assert all((same[k] == seen[k]).all() for k in seen)
+        np.testing.assert_allclose(other["joint_position"], seen["joint_position"] + 1, rtol=1e-6)
+        np.testing.assert_array_equal(other["cube_pos"], seen["cube_pos"])
+    env.close()
+
+
+def test_a_memory_keeps_its_completion_in_its_file(tmp_path):
+    episodes = [Episode.from_stream(s, SPEC) for s in STREAMS]
+    asm = NeuralASM(SPEC, hidden_size=8, association_size=8, epochs=1).fit(episodes)
+    asm.save(tmp_path / "arm.asm")
+    again = NeuralASM.load(tmp_path / "arm.asm").diagnosis_
+    np.testing.assert_allclose(again.completion.covariance, asm.diagnosis_.completion.covariance, rtol=1e-5)
+    assert again.hypotheses[0].part == "encoder[0]"
+
+
+def test_the_readout_learns_by_the_delta_rule_what_tells_families_apart():
+    rng = np.random.default_rng(0)
+    families = rng.integers(0, 3, 300)
+    evidence = np.eye(len(FAMILIES))[families][:, :4] + 0.1 * rng.standard_normal((300, 4))
+    readout = Readout.fit(evidence, families, np.ones(300), steps=300)
+    found = readout(evidence)
+    np.testing.assert_allclose(found.sum(axis=1), 1.0)
+    assert (found.argmax(axis=1) == families).mean() > 0.98

@@ -1,0 +1,242 @@
+"""What is done about what is wrong: a table of causes, and the responses that it names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.abilities import LocatesForces
+from asm_gym.checks import shown
+from asm_gym.choices import check_choice
+from asm_gym.monitors import ExplainsItself, Monitor
+from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, as_info
+from asm_gym.stream import StreamSpec
+from asm_gym.wrappers.arbitration import GOING_ON
+from asm_gym.wrappers.completion import ObservationMap, Repair
+
+LASTING = {"contact": 1.0, "actuator": 2.5}
+"""From when on a cause is a lasting one [s]."""
+
+CAUSES = (*FAMILIES, *(f"lasting {family}" for family in LASTING))
+"""What a table of responses says something about."""
+
+RESPONSES = (*GOING_ON, "hold", "yield", "retract", "stop")
+"""Let the policy go on; complete the sensors at fault and go on; go on at half speed; stay and keep the grip; give way
+to what presses; go back along the path; stay, and end the episode."""
+
+DEFAULT: dict[str, str] = {
+    "sensor": "complete",
+    "contact": "hold",
+    "lasting contact": "yield",
+    "actuator": "slow",
+    "lasting actuator": "stop",
+    "action": "hold",
+    "object": "go on",
+    "unknown": "hold",
+}
+"""What ``on_alarm="graded"`` does."""
+
+SURE = 0.5
+"""A family that is less probable is unknown."""
+
+PRESSING = 6.0
+"""Something presses where an external torque is so many of its completion's standard deviations off."""
+
+
+class Response(NamedTuple):
+    """What is to be done after a row.
+
+    Attributes:
+        name: one of ``RESPONSES``; empty where there is nothing to respond to, or nothing is to be done by the table.
+        cause: as ``info["asm"]["cause"]`` says it.
+        over: the contact that was responded to is over.
+    """
+
+    name: str
+    cause: dict[str, Any]
+    over: bool = False
+
+    @property
+    def why(self) -> str:
+        """The cause in words."""
+        if not self.cause["family"]:
+            return ""
+        part = " ".join(filter(None, (self.cause["family"], self.cause["part"])))
+        return f"{part}, {self.cause['probability']:.2f}"
+
+
+NO_RESPONSE = Response("", as_info(None))
+"""Where nothing is to be done."""
+
+
+def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:
+    """The default table with the entries of ``table`` in place of its own.
+
+    Raises:
+        ValueError: an unknown cause or response; the message lists those that exist.
+    """
+    if table is not None and not isinstance(table, Mapping):
+        raise ValueError(f"responses must map causes to responses, got {shown(table)}")
+    for cause, response in (table or {}).items():
+        check_choice("cause", cause, CAUSES)
+        check_choice("response", response, RESPONSES)
+    return {**DEFAULT, **(table or {})}
+
+
+class Responder:
+    """Names the cause of an alarm in one environment, repairs its rows, and says what is to be done.
+
+    Args:
+        env: where it acts.
+        monitor: what watches; without a diagnosis every cause is unknown.
+        table: what is done about which cause, as ``responses_from`` gives it.
+        repairs: it does something about it, and does not only say what it is.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], monitor: Monitor, table: Mapping[str, str], repairs: bool) -> None:
+        self._table, self._spec, self._repairs = table, monitor.spec, repairs
+        self._diagnosis = monitor.diagnosis_ if isinstance(monitor, ExplainsItself) else None
+        inner = env.unwrapped
+        self._body = inner if isinstance(inner, LocatesForces) else None
+        self.repair: Repair | None = None
+        self._map: ObservationMap | None = None
+        self._touch: Any = None
+        if self._diagnosis is not None:
+            self.repair = Repair(self._diagnosis.completion)
+            missing = _touched(monitor.spec)
+            if missing.any():
+                self._touch = self._diagnosis.completion.filling(missing)
+            self._map = self._mapped(env) if repairs else None
+        self.reset()
+
+    def _mapped(self, env: gym.Env[Any, Any]) -> ObservationMap | None:
+        try:
+            return ObservationMap(env, self._spec)
+        except ValueError as error:
+            # Completing what the monitor sees would hide a fault that the policy goes on to see.
+            gym.logger.warn(f"senses cannot be completed, and on a sensor at fault the robot holds: {error}")
+            return None
+
+    def reset(self) -> None:
+        """A new episode begins."""
+        self._rows: list[NDArray[np.float32]] = []
+        self._since: dict[str, int] = {}  # rows for which a family has been the cause
+        self._named: Cause | None = None
+        self._quiet = 0
+        if self.repair is not None:
+            self.repair.reset()
+
+    @property
+    def settling(self) -> bool:
+        """Whether the monitor still compares repaired rows with some that were not."""
+        return self.repair is not None and self.repair.settling > 0
+
+    @property
+    def doubt(self) -> str:
+        """What can no longer be relied on; empty where everything can."""
+        if self.repair is None or self.repair.trusted:
+            return ""
+        return f"completion: nothing else has told of {', '.join(self.repair.names)} for too long"
+
+    @property
+    def completed(self) -> tuple[str, ...]:
+        """The sensors that are completed."""
+        return () if self.repair is None else self.repair.names
+
+    def read(self, row: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(D,) the row as the monitor is to see it."""
+        if self.repair is not None and self._map is not None:
+            row = self.repair.read(row)
+        self._rows = [*self._rows[-WINDOW:], row]
+        return row
+
+    def observed(self, observation: Any) -> Any:
+        """The observation as the policy is to see it."""
+        if self._map is None or self.repair is None or not self._rows:
+            return observation
+        return self._map.repaired(observation, self._rows[-1], self.repair.missing)
+
+    def row(self) -> NDArray[np.float32] | None:
+        """(D,) the last row, repaired; None where nothing is."""
+        return self._rows[-1] if self._rows and self.completed else None
+
+    def respond(self, alarm: bool, failed: bool) -> Response:
+        """What is to be done about the last row.
+
+        Args:
+            alarm: surprise is over the threshold.
+            failed: monitor, stream or policy failed, so that nothing is known.
+        """
+        dt = self._spec.dt
+        self._quiet = 0 if alarm else self._quiet + 1
+        if self._quiet > 1.0 / dt:
+            self._since, self._named = {}, None
+        over = self._over()
+        for family in self._since:
+            self._since[family] += 1
+        if not alarm:
+            return Response("", as_info(None), over)
+        cause = self._cause(failed)
+        self._named = cause
+        family = cause.family if cause is not None and cause.probability >= SURE else "unknown"
+        self._since.setdefault(family, 0)
+        lasting = self._since[family] >= LASTING.get(family, np.inf) / dt
+        name = self._table[f"lasting {family}" if lasting else family]
+        if name == "complete" and not self._complete(cause):
+            name = self._table["unknown"]
+        said = as_info(cause, self._force(family))
+        if cause is None or family != cause.family:
+            said |= {"family": family, "part": ""}
+        return Response(name if self._repairs else "", said, over and self._repairs)
+
+    def _cause(self, failed: bool) -> Cause | None:
+        if failed or self._diagnosis is None or not all(np.isfinite(row).all() for row in self._rows):
+            return None
+        return self._diagnosis(self._diagnosis.completion.lift(np.stack(self._rows)))
+
+    def _complete(self, cause: Cause | None) -> bool:
+        """Completes what is at fault; whether that could be done."""
+        if cause is None or self.repair is None or self._map is None:
+            return False
+        row = self.repair.suspect(cause.columns)
+        if row is not None:
+            self._rows[-1] = row
+        return row is not None
+
+    def _pressing(self) -> NDArray[np.float64] | None:
+        """(J,) external torque beyond what everything else tells of [N m]; None where it is not measured."""
+        if self._touch is None or self._diagnosis is None or len(self._rows) < 2:
+            return None
+        completion, columns = self._diagnosis.completion, self._touch.columns
+        expected = completion.complete(self._touch, completion.lift(np.stack(self._rows[-2:])))[-1]
+        beyond = self._rows[-1][columns] - expected
+        own = np.array([self._spec.labels[c].split("[")[0].endswith("external_torque") for c in columns])
+        found: NDArray[np.float64] = beyond[own]
+        self._usual = self._touch.error[own]
+        return found
+
+    def _over(self) -> bool:
+        """Whether nothing presses any more."""
+        if self._named is None or self._named.family != "contact":
+            return False
+        torque = self._pressing()
+        return torque is not None and bool((np.abs(torque) < PRESSING * self._usual).all())
+
+    def _force(self, family: str) -> dict[str, Any] | None:
+        """The link that is pressed, and the force (3,) on it [N], in the world's axes."""
+        torque = self._pressing() if family == "contact" and self._body is not None else None
+        if torque is None or self._body is None:
+            return None
+        link, force = self._body.force_behind(torque)
+        return {"link": link, "newtons": float(np.linalg.norm(force)), "vector": force.round(3).tolist()}
+
+
+def _touched(spec: StreamSpec) -> NDArray[np.bool_]:
+    """(D,) what a contact shows in: external torques, and forces and torques at the wrist."""
+    groups = [c.group for c in spec.channels for _ in range(c.size)]
+    external = np.array(["external_torque" in label for label in spec.labels])
+    return external | np.array([g == "wrench" for g in groups]) if external.any() else external
