@@ -207,10 +207,12 @@ def test_a_policy_under_the_wrapper_sees_what_a_faulty_sense_should_say():
         CompletedObservation(Arm(offset), Judge({21})),
         NeuralASMSafety(Arm(offset), Judge({21}), on_alarm="graded"),
     ):
-        for t, (observation, info) in enumerate(played(env, 60)):
+        out = played(env, 60)
+        for t, (observation, _) in enumerate(out):
             expected = 0.3 if 20 <= t < 22 else 0.0
             assert abs(observation[0] - truth[t, 0] - expected) < 0.05, t
             np.testing.assert_array_equal(observation[1:], truth[t, 1:5])
+        info = out[-1][1]
         said = info.get("completed") or info["asm"]["completed"]
         assert said == ("observation[0]",)
 
