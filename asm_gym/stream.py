@@ -7,6 +7,7 @@ commanded during it (the efference copy). A :class:`StreamSpec` names every numb
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -32,6 +33,8 @@ class Channel:
         group: what the channel can be selected by, for example ``joint`` or ``wrench``. The group ``action`` is the
             efference copy: it is given to the memory, not predicted from the senses.
         elements: a name for each number; ``0, 1, …`` where empty.
+        resolution: the step between two readings that the sensor tells apart [unit]; 0 where it is not known, or where
+            the numbers are computed from several sensors.
     """
 
     name: str
@@ -40,12 +43,15 @@ class Channel:
     noise: float = 0.0
     group: str = "sense"
     elements: tuple[str, ...] = ()
+    resolution: float = 0.0
 
     def __post_init__(self) -> None:
         if self.size < 1:
             raise ValueError(f"channel {self.name!r} must have a size of at least 1, got {self.size}")
         if not self.noise >= 0.0:
             raise ValueError(f"channel {self.name!r}: noise must be >= 0, got {self.noise}")
+        if not 0.0 <= self.resolution < math.inf:
+            raise ValueError(f"channel {self.name!r}: resolution must be >= 0 and finite, got {self.resolution}")
         if self.elements and len(self.elements) != self.size:
             raise ValueError(f"channel {self.name!r} has size {self.size} but {len(self.elements)} element names")
 
@@ -101,6 +107,11 @@ class StreamSpec:
     def noise(self) -> NDArray[np.float64]:
         """(D,) standard deviation of the sensor noise [unit of each channel]."""
         return np.concatenate([np.full(c.size, c.noise) for c in self.channels])
+
+    @cached_property
+    def resolution(self) -> NDArray[np.float64]:
+        """(D,) the step between two readings that a sensor tells apart [unit of each channel]; 0 where unknown."""
+        return np.concatenate([np.full(c.size, c.resolution) for c in self.channels])
 
     @cached_property
     def motor(self) -> NDArray[np.intp]:

@@ -1,4 +1,4 @@
-"""StreamScaler that say the same twice: counted in nominal streams, and held against how rare that was."""
+"""Senses that say the same twice: counted in nominal streams, and held against how rare that was."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from asm_gym.detection import ModelOutput
 from asm_gym.detection.repetition import (
-    FADING,
     REPETITION_OFFSET,
+    STUCK,
     Repetition,
     count_repetitions,
+    evidence_steps,
     improbability,
     repeated,
     unrepeated,
@@ -21,10 +23,10 @@ from asm_gym.monitors import NeuralASM
 from tests.streams import frozen, sine_episodes, sine_spec
 
 
-def run(rows: np.ndarray, surprise: np.ndarray) -> list[Repetition]:
+def run(rows: np.ndarray, counted: np.ndarray) -> list[Repetition]:
     state, states = unrepeated(1, rows.shape[1]), []
     for row in rows:
-        state = Repetition(*repeated(*state, row[None], surprise))
+        state = Repetition(*repeated(*state, row[None], evidence_steps(counted[:2])))
         states.append(state)
     return states
 
@@ -34,15 +36,15 @@ def test_repetitions_are_counted_after_none_and_after_one():
     stream = np.array([1.0, 2, 3, 3, 3, 4, 5])[:, None]
     found = count_repetitions([stream], np.array([True]))
     first = (1 + 0.5) / (3 + 1)
-    np.testing.assert_allclose(np.exp(-found[:, 0]), [first, (1 + first) / (2 + 1)])
+    np.testing.assert_allclose(np.exp(-found[:2, 0]), [first, (1 + first) / (2 + 1)])
 
 
 def test_a_sense_without_declared_noise_is_watched_unless_it_stood_still_before():
     streams = [np.random.default_rng(seed).normal(size=(100, 3)) for seed in range(2)]
     streams[1][50, 1] = streams[1][49, 1]
     found = count_repetitions(streams, np.array([True, False, False]))
-    assert (found[:, [0, 2]] > 4.0).all()
-    assert (found[:, 1] == 0.0).all()
+    assert (found[:2, [0, 2]] > 4.0).all()
+    assert (found[:2, 1] == 0.0).all()
 
 
 def test_a_sense_read_at_half_the_rate_surprises_nobody_until_it_sticks():
@@ -55,14 +57,40 @@ def test_a_sense_read_at_half_the_rate_surprises_nobody_until_it_sticks():
     assert stuck > 12.0
 
 
-def test_what_was_repeated_adds_up_and_fades():
-    surprise = np.array([[8.0], [3.0]])
-    states = run(np.array([[1.0], [1.0], [1.0], [2.0], [np.nan], [np.nan]]), surprise)
-    one, two = 8.0, 8.0 * (1 - FADING) + 3.0
-    faded = two * (1 - FADING) ** np.arange(4)
-    np.testing.assert_allclose([s.unlikely[0, 0] for s in states], [0.0, one, *faded])
-    np.testing.assert_allclose(improbability(states[2]), np.exp(TAIL_INDEX * (two - REPETITION_OFFSET)))
-    assert improbability(states[0]) == 0.0
+def test_evidence_for_a_stuck_sense_is_that_of_pages_test():
+    p = np.array([[1e-4], [1e-2]])  # of a repetition after none, and after one
+    states = run(np.array([[1.0], [1.0], [1.0], [2.0], [np.nan], [np.nan]]), -np.log(p))
+    one, two = np.log(STUCK / p[0, 0]), np.log(STUCK / p[1, 0])
+    change = np.log((1 - STUCK) / (1 - p[:, 0]))
+    rest = np.cumsum([one + two, change[1], change[0], change[0]])
+    np.testing.assert_allclose([s.unlikely[0, 0] for s in states], [0.0, one, *rest])
+    ratio = improbability(states[2], np.array([REPETITION_OFFSET]))
+    np.testing.assert_allclose(ratio, np.exp(TAIL_INDEX * (one + two - REPETITION_OFFSET)))
+    assert improbability(states[0], np.array([REPETITION_OFFSET])) == 0.0
+
+
+def quantised(steps: int, seed: int) -> np.ndarray:
+    """(steps, 1) of a sensor at rest, whose noise is a bit more than its resolution: one reading of four repeats."""
+    return np.rint(np.random.default_rng(seed).normal(scale=1.14, size=(steps, 1)))
+
+
+def test_a_sensor_at_rest_may_repeat_itself_by_chance_and_is_found_all_the_same_once_it_sticks():
+    counted = count_repetitions([quantised(100, seed) for seed in range(60)], np.array([True]))
+    np.testing.assert_allclose(np.exp(-counted[:2, 0]), 0.24, atol=0.03)
+    fresh = np.array([max(s.unlikely[0, 0] for s in run(quantised(100, seed), counted)) for seed in range(100, 400)])
+    # Page's bound: the chance to come to n from where it last began is e^-n, and there are 100 beginnings.
+    for n in (6.0, 8.0):
+        assert (fresh >= n).mean() <= 100 * np.exp(-n) + 0.02
+    assert (fresh < REPETITION_OFFSET).all()
+    stuck = [s.unlikely[0, 0] for s in run(np.ones((20, 1)), counted)]
+    assert np.argmax(np.array(stuck) > REPETITION_OFFSET) == pytest.approx(10, abs=1)
+
+
+def test_nothing_is_held_against_a_sense_that_nominal_episodes_showed():
+    still = np.concatenate([quantised(200, 0), np.ones((30, 1)), quantised(200, 1)])
+    counted = count_repetitions([still], np.array([True]))
+    reached = max(s.unlikely[0, 0] for s in run(still, counted))
+    assert counted[2, 0] == reached > REPETITION_OFFSET
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +114,17 @@ def test_what_was_reacted_to_is_forgotten(asm):
         state, _ = asm.observe(state, row)
     assert state.detection.repetition.unlikely.any()
     assert not asm.reset_evidence(state).detection.repetition.unlikely.any()
+
+
+def test_a_memory_of_before_sensors_had_a_resolution_loads(asm):
+    detection = asm.detection
+    learned = detection.learned_ | {"repetition": detection.learned_["repetition"][:2]}
+    old = type(detection)(asm.spec, gains=detection.gains).restore(learned)
+    state, row = old.start(1, len(asm.spec.sensory)), np.ones((1, asm.spec.size))
+    output = ModelOutput(np.zeros((1, len(asm.spec.sensory))), np.zeros((1, asm.hidden_size)))
+    for _ in range(4):
+        state, _ = old.attribute_step(state, output, row, lambda parts: np.zeros((1, asm.spec.size)))
+    assert (state.repetition.unlikely > REPETITION_OFFSET).all()
+    for damaged in (np.full((3, 2), -1.0), np.zeros((1, 2)), np.full((3, len(asm.spec.sensory)), np.nan)):
+        with pytest.raises(ValueError, match="repetition of evidence"):
+            old.restore(learned | {"repetition": damaged})

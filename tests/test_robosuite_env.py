@@ -99,6 +99,27 @@ def test_noise_has_the_standard_deviation_that_the_spec_names():
     exact.close()
 
 
+def test_sensors_read_in_steps_of_their_resolution_and_never_finer():
+    env = gym.make("asm_gym/Lift-v0", horizon=1000)
+    env.reset(seed=0)
+    rows = np.array([env.unwrapped.measure() for _ in range(400)])  # at rest
+    spec = env.unwrapped.measured_spec
+    steps = spec.resolution
+    counts = rows[:, steps > 0] / steps[steps > 0]
+    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
+    assert {c.name for c in spec.channels if c.resolution} == {
+        *("joint_position", "joint_velocity", "measured_torque"),
+        *("wrist_force", "wrist_force_peak", "wrist_torque", "wrist_torque_peak"),
+    }
+    # At rest a Gaussian sensor of step q and noise σ repeats itself with probability q / (2 σ √π), for q up to about σ.
+    again = (rows[1:] == rows[:-1]).mean(axis=0)
+    for name in ("joint_position", "measured_torque", "wrist_force"):
+        channel = next(c for c in spec.channels if c.name == name)
+        expected = channel.resolution / (2 * np.sqrt(np.pi) * channel.noise)
+        assert again[spec.slices[name]].mean() == pytest.approx(expected, rel=0.2)
+    env.close()
+
+
 def test_external_torque_is_the_force_on_a_body_seen_from_the_joints():
     """τ_ext = Jᵀ F for a force F on a link, the closed form that the channel estimates."""
     env = gym.make("asm_gym/Lift-v0", sensor_noise=0.0, horizon=1000)

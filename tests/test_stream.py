@@ -1,5 +1,7 @@
 """The stream's layout, and episodes that hold one."""
 
+import json
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -35,6 +37,7 @@ channels = st.builds(
     size=st.integers(1, 4),
     unit=st.sampled_from(["1", "N m", "rad"]),
     noise=st.floats(0, 10),
+    resolution=st.floats(0, 10),
     group=st.sampled_from(["joint", "wrench"]),
 )
 
@@ -44,6 +47,14 @@ def test_a_spec_survives_json(chosen, dt):
     spec = StreamSpec(tuple(chosen), dt)
     assert StreamSpec.from_json(spec.to_json()) == spec
     assert spec.difference(StreamSpec.from_json(spec.to_json())) == []
+
+
+def test_a_spec_written_before_sensors_had_a_resolution_is_read():
+    written = json.loads(SPEC.to_json())
+    for channel in written["channels"]:
+        del channel["resolution"]
+    assert StreamSpec.from_json(json.dumps(written)) == SPEC
+    assert not SPEC.resolution.any()
 
 
 @pytest.mark.parametrize(
@@ -81,6 +92,8 @@ def test_the_spec_of_plain_spaces_is_observation_then_action():
     [
         lambda: Channel("x", 0),
         lambda: Channel("x", 1, noise=-1.0),
+        lambda: Channel("x", 1, resolution=-1.0),
+        lambda: Channel("x", 1, resolution=float("nan")),
         lambda: Channel("x", 2, elements=("a",)),
         lambda: StreamSpec((Channel("x", 1), Channel("x", 2)), 0.1),
         lambda: StreamSpec((Channel("a", 1, group=MOTOR),), 0.1),

@@ -17,12 +17,20 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number
+from asm_gym.checks import check_number, shown
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Array, Arrays, ModelOutput, Nominal, Place
 from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, accumulate, no_evidence, pool, strength
 from asm_gym.detection.habituation import usual_levels
-from asm_gym.detection.repetition import Repetition, count_repetitions, improbability, repeated, unrepeated
+from asm_gym.detection.repetition import (
+    REPETITION_OFFSET,
+    Repetition,
+    count_repetitions,
+    evidence_steps,
+    improbability,
+    repeated,
+    unrepeated,
+)
 from asm_gym.detection.tails import worst_case
 from asm_gym.detection.whitening import bounded, whitening
 from asm_gym.stream import StreamSpec
@@ -257,6 +265,15 @@ class EvidenceDetection:
         detector = Detector(**found, gains=np.array(self.gains), bound=self.bound)
         if not detector.reach > 1.0:  # what is seldom exceeded in nominal episodes
             raise ValueError(f"no error can add up to evidence: at most {detector.reach:g} of what is usual")
+        counted, senses = learned["repetition"], len(self.spec.sensory)
+        if counted.shape == (2, senses):  # of an older memory
+            counted = np.concatenate([counted, np.full((1, senses), REPETITION_OFFSET)])
+        if counted.shape != (3, senses) or not ((counted >= 0.0) & np.isfinite(counted)).all():
+            raise ValueError(
+                f"the repetition of evidence should be (3, {senses}) numbers of at least 0, found {shown(counted)}"
+            )
+        offset = counted[2]
+        self._steps, self._offset = evidence_steps(counted[:2]), offset
         self.learned_, self.detector_ = learned, detector
         return self
 
@@ -276,11 +293,11 @@ class EvidenceDetection:
         assert self.detector_ is not None
         evidence, _, parts = self.detector_.step(state.evidence, *output)
         senses = self.spec.sensory
-        repetition = Repetition(*repeated(*state.repetition, rows[:, senses], self.learned_["repetition"]))
+        repetition = Repetition(*repeated(*state.repetition, rows[:, senses], self._steps))
         found = place(parts)
         if repetition.unlikely.any():
             ratios = np.zeros_like(found)
-            ratios[:, senses] = improbability(repetition)
+            ratios[:, senses] = improbability(repetition, self._offset)
             found = _joined(found, ratios)
         return EvidenceState(evidence, repetition), found
 

@@ -1,13 +1,15 @@
-"""Repetition: a sense with noise never says the same twice, to the last digit, unless it is stuck.
+"""Repetition: a sense that is stuck says the same again and again, as a working one seldom does.
 
     p_i = P(x_t,i = x_{t-1,i}), counted apart for senses that repeated themselves the time before and that did not
-    n_t = (1 - a) n_{t-1} - [x_t = x_{t-1}] log p                    how unlikely the last repetitions were
+    n_t = max(0, n_{t-1} + log ρ/p) after a repetition, max(0, n_{t-1} + log (1 - ρ)/(1 - p)) after a change
     r_t = exp(ξ_0 (n_t - n_0)) where n_t > 0, else 0                 beside the ratios of ``tails``, with their ξ_0
 
-What predicts a change finds nothing odd in one that is just 0. Yet where the senses are noisy, the density of what
-comes next has no mass on any one number, and a repetition is as surprising as it was rare. A sense that is read more
-slowly than the stream, or rounded, repeats itself in nominal episodes too, and then counts for nothing. One whose noise
-nobody declared is watched where it never repeated itself in any nominal episode.
+What predicts a change finds nothing odd in one that is just 0. Yet noise carries a working sensor from one of its
+readings to another, by steps of its resolution, and how seldom it stays is counted in nominal episodes. n_t is the
+evidence for "it repeats itself with probability ρ" against "with p", begun anew wherever that is best (Page 1954,
+Biometrika 41, 100-115). A sense that repeats itself as often as not, being read more slowly than the stream or coarsely
+rounded, then counts for little or nothing, and none for more than it came to in nominal episodes. One whose noise
+nobody declared is watched where it never repeated itself in any of them.
 """
 
 from __future__ import annotations
@@ -21,8 +23,8 @@ from numpy.typing import NDArray
 from asm_gym.compilation import compiled
 from asm_gym.detection.tails import TAIL_INDEX
 
-FADING = 0.2
-"""a."""
+STUCK = 0.9
+"""ρ: below 1, for a cable that is loose lets a reading through now and then."""
 
 REPETITION_OFFSET = 12.0
 """n_0: one in 160,000, which among a hundred senses happens once in some thousand steps."""
@@ -43,7 +45,7 @@ def unrepeated(batch: int, size: int) -> Repetition:
 
 
 def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(2, X) -log p of a repetition, after none and after one; 0 for senses that may well stand still.
+    """(3, X) -log p of a repetition, after none and after one, 0 for senses that may well stand still; and n_0.
 
     Args:
         streams: (T, X) the senses in nominal episodes.
@@ -58,26 +60,44 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
     first = (happened[0] + 0.5) / (chances[0] + 1.0)
     # As rare after a repetition as after none, until seen to be otherwise.
     p = np.array([first, (happened[1] + first) / (chances[1] + 1.0)])
-    counted: NDArray[np.float64] = np.where(noisy | (happened.sum(axis=0) == 0), -np.log(p), 0.0)
-    return counted
+    counted = np.where(noisy | (happened.sum(axis=0) == 0), -np.log(p), 0.0)
+    offset, steps = np.full(len(noisy), REPETITION_OFFSET), evidence_steps(counted)
+    for stream in streams:
+        state = unrepeated(1, len(noisy))
+        for row in np.asarray(stream, np.float64):
+            state = Repetition(*repeated(*state, row[None], steps))
+            offset = np.maximum(offset, state.unlikely[0])
+    return np.concatenate([counted, offset[None]])
 
 
-def improbability(repetition: Repetition) -> NDArray[np.float64]:
-    """r (B, X)."""
+def evidence_steps(surprise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2, 2, X) what a change and a repetition add to n, after none and after one.
+
+    Args:
+        surprise: (2, X) -log p. Nothing is learned from a sense that repeats itself more often than a stuck one.
+    """
+    p = np.exp(-surprise)
+    with np.errstate(divide="ignore"):
+        steps = np.log([(1.0 - STUCK) / (1.0 - p), STUCK / p])  # (now, before, X)
+    found: NDArray[np.float64] = np.where(p < STUCK, steps, 0.0).swapaxes(0, 1)
+    return np.ascontiguousarray(found)
+
+
+def improbability(repetition: Repetition, offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    """r (B, X), with n_0 (X,)."""
     unlikely = repetition.unlikely
-    ratio: NDArray[np.float64] = np.where(unlikely > 0, np.exp(TAIL_INDEX * (unlikely - REPETITION_OFFSET)), 0.0)
+    ratio: NDArray[np.float64] = np.where(unlikely > 0, np.exp(TAIL_INDEX * (unlikely - offset)), 0.0)
     return ratio
 
 
 @compiled
-def repeated(row: Any, again: Any, unlikely: Any, rows: Any, surprise: Any) -> Any:
-    """The fields of a ``Repetition`` after the next rows (B, X), of ``surprise`` (2, X) as counted."""
+def repeated(row: Any, again: Any, unlikely: Any, rows: Any, steps: Any) -> Any:
+    """The fields of a ``Repetition`` after the next rows (B, X), with ``evidence_steps``."""
     B, X = rows.shape
-    now, faded = np.zeros((B, X), np.bool_), np.empty((B, X))
+    now, evidence = np.zeros((B, X), np.bool_), np.zeros((B, X))
     for n in range(B):
         for i in range(X):
             now[n, i] = rows[n, i] == row[n, i]
-            faded[n, i] = (1.0 - FADING) * unlikely[n, i]
-            if now[n, i]:
-                faded[n, i] += surprise[1 if again[n, i] else 0, i]
-    return rows, now, faded
+            step = steps[1 if again[n, i] else 0, 1 if now[n, i] else 0, i]
+            evidence[n, i] = max(unlikely[n, i] + step, 0.0)
+    return rows, now, evidence

@@ -65,7 +65,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             empty for none.
         stream_freq: rows of the stream a second [Hz]; a multiple of ``control_freq`` that divides 500. Means and peaks
             are then taken since the last row. None for one row a control step.
-        sensor_noise: scales the noise of every channel; 0 for exact readings.
+        sensor_noise: scales the noise of every channel; 0 for exact readings, in steps of no resolution.
         camera, render_size: what ``render`` shows, and its (height, width) [pixels].
 
     Raises:
@@ -184,6 +184,9 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.measured_spec = StreamSpec(everything, dt, source)
         """Everything that is measured, whether or not the stream carries it."""
         self._noise = self.measured_spec.noise * self.sensor_noise
+        steps = self.measured_spec.resolution
+        self._counted = np.flatnonzero(steps if self.sensor_noise else np.zeros_like(steps))
+        self._resolution = steps[self._counted]
         self._layout = Layout(self.measured_spec, self._groups, self._flat)
         self.observation_layout = self._layout.sizes
         """The observation's parts in order, and how many numbers each has."""
@@ -371,7 +374,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     # ------------------------------------------------------------------ senses
 
     def measure(self) -> NDArray[np.float64]:
-        """Reads every sensor once, over the time since the last row of the stream: noise, then faults.
+        """Reads every sensor once, over the time since the last row of the stream: noise, faults, resolution.
 
         Returns:
             (M,) as ``measured_spec`` names it.
@@ -380,6 +383,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         row += self._noise * self.np_random.standard_normal(row.size)
         for corrupt in self.corruptions:
             corrupt(row)
+        with np.errstate(over="ignore"):  # of a simulation that diverges
+            row[self._counted] = np.rint(row[self._counted] / self._resolution) * self._resolution
         return row
 
     def to_stream(self, row: NDArray[np.float64]) -> NDArray[np.float32]:

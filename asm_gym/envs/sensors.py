@@ -8,7 +8,7 @@ at the end of the step.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -24,25 +24,40 @@ GROUPS = ("joint", "torque", "hand", "wrench", "gripper", MOTOR)
 EXTRA_GROUPS = ("contact", "object")
 """What no real robot measures about itself, for those who ask."""
 
-# Standard deviations of the noise, about what a research arm's own sensors have (Franka, Robotiq and ATI data sheets).
-_NOISE = {
-    "joint_position": 2e-4,
-    "joint_velocity": 3e-3,
-    "measured_torque": 0.1,
-    "external_torque": 0.15,
-    "external_torque_peak": 0.3,
-    "hand_position": 3e-4,
-    "hand_orientation": 5e-4,
-    "hand_velocity": 3e-3,
-    "hand_angular_velocity": 1e-2,
-    "wrist_force": 0.2,
-    "wrist_force_peak": 0.4,
-    "wrist_torque": 0.01,
-    "wrist_torque_peak": 0.02,
-    "gripper_opening": 2e-4,
-    "gripper_velocity": 2e-3,
-    "gripper_force": 0.2,
+
+class _Sensor(NamedTuple):
+    """What one reading is worth."""
+
+    noise: float  # standard deviation [unit of the channel]
+    resolution: float = 0.0  # step between readings [unit of the channel]; 0 for what is computed from several sensors
+
+
+_COUNT = np.deg2rad(0.01)
+"""[rad]: 15 bits of a turn; the link-side encoders of DLR's light-weight arm, from which the iiwa descends."""
+
+# About what a research arm's own sensors have. Resolutions: DLR, "Joint sensors of the light-weight robot" (0.01°);
+# Franka Emika, Panda data sheet (0.02 N m, 13 bits of ±87 N m); ATI Industrial Automation, Gamma SI-130-10 (±130 N in
+# steps of 1/20 N, ±10 N m in steps of 1/800 N m). A velocity is the difference of two counts, 50 ms apart. Mean and
+# peak come out of the sensor's own filter, in its steps. The rest is computed in floating point from several of these.
+_SENSORS = {
+    "joint_position": _Sensor(2e-4, _COUNT),
+    "joint_velocity": _Sensor(3e-3, _COUNT / 0.05),
+    "measured_torque": _Sensor(0.1, 0.02),
+    "external_torque": _Sensor(0.15),
+    "external_torque_peak": _Sensor(0.3),
+    "hand_position": _Sensor(3e-4),
+    "hand_orientation": _Sensor(5e-4),
+    "hand_velocity": _Sensor(3e-3),
+    "hand_angular_velocity": _Sensor(1e-2),
+    "wrist_force": _Sensor(0.2, 1 / 20),
+    "wrist_force_peak": _Sensor(0.4, 1 / 20),
+    "wrist_torque": _Sensor(0.01, 1 / 800),
+    "wrist_torque_peak": _Sensor(0.02, 1 / 800),
+    "gripper_opening": _Sensor(2e-4),
+    "gripper_velocity": _Sensor(2e-3),
+    "gripper_force": _Sensor(0.2),
 }
+_EXACT = _Sensor(0.0)
 
 
 @dataclass
@@ -57,7 +72,8 @@ class _Table:
     def add(self, group: str, name: str, unit: str, source: str, where: Any) -> None:
         index = np.atleast_1d(np.asarray(where, dtype=np.intp)) + self.starts[source]
         if index.size:
-            self.channels.append(Channel(self.prefix + name, index.size, unit, _NOISE.get(name, 0.0), group))
+            noise, resolution = _SENSORS.get(name, _EXACT)
+            self.channels.append(Channel(self.prefix + name, index.size, unit, noise, group, resolution=resolution))
             self.indices.append(index)
 
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from torch import Tensor
 
 from asm_gym.detection.evidence import CONTEXT_GAIN, POWER
-from asm_gym.detection.repetition import FADING, REPETITION_OFFSET
+from asm_gym.detection.repetition import evidence_steps
 from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.tables import Table, console_table
@@ -53,7 +53,9 @@ class PlainTorch:
         self.traces = torch.tensor(asm.network_.at_rest(1)).reshape(len(DECAYS), -1)
         self.evidence = torch.zeros(len(self.gains), len(self.sensory))
         self.lately = torch.zeros(asm.hidden_size)
-        self.counted = torch.tensor(asm.learned_["repetition"], dtype=torch.float32)
+        counted = asm.learned_["repetition"]
+        self.steps = torch.tensor(evidence_steps(counted[:2]), dtype=torch.float32)
+        self.offset = torch.tensor(counted[2], dtype=torch.float32)
         self.again, self.unlikely = torch.zeros(len(self.sensory), dtype=torch.bool), torch.zeros(len(self.sensory))
         self.before: Tensor | None = None
         self.earlier: Tensor | None = None
@@ -79,8 +81,8 @@ class PlainTorch:
         again = x[self.sensory] == before[self.sensory]
         if self.before is None:
             error, again = torch.zeros_like(error), torch.zeros_like(again)
-        rare = torch.where(self.again, self.counted[1], self.counted[0])
-        self.unlikely, self.again = (1 - FADING) * self.unlikely + again * rare, again
+        changed, same = torch.where(self.again, self.steps[1], self.steps[0])
+        self.unlikely, self.again = (self.unlikely + torch.where(again, same, changed)).clamp(min=0.0), again
         self.t += 1
         whitened = self.M @ (error / torch.sqrt(1 + (error / self.bound) ** 2))
         self.evidence = self.evidence + self.gains[:, None] * (whitened - self.evidence)
@@ -92,7 +94,7 @@ class PlainTorch:
         drive = self.usual[:-1] @ torch.cat([context, self.lately]) + self.usual[-1]
         usual = torch.exp(drive.clamp(self.lowest, self.highest))
         self.before, self.earlier = x, before
-        repeated = (self.unlikely > 0) * torch.exp(TAIL_INDEX * (self.unlikely - REPETITION_OFFSET))
+        repeated = (self.unlikely > 0) * torch.exp(TAIL_INDEX * (self.unlikely - self.offset))
         return float(((pooled / usual) ** POWER + (repeated**POWER).sum()) ** (1 / POWER))
 
 
