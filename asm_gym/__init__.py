@@ -15,4 +15,6 @@ for _task in TASKS.values():
         max_episode_steps=None,
     )
 
+gymnasium.register(id="asm_gym/SyntheticArm-v0", entry_point="asm_gym.synthetic_arm:SyntheticArm")
+
 install()

@@ -19,6 +19,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.spaces.utils import flatten_space
 from numpy.typing import NDArray
 
 from asm_gym import episodes as single
@@ -27,7 +28,7 @@ from asm_gym.episodes import Episode, check_recorded
 from asm_gym.extras import require
 from asm_gym.files import require_space
 from asm_gym.hdf5 import opened_hdf5
-from asm_gym.stream import StreamSpec, control_period
+from asm_gym.stream import StreamSpec, control_period, flat_rows
 from asm_gym.tasks import TASKS
 
 METADATA, ARRAYS, CHECKSUMS = "metadata.json", "main_data.hdf5", "SHA256SUMS"
@@ -71,7 +72,8 @@ def write_dataset(
     for before in (unfinished, replaced):
         shutil.rmtree(before, ignore_errors=True)
     (unfinished / "data").mkdir(parents=True)
-    spaces = {"observation_space": env.observation_space, "action_space": env.action_space}
+    # A dict is kept as the numbers in it: the stream's channels say which are which.
+    spaces = {"observation_space": flatten_space(env.observation_space), "action_space": env.action_space}
     storage = storage_class.new(unfinished / "data", **spaces, env_spec=env.spec)
     storage.update_episodes(buffer(**_columns(e)) for e in episodes)
     storage.update_episode_metadata([{"success": bool(e.success), "info": json.dumps(e.info)} for e in episodes])
@@ -186,7 +188,8 @@ def read_dataset(path: str | Path, env_id: str | None = None, dt: float | None =
     spec = _spec(folder, known, found, dt)
     if not recorded:
         raise ValueError(f"{folder} holds no episode")
-    return [_episode(folder, data, note, spec) for data, note in zip(recorded, notes, strict=True)]
+    spaces = known["dataset"].observation_space, known["dataset"].action_space
+    return [_episode(folder, data, note, spec, spaces) for data, note in zip(recorded, notes, strict=True)]
 
 
 def find_dataset(path: Path) -> Path:
@@ -230,19 +233,20 @@ def _period(env_id: str | None) -> float:
         env.close()
 
 
-def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec) -> Episode:
+def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec, spaces: tuple[Any, Any]) -> Episode:
     T = len(data.rewards)
     infos = data.infos or {}
     seed = note.get("seed")
     try:
         lengths = {"actions": T, "observations": T + 1, "terminations": T, "truncations": T}
         for name, length in lengths.items():
-            if len(getattr(data, name)) != length:
-                raise ValueError(f"{T} rewards need {length} {name}, got {len(getattr(data, name))}")
+            for found in {len(part) for part in _parts(getattr(data, name))}:
+                if found != length:
+                    raise ValueError(f"{T} rewards need {length} {name}, got {found}")
         actions = np.asarray(data.actions, np.float32).reshape(T, -1)
-        observations = np.asarray(data.observations, np.float32).reshape(T + 1, -1)
-        if spec.source == "spaces":
-            stream = np.concatenate([observations[1:], actions], axis=1)
+        observations = flat_rows(spaces[0], data.observations, T + 1)
+        if spec.source == "spaces" and "stream" not in infos:
+            stream = np.concatenate([observations[1:], flat_rows(spaces[1], data.actions, T)], axis=1)
         else:
             stream = _without_reset(np.asarray(infos["stream"], np.float32), T)
         episode = Episode(
@@ -260,6 +264,11 @@ def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec) ->
         return episode
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{folder}, episode {data.id}: {error}") from error
+
+
+def _parts(values: Any) -> list[Any]:
+    """The arrays that a dict holds, at any depth."""
+    return [part for value in values.values() for part in _parts(value)] if isinstance(values, dict) else [values]
 
 
 def _without_reset(rows: NDArray[Any], T: int) -> NDArray[Any]:

@@ -196,14 +196,44 @@ class StreamSpec:
     def from_spaces(cls, observation: spaces.Space[Any], action: spaces.Space[Any], dt: float = 1.0) -> StreamSpec:
         """The spec of an environment that has no stream of its own: its observation, then the action.
 
+        A dict observation has a channel for each key, ``outer.inner`` where one lies in the other. What is discrete is
+        a 0 or 1 for each of its values.
+
         Raises:
-            TypeError: either space is not a Box.
+            TypeError: either space cannot be read as a row of numbers.
         """
         for name, space in (("observation", observation), ("action", action)):
-            if not isinstance(space, spaces.Box):
-                raise TypeError(f"the {name} space must be a Box to be read as a stream, got {space}")
-        sizes = [int(np.prod(s.shape)) for s in (observation, action) if s.shape is not None]
-        return cls((Channel("observation", sizes[0]), Channel("action", sizes[1], group=MOTOR)), dt, "spaces")
+            if not space.is_np_flattenable:
+                raise TypeError(f"the {name} space must be numbers to be read as a stream, got {space}")
+        return cls((*_channels("observation", observation), _motor(action)), dt, "spaces")
+
+
+def _channels(name: str, space: spaces.Space[Any]) -> list[Channel]:
+    """A channel for each key of a dict, in the order in which Gymnasium flattens it; one of anything else."""
+    if not isinstance(space, spaces.Dict):
+        size = spaces.flatdim(space)
+        return [Channel(name, size)] if size else []
+    prefix = "" if name == "observation" else f"{name}."
+    return [channel for key, part in space.items() for channel in _channels(f"{prefix}{key}", part)]
+
+
+def _motor(space: spaces.Space[Any]) -> Channel:
+    return Channel("action", spaces.flatdim(space), group=MOTOR)
+
+
+def flat(space: spaces.Space[Any], value: Any) -> NDArray[Any]:
+    """(n,) an observation or action as ``StreamSpec.from_spaces`` lays it out."""
+    numbers: NDArray[Any] = np.ravel(value) if isinstance(space, spaces.Box) else spaces.flatten(space, value)
+    return numbers
+
+
+def flat_rows(space: spaces.Space[Any], values: Any, rows: int) -> NDArray[np.float32]:
+    """(rows, n) of so many observations or actions, which dicts hold by key."""
+    if isinstance(space, spaces.Dict):
+        return np.hstack([flat_rows(part, values[key], rows) for key, part in space.items()])
+    if isinstance(space, spaces.Box):
+        return np.asarray(values, np.float32).reshape(rows, -1)
+    return np.array([spaces.flatten(space, value) for value in values], np.float32).reshape(rows, -1)
 
 
 def control_period(env: gym.Env[Any, Any]) -> float:

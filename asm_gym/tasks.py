@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 
 from asm_gym.checks import check_text
 
@@ -85,3 +89,30 @@ def task(name: str) -> TaskSpec:
     if short not in TASKS:
         raise ValueError(f"unknown task {name!r}; known tasks: {', '.join(TASKS)}")
     return TASKS[short]
+
+
+def env_id(name: str) -> str:
+    """The Gymnasium id of a task, or of any other environment that goes by its id.
+
+    Raises:
+        ValueError: neither is known; the message lists the tasks.
+        ImportError: the module of ``module:id`` is not installed.
+    """
+    try:
+        env_spec(check_text("task", name))
+    except gym.error.Error:
+        return task(name).id
+    return name
+
+
+def env_spec(name: str) -> EnvSpec:
+    """Of a Gymnasium id, ``module:id`` included."""
+    module, colon, identifier = name.rpartition(":")
+    if colon:
+        import_module(module)
+    return gym.spec(identifier)
+
+
+def is_task(name: str) -> bool:
+    """Whether it is one of robosuite's, and no other environment."""
+    return name.removeprefix("asm_gym/").removesuffix("-v0") in TASKS

@@ -14,6 +14,7 @@ from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.reflexes import Hold
 from asm_gym.policies.sb3 import read_archive
 from asm_gym.policies.scripted.door import DoorExpert
+from asm_gym.policies.scripted.elsewhere import ELSEWHERE, Swaying
 from asm_gym.policies.scripted.handover import HandoverExpert
 from asm_gym.policies.scripted.lift import LiftExpert
 from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
@@ -24,6 +25,7 @@ from asm_gym.policies.scripted.tool_hang import ToolHangExpert
 from asm_gym.policies.scripted.transport import TransportExpert
 from asm_gym.policies.scripted.two_arm_lift import TwoArmLiftExpert
 from asm_gym.policies.scripted.wipe import WipeExpert
+from asm_gym.tasks import TaskSpec
 
 EXPERTS: dict[str, Callable[..., Policy]] = {
     "Lift": LiftExpert,
@@ -40,7 +42,7 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
 }
 """The scripted expert of each task."""
 
-POLICIES = ("scripted", "hold")
+POLICIES = ("scripted", "hold", "sway")
 """Names that ``make_policy`` knows, besides agents."""
 
 
@@ -57,9 +59,10 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
     """The policy called ``name`` for ``env``.
 
     Args:
-        name: ``"scripted"`` (the task's expert), ``"hold"`` (stay where you are), an agent that comes with the package,
-            such as ``"lift_sac"``, or the path of one: ``.npz`` of ``asm-gym train``, ``.zip`` of stable-baselines3,
-            ``.asm`` of a Neural ASM that learned to act.
+        name: ``"scripted"`` (the task's expert), ``"hold"`` (stay where you are), ``"sway"`` (smooth motion in any
+            environment with Box actions), an agent that comes with the package, such as ``"lift_sac"``, or the path of
+            one: ``.npz`` of ``asm-gym train``, ``.zip`` of stable-baselines3, ``.asm`` of a Neural ASM that learned to
+            act.
         seed: of whatever the policy draws.
         kwargs: handed to the expert, for example ``style=Style(noise=0.1)``.
 
@@ -69,10 +72,16 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
         FileNotFoundError: there is no such agent.
     """
     if name == "scripted":
-        task = getattr(env.unwrapped, "task", None)
-        if task is None or task.name not in EXPERTS:
-            raise ValueError(f"no scripted expert for {task.name if task else env}; there are: {', '.join(EXPERTS)}")
+        task, elsewhere = getattr(env.unwrapped, "task", None), env.spec.id if env.spec else ""
+        if elsewhere in ELSEWHERE:
+            return ELSEWHERE[elsewhere](env, seed=seed, **kwargs)
+        if not isinstance(task, TaskSpec) or task.name not in EXPERTS:
+            known = ", ".join((*EXPERTS, *ELSEWHERE))
+            named = task.name if isinstance(task, TaskSpec) else env
+            raise ValueError(f"no scripted expert for {named}; there are: {known}; 'sway' moves any")
         return EXPERTS[task.name](env, seed=seed, **kwargs)
+    if name == "sway":
+        return Swaying(env, seed=seed)
     if name == "hold":
         return Hold(env)
     if name.endswith(".zip"):

@@ -24,7 +24,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import run
-from asm_gym.tasks import task as task_spec
+from asm_gym.tasks import env_id
 
 __all__ = ["collect", "episode_seeds"]  # which were here before there was a room for them
 
@@ -34,9 +34,9 @@ class Args:
     """Episodes of a policy, as a Minari dataset."""
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")] = "Lift"
-    """Name of a task, or any Gymnasium id with Box spaces."""
+    """Name of a task, or any Gymnasium id whose spaces are numbers, such as Pusher-v5."""
     policy: str = "scripted"
-    """What acts: scripted, hold, a shipped agent, or the path of one."""
+    """What acts: scripted, hold, sway, a shipped agent, or the path of one."""
     robot: str | None = None
     """The arm; the task's own by default."""
     episodes: int = 100
@@ -55,17 +55,16 @@ class Args:
     def __post_init__(self) -> None:
         if self.episodes < 1:
             raise ValueError(f"episodes must be at least 1, got {self.episodes}")
-        if self.task not in gym.registry:
-            task_spec(self.task)
+        env_id(self.task)  # refuses what there is not
 
     @property
     def env_id(self) -> str:
-        return self.task if self.task in gym.registry else task_spec(self.task).id
+        return env_id(self.task)
 
     @property
     def dataset_id(self) -> str:
         """Minari's name of the dataset."""
-        name = self.env_id.rsplit("/", 1)[-1].rsplit("-v", 1)[0].lower()
+        name = self.env_id.rsplit(":", 1)[-1].rsplit("/", 1)[-1].rsplit("-v", 1)[0].lower()
         return f"asm_gym/{name}-{Path(self.policy).stem}-v0"
 
     @property

@@ -7,6 +7,7 @@ same arguments give the same table.
 from __future__ import annotations
 
 import json
+import math
 import platform
 import sys
 from collections.abc import Sequence
@@ -19,24 +20,28 @@ import gymnasium as gym
 import tyro
 from rich.console import Console
 
+from asm_gym.checks import check_number
 from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import EpisodeLabel
 from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.report import publish
-from asm_gym.evaluation.tables import brief_monitors_table, console_table, harmless_table
+from asm_gym.evaluation.tables import brief_monitors_table, console_table, harmless_table, kinds_table
+from asm_gym.faults import anywhere
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of, possible
-from asm_gym.monitors import MONITORS, PARTS
+from asm_gym.monitors import MONITORS, PARTS, make_monitor
 from asm_gym.policies import make_policy
 from asm_gym.rollouts.benchmark import benchmark, calibrated
 from asm_gym.rollouts.folder import claimed, make_missing
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
-from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, record
+from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, horizon_of, record
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
-from asm_gym.scripts.command import run
-from asm_gym.tasks import task as task_spec
+from asm_gym.scripts.command import one_line, run
+from asm_gym.tasks import env_id, is_task
+from asm_gym.wrappers.faults import FaultyInterface
+from asm_gym.wrappers.recording import StreamSource
 
 _HARMLESS = (*HARMLESS, *EXECUTIONS)
 SHOWN = 2
@@ -44,6 +49,7 @@ SHOWN = 2
 
 _QUICK = ("neural_asm", "logpzo", "kalman+evidence", "autoregression", "external_torque_limit", "force_limit")
 """Monitors that are fitted in seconds."""
+_QUICK_ELSEWHERE = ("neural_asm", "association_linear+evidence", "window_pca+evidence", "kalman+evidence")
 
 
 @dataclass(frozen=True)
@@ -51,15 +57,17 @@ class Args:
     """Tasks × monitors × faults: who notices what, how fast, and how often for nothing."""
 
     tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan", "Door")
-    """Names of tasks."""
+    """Names of tasks; or one Gymnasium id with Box spaces, such as Pusher-v5 or gymnasium_robotics:FetchReach-v4."""
     robot: str = "Panda"
-    """The arm."""
+    """The arm, in robosuite's tasks."""
     policy: str = "scripted"
-    """What acts: scripted, or the path of an agent."""
+    """What acts: scripted, sway, or the path of an agent."""
+    steps: int | None = None
+    """Length of an episode, in an environment by its id; by default its own."""
     monitors: tuple[str, ...] = tuple(name for name in MONITORS if name not in PARTS)
     """Names of monitors."""
-    faults: tuple[str, ...] = tuple(KINDS)
-    """Kinds of fault; development or test for those to choose settings by, or to report."""
+    faults: tuple[str, ...] = ()
+    """Kinds of fault, by default all that there are; development or test for robosuite's to choose by, or to report."""
     severities: tuple[str, ...] = SEVERITIES
     """How bad each is."""
     harmless: tuple[str, ...] = _HARMLESS
@@ -91,7 +99,13 @@ class Args:
 
     def __post_init__(self) -> None:
         for name in self.tasks:
-            task_spec(name)
+            env_id(name)
+        if self.elsewhere and len(self.tasks) > 1:
+            raise ValueError(f"one memory has one stream: name one environment at a time, got {', '.join(self.tasks)}")
+        if self.steps is not None:
+            if not self.elsewhere:
+                raise ValueError("robosuite's tasks have lengths of their own: leave --steps out")
+            check_number("steps", self.steps, low=2, whole=True)
         for what, names, known in (
             ("monitor", self.monitors, MONITORS),
             ("severity", self.severities, SEVERITIES),
@@ -99,7 +113,10 @@ class Args:
         ):
             for name in names:
                 check_choice(what, name, known)
-        kinds_of(self.faults)
+        if not self.elsewhere:
+            kinds_of(self.faults)
+        for name in self.faults if self.elsewhere else ():
+            check_choice("kind of fault", name, anywhere.KINDS)
         for field in fields(self):
             if field.name.endswith("_episodes") and getattr(self, field.name) < 1:
                 raise ValueError(f"{field.name} must be at least 1, got {getattr(self, field.name)}")
@@ -109,15 +126,20 @@ class Args:
                 f"{self.nominal_episodes}, got {self.faulty_episodes}"
             )
         needed = conformal_episodes(self.false_alarm_rate)
-        if self.calibration_episodes * len(self.tasks) < needed:
+        if self.calibration_episodes * len(self.tasks) < needed and not self.quick:
             raise ValueError(
                 f"a false-alarm rate of {self.false_alarm_rate:g} needs {needed} calibration episodes in all, got "
                 f"{self.calibration_episodes} for each of {len(self.tasks)} tasks"
             )
         if not self.window > 0:
             raise ValueError(f"window must be > 0 s, got {self.window}")
-        if not self.tasks or not self.monitors or not self.faults or not self.severities:
-            raise ValueError("there must be at least one task, monitor, kind of fault and severity")
+        if not self.tasks or not self.monitors or not self.severities:
+            raise ValueError("there must be at least one task, monitor and severity")
+
+    @property
+    def elsewhere(self) -> bool:
+        """The environment is not one of robosuite's tasks."""
+        return not all(map(is_task, self.tasks))
 
     def scaled(self) -> Args:
         """With ``quick``, three tasks and little of everything."""
@@ -126,10 +148,11 @@ class Args:
         return replace(
             self,
             tasks=tuple(t for t in self.tasks if t in ("Lift", "Stack", "Door")) or self.tasks[:3],
-            monitors=tuple(m for m in self.monitors if m in _QUICK) or self.monitors[:1],
+            monitors=tuple(m for m in self.monitors if m in (_QUICK_ELSEWHERE if self.elsewhere else _QUICK))
+            or self.monitors[:1],
             severities=("strong",) if "strong" in self.severities else self.severities[-1:],
             fit_episodes=16,
-            calibration_episodes=10,
+            calibration_episodes=max(10, math.ceil(conformal_episodes(0.05) / len(self.tasks))),
             nominal_episodes=8,
             faulty_episodes=3,
             harmless_episodes=2,
@@ -138,19 +161,52 @@ class Args:
 
     @property
     def config(self) -> RolloutConfig:
-        return RolloutConfig(self.policy, self.robot)
+        if not self.elsewhere:
+            return RolloutConfig(self.policy, self.robot)
+        return RolloutConfig(self.policy, env_kwargs=(("max_episode_steps", self.steps),) if self.steps else ())
+
+
+def kinds_in(env: gym.Env[Any, Any], args: Args) -> tuple[list[str], list[str]]:
+    """The kinds of fault, and of harmless variation, that there are in ``env``."""
+    if args.elsewhere:
+        FaultyInterface(env)  # refuses spaces that no fault can act on
+        return list(args.faults or anywhere.KINDS), []
+    inner: Any = env.unwrapped
+    harmless = [k for k in args.harmless if k in EXECUTIONS or possible(k, inner)]
+    return [k for k in kinds_of(args.faults or tuple(KINDS)) if possible(k, inner)], harmless
+
+
+def able(args: Args, console: Console) -> Args:
+    """With the monitors that can watch the environment; says which others there were.
+
+    Raises:
+        ValueError: none of them can.
+    """
+    if not args.elsewhere:
+        return args
+    env = gym.make(env_id(args.tasks[0]), **dict(args.config.settings))
+    spec, refused = StreamSource(env).spec, {}
+    env.close()
+    for name in args.monitors:
+        try:
+            make_monitor(name, spec)
+        except ValueError as error:
+            refused[name] = one_line(error)
+    if len(refused) == len(args.monitors):
+        raise ValueError(f"no monitor can watch this: {next(iter(refused.values()))}")
+    for name, why in refused.items():
+        console.print(f"{name} is left out: {why}", highlight=False)
+    return replace(args, monitors=tuple(m for m in args.monitors if m not in refused))
 
 
 def labels(args: Args) -> list[EpisodeLabel]:
     """Every episode of the run, task by task. Raises ValueError or OSError where the policy cannot act in one."""
     made: list[EpisodeLabel] = []
     for task in args.tasks:
-        made_env = gym.make(f"asm_gym/{task}-v0", robot=args.robot)
-        make_policy(args.policy, made_env, seed=0)  # what does not fit is refused before anything is recorded
-        env: Any = made_env.unwrapped
-        faults = [k for k in kinds_of(args.faults) if possible(k, env)]
-        harmless = [k for k in args.harmless if k in EXECUTIONS or possible(k, env)]
-        horizon = env.horizon
+        env = gym.make(env_id(task), **dict(args.config.settings))
+        make_policy(args.policy, env, seed=0)  # what does not fit is refused before anything is recorded
+        faults, harmless = kinds_in(env, args)
+        horizon = horizon_of(env)
         env.close()
         for role in ("fit", "calibration", "nominal"):
             seeds = role_seeds(args.seed, task, role, getattr(args, f"{role}_episodes"))
@@ -181,10 +237,13 @@ def show_examples(args: Args, result: BenchmarkResult, wanted: Sequence[EpisodeL
 
 def evaluate(args: Args, console: Console) -> BenchmarkResult:
     """Records, fits, judges and publishes."""
+    args = able(args, console)
     seconds: dict[str, float] = {}
     with stage("listing episodes", console, seconds):
         wanted = labels(args)
-    with claimed(args.out, "recordings.json", {name: getattr(args, name) for name in ("robot", "policy", "seed")}):
+    with claimed(
+        args.out, "recordings.json", {name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")}
+    ):
         with stage("recording", console, seconds) as progress:
             make = partial(record, config=args.config, folder=args.out.resolve())
             make_missing(make, wanted, lambda label: args.out / label.path, args.parallel, progress)
@@ -192,7 +251,12 @@ def evaluate(args: Args, console: Console) -> BenchmarkResult:
             how = args.false_alarm_rate, args.window, args.seed, args.parallel
             result = benchmark(args.out, wanted, args.monitors, *how, progress)
         video = None
-        if args.video and result.monitors[args.monitors[0]].examples and can_record_video(console):
+        if (
+            args.video
+            and not args.elsewhere
+            and result.monitors[args.monitors[0]].examples
+            and can_record_video(console)
+        ):
             with stage("recording a video", console, seconds) as progress:
                 video = show_examples(args, result, wanted, progress)
         with stage("drawing", console, seconds):
@@ -206,7 +270,8 @@ def evaluate_and_report(args: Args, console: Console) -> None:
     """Evaluates, and prints the tables in brief."""
     args = args.scaled()
     result = evaluate(args, console)
-    for table in (brief_monitors_table(result), harmless_table(result, args.monitors[:1])):
+    details = kinds_table(result) if args.elsewhere else harmless_table(result, args.monitors[:1])
+    for table in (brief_monitors_table(result), details):
         console.print(console_table(table))
     console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.parquet'}")
 

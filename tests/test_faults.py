@@ -320,8 +320,8 @@ def test_unknown_kinds_and_severities_list_the_known(lift):
 
 
 def test_faults_need_one_of_our_environments(lift):
-    with pytest.raises(TypeError, match="robosuite environments"):
-        FaultInjection(FakeEnv(), [])
+    with pytest.raises(ValueError, match="robosuite environments"):
+        FaultInjection(FakeEnv(), [Push()])
     with pytest.raises(TypeError, match="push"):
         FaultInjection(lift, ["push"])
     with pytest.raises(TypeError, match="sequence"):

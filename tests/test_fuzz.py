@@ -301,6 +301,6 @@ def test_a_fault_of_ones_own_has_a_name_where_it_is_defined():
         assert FAULTS["loose_screw"] is LooseScrew
         assert "on_body" not in FAULTS
         assert "sensor_fault" not in FAULTS
-        assert len(FAULTS) == 39
+        assert len(FAULTS) == 40
     finally:
         del FAULTS["loose_screw"]

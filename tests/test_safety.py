@@ -138,7 +138,7 @@ def test_an_uncalibrated_monitor_is_refused_before_anything_runs():
 def test_discrete_actions_are_refused():
     env = FakeEnv()
     env.action_space = spaces.Discrete(3)
-    with pytest.raises(TypeError, match="Box"):
+    with pytest.raises(TypeError, match="Box action space to act in"):
         NeuralASMSafety(env, CueMonitor())
 
 

@@ -110,14 +110,20 @@ class Arbiter:
         reflex: acts after an alarm; None where nothing does.
         threshold: what surprise must exceed for an alarm.
         patience: when control is handed back, counted in what ``decide`` is called for.
-        fallback: acts where nobody else can.
-        space: of the actions.
+        fallback: acts where nobody else can; None where nobody ever acts but the policy.
+        space: of the actions; None where ``command`` is never asked.
     """
 
     def __init__(
-        self, reflex: Policy | None, threshold: float, patience: Patience, fallback: Hold, space: gym.spaces.Box
+        self,
+        reflex: Policy | None,
+        threshold: float,
+        patience: Patience,
+        fallback: Hold | None,
+        space: gym.spaces.Box | None,
     ) -> None:
-        self._reflex, self._patience, self._fallback, self._space = reflex, patience, fallback, space
+        self._reflex, self._patience, self._fallback = reflex, patience, fallback
+        self._space = gym.spaces.Box(-1.0, 1.0, (0,)) if space is None else space
         self.threshold = threshold
         """May be set between episodes."""
         self.reset()
@@ -195,6 +201,7 @@ class Arbiter:
         return Command(np.clip(chosen, self._space.low, self._space.high))
 
     def _stay(self, executed: NDArray[np.float32], observation: Any) -> NDArray[np.float32]:
+        assert self._fallback is not None
         return self._fallback.predict(observation, self._fallback.begin(executed))[0]
 
     def decide(

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_flag, check_number
+from asm_gym.checks import check_flag, check_number, shown
 from asm_gym.choices import check_choice
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import LearnsOnTheJob, Monitor, Surprise
@@ -43,7 +43,7 @@ class RowReport(NamedTuple):
 
 
 class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """A safety layer around any environment with a Box action space, under any policy.
+    """A safety layer around any environment with a Box action space, under any policy; others can be watched.
 
     After each step the monitor compares what was sensed with what it expected. From the step after an alarm on, a
     reflex acts in the policy's place, until surprise has stayed under ``release_below`` of the threshold for
@@ -66,7 +66,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     and 0.0 otherwise, as safe-RL libraries expect.
 
     Args:
-        env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream.
+        env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream. No
+            reflex can act where actions are not a Box: ``on_alarm`` must be ``"monitor"`` or ``"terminate"`` there.
         monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that ``env`` moves.
         on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip, in environments of this package under
             every controller and wrapper; ``"retract"`` goes back along the path; ``"comply"`` yields to what presses;
@@ -135,8 +136,12 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             responses=responses,
         )
         gym.Wrapper.__init__(self, env)
-        if not isinstance(env.action_space, gym.spaces.Box):
-            raise TypeError(f"NeuralASMSafety needs a Box action space, got {env.action_space}")
+        self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
+        if self._box is None and on_alarm not in ("monitor", "terminate"):
+            raise TypeError(
+                f"on_alarm={shown(on_alarm)} needs a Box action space to act in, got {env.action_space}: others can "
+                'only be watched, on_alarm="monitor", or ended, "terminate"'
+            )
         check_choice("on_overrun", on_overrun, ("warn", "alarm", "ignore"))
         self.learning_rate = check_number("learning_rate", learning_rate, low=0, high=1)
         self._source = StreamSource(env)
@@ -159,11 +164,11 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             raise ValueError(f"responses are those of on_alarm='graded', got on_alarm={on_alarm!r}")
         self._responder = Responder(env, monitor, table, repairs=on_alarm == "graded")
         patience = make_patience(reflex, env, release_after, release_below, max_override, try_after)
-        fallback = make_fallback(env)
+        fallback = None if self._box is None else make_fallback(env)
         if monitor_freq is not None:
             sensing.stream_freq = monitor_freq  # nothing changes before everything is known to fit
         self._rows_per_step = self._source.rows_per_step
-        self._arbiter = Arbiter(reflex, threshold, patience.in_rows(self._rows_per_step), fallback, env.action_space)
+        self._arbiter = Arbiter(reflex, threshold, patience.in_rows(self._rows_per_step), fallback, self._box)
         self._largest: float | None = None  # surprise in this episode, while the policy acted
         self._confirmed = False
         self._on_overrun: str = on_overrun
@@ -194,9 +199,10 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         if self._ended:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
-        action = np.asarray(action, dtype=np.float32)
-        if action.shape != self.action_space.shape:
-            raise ValueError(f"an action has the shape {self.action_space.shape}, got {action.shape}")
+        if self._box is not None:
+            action = np.asarray(action, dtype=np.float32)
+            if action.shape != self._box.shape:
+                raise ValueError(f"an action has the shape {self._box.shape}, got {action.shape}")
         self._ended = True  # where anything raises, nobody knows what was done
         self._failed = ""
         self._command(action)
@@ -222,8 +228,11 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             self._arbiter.threshold = self._running.value
         self._largest, self._confirmed = None, False
 
-    def _command(self, action: NDArray[np.float32]) -> None:
-        """Says what is to be done next: the policy's ``action`` (A,), or something else."""
+    def _command(self, action: Any) -> None:
+        """Says what is to be done next: the policy's ``action`` (A,), or something else; never, where it is no Box."""
+        if self._box is None:
+            self._executed, self._refused = action, False
+            return
         self._executed, failure, self._refused = self._arbiter.command(action, self._observation)
         self._failed = joined(self._failed, failure)
 
@@ -296,9 +305,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             )
         return late and self._on_overrun == "alarm"
 
-    def _report(
-        self, info: dict[str, Any], rows: list[RowReport], executed: NDArray[np.float32] | None
-    ) -> dict[str, Any]:
+    def _report(self, info: dict[str, Any], rows: list[RowReport], executed: Any) -> dict[str, Any]:
         surprises = np.array([row.surprise.value[0] for row in rows])
         worst = rows[int(np.argmax(surprises))].surprise
         alarm = bool((surprises > self.threshold).any())

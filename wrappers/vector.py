@@ -82,6 +82,11 @@ class VectorNeuralASMSafety(VectorWrapper):
             first = self._members[0]
             monitor = body_memory(first, StreamSource(first).spec)
         self._own_stream = self._members[0].has_wrapper_attr("stream_spec")
+        if not self._own_stream and not isinstance(env.single_observation_space, gym.spaces.Box):
+            raise TypeError(
+                f"environments without a stream are watched side by side where each senses a Box, got "
+                f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
+            )
         for member in self._members:
             source = StreamSource(member)
             if source.rows_per_step > 1:

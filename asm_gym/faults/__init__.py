@@ -6,6 +6,7 @@ from asm_gym.faults.action import (
     ActionDrop,
     ActionNoise,
     ActionRepeat,
+    ActionScale,
     Adversary,
     SignFlip,
 )
@@ -23,6 +24,7 @@ __all__ = [
     "ActionDrop",
     "ActionNoise",
     "ActionRepeat",
+    "ActionScale",
     "Adversary",
     "Backlash",
     "Bias",

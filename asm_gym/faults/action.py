@@ -12,11 +12,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import LONGEST, Apply, Fault, group_labels, listed, within
+from asm_gym.faults.base import LONGEST, Apply, Fault, Interface, group_labels, listed, within
 
 Action = NDArray[np.float32]
 Deliver = Callable[[Action, float, int], Action]
@@ -26,7 +26,9 @@ Deliver = Callable[[Action, float, int], Action]
 class ActionFault(Fault):
     """One that acts on the commanded action, grippers aside."""
 
-    def check(self, env: RobosuiteEnv) -> None:
+    anywhere = True
+
+    def check(self, env: Interface) -> None:
         axis = getattr(self, "axis", 0)
         if not 0 <= axis < len(_arm_axes(env)):
             raise ValueError(f"axis must be 0 to {len(_arm_axes(env)) - 1}, got {axis}")
@@ -40,7 +42,7 @@ class ActionFault(Fault):
         """
 
     @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+    def applied(self, env: Interface) -> Iterator[Apply]:
         intensity, k = 0.0, -1
         rule = self.deliver(_arm_axes(env))
 
@@ -51,12 +53,12 @@ class ActionFault(Fault):
         with listed(env.deliveries, lambda action: rule(action, intensity, k)):
             yield apply
 
-    def labels(self, env: RobosuiteEnv) -> frozenset[str]:
+    def labels(self, env: Interface) -> frozenset[str]:
         return group_labels(env, "joint", "torque", "hand")
 
 
-def _arm_axes(env: RobosuiteEnv) -> NDArray[np.intp]:
-    size = env.action_space.shape[0]  # type: ignore[index]
+def _arm_axes(env: Interface) -> NDArray[np.intp]:
+    size = gym.spaces.flatdim(env.action_space)
     return np.setdiff1d(np.arange(size), np.asarray(env.gripper_actions, dtype=int))
 
 
@@ -116,6 +118,20 @@ class ActionBias(ActionFault):
     def deliver(self, axes: NDArray[np.intp]) -> Deliver:
         where = axes[self.axis]
         return lambda action, intensity, _: _with(action, where, action[where] + intensity * self.amount)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionScale(ActionFault):
+    """Motors do more or less than they are told, all alike.
+
+    Args:
+        factor: what the action is multiplied by.
+    """
+
+    factor: float = within(0.5, low=0, high=100)
+
+    def deliver(self, axes: NDArray[np.intp]) -> Deliver:
+        return lambda action, intensity, _: _with(action, axes, action[axes] * (1 + intensity * (self.factor - 1)))
 
 
 @dataclass(frozen=True, kw_only=True)

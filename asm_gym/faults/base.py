@@ -8,8 +8,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import Field, dataclass, field, fields
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, Protocol, cast
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from asm_gym.checks import check_number, check_numbers, check_text, shown
 from asm_gym.choices import check_choice
 from asm_gym.envs.robosuite_env import RobosuiteEnv
+from asm_gym.stream import StreamSpec
 
 SHAPES = ("constant", "pulse", "ramp", "periodic", "random_walk")
 
@@ -25,6 +27,29 @@ Vector3 = tuple[float, float, float]
 
 Apply = Callable[[float], None]
 """Gives a fault an intensity in [0, 1] for the next control step."""
+
+
+class Interface(Protocol):
+    """What lies between senses and policy, and between policy and motors: all that faults of either act on."""
+
+    measured_spec: StreamSpec
+    corruptions: list[Callable[[NDArray[np.float64]], None]]
+    """Each edits what was measured, in place."""
+    deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]]
+    """Each makes another action of what was commanded."""
+
+    @property
+    def measured(self) -> NDArray[np.float64]:
+        """The row measured last, laid out as ``measured_spec`` says; a copy."""
+        ...
+
+    @property
+    def gripper_actions(self) -> tuple[int, ...]:
+        """Numbers of the action that command grippers."""
+        ...
+
+    @property
+    def action_space(self) -> gym.Space[Any]: ...
 
 
 FAULTS: dict[str, type[Fault]] = {}
@@ -67,6 +92,8 @@ class Fault(ABC):
     """Whether there is a little of it; what is all or nothing takes the shape ``constant`` alone."""
     harmless: ClassVar[bool] = False
     """A variation that should raise no alarm."""
+    anywhere: ClassVar[bool] = False
+    """Whether it takes no more than an ``Interface``, which any environment with Boxes has."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Every fault that can be made has a name: ``weak_joint`` is ``WeakJoint``."""
@@ -244,6 +271,7 @@ def joint_labels(env: RobosuiteEnv, joint: int, *names: str) -> frozenset[str]:
     return frozenset()
 
 
-def group_labels(env: RobosuiteEnv, *groups: str) -> frozenset[str]:
-    """Every element of these channel groups."""
-    return frozenset(label for c in env.measured_spec.channels if c.group in groups for label in c.labels)
+def group_labels(env: Interface, *groups: str) -> frozenset[str]:
+    """Every element of these channel groups; of all, in an environment that is not robosuite's."""
+    every = not isinstance(env, RobosuiteEnv)
+    return frozenset(label for c in env.measured_spec.channels if every or c.group in groups for label in c.labels)

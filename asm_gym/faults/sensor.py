@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import LONGEST, Apply, Fault, check_joint, joint_labels, listed, within
+from asm_gym.faults.base import LONGEST, Apply, Fault, Interface, check_joint, joint_labels, listed, within
 
 Row = NDArray[Any]
 Act = Callable[[Row, float, int], None]
@@ -27,17 +27,20 @@ class SensorFault(Fault):
     """One that acts on numbers of one channel.
 
     Args:
-        channel: a channel that is measured, such as ``joint_position`` or ``wrist_force``.
+        channel: a channel that is measured, such as ``joint_position`` or ``wrist_force``; in environments that are not
+            robosuite's ``observation``, or a key of it, as ``StreamSpec.from_spaces`` names them.
         element: which of its numbers; all where None.
     """
+
+    anywhere = True
 
     channel: str = "joint_position"
     element: int | None = 3
 
-    def check(self, env: RobosuiteEnv) -> None:
+    def check(self, env: Interface) -> None:
         self.where(env)
 
-    def where(self, env: RobosuiteEnv) -> NDArray[np.intp]:
+    def where(self, env: Interface) -> NDArray[np.intp]:
         """Where its numbers stand in a measured row."""
         slices = env.measured_spec.slices
         if self.channel not in slices:
@@ -49,7 +52,7 @@ class SensorFault(Fault):
             raise ValueError(f"element of {self.channel} must be 0 to {len(span) - 1}, got {self.element}")
         return span[[self.element]]
 
-    def labels(self, env: RobosuiteEnv) -> frozenset[str]:
+    def labels(self, env: Interface) -> frozenset[str]:
         return frozenset(env.measured_spec.labels[i] for i in self.where(env))
 
     @abstractmethod
@@ -58,7 +61,7 @@ class SensorFault(Fault):
         onset; ``last`` is the row before it."""
 
     @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+    def applied(self, env: Interface) -> Iterator[Apply]:
         where, intensity, k = self.where(env), 0.0, -1
         act = self.act(env.measured, where)
 
@@ -188,7 +191,7 @@ class Freeze(SensorFault):
 
     graded = False
 
-    def holds(self, env: RobosuiteEnv) -> frozenset[str]:
+    def holds(self, env: Interface) -> frozenset[str]:
         return self.labels(env)
 
     def act(self, last: Row, where: NDArray[np.intp]) -> Act:

@@ -15,6 +15,7 @@ from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import PolicySource, RolloutConfig, Trial, environment, play, policy_for, staged
+from asm_gym.tasks import env_spec
 from asm_gym.wrappers import StreamRecorder
 
 
@@ -34,7 +35,7 @@ def collect(
     Where ``info`` has no ``"stream"``, observation and action are the stream.
 
     Args:
-        env_id: any Gymnasium id with Box spaces, such as ``asm_gym/Lift-v0`` or ``Pusher-v5``.
+        env_id: any Gymnasium id whose spaces are numbers, such as ``asm_gym/Lift-v0``, ``Pusher-v5`` or ``module:id``.
         policy: a name or a path, as ``asm_gym.policies.make_policy`` takes; whatever has stable-baselines3's
             ``predict``; or a factory that makes one for an environment, called anew for every episode. An object is
             shared by the episodes of one process, so it must forget the last one where ``episode_start`` is set; one
@@ -48,12 +49,12 @@ def collect(
 
     Raises:
         ValueError: fewer than one episode or worker; whatever the environment and the policy refuse.
-        TypeError: spaces other than Boxes, or a policy that cannot be sent to another process.
+        TypeError: spaces that are no numbers, or a policy that cannot be sent to another process.
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     config = RolloutConfig(policy, env_kwargs=tuple(sorted(env_kwargs.items())))
-    task = partial(record_episode, spec=gym.spec(env_id), config=config)
+    task = partial(record_episode, spec=env_spec(env_id), config=config)
     return parallel_map(task, episode_seeds(seed, episodes, stage), workers, progress)
 
 
@@ -80,7 +81,7 @@ def collect_to(
     def place(seed: int) -> Path:
         return folder.resolve() / f"{seed}.npz"
 
-    record = partial(_record_to, folder=folder.resolve(), spec=gym.spec(env_id), config=config)
+    record = partial(_record_to, folder=folder.resolve(), spec=env_spec(env_id), config=config)
     return make_missing(record, seeds, place, parallel, progress)
 
 

@@ -16,16 +16,21 @@ import gymnasium as gym
 import numpy as np
 
 import asm_gym  # noqa: F401  (registers the environments in every worker)
+from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.episodes import Episode, EpisodeLabel, save_episode
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, InterventionOutcome, Trace, TraceDetail
 from asm_gym.faults import Fault, Push
+from asm_gym.faults.anywhere import faults_anywhere, sigmas
+from asm_gym.faults.base import Interface
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
 from asm_gym.monitors import Monitor, NeuralASM
 from asm_gym.policies import Policy, Seeded, make_policy, rollout
 from asm_gym.policies.scripted.base import Style
-from asm_gym.rollouts.seeds import draw_onset
+from asm_gym.rollouts.seeds import draw_onset, episode_seeds
 from asm_gym.stream import control_period
+from asm_gym.tasks import env_id
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder
+from asm_gym.wrappers.faults import FaultyInterface
 
 Settings = tuple[tuple[str, Any], ...]
 """Arguments by name, in an order of their own."""
@@ -95,7 +100,7 @@ class Trial:
         """The trial that is recorded as ``label`` says."""
         after = AFTER_S if label.role == "faulty" else None
         kind = label.kind or NOMINAL
-        return cls(f"asm_gym/{label.task}-v0", label.seed, kind, label.severity, label.onset, after_s=after)
+        return cls(env_id(label.task), label.seed, kind, label.severity, label.onset, after_s=after)
 
     @property
     def task(self) -> str:
@@ -111,14 +116,17 @@ class Trial:
         """When in ``env`` something goes wrong, or would [steps]."""
         if self.onset is not None or self.faults:
             return self.onset if self.onset is not None else min(f.onset for f in self.faults or ())
-        return draw_onset(self.seed, getattr(env.unwrapped, "horizon", 0))
+        return draw_onset(self.seed, horizon_of(env))
 
-    def faults_in(self, env: gym.Env[Any, Any]) -> tuple[Fault, ...]:
-        """What goes wrong in ``env``."""
+    def faults_in(self, env: gym.Env[Any, Any], config: RolloutConfig) -> tuple[Fault, ...]:
+        """What goes wrong in ``env``, whose senses move as in episodes that are made as ``config`` says."""
         if self.faults is not None or self.kind == NOMINAL or self.kind in EXECUTIONS:
             return self.faults or ()
         inner: Any = env.unwrapped
         onset = self.begins(env)
+        if not isinstance(inner, RobosuiteEnv):
+            sigma = np.array(_sigmas(self.env_id, cloudpickle.dumps(config)))
+            return faults_anywhere(self.kind, FaultyInterface(env), sigma, self.severity, onset, self.seed)
         if self.kind == PASSING:
             drawn, steps = draw(inner, onset, self.seed), max(1, round(0.3 / control_period(env)))
             return (Push(body=drawn.link, newtons=20.0, direction=drawn.direction, duration=steps, onset=onset),)
@@ -129,6 +137,30 @@ class Trial:
     def steps_in(self, env: gym.Env[Any, Any]) -> int | None:
         """Where the episode is left; None for its end."""
         return None if self.after_s is None else self.begins(env) + round(self.after_s / control_period(env))
+
+
+def horizon_of(env: gym.Env[Any, Any]) -> int:
+    """Control steps of an episode; 0 where nobody says."""
+    limit = env.spec.max_episode_steps if env.spec else None
+    return int(getattr(env.unwrapped, "horizon", limit) or 0)
+
+
+def interface_of(env: gym.Env[Any, Any]) -> Interface:
+    """What faults in ``env`` act on."""
+    inner = env.unwrapped
+    return inner if isinstance(inner, RobosuiteEnv) else FaultyInterface(env)
+
+
+@lru_cache(maxsize=1)
+def _sigmas(env_id: str, config: bytes) -> tuple[float, ...]:
+    """Of each sense, from nominal episodes of seeds that no role has."""
+    how: RolloutConfig = pickle.loads(config)
+    env = StreamRecorder(environment(env_id, how.settings))
+    streams = []
+    for seed in episode_seeds(0, 3, stage=99):
+        play(Trial(env_id, seed), how, env)
+        streams.append(env.finish().stream[:, env.stream_spec.sensory])
+    return tuple(sigmas(FaultyInterface(env.env), streams))
 
 
 def environment(env_id: str, settings: Settings = ()) -> gym.Env[Any, Any]:
@@ -155,7 +187,7 @@ def _memory(path: Path, written_ns: int) -> NeuralASM:
 def staged(trial: Trial, config: RolloutConfig, env: gym.Env[Any, Any] | None = None) -> Iterator[gym.Env[Any, Any]]:
     """``env``, or this process's environment, in which the trial's faults happen; they are undone in the end."""
     base = environment(trial.env_id, config.settings) if env is None else env
-    faults = trial.faults_in(base)
+    faults = trial.faults_in(base, config)
     if not faults:
         yield base
         return
@@ -209,9 +241,10 @@ def record(label: EpisodeLabel, config: RolloutConfig, folder: Path) -> Path:
     forces: list[float] = []
     with staged(trial, config) as env:
         recorder = StreamRecorder(env)
-        play(trial, config, recorder, lambda info: forces.append(info["contact_force"]))
-        inner: Any = env.unwrapped
-    affected = [fault.labels(inner) for fault in trial.faults_in(env)] if label.role == "faulty" else []
+        play(trial, config, recorder, lambda info: forces.append(info.get("contact_force", math.nan)))
+    base = environment(trial.env_id, config.settings)
+    faults = trial.faults_in(base, config) if label.role == "faulty" else ()
+    affected = [fault.labels(interface_of(base)) for fault in faults]
     recorded = recorder.finish()
     kept = Episode(  # what monitors look at: actions stand in the stream, and nobody learns to act from these
         stream=recorded.stream,
@@ -219,7 +252,7 @@ def record(label: EpisodeLabel, config: RolloutConfig, folder: Path) -> Path:
         success=recorded.success,
         seed=label.seed,
         faults=recorded.faults,
-        contact_force=np.asarray(forces, np.float32),
+        contact_force=np.asarray([] if np.isnan(forces).all() else forces, np.float32),
         label=replace(label, affected_channels=frozenset().union(*affected)),
         info={"skill": label.task},
     )

@@ -1,0 +1,99 @@
+"""A synthetic arm at 100 Hz, for logs and tests without a simulator: seven coupled joints that follow velocities.
+
+    M v̇ = τ - g(q) - 3 D v - D tanh(20 v)/2      D: the diagonal of M;  g with a load that is drawn for each episode
+    τ   = 60 D (u - v) + ĝ(q)                     the drive: a velocity loop, with gravity compensated for a load of 1
+
+Masses and gains resemble those of a seven-joint arm of 20 kg, but are nobody's.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.compilation import compiled
+from asm_gym.stream import MOTOR, Channel, StreamSpec
+
+Floats = NDArray[np.float64]
+
+JOINTS = 7
+SUBSTEPS, DT = 10, 0.01
+MASS = np.array([2.5, 2.5, 1.5, 1.5, 0.5, 0.5, 0.2])  # [kg m²]
+GRAVITY = np.array([0.0, 30.0, 10.0, 12.0, 2.0, 1.5, 0.0])  # [N m]
+COUPLING = 0.15
+"""Between neighbouring joints, as a share of the geometric mean of their masses."""
+
+
+@compiled
+def _gravity(position: Floats) -> Floats:
+    """(7,) torques that would hold the arm with a load of 1."""
+    held: Floats = GRAVITY * np.sin(np.cumsum(position) + 0.5)
+    return held
+
+
+@compiled
+def _advance(
+    position: Floats, velocity: Floats, told: Floats, load: float, inverse: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Position, velocity and torque (7,) after a control step."""
+    torque = told
+    for _ in range(SUBSTEPS):
+        compensated = _gravity(position)
+        torque = 60 * MASS * (told - velocity) + compensated
+        friction = 3 * MASS * velocity + 0.5 * MASS * np.tanh(20 * velocity)
+        velocity = velocity + DT / SUBSTEPS * (inverse @ (torque - load * compensated - friction))
+        position = position + DT / SUBSTEPS * velocity
+    return position, velocity, torque
+
+
+class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """Observes positions [rad], velocities [rad/s] and torques [N m] of its joints, with noise; is told velocities.
+
+    Args:
+        horizon: control steps of an episode.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    stream_spec = StreamSpec(
+        (
+            Channel("joint_position", JOINTS, "rad", 1e-4, "position"),
+            Channel("joint_velocity", JOINTS, "rad/s", 2e-3, "velocity"),
+            Channel("joint_torque", JOINTS, "N m", 0.05, "torque"),
+            Channel("command", JOINTS, "rad/s", group=MOTOR),
+        ),
+        dt=DT,
+        source="SyntheticArm",
+    )
+    dt = DT
+
+    def __init__(self, horizon: int = 400) -> None:
+        self.horizon = horizon
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (3 * JOINTS,), np.float32)
+        self.action_space = gym.spaces.Box(-3.0, 3.0, (JOINTS,), np.float32)
+        coupled = np.diag(np.full(JOINTS - 1, COUPLING), 1)
+        self._inverse = np.linalg.inv(np.diag(MASS) + (coupled + coupled.T) * np.sqrt(np.outer(MASS, MASS)))
+        self._noise = self.stream_spec.noise[: 3 * JOINTS]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._position, self._velocity, self._steps = np.zeros(JOINTS), np.zeros(JOINTS), 0
+        self._load = 0.7 + 0.3 * self.np_random.uniform(0.5, 1.5)
+        observation = self._sense(_gravity(self._position))
+        return observation, {"stream": np.concatenate([observation, np.zeros(JOINTS, np.float32)])}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        told = np.clip(np.asarray(action, np.float64), -3.0, 3.0)
+        self._position, self._velocity, torque = _advance(
+            self._position, self._velocity, told, self._load, self._inverse
+        )
+        self._steps += 1
+        observation = self._sense(torque)
+        stream = np.concatenate([observation, np.asarray(action, np.float32)])
+        return observation, 0.0, False, self._steps >= self.horizon, {"stream": stream}
+
+    def _sense(self, torque: Floats) -> NDArray[np.float32]:
+        exact = np.concatenate([self._position, self._velocity, torque])
+        return (exact + self._noise * self.np_random.standard_normal(len(exact))).astype(np.float32)

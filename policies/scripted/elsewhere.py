@@ -1,0 +1,132 @@
+"""Policies for environments that are not robosuite's: what they do is not clever, but alike from episode to episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.policies.base import Policy, PolicyState
+from asm_gym.stream import control_period
+
+Floats = NDArray[np.float64]
+
+
+class Swaying:
+    """Sways smoothly: each number of the action a sine of its own, and coloured noise.
+
+    Args:
+        env: takes finite Box actions.
+        seed: of phases, amplitudes and noise.
+    """
+
+    WIDTH, NOISE, COLOUR = 0.4, 0.05, 0.7
+    """Shares of half the range of an action; how much of the noise stays from step to step."""
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None) -> None:
+        space = env.action_space
+        if not isinstance(space, gym.spaces.Box) or not np.isfinite([space.low, space.high]).all():
+            raise ValueError(f"the policy 'sway' needs actions in a finite Box, got {space}")
+        self.space, self.dt, self.size = space, control_period(env), int(np.prod(space.shape))
+        self.middle = np.ravel(0.5 * (space.high + space.low)).astype(np.float64)
+        self.half = np.ravel(0.5 * (space.high - space.low)).astype(np.float64)
+        self.set_random_seed(0 if seed is None else seed)
+
+    def set_random_seed(self, seed: int) -> None:
+        """Begins a new episode of this seed."""
+        self.rng = np.random.default_rng([seed, 3])
+        self.t, self.noise = 0.0, np.zeros(self.size)
+        self.draw()
+
+    def draw(self) -> None:
+        """What is drawn once an episode."""
+        self.phase = self.rng.normal(0.0, 0.3, self.size) + np.arange(self.size)
+        self.width = self.WIDTH * self.rng.uniform(0.8, 1.2, self.size)
+        self.frequency = 0.5 + 0.3 * np.linspace(0.0, 1.0, self.size)  # [Hz]
+
+    def act(self, observation: Any) -> Floats:
+        """(A,) before noise."""
+        wave: Floats = self.middle + self.half * self.width * self.sine()
+        return wave
+
+    def sine(self) -> Floats:
+        """(A,) now, in [-1, 1]."""
+        now: Floats = np.sin(2 * np.pi * self.frequency * self.t + self.phase)
+        return now
+
+    def predict(
+        self,
+        observation: Any,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], PolicyState]:
+        self.noise = self.COLOUR * self.noise + self.NOISE * self.half * self.rng.standard_normal(self.size)
+        chosen = (self.act(observation) + self.noise).reshape(self.space.shape)
+        self.t += self.dt
+        return np.clip(chosen, self.space.low, self.space.high).astype(np.float32), state
+
+
+class Pusher(Swaying):
+    """Joints follow sines around a pose, by a proportional and derivative law."""
+
+    POSE = np.array([-0.3, 0.4, 0.0, -0.6, 0.0, -0.4, 0.0])
+
+    def act(self, observation: Any) -> Floats:
+        towards = self.POSE + self.width * self.sine() - observation[:7]
+        return np.asarray(1.5 * towards - 0.3 * observation[7:14], np.float64)
+
+
+class HalfCheetah(Swaying):
+    """Hind and fore legs swing against each other, at 2 Hz."""
+
+    WIDTH = 0.6
+
+    def draw(self) -> None:
+        super().draw()
+        self.phase = self.rng.uniform(0, 2 * np.pi) + np.array([0.0, 0.7, 1.4, 3.1, 3.8, 4.5])
+        self.frequency = np.full(6, 2.0)
+
+
+class Arm(Swaying):
+    """The synthetic arm goes through four poses, a second each, and sways a little on the way."""
+
+    NOISE = 0.0
+
+    def draw(self) -> None:
+        self.poses = 0.7 * np.cumsum(np.vstack([np.zeros(7), self.rng.uniform(-0.6, 0.6, (4, 7))]), axis=0)
+        self.width = self.rng.uniform(0.02, 0.08, 7)
+
+    def act(self, observation: Any) -> Floats:
+        now, soon = self.reference(self.t), self.reference(self.t + self.dt)
+        return np.asarray((soon - now) / self.dt + 4.0 * (now - observation[:7]), np.float64)
+
+    def reference(self, t: float) -> Floats:
+        """(7,) positions along minimum-jerk moves [rad]."""
+        k = min(int(t), len(self.poses) - 2)
+        s = min(t - k, 1.0)
+        there = 10 * s**3 - 15 * s**4 + 6 * s**5
+        sway: Floats = self.width * np.sin(2 * np.pi * np.linspace(0.5, 1.5, 7) * t)
+        return np.asarray(self.poses[k] + there * (self.poses[k + 1] - self.poses[k]) + sway, np.float64)
+
+
+class Fetch(Swaying):
+    """The hand goes to the goal, and stays there."""
+
+    NOISE = 0.02
+
+    def act(self, observation: Any) -> Floats:
+        towards = 5.0 * (observation["desired_goal"] - observation["achieved_goal"])
+        return np.append(towards, np.zeros(self.size - 3))
+
+
+ELSEWHERE: dict[str, Callable[..., Policy]] = {
+    "Pusher-v5": Pusher,
+    "HalfCheetah-v5": HalfCheetah,
+    "FetchReach-v4": Fetch,
+    "asm_gym/SyntheticArm-v0": Arm,
+}
+"""The scripted policy of each environment, by its id."""
