@@ -223,8 +223,7 @@ def _motor(space: spaces.Space[Any]) -> Channel:
 
 def flat(space: spaces.Space[Any], value: Any) -> NDArray[Any]:
     """(n,) an observation or action as ``StreamSpec.from_spaces`` lays it out."""
-    numbers: NDArray[Any] = np.ravel(value) if isinstance(space, spaces.Box) else spaces.flatten(space, value)
-    return numbers
+    return np.ravel(value) if isinstance(space, spaces.Box) else np.asarray(spaces.flatten(space, value))
 
 
 def flat_rows(space: spaces.Space[Any], values: Any, rows: int) -> NDArray[np.float32]:

@@ -8,7 +8,7 @@ Masses and gains resemble those of a seven-joint arm of 20 kg, but are nobody's.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -56,7 +56,7 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         horizon: control steps of an episode.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    metadata = {"render_modes": []}  # noqa: RUF012 (as Gymnasium has it)
     stream_spec = StreamSpec(
         (
             Channel("joint_position", JOINTS, "rad", 1e-4, "position"),
@@ -96,4 +96,5 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _sense(self, torque: Floats) -> NDArray[np.float32]:
         exact = np.concatenate([self._position, self._velocity, torque])
-        return (exact + self._noise * self.np_random.standard_normal(len(exact))).astype(np.float32)
+        row: NDArray[np.float32] = (exact + self._noise * self.np_random.standard_normal(len(exact))).astype(np.float32)
+        return row

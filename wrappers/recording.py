@@ -51,14 +51,18 @@ class StreamSource:
             return row
         spaces = self._env.observation_space, self._env.action_space
         parts = [flat(space, value) for space, value in zip(spaces, (observation, action), strict=True)]
-        return np.concatenate(parts).astype(np.float32)
+        both: NDArray[np.float32] = np.concatenate(parts).astype(np.float32)
+        return both
 
     def first(self, observation: Any, info: dict[str, Any]) -> NDArray[np.float32]:
         """(D,) what was sensed after ``reset``, when nothing had been commanded."""
         if self.own:
             return self.row(observation, None, info)
         sensed = flat(self._env.observation_space, observation)
-        return np.concatenate([sensed, np.zeros(self._spaces.size - len(sensed))]).astype(np.float32)
+        row: NDArray[np.float32] = np.concatenate([sensed, np.zeros(self._spaces.size - len(sensed))]).astype(
+            np.float32
+        )
+        return row
 
     def rows(self, observation: Any, action: Any, info: dict[str, Any]) -> NDArray[np.float32]:
         """(n, D) all that was sensed since the last step; n is 1 unless the stream runs faster than control."""

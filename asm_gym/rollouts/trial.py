@@ -21,7 +21,6 @@ from asm_gym.episodes import Episode, EpisodeLabel, save_episode
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, InterventionOutcome, Trace, TraceDetail
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.anywhere import faults_anywhere, sigmas
-from asm_gym.faults.base import Interface
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
 from asm_gym.monitors import Monitor, NeuralASM
 from asm_gym.policies import Policy, Seeded, make_policy, rollout
@@ -145,8 +144,8 @@ def horizon_of(env: gym.Env[Any, Any]) -> int:
     return int(getattr(env.unwrapped, "horizon", limit) or 0)
 
 
-def interface_of(env: gym.Env[Any, Any]) -> Interface:
-    """What faults in ``env`` act on."""
+def interface_of(env: gym.Env[Any, Any]) -> Any:
+    """What faults in ``env`` act on: the environment, or an ``Interface`` to one that is not robosuite's."""
     inner = env.unwrapped
     return inner if isinstance(inner, RobosuiteEnv) else FaultyInterface(env)
 
