@@ -59,6 +59,15 @@ def test_files_that_are_named_exist(page: Path):
     assert not missing, f"{documents.name(page)} names {missing}"
 
 
+def test_every_promise_names_tests_that_are_there():
+    named = re.findall(r"`(tests/\w+\.py)(?:::(\w+))?`", (documents.ROOT / "SECURITY.md").read_text(encoding="utf-8"))
+    assert len(named) > 20
+    for file, test in named:
+        path = documents.ROOT / file
+        assert path.is_file(), file
+        assert not test or re.search(rf"^(def|class) {test}\b|^{test} = ", path.read_text(encoding="utf-8"), re.M), test
+
+
 def test_every_page_can_be_reached_from_the_first():
     listed = {p for page in PAGES for p in _toctree(page)}
     lost = [documents.name(p) for p in PAGES if p.is_relative_to(documents.DOCS) and p not in listed]

@@ -102,6 +102,13 @@ def test_only_envs_imports_robosuite() -> None:
     assert not [line for line in offences("asm_gym", "robosuite") if not line.startswith(allowed)]
 
 
+def test_no_module_speaks_to_a_network() -> None:
+    # Clusters are dask's and ray's to speak to, where an address is named.
+    assert not offences(
+        "asm_gym", "socket", "ssl", "urllib", "http", "ftplib", "smtplib", "requests", "httpx", "aiohttp"
+    )
+
+
 def test_importing_the_package_is_cheap() -> None:
     code = (
         "import sys, asm_gym;"

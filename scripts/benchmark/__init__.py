@@ -1,4 +1,4 @@
-"""Speeds as ratios against a rival in the same run, and how often experts succeed.
+"""Speeds as ratios against a rival in the same run, how often experts succeed, and whether alarms keep their rate.
 
 Machines differ and are noisy: rivals take turns, step by step, and the medians of their turns are compared.
 """
@@ -21,6 +21,7 @@ from rich.progress import track
 import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
 from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.scripts.benchmark.coverage import Coverage
 from asm_gym.scripts.benchmark.experts import Experts
 from asm_gym.scripts.benchmark.fit import Fit
 from asm_gym.scripts.benchmark.memory import Memory, Safety
@@ -182,6 +183,7 @@ class Args:
         Annotated[Env, tyro.conf.subcommand("env")]
         | Annotated[Leaks, tyro.conf.subcommand("leaks")]
         | Annotated[Experts, tyro.conf.subcommand("experts")]
+        | Annotated[Coverage, tyro.conf.subcommand("coverage")]
         | Annotated[Memory, tyro.conf.subcommand("memory")]
         | Annotated[Fit, tyro.conf.subcommand("fit")]
         | Annotated[Safety, tyro.conf.subcommand("safety")],
