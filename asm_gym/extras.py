@@ -15,6 +15,7 @@ BROUGHT_BY = {
     **dict.fromkeys(("pyarrow", "sklearn", "loky", "packaging"), "report"),
     **dict.fromkeys(("distributed", "dask", "ray"), "cluster"),
     **dict.fromkeys(("moviepy",), "video"),
+    **dict.fromkeys(("rosbags",), "ros"),
 }
 """The extra of asm-gym that installs a package, by the name it is imported under."""
 

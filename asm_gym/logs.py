@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from asm_gym.bags import read_bag
 from asm_gym.checkpoint import read_arrays
+from asm_gym.columns import read_array, read_parquet, read_table
 from asm_gym.datasets import METADATA, read_dataset
 from asm_gym.episodes import Episode, load_episode
+from asm_gym.lerobot import INFO, read_lerobot
 from asm_gym.stream import StreamSpec
-from asm_gym.tables import read_table
 
 
 class Log(NamedTuple):
@@ -56,7 +58,10 @@ def _arrays(path: Path, layout: Layout) -> Episode:
 
 READERS: dict[str, Callable[[Path, Layout], Episode]] = {
     ".npz": _arrays,
+    ".npy": lambda path, layout: layout.episode(read_array(path)),
     ".csv": lambda path, layout: layout.episode(read_table(path)),
+    ".parquet": lambda path, layout: layout.episode(read_parquet(path)),
+    **dict.fromkeys((".mcap", ".db3", ".bag"), lambda path, layout: layout.episode(read_bag(path))),
 }
 """By the suffix of a file."""
 
@@ -66,7 +71,7 @@ def read_logs(path: str | Path, layout: Layout | None = None) -> Iterator[Log]:
 
     Args:
         path: a file; the folder of a run, whose ``episodes`` are read; one of such files, at any depth; or one with a
-            Minari dataset.
+            LeRobot or a Minari dataset.
         layout: how to read tables.
 
     Raises:
@@ -78,6 +83,9 @@ def read_logs(path: str | Path, layout: Layout | None = None) -> Iterator[Log]:
         raise FileNotFoundError(f"there is no {path}")
     if path.is_file() and path.suffix not in READERS:
         raise ValueError(f"{path}: files that can be read end in {', '.join(READERS)}")
+    if (path / INFO).is_file():
+        yield from _lerobot(path, layout)
+        return
     root = path / "episodes" if (path / "episodes").is_dir() else path
     files = [path] if path.is_file() else sorted(f for f in root.rglob("*") if _readable(f.relative_to(root)))
     for file in files:
@@ -90,8 +98,16 @@ def read_logs(path: str | Path, layout: Layout | None = None) -> Iterator[Log]:
     if files:
         return
     if next(path.rglob(METADATA), None) is None:
-        raise FileNotFoundError(f"{path} holds no episodes: no {', no '.join(READERS)}, no Minari dataset")
+        raise FileNotFoundError(f"{path} holds no episodes: no {', '.join(READERS)}, no LeRobot or Minari dataset")
     for n, episode in enumerate(read_dataset(path)):
+        yield Log(f"episode {n}", episode)
+
+
+def _lerobot(folder: Path, layout: Layout) -> Iterator[Log]:
+    for n, (columns, rate, success) in enumerate(read_lerobot(folder)):
+        known = replace(layout, rate=layout.rate or rate, action=layout.action or ("action*",))
+        episode = replace(known.episode(columns), success=success)
+        layout = replace(layout, spec=layout.spec or episode.spec)
         yield Log(f"episode {n}", episode)
 
 

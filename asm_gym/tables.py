@@ -2,24 +2,28 @@
 
 A column is a channel of its own. Columns that differ in a number only, ``joint[0], joint[1]`` or ``joint_0, joint_1``,
 are the elements of one channel, and so are the columns of a two-dimensional array. Each channel is a group: what it
-does is expected from what the others do. What is called ``action`` was commanded, whether somebody says so or not.
+does is expected from what the others do. What is called ``action`` was commanded, whether somebody says so or not. A
+unit may stand behind a name, ``joint_0 [rad]``. Rows that are late or lost, by the column of time, are put right by
+``asm_gym.timing``.
 """
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checks import check_number
+from asm_gym.columns import as_array, read_table
 from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.timing import noise_of, period, regular
+
+__all__ = ["TIME", "label_of", "read_table", "stream_of"]
 
 Column = NDArray[Any]
 
@@ -32,6 +36,9 @@ RATE_TOLERANCE = 0.01
 _ELEMENT = re.compile(r"(?P<stem>.*[^\W\d_])(?:\[(?P<named>\w+)\]|[_.]?(?P<number>\d+))")
 
 
+_UNIT = re.compile(r"(?P<name>.*\S)\s+[\[(](?P<unit>[^\[\]()]+)[\])]")
+
+
 class Signal(NamedTuple):
     """One number of every row.
 
@@ -40,12 +47,14 @@ class Signal(NamedTuple):
         channel: which channel it belongs to.
         element: which element of that; empty where it is the only one.
         values: (T,).
+        unit: as the table says; empty where it does not.
     """
 
     column: str
     channel: str
     element: str
     values: Column
+    unit: str = ""
 
     def goes_by(self, pattern: str) -> bool:
         """Its column or its channel is called so."""
@@ -71,9 +80,15 @@ def stream_of(
         ValueError: columns are missing, doubled, of several lengths or no numbers; the rate is unknown, or another one
             than the spec's; time runs backwards.
     """
-    columns = _columns(frame)
-    dt = _period(columns, rate)
-    signals = _signals({name: column for name, column in columns.items() if name not in TIME})
+    columns, units = _without_units(_columns(frame))
+    times = _times(columns)
+    dt = None if times is None else period(times)
+    dt = dt if rate is None else 1.0 / check_number("rate", rate, above=0)
+    rows_of = {name: column for name, column in columns.items() if name not in TIME}
+    if times is not None and dt is not None and len(times) > 1:
+        theirs = channels.dt if isinstance(channels, StreamSpec) and _alike(channels.dt, dt) else dt
+        rows_of = regular(rows_of, times, theirs)
+    signals = [s._replace(unit=units.get(s.column, units.get(s.channel, ""))) for s in _signals(rows_of)]
     if isinstance(channels, StreamSpec):
         return _read_by(channels, signals, dt), channels
     if dt is None:
@@ -94,28 +109,6 @@ def stream_of(
     return rows.astype(np.float32), StreamSpec(made, dt, "table")
 
 
-def read_table(path: Path) -> dict[str, Column]:
-    """The columns of numbers of a ``.csv`` file with a header: text is left out, an empty cell is NaN.
-
-    Raises:
-        ValueError: no header or no row, a name that stands twice, rows of several lengths, a column of numbers that
-            holds something else.
-    """
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        lines = [line for line in csv.reader(file) if line]
-    if len(lines) < 2:
-        raise ValueError(f"{path} needs a header and at least one row, got {len(lines)} lines")
-    header = [name.strip() for name in lines[0]]
-    doubled = sorted({name for name in header if header.count(name) > 1})
-    if doubled:
-        raise ValueError(f"{path} has columns of the same name: {', '.join(map(repr, doubled))}")
-    for n, line in enumerate(lines[1:], 2):
-        if len(line) != len(header):
-            raise ValueError(f"{path}, line {n} has {len(line)} cells, its header {len(header)}")
-    columns = {name: _numbers(f"{path}, {name}", cells) for name, *cells in zip(header, *lines[1:], strict=True)}
-    return {name: column for name, column in columns.items() if column is not None}
-
-
 @cache
 def label_of(column: str) -> str:
     """What a stream calls a number that a table calls so: ``joint[0]`` for ``joint_0``."""
@@ -123,26 +116,11 @@ def label_of(column: str) -> str:
     return f"{found['stem']}[{found['named'] or found['number']}]" if found else column
 
 
-def _numbers(where: str, cells: Sequence[str]) -> Column | None:
-    """A column of text as numbers; None where none of it is one."""
-    values, wrong = np.full(len(cells), np.nan), []
-    for n, cell in enumerate(cells):
-        try:
-            values[n] = float(cell or "nan")
-        except ValueError:
-            wrong.append(n)
-    if not wrong:
-        return values
-    if len(wrong) == sum(bool(cell) for cell in cells):
-        return None
-    raise ValueError(f"{where}, line {wrong[0] + 2} must be a number, got {cells[wrong[0]]!r}")
-
-
 def _columns(frame: Any) -> dict[str, Column]:
     """The columns of numbers by name, (T,) or (T, k) each."""
     # A dictionary has keys, an Arrow table column_names, pandas and Polars have columns.
     names = frame if isinstance(frame, Mapping) else getattr(frame, "column_names", None) or frame.columns
-    columns = {str(name): np.asarray(frame[name]) for name in names}
+    columns = {str(name): as_array(frame[name]) for name in names}
     if len(columns) < len(list(names)):
         raise ValueError(f"columns must have different names, got {', '.join(map(str, names))}")
     columns = {n: c for n, c in columns.items() if c.dtype.kind in "biuf" and c.ndim in (1, 2)}
@@ -154,18 +132,26 @@ def _columns(frame: Any) -> dict[str, Column]:
     return columns
 
 
-def _period(columns: dict[str, Column], rate: float | None) -> float | None:
-    """Seconds from row to row, as said or as a column of time has it; None where nothing says."""
-    if rate is not None:
-        return 1.0 / check_number("rate", rate, above=0)
-    found = next((columns[name] for name in TIME if name in columns), None)
-    if found is None or len(found) < 2 or found.ndim != 1:
-        return None
-    steps = np.diff(found.astype(np.float64))
-    if not np.all(steps > 0):
-        row = int(np.argmin(steps > 0)) + 1
-        raise ValueError(f"time must increase from row to row, got {found[row - 1]:g} s before {found[row]:g} s")
-    return float(f"{np.median(steps):.6g}")  # stamps jitter, and rates that differ by rounding would be two rates
+def _alike(dt: float, other: float) -> bool:
+    return abs(dt / other - 1) <= RATE_TOLERANCE
+
+
+def _without_units(columns: Mapping[str, Column]) -> tuple[dict[str, Column], dict[str, str]]:
+    """Columns by their bare names, and the unit of each that says one."""
+    bare, units = {}, {}
+    for name, column in columns.items():
+        found = _UNIT.fullmatch(name)
+        short = found["name"] if found else name
+        if short in bare:
+            raise ValueError(f"columns must have different names, got {short!r} twice")
+        bare[short] = column
+        if found:
+            units[short] = found["unit"]
+    return bare, units
+
+
+def _times(columns: Mapping[str, Column]) -> Column | None:
+    return next((columns[name] for name in TIME if name in columns), None)
 
 
 def _signals(columns: Mapping[str, Column]) -> list[Signal]:
@@ -201,15 +187,25 @@ def _renamed(channel: str, signals: Sequence[Signal]) -> list[Signal]:
 def _channel(name: str, signals: Sequence[Signal], commanded: set[str]) -> Channel:
     elements = tuple(s.element for s in signals)
     group = MOTOR if signals[0].column in commanded else name
-    return Channel(name, len(signals), group=group, elements=elements if any(elements) else ())
+    units = {s.unit for s in signals if s.unit}
+    if len(units) > 1:
+        raise ValueError(f"channel {name!r} is of several units: {', '.join(sorted(units))}")
+    noise = 0.0 if group == MOTOR else float(np.median([noise_of(s.values) for s in signals]))
+    named = elements if any(elements) else ()
+    return Channel(name, len(signals), next(iter(units), "1"), noise, group, named)
 
 
 def _read_by(spec: StreamSpec, signals: Sequence[Signal], dt: float | None) -> NDArray[np.float32]:
     """The rows (T, D) as a memory of this spec reads them; what else the table holds is left out."""
-    if dt is not None and abs(dt / spec.dt - 1) > RATE_TOLERANCE:
+    if dt is not None and not _alike(dt, spec.dt):
         raise ValueError(f"the memory reads {1 / spec.dt:g} rows a second, these come at {1 / dt:g}")
     # joint_0 is joint[0] too, though it may be the only one here.
     known = {label_of(s.column): s.values for s in signals} | {s.column: s.values for s in signals}
+    units = {label: c.unit for c in spec.channels for label in c.labels}
+    for signal in signals:
+        mine = units.get(signal.column, units.get(label_of(signal.column), "1"))
+        if signal.unit and mine not in ("1", signal.unit):
+            raise ValueError(f"{signal.column} is in {signal.unit}, and the memory reads {mine}")
     missing = [label for label in spec.labels if label not in known]
     if missing:
         raise ValueError(f"the memory reads channels that are not there: {', '.join(missing)}")

@@ -23,11 +23,15 @@ from asm_gym.checks import check_number
 from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode
+from asm_gym.evaluation.trace import spans
 from asm_gym.logs import Layout, Log, read_logs
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
+
+SHORTEST_S = 0.5
+"""Least length of a part between lost rows that is worth learning from [s]."""
 
 _QUICK = {"episodes": 20, "epochs": 5}
 
@@ -37,7 +41,8 @@ class Args:
     """A memory from recordings."""
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
-    """A run folder of collect, import or evaluate, a Minari dataset, or .npz and .csv logs (a file, or a folder)."""
+    """A run folder of collect, import or evaluate, a Minari or LeRobot dataset, or logs (a file, or a folder): .csv,
+    .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("runs/fit/memory.asm")
     """File to write the memory to."""
     monitor: str = "neural_asm"
@@ -109,6 +114,16 @@ def pieces(episode: Episode, seconds: float) -> list[Episode]:
     return [Episode.from_stream(episode.stream[n - rows : n], episode.spec, success=True) for n in ends]
 
 
+def unbroken(episode: Episode) -> list[Episode]:
+    """The parts of an episode between rows that were lost, in whole or in part; those under half a second left out."""
+    known = np.isfinite(episode.stream).all(axis=1)
+    if known.all():
+        return [episode]
+    least = max(2, round(SHORTEST_S / episode.spec.dt))
+    parts = [slice(start, stop) for start, stop in spans(known) if stop - start >= least]
+    return [Episode.from_stream(episode.stream[part], episode.spec, success=True) for part in parts]
+
+
 def divided(episodes: list[Episode], args: Args) -> tuple[list[Episode], list[Episode]]:
     """Those to learn from, and those to calibrate on.
 
@@ -145,7 +160,8 @@ def fit(args: Args, console: Console) -> None:
     if not kept.episodes:
         hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
-    episodes = kept.episodes if args.split is None else [p for e in kept.episodes for p in pieces(e, args.split)]
+    whole = [part for episode in kept.episodes for part in unbroken(episode)]
+    episodes = whole if args.split is None else [p for e in whole for p in pieces(e, args.split)]
     fitting, calibration = divided(episodes, args)
     fitting = fitting[: _QUICK["episodes"]] if args.quick else fitting
     with stage("learning", console, {}) as progress:
@@ -158,6 +174,8 @@ def fit(args: Args, console: Console) -> None:
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
     if left_out:
         say(f"Left out: {left_out}.")
+    if len(whole) != len(kept.episodes):
+        say(f"Rows were lost: {len(kept.episodes)} episodes were cut there, into {len(whole)} parts.")
     say(
         f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: an alarm in at most "
         f"{args.false_alarm_rate:.1%} of normal ones, {hourly:.{0 if hourly >= 10 else 1}f} an hour at their length."

@@ -185,8 +185,12 @@ def test_a_run_folder_a_file_and_arrays_are_read(tmp_path):
     ("make", "error", "message"),
     [
         (lambda p: None, FileNotFoundError, "there is no"),
-        (lambda p: p.mkdir(), FileNotFoundError, "holds no episodes: no .npz, no .csv, no Minari"),
-        (lambda p: p.write_bytes(b"PK"), ValueError, "files that can be read end in .npz, .csv"),
+        (
+            lambda p: p.mkdir(),
+            FileNotFoundError,
+            "no episodes: no .npz, .npy, .csv, .parquet.*no LeRobot or Minari",
+        ),
+        (lambda p: p.write_bytes(b"PK"), ValueError, "files that can be read end in .npz, .npy, .csv"),
     ],
 )
 def test_what_holds_no_log_is_refused(make, error, message, tmp_path):
