@@ -8,7 +8,7 @@ from gymnasium import spaces
 from asm_gym.episodes import Episode
 from asm_gym.memory.completion import Completion, sensors_of
 from asm_gym.monitors import NeuralASM, Surprise
-from asm_gym.monitors.diagnosis import FAMILIES, Diagnosis, Readout
+from asm_gym.monitors.diagnosis import CLASSES, Diagnosis, Readout
 from asm_gym.scaling import StreamScaler
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import CompletedObservation, NeuralASMSafety
@@ -161,7 +161,7 @@ class Named:
     """Says which family it was; a read-out that needs no learning."""
 
     def __init__(self, family):
-        self.p = 0.9 * np.eye(len(FAMILIES))[FAMILIES.index(family)] + 0.1 / len(FAMILIES)
+        self.p = 0.9 * np.eye(len(CLASSES))[list(CLASSES).index(family)] + 0.1 / len(CLASSES)
 
     def __call__(self, evidence):
         return self.p[None]
@@ -264,7 +264,7 @@ def test_a_memory_keeps_its_completion_in_its_file(tmp_path):
 def test_the_readout_learns_by_the_delta_rule_what_tells_families_apart():
     rng = np.random.default_rng(0)
     families = rng.integers(0, 3, 300)
-    evidence = np.eye(len(FAMILIES))[families][:, :4] + 0.1 * rng.standard_normal((300, 4))
+    evidence = np.eye(len(CLASSES))[families][:, :4] + 0.1 * rng.standard_normal((300, 4))
     readout = Readout.fit(evidence, families, np.ones(300), steps=300)
     found = readout(evidence)
     np.testing.assert_allclose(found.sum(axis=1), 1.0)

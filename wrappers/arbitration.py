@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number, shown
+from asm_gym.checks import shown
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Graded, Hold, Recall, Reflex
+from asm_gym.wrappers.patience import Patience
 
 _log = logging.getLogger("asm_gym.safety")
 
@@ -26,41 +26,6 @@ GOING_ON = ("go on", "complete", "slow")
 
 OVER_AFTER = 3
 """Rows for which a contact must be over before control goes back, though surprise is not quiet."""
-
-
-@dataclass(frozen=True)
-class Patience:
-    """When control is handed back.
-
-    Args:
-        release_after: control steps of quiet after which it is.
-        release_below: share of the threshold, in (0, 1], that surprise must be under to count as quiet.
-        max_override: control steps for which a reflex may act. Those before a hand-back after which the alarm is back
-            within ``release_after`` steps count too: what comes back at once has not gone. None for as many as it
-            takes.
-        try_after: control steps after which control is handed back on trial though surprise is not quiet, for a robot
-            that holds still where it never did may surprise itself; after each trial that fails, twice as many. None
-            for no trials.
-    """
-
-    release_after: int = 10
-    release_below: float = 0.8
-    max_override: int | None = None
-    try_after: int | None = None
-
-    def __post_init__(self) -> None:
-        check_number("release_after", self.release_after, low=1, whole=True)
-        check_number("release_below", self.release_below, above=0, high=1)
-        for name in ("max_override", "try_after"):
-            number = getattr(self, name)
-            if number is not None:
-                check_number(name, number, low=1, whole=True)
-
-    def in_rows(self, each: int) -> Self:
-        """The same, counted in rows of a stream that has ``each`` of them in a control step."""
-        longest = None if self.max_override is None else each * self.max_override
-        wait = None if self.try_after is None else each * self.try_after
-        return replace(self, release_after=each * self.release_after, max_override=longest, try_after=wait)
 
 
 class Command(NamedTuple):
@@ -266,6 +231,9 @@ class Arbiter:
         """Who acts next, as a transition."""
         if not self.overriding:
             return self._begin(alarm, executed, response)
+        if alarm and response == "complete":
+            self.overriding, self._handed_back, self._tried = False, 0, False
+            return response
         if alarm and response not in ("", *GOING_ON):
             self._choose(response)
         if self._quiet >= self._patience.release_after or (self._past >= OVER_AFTER and self._response != "stop"):

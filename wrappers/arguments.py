@@ -14,7 +14,7 @@ from asm_gym.monitors import ExpectsActions, Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract, nearest_to_rest
 from asm_gym.stream import StreamSpec, control_period
-from asm_gym.wrappers.arbitration import Patience
+from asm_gym.wrappers.patience import Patience
 
 LOG = logging.getLogger("asm_gym.safety")
 

@@ -263,7 +263,7 @@ class CompletedObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArg
         self._rows = [*self._rows[-3:], row]
         surprise = self._observer.observe(row[None], ("",)).surprise
         if float(surprise.value[0]) > self._threshold and not self._repair.settling:
-            cause = self._explained(self._explained.completion.lift(np.stack(self._rows)))
+            cause = self._explained(np.stack(self._rows), surprise.attribution[0])
             again = self._repair.suspect(cause.columns) if cause.family == "sensor" else None
             row = row if again is None else again
             self._rows[-1] = row

@@ -40,6 +40,9 @@ DEFAULT: dict[str, str] = {
 }
 """What ``on_alarm="graded"`` does."""
 
+QUIET_S = 1.0
+"""After so long without an alarm, what comes next has a cause of its own [s]."""
+
 SURE = 0.5
 """A family that is less probable is unknown."""
 
@@ -124,11 +127,17 @@ class Responder:
     def reset(self) -> None:
         """A new episode begins."""
         self._rows: list[NDArray[np.float32]] = []
-        self._since: dict[str, int] = {}  # rows for which a family has been the cause
-        self._named: Cause | None = None
         self._quiet = 0
+        self._forget()
         if self.repair is not None:
             self.repair.reset()
+
+    def _forget(self) -> None:
+        """What was wrong is over."""
+        self._since: dict[str, int] = {}  # rows since a family was first the cause
+        self._named: Cause | None = None
+        self._belief, self._diagnoses = np.zeros(len(FAMILIES)), 0
+        self._latest: dict[str, Cause] = {}  # the newest diagnosis of each family
 
     @property
     def settling(self) -> bool:
@@ -150,7 +159,12 @@ class Responder:
     def read(self, row: NDArray[np.float32]) -> NDArray[np.float32]:
         """(D,) the row as the monitor is to see it."""
         if self.repair is not None and self._map is not None:
-            row = self.repair.read(row)
+            try:
+                row = self.repair.read(row)
+            except Exception as error:
+                # Nobody knows what the row should say: what is not finite is an alarm, and nothing explains it.
+                gym.logger.warn(f"completion: {error!r}; the row counts as lost")
+                row = np.full_like(row, np.nan)
         self._rows = [*self._rows[-WINDOW:], row]
         return row
 
@@ -164,23 +178,24 @@ class Responder:
         """(D,) the last row, repaired; None where nothing is."""
         return self._rows[-1] if self._rows and self.completed else None
 
-    def respond(self, alarm: bool, failed: bool) -> Response:
+    def respond(self, alarm: bool, failed: bool, attribution: NDArray[np.float64]) -> Response:
         """What is to be done about the last row.
 
         Args:
             alarm: surprise is over the threshold.
             failed: monitor, stream or policy failed, so that nothing is known.
+            attribution: (D,) where the surprise is.
         """
         dt = self._spec.dt
         self._quiet = 0 if alarm else self._quiet + 1
-        if self._quiet > 1.0 / dt:
-            self._since, self._named = {}, None
-        over = self._over()
+        if self._quiet > QUIET_S / dt:
+            self._forget()
+        over = self._repairs and self._over()
         for family in self._since:
             self._since[family] += 1
         if not alarm:
             return Response("", as_info(None), over)
-        cause = self._cause(failed)
+        cause = self._believed(self._cause(failed, attribution))
         self._named = cause
         family = cause.family if cause is not None and cause.probability >= SURE else "unknown"
         self._since.setdefault(family, 0)
@@ -191,12 +206,30 @@ class Responder:
         said = as_info(cause, self._force(family))
         if cause is None or family != cause.family:
             said |= {"family": family, "part": ""}
-        return Response(name if self._repairs else "", said, over and self._repairs)
+        return Response(name if self._repairs else "", said, over)
 
-    def _cause(self, failed: bool) -> Cause | None:
+    def _cause(self, failed: bool, attribution: NDArray[np.float64]) -> Cause | None:
         if failed or self._diagnosis is None or not all(np.isfinite(row).all() for row in self._rows):
             return None
-        return self._diagnosis(self._diagnosis.completion.lift(np.stack(self._rows)))
+        try:
+            return self._diagnosis(np.stack(self._rows), attribution)
+        except Exception as error:
+            # Whatever goes wrong here, an alarm is answered: by what is done about the unknown.
+            gym.logger.warn(f"diagnosis: {error!r}; the cause counts as unknown")
+            return None
+
+    def _believed(self, cause: Cause | None) -> Cause | None:
+        """The cause by all diagnoses since it was quiet for a second, the newest of which counts a tenth at least."""
+        if cause is None:
+            return None
+        self._diagnoses += 1
+        newest, share = np.array([cause.probabilities[name] for name in FAMILIES]), max(1 / self._diagnoses, 0.1)
+        self._belief = self._belief + share * (newest - self._belief)
+        family = FAMILIES[int(self._belief.argmax())]
+        self._latest[cause.family] = cause
+        said = self._latest.get(family, cause)
+        believed = dict(zip(FAMILIES, self._belief.tolist(), strict=True))
+        return said._replace(family=family, probability=float(self._belief.max()), probabilities=believed)
 
     def _complete(self, cause: Cause | None) -> bool:
         """Completes what is at fault; whether that could be done."""
@@ -205,6 +238,7 @@ class Responder:
         row = self.repair.suspect(cause.columns)
         if row is not None:
             self._rows[-1] = row
+            self._forget()
         return row is not None
 
     def _pressing(self) -> NDArray[np.float64] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Literal, NamedTuple, SupportsFloat
+from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +16,7 @@ from asm_gym.choices import check_choice
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import LearnsOnTheJob, Monitor, Surprise
 from asm_gym.policies.base import Policy
-from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Decision
+from asm_gym.wrappers.arbitration import NOTHING, Arbiter
 from asm_gym.wrappers.arguments import (
     body_memory,
     check_expectation,
@@ -29,17 +29,8 @@ from asm_gym.wrappers.arguments import (
 )
 from asm_gym.wrappers.observer import Observer, joined
 from asm_gym.wrappers.recording import StreamSource
-from asm_gym.wrappers.responses import NO_RESPONSE, Responder, Response, responses_from
-
-
-class RowReport(NamedTuple):
-    """What became of one row."""
-
-    surprise: Surprise
-    decision: Decision
-    latency: float = 0.0  # of the monitor [s]
-    failure: str = ""
-    response: Response = NO_RESPONSE
+from asm_gym.wrappers.reports import RowReport, report
+from asm_gym.wrappers.responses import Responder, responses_from
 
 
 class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -275,7 +266,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             surprise = surprise if not failure else surprise._replace(value=np.full(1, np.inf))
         if failure:
             self._arbiter.warn(failure, "which counts as an alarm")
-        response = self._responder.respond(not surprise.value[0] <= self.threshold, bool(failure))
+        alarm = not surprise.value[0] <= self.threshold
+        response = self._responder.respond(alarm, bool(failure), surprise.attribution[0])
         decision = self._arbiter.decide(
             float(surprise.value[0]),
             row,
@@ -306,29 +298,12 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return late and self._on_overrun == "alarm"
 
     def _report(self, info: dict[str, Any], rows: list[RowReport], executed: Any) -> dict[str, Any]:
-        surprises = np.array([row.surprise.value[0] for row in rows])
-        worst = rows[int(np.argmax(surprises))].surprise
-        alarm = bool((surprises > self.threshold).any())
-        intervened = any(row.decision.intervened for row in rows)
-        failed = (self._failed,) if executed is not None else ()
-        info["asm"] = {
-            "surprise": float(worst.value[0]),
-            "threshold": self.threshold,
-            "alarm": alarm,
-            "intervened": intervened,
-            "gave_up": any(row.decision.gave_up for row in rows),
-            "transition": next((t for row in reversed(rows) if (t := row.decision.transition)), ""),
-            "failure": joined(*failed, *(row.failure for row in rows)),
-            "cause": next((r.response.cause for r in reversed(rows) if r.response.why), NO_RESPONSE.cause),
-            "response": next((r.response.name for r in reversed(rows) if r.response.name), ""),
-            "completed": self._responder.completed,
-            "executed_action": executed,
-            "attribution": dict(zip(self.monitor.spec.labels, worst.attribution[0].tolist(), strict=True)),
-            "surprises": surprises,
-            "latency_us": 1e6 * max(row.latency for row in rows),
-        }
+        failed = self._failed if executed is not None else ""
+        asm = report(rows, self.monitor.spec, self.threshold, executed, failed)
+        asm["completed"] = self._responder.completed
         if self._running is not None:
-            info["asm"] |= {"ceiling": self._running.ceiling, "level": self._running.level}
-        info["asm_surprise"], info["asm_alarm"] = np.float64(worst.value[0]), np.bool_(alarm)
-        info["asm_intervened"], info["cost"] = np.bool_(intervened), np.float64(alarm)
+            asm |= {"ceiling": self._running.ceiling, "level": self._running.level}
+        info["asm"] = asm
+        info["asm_surprise"], info["asm_alarm"] = np.float64(asm["surprise"]), np.bool_(asm["alarm"])
+        info["asm_intervened"], info["cost"] = np.bool_(asm["intervened"]), np.float64(asm["alarm"])
         return info

@@ -3,7 +3,7 @@
     E      = yᵀ P y                           the energy of a moment; y, P = (C + λ)⁻¹: see ``memory.completion``
     E_S    = E - g_Eᵀ (P_EE)⁻¹ g_E, g = P y    what is left of it once the senses S, which take part in E, are completed
     L_S    = log E / E_S                      how much of it S explains
-    p      = softmax(W [L, log E/E₀] + b)     the families of causes; W by the delta rule, local
+    p      = softmax(W [L, log E/E₀, a] + b)  the families of causes; a: where the surprise is; W by the delta rule
 
 A sensor at fault is explained by that sensor, a command that is not carried out by the command, a contact by external
 torques and the wrist's forces together, a joint by the torques of that joint.
@@ -29,14 +29,37 @@ FAMILIES = ("sensor", "contact", "actuator", "action", "object", "unknown")
 """Of causes: a sensor; something that touches the body; a joint or gripper; what becomes of an action on its way; a
 thing that is handled; none of these, or none for sure."""
 
+CLASSES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "sensor": ("sensor", ("sensor",)),
+    "force sensor": ("sensor", ("force sensor",)),
+    "torque sensor": ("sensor", ("measured torque",)),
+    "contact": ("contact", ("external torque",)),
+    "joint": ("actuator", ("joint",)),
+    "gripper": ("actuator", ("gripper",)),
+    "command": ("action", ("command",)),
+    "object": ("object", ("gripper",)),
+    "unknown": ("unknown", ()),
+}
+"""What is told apart: the family of each, and the kinds of hypotheses among which its part is looked for."""
+
 WINDOW = 3
 """Rows that a diagnosis looks at: the last ones."""
 
-EVIDENCE = (
+KINDS = (
     *("sensor", "force sensor", "commanded torque", "measured torque", "external torque", "joint", "contact"),
-    *("wrist", "gripper", "hand", "command", "energy"),
+    *("wrist", "gripper", "hand", "command"),
 )
-"""What is weighed, in order: how much the best sensor explains that measures no force, the best that does, …"""
+"""Of hypotheses: a sensor that measures no force, one that does, torques of one joint, …"""
+
+GROUPS = ("joint", "torque", "hand", "wrench", "gripper")
+"""Of channels, whose share of the surprise is weighed."""
+
+EVIDENCE = (*KINDS, "energy", "alone", *GROUPS)
+"""What is weighed, in order: how much the best hypothesis of each kind explains; the energy; the share of the surprise
+that is in one sensor alone, and in each group of channels."""
+
+REPEATS = 3
+"""Readings that are the same to the last digit, of a sensor that has noise and surprises: it is stuck."""
 
 
 class Cause(NamedTuple):
@@ -67,11 +90,12 @@ class Hypothesis(NamedTuple):
 
 @dataclass(frozen=True)
 class Readout:
-    """Tells families apart by evidence.
+    """Tells classes of causes apart by evidence.
 
     Args:
         mean, spread: (F,) of the evidence it learned from.
-        weights: (families, F). bias: (families,).
+        weights: (C, F) for each of ``CLASSES``.
+        bias: (C,).
     """
 
     mean: NDArray[np.float64]
@@ -80,24 +104,24 @@ class Readout:
     bias: NDArray[np.float64]
 
     def __call__(self, evidence: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, families) probabilities for evidence (N, F)."""
+        """(N, C) probabilities of ``CLASSES`` for evidence (N, F)."""
         return softmax((evidence - self.mean) / self.spread @ self.weights.T + self.bias)
 
     @classmethod
     def fit(
         cls,
         evidence: NDArray[np.float64],
-        families: NDArray[np.intp],
+        classes: NDArray[np.intp],
         weight: NDArray[np.float64],
         shrinkage: float = 1e-3,
         steps: int = 3000,
         rate: float = 0.5,
     ) -> Self:
-        """By the delta rule, ΔW ∝ (target - p) evidenceᵀ, on examples (N, F) of families (N,) that count ``weight``."""
+        """By the delta rule, ΔW ∝ (target - p) evidenceᵀ, for examples (N, F) of classes (N,) that count ``weight``."""
         mean, spread = evidence.mean(axis=0), evidence.std(axis=0) + 1e-9
         x = (evidence - mean) / spread
-        target = np.eye(len(FAMILIES))[families]
-        W, b = np.zeros((len(FAMILIES), x.shape[1])), np.zeros(len(FAMILIES))
+        target = np.eye(len(CLASSES))[classes]
+        W, b = np.zeros((len(CLASSES), x.shape[1])), np.zeros(len(CLASSES))
         share = (weight / weight.sum())[:, None]
         for _ in range(steps):
             error = share * (target - softmax(x @ W.T + b))
@@ -163,8 +187,15 @@ class Diagnosis:
         left = [energy - np.einsum("te,ef,tf->t", g[:, E], Q, g[:, E]) for E, Q in self._freed]
         return energy, np.stack(left, axis=1)
 
-    def evidence(self, lifted: NDArray[np.float64]) -> tuple[NDArray[np.float64], dict[str, int]]:
-        """(F,) what is weighed, for the last rows of y (T, Y); and the best hypothesis of each kind of evidence."""
+    def evidence(
+        self, lifted: NDArray[np.float64], attribution: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], dict[str, int]]:
+        """(F,) what is weighed, and the best hypothesis of each kind.
+
+        Args:
+            lifted: (T, Y) y of the last rows.
+            attribution: (D,) where the surprise is, of the last row.
+        """
         energy, left = self.explained(lifted[-WINDOW:])
         usual = len(self.completion.covariance)
         total, rest = energy.mean() + 1.0, np.maximum(left.mean(axis=0), 0.0) + 1.0
@@ -173,37 +204,51 @@ class Diagnosis:
         for i, h in enumerate(self.hypotheses):
             if h.evidence not in best or explains[i] > explains[best[h.evidence]]:
                 best[h.evidence] = i
-        found = [explains[best[name]] if name in best else 0.0 for name in EVIDENCE[:-1]]
-        return np.array([*found, np.log(total / usual)]), best
+        found = [explains[best[name]] if name in best else 0.0 for name in KINDS]
+        shares = np.nan_to_num(attribution) / max(float(np.nan_to_num(attribution).sum()), 1e-12)
+        alone = max(float(shares[columns].sum()) for _, columns in self.completion.sensors)
+        groups = [float(shares[columns].sum()) for columns in self._groups]
+        return np.array([*found, np.log(total / usual), alone, *groups]), best
 
-    def __call__(self, lifted: NDArray[np.float64]) -> Cause:
-        """The cause of the surprise in the last row of y (T, Y)."""
-        evidence, best = self.evidence(lifted)
+    @cached_property
+    def _groups(self) -> list[NDArray[np.intp]]:
+        spec = self.completion.spec
+        names = np.array([c.group for c in spec.channels for _ in range(c.size)])
+        return [np.flatnonzero(names == group) for group in GROUPS]
+
+    def __call__(self, rows: NDArray[np.floating[Any]], attribution: NDArray[np.float64]) -> Cause:
+        """The cause of the surprise in the last of the rows (T, D), of which it attributes (D,)."""
+        stuck = self._stuck(rows, attribution)
+        if stuck is not None:
+            certain = {name: float(name == "sensor") for name in FAMILIES}
+            return Cause("sensor", stuck[0], 1.0, certain, stuck[1])
+        evidence, best = self.evidence(self.completion.lift(rows), attribution)
         p = self.readout(evidence[None])[0]
-        which = int(p.argmax())
-        family = FAMILIES[which]
-        named = self._named(family, evidence, best)
+        probabilities = dict.fromkeys(FAMILIES, 0.0)
+        for (family, _), q in zip(CLASSES.values(), p, strict=True):
+            probabilities[family] += float(q)
+        family = max(probabilities, key=lambda name: probabilities[name])
+        which = max((q, name) for (name, (own, _)), q in zip(CLASSES.items(), p, strict=True) if own == family)[1]
+        named = self._named(which, evidence, best)
         columns = named.columns if named is not None and family == "sensor" else np.zeros(0, np.intp)
-        probabilities = {name: float(q) for name, q in zip(FAMILIES, p, strict=True)}
-        return Cause(family, named.part if named else "", float(p[which]), probabilities, columns)
+        return Cause(family, named.part if named else "", probabilities[family], probabilities, columns)
 
-    def _named(self, family: str, evidence: NDArray[np.float64], best: dict[str, int]) -> Hypothesis | None:
-        """The part that explains most, of those that a family has."""
-        able = [name for name in PARTS[family] if name in best]
+    def _stuck(
+        self, rows: NDArray[np.floating[Any]], attribution: NDArray[np.float64]
+    ) -> tuple[str, NDArray[np.intp]] | None:
+        """The sensor that most surprise is about, where it repeats itself to the last digit though it has noise."""
+        if len(rows) < REPEATS:
+            return None
+        same = (np.ptp(rows[-REPEATS:], axis=0) == 0) & (self.completion.spec.noise > 0)
+        most = max(self.completion.sensors, key=lambda sensor: float(attribution[sensor[1]].sum()))
+        return most if same[most[1]].any() else None
+
+    def _named(self, which: str, evidence: NDArray[np.float64], best: dict[str, int]) -> Hypothesis | None:
+        """The part that explains most, of those that a class has."""
+        able = [kind for kind in CLASSES[which][1] if kind in best]
         if not able:
             return None
-        return self.hypotheses[best[max(able, key=lambda name: evidence[EVIDENCE.index(name)])]]
-
-
-PARTS: dict[str, tuple[str, ...]] = {
-    "sensor": ("sensor", "force sensor", "measured torque"),
-    "contact": ("external torque",),
-    "actuator": ("joint", "gripper"),
-    "action": ("command",),
-    "object": ("gripper",),
-    "unknown": (),
-}
-"""Where the part of a cause is looked for."""
+        return self.hypotheses[best[max(able, key=lambda kind: evidence[EVIDENCE.index(kind)])]]
 
 
 def hypotheses_of(completion: Completion) -> tuple[Hypothesis, ...]:

@@ -1,0 +1,58 @@
+"""What ``info["asm"]`` says of a control step, from the rows that were sensed in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.monitors import Surprise
+from asm_gym.stream import StreamSpec
+from asm_gym.wrappers.arbitration import Decision
+from asm_gym.wrappers.observer import joined
+from asm_gym.wrappers.responses import NO_RESPONSE, Response
+
+
+class RowReport(NamedTuple):
+    """What became of one row."""
+
+    surprise: Surprise
+    decision: Decision
+    latency: float = 0.0  # of the monitor [s]
+    failure: str = ""
+    response: Response = NO_RESPONSE
+
+
+def report(
+    rows: Sequence[RowReport],
+    spec: StreamSpec,
+    threshold: float,
+    executed: NDArray[np.float32] | None,
+    failed: str,
+) -> dict[str, Any]:
+    """What to say of the rows of a step.
+
+    Args:
+        executed: (A,) the action that was done last; None before the first step.
+        failed: what failed before the step; empty where nothing did.
+    """
+    surprises = np.array([row.surprise.value[0] for row in rows])
+    worst = rows[int(np.argmax(surprises))].surprise
+    caused = next((row.response for row in reversed(rows) if row.response.why), NO_RESPONSE)
+    return {
+        "surprise": float(worst.value[0]),
+        "threshold": threshold,
+        "alarm": bool((surprises > threshold).any()),
+        "intervened": any(row.decision.intervened for row in rows),
+        "gave_up": any(row.decision.gave_up for row in rows),
+        "transition": next((t for row in reversed(rows) if (t := row.decision.transition)), ""),
+        "failure": joined(failed, *(row.failure for row in rows)),
+        "cause": caused.cause,
+        "response": caused.name,
+        "executed_action": executed,
+        "attribution": dict(zip(spec.labels, worst.attribution[0].tolist(), strict=True)),
+        "surprises": surprises,
+        "latency_us": 1e6 * max(row.latency for row in rows),
+    }
