@@ -15,7 +15,7 @@ MOVED = {
     "asm_gym.faults.catalogue": "asm_gym.faults.base",
     "asm_gym.memory.checkpoint": "asm_gym.checkpoint",
     "asm_gym.memory.senses": "asm_gym.scaling",
-    "asm_gym.scripts.adopt": "asm_gym.scripts.reproduce.transfer",
+    "asm_gym.scripts.adopt": "asm_gym.scripts.reproduce.adoption",
     "asm_gym.scripts.demonstrations": "asm_gym.scripts.import_demonstrations",
     "asm_gym.scripts.dispatch": "asm_gym.rollouts.parallel",
     "asm_gym.scripts.lagrangian": "asm_gym.scripts.examples.lagrangian",

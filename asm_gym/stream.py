@@ -160,27 +160,39 @@ class StreamSpec:
         if lines:
             raise ValueError(f"{whose} does not fit this stream:\n  " + "\n  ".join(lines))
 
+    def never_met(self, known: StreamSpec) -> list[str]:
+        """What of this stream a memory of one that is ``known`` cannot do with, a line each; commands do not matter."""
+        theirs = {c.name: c for c in known.channels}
+        lines = []
+        for c in self.channels:
+            same = theirs.get(c.name)
+            if c.group != MOTOR and same is None:
+                lines.append(f"{c.name}: never met")
+            elif c.group != MOTOR and same is not None and not _alike(c, same):
+                met = f"met with size {same.size}, unit {same.unit}, group {same.group}"
+                lines.append(f"{c.name}: of size {c.size}, unit {c.unit}, group {c.group}, {met}")
+        if abs(self.dt - known.dt) > 1e-9:
+            lines.append(f"dt: {known.dt} s against {self.dt} s")
+        return lines
+
     def columns_in(self, known: StreamSpec) -> NDArray[np.intp]:
         """(D,) where each number of this stream stands in one that is ``known``; -1 for commands that are not.
 
         Raises:
-            ValueError: a sense that is not known, by name, size, unit and group; another rate; no sense at all.
+            ValueError: a sense that is not known, by name, size, unit and group; another rate.
         """
-        theirs = {c.name: c for c in known.channels}
-        columns, never = np.full(self.size, -1, np.intp), []
-        for c in self.channels:
-            same = theirs.get(c.name)
-            if same is not None and (c.size, c.unit, c.group) == (same.size, same.unit, same.group):
-                columns[self.slices[c.name]] = np.arange(known.size)[known.slices[c.name]]
-            elif c.group != MOTOR:
-                never.append(c.name if same is None else f"{c.name} of size {c.size}, unit {c.unit}, group {c.group}")
-        if never:
+        lines = self.never_met(known)
+        if lines:
             raise ValueError(
-                f"the memory never met {', '.join(never)}; it knows {', '.join(theirs)}. Leave the others out of the "
-                "stream, or fit a memory of your own"
+                "the memory cannot watch this stream:\n  "
+                + "\n  ".join(lines)
+                + "\nLeave what it never met out of the "
+                f"stream, or fit a memory of your own. It knows {', '.join(c.name for c in known.channels)}"
             )
-        if abs(self.dt - known.dt) > 1e-9:
-            raise ValueError(f"the memory knows rows every {known.dt} s, and this stream has one every {self.dt} s")
+        theirs, columns = {c.name: c for c in known.channels}, np.full(self.size, -1, np.intp)
+        for c in self.channels:
+            if c.name in theirs and _alike(c, theirs[c.name]):
+                columns[self.slices[c.name]] = np.arange(known.size)[known.slices[c.name]]
         return columns
 
     def to_json(self) -> str:
@@ -233,6 +245,10 @@ def flat_rows(space: spaces.Space[Any], values: Any, rows: int) -> NDArray[np.fl
     if isinstance(space, spaces.Box):
         return np.asarray(values, np.float32).reshape(rows, -1)
     return np.array([spaces.flatten(space, value) for value in values], np.float32).reshape(rows, -1)
+
+
+def _alike(one: Channel, other: Channel) -> bool:
+    return (one.size, one.unit, one.group) == (other.size, other.unit, other.group)
 
 
 def control_period(env: gym.Env[Any, Any]) -> float:

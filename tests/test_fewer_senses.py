@@ -120,13 +120,13 @@ def test_commands_of_another_controller_are_not_looked_at(memory):
 @pytest.mark.parametrize(
     ("channels", "named"),
     [
-        ((JOINT, Channel("camera", 3)), "camera"),
-        ((Channel("joint", 6, "rad", group="joint"), HAND), "joint of size 6"),
+        ((JOINT, Channel("camera", 3)), "camera: never met"),
+        ((Channel("joint", 6, "rad", group="joint"), HAND), "joint: of size 6"),
         ((Channel("joint", 4, "deg", group="joint"), HAND), "unit deg"),
     ],
 )
 def test_senses_that_it_never_met_are_refused_by_name(memory, channels, named):
-    with pytest.raises(ValueError, match=f"never met.*{named}"):
+    with pytest.raises(ValueError, match=named):
         memory.for_stream(StreamSpec((*channels, COMMAND), dt=0.05))
 
 
@@ -157,5 +157,5 @@ def test_the_wrapper_refuses_senses_that_the_memory_never_met():
     rng = np.random.default_rng(0)
     episodes = [Episode.from_stream(rng.normal(size=(40, spec.size)), spec) for _ in range(20)]
     memory = NeuralASM(spec, hidden_size=8, association_size=16, epochs=1).fit(episodes).calibrate(episodes, 0.1)
-    with pytest.raises(ValueError, match="never met position"):
+    with pytest.raises(ValueError, match="position: never met"):
         NeuralASMSafety(FakeEnv(), memory)

@@ -140,7 +140,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if monitor_freq is not None:
             sensing = check_rate(env, monitor_freq)
             watched = sensing.stream_spec_at(monitor_freq)
-        monitor = body_memory(env, watched) if monitor is None else fitted_to(monitor, watched)
+        monitor = fitted_to(body_memory(env, watched) if monitor is None else monitor, watched)
         if learning_rate > 0 and not isinstance(monitor, LearnsOnTheJob):
             raise ValueError(f"{type(monitor).__name__} cannot learn on the job: learning_rate must be 0")
         threshold = check_monitor(monitor, watched)

@@ -35,7 +35,7 @@ def pretrained_file(name: str) -> Path:
 
 
 def pretrained_for(spec: StreamSpec, controller: str = "") -> str:
-    """The name of the shipped memory of this body.
+    """The name of the shipped memory of this body; a stream may lack channels that it knows.
 
     Args:
         spec: of the stream to be watched; its source says whose body it is.
@@ -49,7 +49,7 @@ def pretrained_for(spec: StreamSpec, controller: str = "") -> str:
         header = read_header(path)
         known, about = StreamSpec.from_json(header["spec"]), header["about"]
         misfits = [f"{what}: {mine} against {theirs}" for what, mine, theirs in _named(known, about, spec, controller)]
-        misfits += known.difference(spec)
+        misfits += spec.never_met(known)
         if not misfits:
             return name
         lines.append(f"  {name}: {'; '.join(misfits)}")

@@ -25,8 +25,9 @@ STUDIES = {
     "speed_accuracy": Study("more inference, or slower movements, for more accuracy"),
     "fault_detection": Study("surprise, against a library that is told the skill"),
     "safe_training": Study("an agent trained alone, and under the safety wrapper"),
+    "transfer": Study("one memory of a body, for policies and tasks never met"),
     "reflexes": Study("what acting on alarms is worth, reflex by fault", needs_a_run=True),
-    "transfer": Study("one policy's memory on another policy", needs_a_run=True),
+    "adoption": Study("one policy's memory on another policy", needs_a_run=True),
     "learning_curve": Study("detection by the number of episodes learned from", needs_a_run=True),
     "repertoire": Study("one memory of all skills against one for each", needs_a_run=True),
 }

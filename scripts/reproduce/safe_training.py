@@ -2,7 +2,8 @@
 
 An untrained actor learns by SAC with demonstrations in its replay buffer: alone; where an alarm costs reward and ends
 the episode; and where the robot holds on an alarm. The memory knows harmless exploration, in which none of the runs
-takes part. A run can be killed at any time: what has been recorded, fitted or trained is not made again.
+takes part; or it is a shipped memory of the body (``--memory panda``), and nothing is recorded for it. A run can be
+killed at any time: what has been recorded, fitted or trained is not made again.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode, load_episode
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.tables import Table, console_table, markdown
-from asm_gym.monitors import NeuralASM
+from asm_gym.monitors import NeuralASM, load_monitor, pretrained
+from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.rollouts.collect import collect_to
 from asm_gym.rollouts.folder import claimed, make_missing
 from asm_gym.rollouts.parallel import THIS_PROCESS, ParallelConfig, Progress
@@ -59,6 +61,8 @@ class Args:
     """Control steps of each run."""
     demonstrations: int = 50
     """Episodes of the expert in the replay buffer, and as many others for a memory of the expert."""
+    memory: str | None = None
+    """What watches: the name of a shipped memory, or the path of one; by default one of exploration is made."""
     fit_episodes: int = 120
     """Episodes of exploration that the memory learns from."""
     calibration_episodes: int = 60
@@ -103,6 +107,8 @@ class Args:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
         needed = conformal_episodes(self.false_alarm_rate)
+        if self.memory is not None and self.memory not in pretrained():
+            load_monitor(self.memory)  # refused before anything runs
         if min(self.calibration_episodes, self.demonstrations) < needed:
             raise ValueError(
                 f"a false-alarm rate of {self.false_alarm_rate:g} needs {needed} calibration_episodes and as many "
@@ -145,7 +151,7 @@ class Recorded(NamedTuple):
     """Files of episodes."""
 
     expert: list[Path]  # twice the demonstrations: those of the buffer, and others
-    exploration: list[Path]  # to fit on and to calibrate on
+    exploration: list[Path]  # to fit on and to calibrate on; none for a memory that is there already
     testing: list[Path]
 
 
@@ -160,21 +166,23 @@ def record(args: Args, progress: Progress) -> Recorded:
         seeds = episode_seeds(args.seed, count, stage)
         return make_missing(make, seeds, lambda s: folder / "exploration" / f"{s}.npz", args.parallel, progress)
 
-    fitting = explored(args.fit_episodes + args.calibration_episodes, FITTING)
+    fitting = [] if args.memory else explored(args.fit_episodes + args.calibration_episodes, FITTING)
     return Recorded(expert, fitting, explored(args.test_episodes, TESTING))
 
 
 def memories(args: Args, recorded: Recorded) -> dict[str, Path]:
-    """One memory of exploration, which watches, and one of the expert, to compare; fitted where they are not yet."""
+    """One memory that watches, and one of the expert, to compare; fitted where they are not yet."""
     expert = [load_episode(f) for f in recorded.expert]
     n, k = args.fit_episodes, args.demonstrations
-    learned: dict[str, tuple[list[Episode], list[Episode]]] = {
-        "exploration": (harmless(recorded.exploration[:n]), harmless(recorded.exploration[n:])),
-        "expert": (expert[:k], expert[k:]),
-    }
+    learned: dict[str, tuple[list[Episode], list[Episode]]] = {"the expert": (expert[:k], expert[k:])}
     paths = {}
+    if args.memory is None:
+        explored = harmless(recorded.exploration[:n]), harmless(recorded.exploration[n:])
+        learned = {"exploration": explored, **learned}
+    else:
+        paths["the body"] = pretrained_file(args.memory) if args.memory in pretrained() else Path(args.memory)
     for name, (fit, calibration) in learned.items():
-        paths[name] = args.out.resolve() / f"{name}.asm"
+        paths[name] = args.out.resolve() / f"{name.removeprefix('the ')}.asm"
         if not paths[name].is_file():
             if not fit:
                 raise ValueError(f"no episode stays harmless for long enough: is {args.task} done gently?")
@@ -228,7 +236,7 @@ def _train_safely(args: Args, console: Console) -> list[Table]:
         each = partial(
             run,
             setting=args.setting,
-            memory=memory["exploration"],
+            memory=next(iter(memory.values())),
             demonstrations=recorded.expert[: args.demonstrations],
             folder=folder,
         )
