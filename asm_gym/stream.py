@@ -162,18 +162,9 @@ class StreamSpec:
 
     def never_met(self, known: StreamSpec) -> list[str]:
         """What of this stream a memory of one that is ``known`` cannot do with, a line each; commands do not matter."""
-        theirs = {c.name: c for c in known.channels}
-        lines = []
-        for c in self.channels:
-            same = theirs.get(c.name)
-            if c.group != MOTOR and same is None:
-                lines.append(f"{c.name}: never met")
-            elif c.group != MOTOR and same is not None and not _alike(c, same):
-                met = f"met with size {same.size}, unit {same.unit}, group {same.group}"
-                lines.append(f"{c.name}: of size {c.size}, unit {c.unit}, group {c.group}, {met}")
-        if abs(self.dt - known.dt) > 1e-9:
-            lines.append(f"dt: {known.dt} s against {self.dt} s")
-        return lines
+        senses = {c.name for c in self.channels if c.group != MOTOR} | {"dt"}
+        lines = (line.partition(": ") for line in known.difference(self))
+        return ["".join(line) for line in lines if line[0] in senses and line[2] != "missing"]
 
     def columns_in(self, known: StreamSpec) -> NDArray[np.intp]:
         """(D,) where each number of this stream stands in one that is ``known``; -1 for commands that are not.
@@ -184,7 +175,7 @@ class StreamSpec:
         lines = self.never_met(known)
         if lines:
             raise ValueError(
-                "the memory cannot watch this stream:\n  "
+                "the memory never met what this stream holds:\n  "
                 + "\n  ".join(lines)
                 + "\nLeave what it never met out of the "
                 f"stream, or fit a memory of your own. It knows {', '.join(c.name for c in known.channels)}"

@@ -120,9 +120,9 @@ def test_commands_of_another_controller_are_not_looked_at(memory):
 @pytest.mark.parametrize(
     ("channels", "named"),
     [
-        ((JOINT, Channel("camera", 3)), "camera: never met"),
-        ((Channel("joint", 6, "rad", group="joint"), HAND), "joint: of size 6"),
-        ((Channel("joint", 4, "deg", group="joint"), HAND), "unit deg"),
+        ((JOINT, Channel("camera", 3)), "camera: new"),
+        ((Channel("joint", 6, "rad", group="joint"), HAND), "joint: size 4 against 6"),
+        ((Channel("joint", 4, "deg", group="joint"), HAND), "joint: unit rad against deg"),
     ],
 )
 def test_senses_that_it_never_met_are_refused_by_name(memory, channels, named):
@@ -157,5 +157,5 @@ def test_the_wrapper_refuses_senses_that_the_memory_never_met():
     rng = np.random.default_rng(0)
     episodes = [Episode.from_stream(rng.normal(size=(40, spec.size)), spec) for _ in range(20)]
     memory = NeuralASM(spec, hidden_size=8, association_size=16, epochs=1).fit(episodes).calibrate(episodes, 0.1)
-    with pytest.raises(ValueError, match="position: never met"):
+    with pytest.raises(ValueError, match="position: new"):
         NeuralASMSafety(FakeEnv(), memory)
