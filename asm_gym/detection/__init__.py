@@ -8,7 +8,7 @@ from typing import Any
 from asm_gym.detection import evidence, repetition, tails
 from asm_gym.detection.adaptive import AdaptiveThreshold, RunningThreshold
 from asm_gym.detection.base import Detection, ModelOutput, Nominal
-from asm_gym.detection.conformal import conformal_episodes, conformal_threshold
+from asm_gym.detection.conformal import Promise, conformal_episodes, conformal_threshold
 from asm_gym.detection.detector import Detector, EvidenceDetection, EvidenceState
 from asm_gym.detection.evidence import Evidence, accumulate, no_evidence, pool, strength
 from asm_gym.detection.tails import worst_case
@@ -23,6 +23,7 @@ __all__ = [
     "EvidenceState",
     "ModelOutput",
     "Nominal",
+    "Promise",
     "RunningThreshold",
     "accumulate",
     "bounded",

@@ -8,8 +8,10 @@ Sources: Vovk et al. 2005 and Angelopoulos and Bates 2023 (split conformal predi
 from __future__ import annotations
 
 import math
+from typing import NamedTuple, Self
 
 import numpy as np
+from scipy.special import betaincinv
 
 from asm_gym.detection.base import Array
 
@@ -33,6 +35,37 @@ def conformal_threshold(maxima: Array, rate: float) -> float:
     """
     n, needed = len(maxima), conformal_episodes(rate)
     if n < needed:
-        raise ValueError(f"a false alarm rate of {rate} needs at least {needed} nominal episodes, got {n}")
+        raise ValueError(
+            f"a false alarm rate of {rate} needs at least {needed} nominal episodes, got {n}, which can promise "
+            f"{math.ceil(1e3 / (n + 1)) / 1e3:g} at best"
+        )
     rank = math.ceil((n + 1) * (1.0 - rate) - 1e-9)  # (n + 1)(1 - rate) is often whole, but not in floating point
     return float(np.sort(maxima)[rank - 1])
+
+
+class Promise(NamedTuple):
+    """What a threshold that was set on n nominal episodes promises of the next.
+
+    Given those n, the share of fresh episodes that alarm is Beta(k + 1, n - k)-distributed where k of them exceed the
+    threshold (Vovk 2012; of continuous maxima, and larger never).
+
+    Attributes:
+        episodes: n.
+        rate: of alarms on average over such calibrations: (k + 1)/(n + 1).
+        at_most: which the share of alarms stays below in 95 % of such calibrations.
+    """
+
+    episodes: int
+    rate: float
+    at_most: float
+
+    @classmethod
+    def of(cls, maxima: Array, threshold: float) -> Self:
+        """Of the maxima (n,) of nominal episodes."""
+        n, beyond = len(maxima), int((maxima > threshold).sum())
+        surely = float(betaincinv(beyond + 1, n - beyond, SURELY)) if beyond < n else 1.0
+        return cls(n, (beyond + 1) / (n + 1), surely)
+
+
+SURELY = 0.95
+"""Share of calibrations in which ``Promise.at_most`` holds."""

@@ -148,6 +148,15 @@ class LearnsOnTheJob(Protocol):
 
 
 @runtime_checkable
+class Specialises(Protocol):
+    """A model that can go on from what it knows, with few episodes."""
+
+    def specialise(self, episodes: Sequence[Episode]) -> Self:
+        """Learns what these nominal episodes have of their own."""
+        ...
+
+
+@runtime_checkable
 class NamesSkills(Protocol):
     """A monitor that can be taught the names of skills, and says which one runs."""
 

@@ -26,6 +26,7 @@ from asm_gym.memory.network import Network, train
 from asm_gym.memory.readout import add_up, learn_readout, running
 from asm_gym.memory.recall import continued
 from asm_gym.memory.recurrent import RecurrentNetwork, RecurrentWeights, recurrent_shapes
+from asm_gym.memory.specialise import specialise
 from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.model import StreamModel, skills_of
@@ -101,6 +102,19 @@ class MemoryModel(StreamModel):
         learned = {**standard, **skills, "energy": self.learned_["energy"]}
         model = MemoryModel(spec, self.hidden_size, self.association_size, self.schedule)
         return model.restore({**learned, **weights._asdict(), **kept.association._asdict()}, self.skills_), kept
+
+    def specialise(self, episodes: Sequence[Episode]) -> Self:
+        """Goes on from what it knows: association learns what these episodes have of their own, all else stays.
+
+        Names of skills, and what was learned to act by, are of the association as it was, and are forgotten.
+        """
+        senses, lag = self.senses_, self.lag
+        inputs = np.concatenate([senses.read_episode(e.stream).inputs[lag:] for e in episodes])
+        changes = np.ascontiguousarray(inputs[:, senses.changes])
+        layout = senses.groups, senses.changes, self._units_each(senses)
+        now = specialise(self.network.association, inputs, changes, *layout)
+        kept = {"mean", "spread", "change", "energy", *self.network.weights._fields}
+        return self.restore({**{n: a for n, a in self.learned_.items() if n in kept}, **now._asdict()})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         senses = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint, write_checkpoint
-from asm_gym.checks import check_number
+from asm_gym.checks import check_flag, check_number
 from asm_gym.choices import check_choice
-from asm_gym.detection import Detection, ModelOutput, Nominal, conformal_episodes, conformal_threshold
+from asm_gym.detection import Detection, ModelOutput, Nominal, Promise, conformal_episodes, conformal_threshold
 from asm_gym.detection.detector import ANYTHING
 from asm_gym.episodes import Episode
-from asm_gym.monitors.base import Model, Progress, State, Surprise
+from asm_gym.monitors.base import Model, Progress, Specialises, State, Surprise
 from asm_gym.monitors.model import batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.nominal import check_nominal
 from asm_gym.stream import StreamSpec
@@ -107,6 +107,19 @@ class CalibratedMonitor:
             raise RuntimeError(f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first")
         return conformal_threshold(self.maxima_, false_alarm_rate)
 
+    @property
+    def promise(self) -> Promise:
+        """Which share of nominal episodes the threshold promises to stay without an alarm, and how surely.
+
+        Raises:
+            RuntimeError: it is not calibrated, or does not keep the nominal episodes' surprise.
+        """
+        if self.maxima_ is None:
+            raise RuntimeError(
+                f"this {self._name} does not know its calibration: call calibrate(nominal_episodes) first"
+            )
+        return Promise.of(self.maxima_, self.threshold)
+
     def with_threshold(self, value: float) -> Self:
         """The same monitor with another threshold, ``inf`` for none that could be exceeded; this one keeps its own."""
         other = self._copy()
@@ -132,30 +145,41 @@ class CalibratedMonitor:
         found = {n: getattr(p, n) for p in parts for n in parameter_names(type(p)) if n != "seed"}
         return found | {"seed": self.seed}
 
-    def fit(self, episodes: Sequence[Episode], progress: Progress | None = None) -> Self:
+    def fit(self, episodes: Sequence[Episode], progress: Progress | None = None, *, warm_start: bool = False) -> Self:
         """Learns from whole nominal episodes of any number of skills; no labels.
 
         Args:
             episodes: of this spec.
             progress: called as ``progress(done, total)`` while learning.
+            warm_start: go on from what it knows, for a model that can specialise: 10 to 50 episodes are enough then.
 
         Raises:
             ValueError: no episode, one that is too short or of another spec, or a number that is not finite.
+            TypeError: the model cannot go on from what it knows.
+            RuntimeError: it is to go on, and knows nothing yet.
         """
+        if check_flag("warm_start", warm_start):
+            if not isinstance(self.model, Specialises):
+                raise TypeError(f"a {self._name} learns all anew: leave warm_start out")
+            self._fitted()
         check_nominal(episodes, self.spec, self.model.shortest)
         new = self._copy()  # whatever interrupts leaves this one as it was
-        new._learn(episodes, progress or (lambda done, total: None))
+        new._learn(episodes, progress or (lambda done, total: None), warm_start)
+        new.about = {**self.about, "specialised_on": len(episodes)} if warm_start else {}
         vars(self).update(vars(new))
         return self
 
-    def _learn(self, episodes: Sequence[Episode], progress: Progress) -> None:
+    def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
         rng, one_in = np.random.default_rng(self.seed), self.model.held_out
         order = rng.permutation(len(episodes)) if one_in else np.arange(len(episodes))
         kept = len(episodes) // one_in if one_in else 0
         held_out, learned = ([episodes[i] for i in part] for part in (order[:kept], order[kept:]))
         # One thread: products this small are slowed down by several, and ruined by several that share a core.
         with threadpool_limits(1):
-            self.model.fit(learned, rng, progress)
+            if warm_start and isinstance(self.model, Specialises):
+                self.model.specialise(learned)
+            else:
+                self.model.fit(learned, rng, progress)
             self.threshold_ = self.maxima_ = None
             self._prepare()
             nominal = Nominal(episodes, learned, held_out or learned, self._outputs)
@@ -171,8 +195,11 @@ class CalibratedMonitor:
         What it finds is kept, so that ``threshold_at`` knows the threshold of every other rate too.
 
         Args:
-            episodes: at least ``conformal_episodes(false_alarm_rate)`` of them.
-            false_alarm_rate: P(any alarm in a nominal episode), at most.
+            episodes: at least ``conformal_episodes(false_alarm_rate)`` of them: 99 for 0.01, 19 for 0.05.
+            false_alarm_rate: P(any alarm in a nominal episode), at most; ``promise`` says how surely.
+
+        Raises:
+            ValueError: too few episodes for this rate (the message says which they can promise), or bad ones.
         """
         self._fitted()
         conformal_episodes(false_alarm_rate)  # refuses a bad rate before the work begins

@@ -36,7 +36,7 @@ LEADING = (LED, DRIVEN, ALONE, DRIVEN)
 """What leads, lesson by lesson of a task."""
 SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
 """ρ: from the noise by which agents explore to pushing on in one direction, as half-trained ones do."""
-NOISE = 0.05, 1.0
+NOISE = 0.03, 0.6
 """s, from hardly to thoroughly [action units]."""
 SPEED = 0.5, 1.5
 """Of the expert, relative to its usual one."""
