@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number, shown
+from asm_gym.checks import check_flag, check_number, shown
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Array, Arrays, ModelOutput, Nominal, Place
 from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, accumulate, no_evidence, pool, strength
@@ -126,6 +126,7 @@ class Detector:
         bound: float,
         shrinkage: float,
         rng: np.random.Generator,
+        habituates: bool = True,
     ) -> Self:
         """From nominal episodes that the model has learned, and others that it has not."""
         matrix = whitening(bounded(np.concatenate([r.errors for r in learned]), bound), shrinkage)
@@ -134,6 +135,9 @@ class Detector:
         plain = cls(matrix, ones, ones, np.zeros(1), ANYTHING, a, bound)
         everything = [*learned, *held_out]
         ceiling, tail = worst_case(np.array([plain._strengths(r)[0].max(axis=0) for r in everything]))
+        if not habituates:
+            nothing = np.zeros(2 * everything[0].contexts.shape[1] + 1)
+            return cls(matrix, ceiling, tail, nothing, np.zeros(2), a, bound)
         apart = -(-sum(len(r.errors) for r in everything) // MOST_ROWS)
         contexts, levels = [], []
         for r in everything:
@@ -212,6 +216,8 @@ class EvidenceDetection:
         bound: ν > 0, how many standard deviations an error counts at most, so that a knock that is soon over counts
             less than what stays.
         shrinkage: λ in [0, 1] of the whitening, towards no correlation between errors.
+        habituates: surprise is measured against what is usual in a context. A context knows the policy, so a memory
+            that is to watch any policy leaves it out.
 
     Attributes:
         detector_: what turns errors into surprise; None before ``fit``.
@@ -221,20 +227,26 @@ class EvidenceDetection:
     arrays: tuple[str, ...] = ("whitening", "ceiling", "tail", "context_quantile", "context_range", "repetition")
 
     def __init__(
-        self, spec: StreamSpec, gains: Sequence[float] = GAINS, bound: float = BOUND, shrinkage: float = 1e-3
+        self,
+        spec: StreamSpec,
+        gains: Sequence[float] = GAINS,
+        bound: float = BOUND,
+        shrinkage: float = 1e-3,
+        habituates: bool = True,
     ) -> None:
         self.spec, self.gains = spec, tuple(map(float, gains))
         if not self.gains or not all(0.0 < a <= 1.0 for a in self.gains):
             raise ValueError(f"gains must be numbers in (0, 1], got {gains}")
         self.bound = check_number("bound", bound, above=0.0)
         self.shrinkage = check_number("shrinkage", shrinkage, low=0.0, high=1.0)
+        self.habituates = check_flag("habituates", habituates)
         self.learned_: Arrays = {}
         self.detector_: Detector | None = None
 
     def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
         """Whitening from what the model has learned; its ceilings, and what is usual in a context, from all."""
         learned, fresh = nominal.outputs(nominal.learned), nominal.outputs(nominal.held_out)
-        detector = Detector.fit(learned, fresh, self.gains, self.bound, self.shrinkage, rng)
+        detector = Detector.fit(learned, fresh, self.gains, self.bound, self.shrinkage, rng, self.habituates)
         senses = self.spec.sensory
         counted = count_repetitions([e.stream[:, senses] for e in nominal.episodes], self.spec.noise[senses] > 0)
         return self.restore({name: getattr(detector, name) for name in self.arrays[:-1]} | {"repetition": counted})
@@ -249,7 +261,7 @@ class EvidenceDetection:
         kept = {name: old[name][:, left] for name in ("ceiling", "tail", "repetition")}
         usual = {name: old[name] for name in ("context_quantile", "context_range")}
         matrix = (vectors / np.sqrt(values)) @ vectors.T
-        return EvidenceDetection(spec, self.gains, self.bound, self.shrinkage).restore(
+        return EvidenceDetection(spec, self.gains, self.bound, self.shrinkage, self.habituates).restore(
             {"whitening": matrix, **usual, **kept}
         )
 

@@ -115,9 +115,7 @@ class CalibratedMonitor:
             RuntimeError: it is not calibrated, or does not keep the nominal episodes' surprise.
         """
         if self.maxima_ is None:
-            raise RuntimeError(
-                f"this {self._name} does not know its calibration: call calibrate(nominal_episodes) first"
-            )
+            raise RuntimeError(f"this {self._name} knows no calibration: call calibrate(nominal_episodes) first")
         return Promise.of(self.maxima_, self.threshold)
 
     def with_threshold(self, value: float) -> Self:

@@ -58,6 +58,8 @@ class NeuralASM(CalibratedMonitor):
         bound: ν > 0, how many standard deviations an error counts at most, so that a knock that is soon over counts
             less than what stays.
         shrinkage: λ in [0, 1] of the whitening, towards no correlation between errors.
+        habituates: surprise is measured against what is usual in a context. A context knows the policy, so a memory
+            that is to watch any policy leaves it out.
         seed: of the initial weights and of the order of the episodes.
 
     Attributes:
@@ -83,6 +85,7 @@ class NeuralASM(CalibratedMonitor):
         gains: Sequence[float] = GAINS,
         bound: float = BOUND,
         shrinkage: float = 1e-3,
+        habituates: bool = True,
         seed: int = 0,
         **renamed: float,
     ) -> None:
@@ -104,7 +107,7 @@ class NeuralASM(CalibratedMonitor):
         )
         schedule = Schedule(**{name: getattr(self, name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule)
-        super().__init__(model, EvidenceDetection(spec, gains, bound, shrinkage), seed=seed)
+        super().__init__(model, EvidenceDetection(spec, gains, bound, shrinkage, habituates), seed=seed)
         self._diagnosis: Diagnosis | None = None
 
     @property

@@ -2,9 +2,10 @@
 
     a_t = clip(e_t + s x_t),   x_t = ρ x_{t-1} + √(1 - ρ²) ξ_t      e the guide's action, 0 without one; ξ white
 
-Each lesson is one episode. Half of them are led by an expert that noise drives off its course, from hardly to
-thoroughly, in jerks or slowly; a quarter are the expert's own, at many speeds; in a quarter noise alone moves the arm.
-In half of all the arm stops now and then, whatever it holds or leans on, and in half a thing weighs more or less.
+Each lesson is one episode. Two in five are the expert's own, at many speeds; in two of five noise drives the expert off
+its course, in jerks or slowly; in one noise alone moves the arm. In half of all the arm stops now and then, whatever it
+holds or leans on, and in half a thing weighs more or less. No noise is so strong that most of a lesson would be hits:
+those taught the memory to expect them, and cost more faults than they spared alarms.
 
 Sources: Laskey et al. 2017 (CoRL, DART) for noise on an expert's commands; Saegusa et al. 2009 (ROBIO) for babbling.
 """
@@ -32,12 +33,12 @@ from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import StreamRecorder
 
 ALONE, LED, DRIVEN = "noise", "expert", "disturbed"
-LEADING = (LED, DRIVEN, ALONE, DRIVEN)
+LEADING = (LED, DRIVEN, ALONE, LED, DRIVEN)
 """What leads, lesson by lesson of a task."""
 SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
 """ρ: from the noise by which agents explore to pushing on in one direction, as half-trained ones do."""
-NOISE = 0.03, 0.6
-"""s, from hardly to thoroughly [action units]."""
+NOISE = 0.02, 0.2
+"""s, from hardly to about what a half-trained agent explores by [action units]."""
 SPEED = 0.5, 1.5
 """Of the expert, relative to its usual one."""
 WEIGHT = 0.7, 1.4

@@ -89,17 +89,14 @@ def until_contact(episode: Episode, forces: NDArray[np.floating[Any]], gentle: G
     Args:
         forces: (T,) the largest external force of each step [N].
     """
-    rows = len(episode) // len(forces)  # of the stream, in a step
-    torques = peak_torques(episode).reshape(-1, rows).max(axis=1)
-    over = ~((forces <= gentle.force) & (torques <= gentle.torque))
+    over = ~((forces <= gentle.force) & (peak_torques(episode) <= gentle.torque))
     end = int(np.argmax(over)) if over.any() else len(forces)
-    kept = {name: getattr(episode, name)[:end] for name in ("actions", "rewards", "contact_force")}
-    kept |= {name: getattr(episode, name)[: rows * end] for name in ("stream", "faults")}
+    kept = {name: getattr(episode, name)[:end] for name in ("stream", "actions", "rewards", "faults")}
     return replace(episode, observations=episode.observations[: end + 1], **kept)
 
 
 def peak_torques(episode: Episode) -> NDArray[np.floating[Any]]:
-    """The largest external torque on a joint in each row of the stream [N m]."""
+    """(T,) the largest external torque on a joint in each row of the stream [N m]."""
     torques = episode.stream[:, columns(episode.spec, "external_torque_peak")]
     peaks: NDArray[np.floating[Any]] = np.abs(torques).max(axis=1)
     return peaks
