@@ -69,3 +69,40 @@ def compare(alone: Sequence[Trace], acted: Sequence[Trace], seed: int = 0) -> Co
         ended=Share.of([t.outcome.ended_by_alarm for t in acted]),
         median_delay_ms=delays[(len(delays) - 1) // 2],
     )
+
+
+@dataclass(frozen=True)
+class IdealShare:
+    """How much of what the ideal reflex gains over the policy alone a reflex gains: 0 for nothing, 1 for all.
+
+    NaN where the ideal reflex gains nothing.
+    """
+
+    success: float
+    peak: float
+    impulse: float
+
+
+def share_of_ideal(alone: Sequence[Trace], acted: Sequence[Trace], ideal: Sequence[Trace]) -> IdealShare:
+    """Of sums over all episodes, within [0, 1].
+
+    Raises:
+        ValueError: they are not of the same tasks and seeds.
+    """
+    told = [{(t.task, t.seed): t.outcome for t in traces} for traces in (alone, acted, ideal)]
+    if not told[0] or any(outcomes.keys() != told[0].keys() for outcomes in told):
+        raise ValueError("every episode of the reflex needs its twins with the policy alone and the ideal reflex")
+
+    def share(measured: Callable[[InterventionOutcome], float]) -> float:
+        none, some, most = (float(np.nansum([measured(o) for o in outcomes.values()])) for outcomes in told)
+        return float(np.clip((some - none) / (most - none), 0.0, 1.0)) if most != none else math.nan
+
+    def gained(measured: Callable[[InterventionOutcome], float], sign: float) -> float:
+        none, most = (sum(sign * measured(o) for o in outcomes.values()) for outcomes in (told[0], told[2]))
+        return share(measured) if most > none else math.nan
+
+    return IdealShare(
+        gained(lambda o: float(o.success), 1.0),
+        gained(lambda o: o.external_force, -1.0),
+        gained(lambda o: o.impulse, -1.0),
+    )

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.evaluation.contact import ContactForce
+
 Floats = NDArray[np.floating[Any]]
 
 NOMINAL = "nominal"
@@ -18,6 +20,9 @@ NOMINAL = "nominal"
 
 POLICY_ALONE = "policy alone"
 """The acting in which the monitor only watches."""
+
+IDEAL = "ideal"
+"""The acting in which a reflex is told of the fault, and senses that would be at fault are not."""
 
 
 def spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -36,6 +41,9 @@ class InterventionOutcome(NamedTuple):
         external_force: the greatest external force on an arm since the onset [N].
         impulse: its time integral since the onset [N s].
         acted_s: time in which the reflex acted [s].
+        contact: the greatest force of the first contact since the onset: at first, and after half a second.
+        cause: the family of causes that was named at the first alarm since the onset; empty without one.
+        part: the part that was named with it.
     """
 
     success: bool = False
@@ -44,6 +52,9 @@ class InterventionOutcome(NamedTuple):
     external_force: float = math.nan
     impulse: float = math.nan
     acted_s: float = 0.0
+    contact: ContactForce = ContactForce(0.0, 0.0)
+    cause: str = ""
+    part: str = ""
 
 
 @dataclass(frozen=True, eq=False)

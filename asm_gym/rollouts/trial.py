@@ -18,7 +18,8 @@ import numpy as np
 import asm_gym  # noqa: F401  (registers the environments in every worker)
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.episodes import Episode, EpisodeLabel, save_episode
-from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, InterventionOutcome, Trace, TraceDetail
+from asm_gym.evaluation.contact import contact_force
+from asm_gym.evaluation.trace import IDEAL, NOMINAL, POLICY_ALONE, InterventionOutcome, Trace, TraceDetail
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.anywhere import faults_anywhere, sigmas
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
@@ -81,7 +82,8 @@ class Trial:
         severity: of a fault of the suite.
         onset: when it begins [steps]; by default drawn from the seed, in the first half of the episode.
         faults: what goes wrong, in place of what ``kind`` names.
-        acting: ``"policy alone"``, or what ``on_alarm`` takes.
+        acting: ``"policy alone"``, ``"ideal"`` for a reflex that is told what is wrong and when, or what ``on_alarm``
+            takes.
         after_s: where to leave the episode, counted from the onset [s]; at its end by default.
     """
 
@@ -109,7 +111,7 @@ class Trial:
     @property
     def on_alarm(self) -> str:
         """What the safety wrapper is told."""
-        return "monitor" if self.acting == POLICY_ALONE else self.acting
+        return "monitor" if self.acting in (POLICY_ALONE, IDEAL) else self.acting
 
     def begins(self, env: gym.Env[Any, Any]) -> int:
         """When in ``env`` something goes wrong, or would [steps]."""

@@ -1,0 +1,212 @@
+"""What is done follows from what is wrong, by a table that a user can edit; whatever fails, the robot holds."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from asm_gym.policies.reflexes import Graded
+from asm_gym.wrappers import NeuralASMSafety
+from asm_gym.wrappers.arbitration import Arbiter
+from asm_gym.wrappers.arguments import make_fallback
+from asm_gym.wrappers.patience import Patience
+from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, responses_from
+from tests.fakes import CueMonitor, FakeEnv
+from tests.test_completion import Arm, Judge, offset
+
+ACT = np.array([0.5, -0.5], np.float32)
+
+
+class Acting(Arm):
+    """Keeps the actions it was given."""
+
+    def reset(self, **kwargs):
+        self.actions = []
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        self.actions.append(np.array(action))
+        return super().step(action)
+
+
+def infos(env, steps):
+    env.reset(seed=0)
+    return [env.step(ACT)[4]["asm"] for _ in range(steps)]
+
+
+def test_every_cause_has_a_response_and_every_response_is_known():
+    assert set(DEFAULT) == set(CAUSES)
+    assert set(DEFAULT.values()) <= set(RESPONSES)
+    assert responses_from({"contact": "retract"}) == {**DEFAULT, "contact": "retract"}
+    assert DEFAULT["contact"] != "retract"
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"weather": "hold"}, "weather.*lasting contact"),
+        ({"contact": "dance"}, "dance.*yield"),
+        (["hold"], "must map causes to responses"),
+    ],
+)
+def test_unknown_names_in_a_table_are_refused_with_the_known_ones(table, message):
+    with pytest.raises(ValueError, match=message):
+        NeuralASMSafety(FakeEnv(), CueMonitor(), on_alarm="graded", responses=table)
+
+
+def test_a_table_is_that_of_graded_alone():
+    with pytest.raises(ValueError, match="responses are those of on_alarm='graded', got on_alarm='hold'"):
+        NeuralASMSafety(FakeEnv(), CueMonitor(), on_alarm="hold", responses={})
+
+
+@pytest.mark.parametrize(("family", "response"), [("contact", "hold"), ("object", "go on"), ("command", "hold")])
+def test_what_is_done_follows_from_the_cause(family, response):
+    env = NeuralASMSafety(Acting(), Judge({10}, family), on_alarm="graded", release_after=2)
+    said = infos(env, 20)
+    assert said[10]["response"] == response
+    assert said[10]["cause"]["family"] == {"command": "action"}.get(family, family)
+    assert said[10]["cause"]["probability"] > 0.9
+    assert sum(said[10]["cause"]["probabilities"].values()) == pytest.approx(1.0)
+    held = [t for t, a in enumerate(env.unwrapped.actions) if not np.array_equal(a, ACT)]
+    assert held == ([11, 12] if response == "hold" else [])
+    assert said[9]["response"] == ""
+    assert said[9]["cause"]["family"] == ""
+
+
+def test_a_table_of_ones_own_is_followed():
+    env = NeuralASMSafety(Acting(), Judge({10}, "contact"), on_alarm="graded", responses={"contact": "go on"})
+    said = infos(env, 20)
+    assert said[10]["transition"] == "go on"
+    assert not any(s["intervened"] for s in said)
+
+
+def test_stopping_holds_for_half_a_second_and_ends_the_episode():
+    env = NeuralASMSafety(Acting(), Judge(range(10, 99), "joint"), on_alarm="graded", responses={"actuator": "stop"})
+    env.reset(seed=0)
+    outs = []
+    while not outs or not (outs[-1][2] or outs[-1][3]):
+        outs.append(env.step(ACT))
+    assert len(outs) == 11 + 10
+    assert outs[-1][4]["asm"]["gave_up"]
+    assert outs[-1][4]["asm"]["cause"]["family"] == "actuator"
+
+
+def test_a_contact_that_lasts_is_answered_as_one():
+    table = {"contact": "go on", "lasting contact": "hold"}
+    env = NeuralASMSafety(Acting(), Judge(range(10, 99), "contact"), on_alarm="graded", responses=table)
+    said = infos(env, 35)
+    assert [s["response"] for s in said[10:30]] == ["go on"] * 20
+    assert said[30]["response"] == "hold"
+
+
+def test_a_sensor_at_fault_is_completed_and_the_policy_goes_on():
+    env = NeuralASMSafety(Acting(offset), Judge({21}, "sensor"), on_alarm="graded")
+    said = infos(env, 40)
+    assert said[21]["transition"] == "complete"
+    assert said[21]["completed"] == ("observation[0]",)
+    assert not any(s["intervened"] for s in said)
+
+
+def test_a_sensor_that_is_completed_already_and_surprises_still_is_held(monkeypatch):
+    env = NeuralASMSafety(Acting(offset), Judge({21, 30}, "sensor"), on_alarm="graded", release_after=2)
+    diagnosis = env.monitor.diagnosis_
+    same = diagnosis.hypotheses[0]
+    monkeypatch.setattr(type(diagnosis), "_named", lambda *_: same)
+    assert [s["response"] for s in infos(env, 40) if s["response"]] == ["complete", "hold"]
+
+
+def test_where_nothing_is_left_to_check_by_the_robot_holds_and_says_so():
+    def silent(t, row):
+        row[4] = np.nan if t >= 10 else row[4]  # what nothing else tells of
+
+    env = NeuralASMSafety(Acting(silent), Judge(()), on_alarm="graded")
+    with pytest.warns(UserWarning, match=r"nothing else has told of observation\[4\] for too long"):
+        said = infos(env, 40)
+    assert not any(s["intervened"] for s in said[:30])
+    assert all(s["intervened"] for s in said[32:])
+    assert "nothing else has told" in said[-1]["failure"]
+
+
+def test_all_senses_lost_is_held():
+    def blind(t, row):
+        row[:] = np.nan if t >= 10 else row
+
+    class Careful(Judge):
+        def observe(self, state, stream):
+            state, surprise = super().observe(state, stream)
+            return state, surprise._replace(value=np.where(np.isfinite(stream).all(axis=1), 0.1, np.inf))
+
+    said = infos(NeuralASMSafety(Acting(blind), Careful(()), on_alarm="graded"), 20)
+    assert all(s["intervened"] for s in said[10:])
+    assert said[-1]["cause"]["family"] == "unknown"
+
+
+def test_a_diagnosis_that_raises_is_answered_as_the_unknown_is():
+    monitor = Judge({10}, "object")
+    object.__setattr__(monitor.diagnosis_, "readout", lambda evidence: 1 / 0)
+    env = NeuralASMSafety(Acting(), monitor, on_alarm="graded", release_after=2)
+    with pytest.warns(UserWarning, match="diagnosis: ZeroDivisionError"):
+        said = infos(env, 20)
+    assert (said[10]["cause"]["family"], said[10]["response"]) == ("unknown", "hold")
+    assert [s["intervened"] for s in said[10:14]] == [False, True, True, False]
+
+
+def test_a_completion_that_raises_loses_the_row_and_not_the_guard(monkeypatch):
+    env = NeuralASMSafety(Acting(offset), Judge({21}, "sensor"), on_alarm="graded")
+    monkeypatch.setattr(env._responder.repair, "read", lambda row: 1 / 0)
+    with pytest.warns(UserWarning, match="completion: ZeroDivisionError"):
+        infos(env, 2)
+
+
+def test_a_monitor_without_a_diagnosis_is_held_and_its_causes_are_unknown():
+    env = NeuralASMSafety(FakeEnv(), CueMonitor([2]), on_alarm="graded", release_after=2)
+    env.reset(seed=0)
+    said = [env.step(np.ones(3, np.float32))[4]["asm"] for _ in range(6)]
+    assert said[2]["cause"]["family"] == "unknown"
+    assert [s["intervened"] for s in said] == [False] * 3 + [True, True, False]
+
+
+def test_a_cause_is_named_whatever_is_done_about_it():
+    env = NeuralASMSafety(Acting(offset), Judge({21}, "sensor"), on_alarm="hold", release_after=2)
+    said = infos(env, 30)
+    assert said[21]["cause"]["family"] == "sensor"
+    assert said[21]["response"] == ""
+    assert said[21]["completed"] == ()
+    assert [s["intervened"] for s in said[21:25]] == [False, True, True, False]
+
+
+def test_going_slowly_halves_what_moves_the_arm_and_keeps_the_grip():
+    env = gym.make("asm_gym/Lift-v0", horizon=10)
+    reflex = Graded(env)
+    arbiter = Arbiter(reflex, 1.0, Patience(release_after=2), make_fallback(env), env.action_space)
+    action = np.array([0.4, 0, 0, 0, 0.2, 0, -1], np.float32)
+    row = np.zeros(env.unwrapped.stream_spec.size)
+    assert arbiter.decide(2.0, row, action, response="slow").transition == "slow"
+    np.testing.assert_allclose(arbiter.command(action, None).action, [0.2, 0, 0, 0, 0.1, 0, -1])
+    assert arbiter.decide(0.0, row, action).intervened  # what was done was not the policy's
+    assert arbiter.decide(0.0, row, action).transition == "release"
+    np.testing.assert_array_equal(arbiter.command(action, None).action, action)
+    env.close()
+
+
+def test_control_goes_back_soon_once_a_contact_is_over():
+    env = FakeEnv()
+    arbiter = Arbiter(Graded(env), 1.0, Patience(release_after=10), make_fallback(env), env.action_space)
+    act, row = np.ones(3, np.float32), np.zeros(5)
+    assert arbiter.decide(2.0, row, act, response="hold").transition == "override"
+    said = [arbiter.decide(0.9, row, act, over=True).transition for _ in range(3)]
+    assert said == ["", "", "release"]
+
+
+def test_the_force_of_a_push_is_found_where_it_pushes():
+    mujoco = pytest.importorskip("mujoco")
+    env = gym.make("asm_gym/Lift-v0", horizon=20)
+    env.reset(seed=0)
+    inner = env.unwrapped
+    model, data = inner.simulation.model, inner.simulation.data
+    body, force = model.body("robot0_link5").id, np.array([3.0, -8.0, 5.0])
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
+    link, found = inner.force_behind(jacobian[:, inner.simulation._dofs].T @ force)
+    assert link == "robot0_link5"
+    np.testing.assert_allclose(found, force, atol=0.5)
+    env.close()
