@@ -7,9 +7,10 @@ import re
 import numpy as np
 import pytest
 
-from asm_gym.evaluation.intervention import compare
+from asm_gym.evaluation.contact import ContactForce, contact_force, within_limits
+from asm_gym.evaluation.intervention import compare, share_of_ideal
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, InterventionOutcome, Trace
-from asm_gym.rollouts.trial import PASSING
+from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, staged
 from asm_gym.scripts.evaluate import main as evaluate
 from asm_gym.scripts.reproduce.reflexes import Args, main, trials
 
@@ -44,11 +45,48 @@ def test_what_is_no_pair_is_refused():
 def test_every_reflex_has_the_twin_of_the_policy_alone():
     args = Args(tasks=("Lift", "Door"), reflexes=("hold", "retract"), faults=(NOMINAL, PASSING), episodes=3)
     made = trials(args)
-    assert len(set(made)) == len(made) == 2 * 2 * 3 * 3
+    assert len(set(made)) == len(made) == 2 * 2 * 3 * 4
     seeds = {(b.task, b.acting): set() for b in made}
     for b in made:
         seeds[b.task, b.acting].add(b.seed)
     assert all(seeds["Lift", r] == seeds["Lift", POLICY_ALONE] for r in ("hold", "retract"))
+
+
+def test_a_share_of_the_ideal_reflexs_gain_is_between_none_and_all():
+    alone = [trace(n, POLICY_ALONE, external_force=40.0, impulse=8.0, success=n < 2) for n in range(4)]
+    ideal = [trace(n, "ideal", external_force=20.0, impulse=8.0) for n in range(4)]
+    acted = [trace(n, "graded", external_force=25.0, impulse=1.0, success=n < 3) for n in range(4)]
+    share = share_of_ideal(alone, acted, ideal)
+    assert (share.success, share.peak) == (0.5, 0.75)
+    assert math.isnan(share.impulse)  # there is nothing to gain
+    assert share_of_ideal(alone, alone, ideal).peak == 0.0
+    assert share_of_ideal(alone, ideal, ideal).peak == 1.0
+    with pytest.raises(ValueError, match="twins"):
+        share_of_ideal(alone, acted[1:], ideal)
+
+
+def test_a_contact_is_transient_for_half_a_second():
+    forces = np.array([0.0, 0.5, 250.0, *[100.0] * 9, 120.0, 90.0])
+    assert contact_force(forces, 0.05) == ContactForce(250.0, 120.0)
+    assert contact_force(np.zeros(5), 0.05) == ContactForce(0.0, 0.0)
+    found = within_limits([ContactForce(250, 120), ContactForce(250, 150), ContactForce(290, 10)], "hand")
+    assert (found.k, found.n) == (1, 3)
+    with pytest.raises(ValueError, match=r"tail.*hand"):
+        within_limits([], "tail")
+
+
+def test_the_ideal_reflex_stays_while_something_touches_and_is_told_no_lies():
+    collision, biased = (
+        Trial("asm_gym/Lift-v0", 3, kind, "strong", onset=20, acting="ideal") for kind in ("collision", "encoder_bias")
+    )
+    with staged(collision, RolloutConfig()) as env:
+        env.reset(seed=3)
+        act = np.array([0.3, 0, 0, 0, 0, 0, 1], np.float32)
+        spec = env.unwrapped.stream_spec
+        done = [env.step(act)[4]["stream"][spec.slices["action"]][0] for _ in range(45)]
+    np.testing.assert_allclose(done, [0.3] * 20 + [0.0] * 20 + [0.3] * 5)
+    with staged(biased, RolloutConfig()) as env:
+        assert "FaultInjection" not in str(env)
 
 
 @pytest.mark.parametrize(
@@ -79,9 +117,9 @@ def test_it_runs_on_what_an_evaluation_has_recorded(tmp_path):
     where = ["--run", str(tmp_path / "run"), "--out", str(tmp_path / "out")]
     assert main([*how, *where, "--episodes", "2", "--false-alarm-rate", "0.05"]) == 0
     made = json.loads((tmp_path / "out" / "reactions.json").read_text())["episodes"]
-    assert len(made) == 2 * 2 * 4
+    assert len(made) == 2 * 2 * 5
     for one in made:
         assert one["acting"] != POLICY_ALONE or one["acted_s"] == 0
         assert one["fault"] == "nominal" or one["peak_force"] > 0
         assert math.isfinite(one["impulse"])
-    assert (tmp_path / "out" / "reactions.md").read_text().count("\n| ") == 2 + 2 * 3
+    assert (tmp_path / "out" / "reactions.md").read_text().count("\n| ") == 2 + 2 * 4

@@ -1,4 +1,4 @@
-"""The best that acting on a contact could do: a reflex that is told when something touches the arm, and for how long."""
+"""The best that acting on a contact could do: a reflex that is told when something touches the arm."""
 
 from __future__ import annotations
 

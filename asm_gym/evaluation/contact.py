@@ -1,9 +1,9 @@
 """How contacts compare with what ISO/TS 15066 lets a robot do to a person.
 
-Sources: ISO/TS 15066:2016, Table A.2, now in ISO 10218-2:2025: the largest permissible forces of a quasi-static contact,
-by the region of the body, and twice that for a transient one, that is within 0.5 s; for the head no transient one is
-given. A comparison of forces in a simulation, and no claim of conformity, which asks for pressure and for measurements
-on the real robot as well.
+Source: ISO/TS 15066:2016, Table A.2, now in ISO 10218-2:2025: the largest permissible forces of a quasi-static
+contact, by the region of the body, and twice that for a transient one, that is within 0.5 s; for the head no transient
+one is given. A comparison of forces in a simulation, and no claim of conformity, which asks for pressure and for
+measurements on the real robot as well.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ QUASI_STATIC = {
 """The largest permissible force on each region [N]."""
 
 TRANSIENT = 2.0
-"""Times as much is permissible within the first ``TRANSIENT_S``."""
+"""Times as much is permissible within the first ``TRANSIENT_S``, except on the head."""
+
+HEAD = ("skull", "face")
 
 TRANSIENT_S = 0.5
 """How long a contact counts as transient [s]."""
@@ -67,5 +69,5 @@ def within_limits(contacts: Sequence[ContactForce], region: str = "hand") -> Sha
         ValueError: an unknown region; the message lists those that exist.
     """
     check_choice("region of the body", region, QUASI_STATIC)
-    limit = QUASI_STATIC[region]
-    return Share.of([c.transient <= TRANSIENT * limit and c.lasting <= limit for c in contacts])
+    limit, more = QUASI_STATIC[region], 1.0 if region in HEAD else TRANSIENT
+    return Share.of([c.transient <= more * limit and c.lasting <= limit for c in contacts])

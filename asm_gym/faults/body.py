@@ -220,3 +220,8 @@ class HeldByPerson(_OnBody):
 
         with _force_field(env, body, force):
             yield apply
+
+
+def touches_body(fault: Fault) -> bool:
+    """Whether it acts on the robot's body from outside."""
+    return isinstance(fault, _OnBody)

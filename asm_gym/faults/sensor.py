@@ -259,3 +259,8 @@ class FrozenEncoder(Fault):
 
     def holds(self, env: RobosuiteEnv) -> frozenset[str]:
         return self.labels(env)
+
+
+def corrupts_senses(fault: Fault) -> bool:
+    """Whether it changes what is measured, and nothing that happens."""
+    return isinstance(fault, SensorFault | FrozenEncoder)

@@ -22,6 +22,8 @@ from asm_gym.evaluation.contact import contact_force
 from asm_gym.evaluation.trace import IDEAL, NOMINAL, POLICY_ALONE, InterventionOutcome, Trace, TraceDetail
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.anywhere import faults_anywhere, sigmas
+from asm_gym.faults.body import touches_body
+from asm_gym.faults.sensor import corrupts_senses
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
 from asm_gym.monitors import Monitor, NeuralASM
 from asm_gym.policies import Policy, Seeded, make_policy, rollout
@@ -31,6 +33,7 @@ from asm_gym.stream import control_period
 from asm_gym.tasks import env_id
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder
 from asm_gym.wrappers.faults import FaultyInterface
+from asm_gym.wrappers.ideal import IdealReflex
 
 Settings = tuple[tuple[str, Any], ...]
 """Arguments by name, in an order of their own."""
@@ -189,12 +192,15 @@ def staged(trial: Trial, config: RolloutConfig, env: gym.Env[Any, Any] | None = 
     """``env``, or this process's environment, in which the trial's faults happen; they are undone in the end."""
     base = environment(trial.env_id, config.settings) if env is None else env
     faults = trial.faults_in(base, config)
+    if trial.acting == IDEAL:
+        faults = tuple(fault for fault in faults if not corrupts_senses(fault))
     if not faults:
         yield base
         return
     faulty = FaultInjection(base, faults)
+    touching = [fault for fault in faults if touches_body(fault)] if trial.acting == IDEAL else []
     try:
-        yield faulty
+        yield IdealReflex(faulty, touching) if touching else faulty
     finally:
         faulty.undo_faults()  # the next trial has wrappers of its own around the same environment
 
@@ -231,7 +237,7 @@ def guarded(
     env: gym.Env[Any, Any], monitor: Monitor, trial: Trial, max_override_s: float | None = None
 ) -> gym.Env[Any, Any]:
     """``env`` under the safety wrapper, which acts as the trial says."""
-    limited = max_override_s is not None and trial.acting != POLICY_ALONE
+    limited = max_override_s is not None and trial.acting not in (POLICY_ALONE, IDEAL)
     steps = max(1, round((max_override_s or 0.0) / control_period(env))) if limited else None
     return NeuralASMSafety(env, monitor, on_alarm=trial.on_alarm, max_override=steps, on_overrun="ignore")
 
@@ -279,6 +285,7 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> Trace:
     def felt(name: str, since: int) -> list[float]:
         return [info.get(name, math.nan) for info in infos[since:]]
 
+    named = next((a["cause"] for a in asm[began:] if a["cause"]["family"]), asm[0]["cause"])
     trace = Trace(
         kind=trial.kind,
         severity=trial.severity,
@@ -296,6 +303,9 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> Trace:
             external_force=float(np.nanmax(felt("external_force", began), initial=0.0)),
             impulse=float(np.nansum(felt("external_impulse", began))),
             acted_s=sum(a["intervened"] for a in asm) * dt,
+            contact=contact_force(np.array(felt("external_force", began)), dt),
+            cause=named["family"],
+            part=named["part"],
         ),
         detail=TraceDetail(attribution, monitor.spec.labels, fault),
     )

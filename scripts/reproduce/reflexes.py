@@ -9,20 +9,23 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import tyro
 from rich.console import Console
 
 from asm_gym.choices import check_choice
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
-from asm_gym.evaluation.intervention import Comparison, compare
+from asm_gym.evaluation.contact import QUASI_STATIC, within_limits
+from asm_gym.evaluation.intervention import Comparison, IdealShare, compare, share_of_ideal
+from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table, console_table, markdown
-from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace
+from asm_gym.evaluation.trace import IDEAL, NOMINAL, POLICY_ALONE, Trace
 from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.benchmark import fitted
@@ -63,6 +66,8 @@ class Args:
     """Nominal episodes of each task to learn from, with a monitor_freq."""
     calibration_episodes: int = 60
     """Other nominal episodes of each task, to calibrate on."""
+    region: str = "hand"
+    """Region of a person's body by whose permissible forces contacts are judged."""
     max_override_s: float = 3.0
     """How long a reflex may act at a stretch before the episode is ended [s]."""
     false_alarm_rate: float = 0.01
@@ -79,6 +84,7 @@ class Args:
             task_spec(task)
         for name in self.reflexes:
             check_choice("reflex", name, ON_ALARM)
+        check_choice("region of the body", self.region, QUASI_STATIC)
         for name in self.faults:
             check_choice("fault", name, (NOMINAL, PASSING, *KINDS))
         for name in ("episodes", "fit_episodes", "calibration_episodes"):
@@ -133,24 +139,40 @@ def trials(args: Args) -> list[Trial]:
         for task in args.tasks
         for fault in args.faults
         for seed in role_seeds(args.seed, task, "react", args.episodes)
-        for acting in (POLICY_ALONE, *args.reflexes)
+        for acting in (POLICY_ALONE, IDEAL, *args.reflexes)
     ]
 
 
-def comparisons(traces: Sequence[Trace], args: Args) -> list[Comparison]:
+class Measured(NamedTuple):
+    """What became of one reflex under one fault, over all tasks."""
+
+    comparison: Comparison
+    ideal: IdealShare
+    harmless: Share  # contacts within the limits
+    named: Counter[str]  # families of causes at the first alarm
+
+
+def comparisons(traces: Sequence[Trace], args: Args) -> list[Measured]:
     """Each reflex under each fault, over all tasks."""
 
     def of(fault: str, acting: str) -> list[Trace]:
         return [t for t in traces if (t.kind, t.acting) == (fault, acting)]
 
-    return [compare(of(f, POLICY_ALONE), of(f, r), args.seed) for f in args.faults for r in args.reflexes]
+    def measured(fault: str, reflex: str) -> Measured:
+        alone, acted = of(fault, POLICY_ALONE), of(fault, reflex)
+        ideal = share_of_ideal(alone, acted, of(fault, IDEAL))
+        named = Counter(t.outcome.cause for t in acted if t.outcome.cause)
+        contacts = within_limits([t.outcome.contact for t in acted], args.region)
+        return Measured(compare(alone, acted, args.seed), ideal, contacts, named)
+
+    return [measured(fault, reflex) for fault in args.faults for reflex in (*args.reflexes, IDEAL)]
 
 
-def table(found: Sequence[Comparison], args: Args) -> Table:
+def table(found: Sequence[Measured], args: Args) -> Table:
     """A row for each fault and reflex."""
     headings = (
         *("Fault", "Reflex", "Success", "alone", "gained", "Peak force less by", "Impulse less by"),
-        *("In alarm [s]", "Ended", "Median delay [ms]"),
+        *("Of the ideal reflex's", "Within limits", "In alarm [s]", "Ended", "Median delay [ms]", "Cause named"),
     )
     rows = [
         (
@@ -161,16 +183,23 @@ def table(found: Sequence[Comparison], args: Args) -> Table:
             c.gained.percent(),
             c.peak.percent() if c.kind != NOMINAL else "",
             c.impulse.percent() if c.kind != NOMINAL else "",
+            " / ".join("" if math.isnan(share) else f"{share:.2f}" for share in asdict(m.ideal).values()),
+            f"{m.harmless.k} of {m.harmless.n}",
             f"{c.alarm_s:.2f}",
             f"{c.ended.k} of {c.ended.n}",
             "" if c.kind == NOMINAL else f"{c.median_delay_ms:.0f}" if math.isfinite(c.median_delay_ms) else "missed",
+            ", ".join(f"{family} {n}" for family, n in m.named.most_common(3)),
         )
-        for c in found
+        for m in found
+        for c in (m.comparison,)
     ]
     return Table(
         f"Reflexes against the policy alone, paired by seed, {args.episodes} episodes of each of "
         f"{', '.join(args.tasks)}; force on the arm from outside since the onset; in brackets 95 % bootstrap "
-        "intervals.",
+        "intervals. The ideal reflex is told of the fault: it stays from the first physics substep of a contact to its "
+        "end, and its senses are never at fault. Shares of what it gains are of success / peak / impulse, from the "
+        "policy alone (0) to it (1). Within limits: contacts under the forces of ISO/TS 15066 for the "
+        f"{args.region}, which is no claim of conformity.",
         headings,
         rows,
     )
@@ -190,6 +219,9 @@ def _row(trace: Trace) -> dict[str, Any]:
         "acted_s": trace.outcome.acted_s,
         "delay_ms": None if trace.delay is None else 1e3 * trace.delay,
         "ended": trace.outcome.ended_by_alarm,
+        "contact": list(trace.outcome.contact),
+        "cause": trace.outcome.cause,
+        "part": trace.outcome.part,
     }
 
 
