@@ -23,7 +23,7 @@ from asm_gym.columns import as_array, read_table
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.timing import noise_of, period, regular
 
-__all__ = ["TIME", "label_of", "read_table", "stream_of"]
+__all__ = ["TIME", "bare_name", "label_of", "read_table", "stream_of"]
 
 Column = NDArray[Any]
 
@@ -136,12 +136,17 @@ def _alike(dt: float, other: float) -> bool:
     return abs(dt / other - 1) <= RATE_TOLERANCE
 
 
+def bare_name(column: str) -> str:
+    """What a column is called without its unit."""
+    found = _UNIT.fullmatch(column)
+    return found["name"] if found else column
+
+
 def _without_units(columns: Mapping[str, Column]) -> tuple[dict[str, Column], dict[str, str]]:
     """Columns by their bare names, and the unit of each that says one."""
     bare, units = {}, {}
     for name, column in columns.items():
-        found = _UNIT.fullmatch(name)
-        short = found["name"] if found else name
+        found, short = _UNIT.fullmatch(name), bare_name(name)
         if short in bare:
             raise ValueError(f"columns must have different names, got {short!r} twice")
         bare[short] = column

@@ -1,13 +1,13 @@
 """Says when a recording is surprising, where, and how much; or watches rows as they come.
 
-A recording gives a table, figures and a report. With - as the source, JSON lines are read from standard input: a list
-of numbers, or an object by channel, one a row; every alarm is printed as it is raised. Exit code 1: there was an alarm.
+A recording gives a table, figures and a report. A live source is - for standard input, tail:FILE for a file that grows,
+or udp:PORT for datagrams from this machine: JSON lines (a list of numbers, or an object by channel, one a row), or CSV
+with a header; every alarm is printed as it is raised, in constant memory. Exit code 1: there was an alarm.
 """
 
 from __future__ import annotations
 
 import csv
-import json
 import math
 import sys
 import time
@@ -21,7 +21,6 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 from rich.console import Console
 
 from asm_gym.checks import check_number
@@ -29,12 +28,12 @@ from asm_gym.evaluation import figures
 from asm_gym.evaluation.report import write_report
 from asm_gym.evaluation.tables import Table
 from asm_gym.evaluation.trace import Trace, TraceDetail, spans
+from asm_gym.live import RowReader, SourceDied, is_live, lines_from
 from asm_gym.logs import Layout, Log, read_logs
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 from asm_gym.stream import StreamSpec
-from asm_gym.tables import label_of
 
 AT_ONCE = 64
 """Episodes scored side by side."""
@@ -51,18 +50,21 @@ class Args:
     """Watches a recording, or rows as they come."""
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """What asm-gym fit reads; or - for JSON lines on standard input."""
+    """What asm-gym fit reads; or what is live: -, tail:FILE or udp:PORT."""
     monitor: Annotated[Path, tyro.conf.arg(metavar="FILE.asm")]
     """A calibrated monitor, such as asm-gym fit writes."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/watch")
     """Folder of the table, the figures and the report of a recording."""
     rate: float | None = None
     """Rows of logs a second [Hz]; by default their column called time says it, or else the memory."""
+    silence: float = 2.0
+    """Seconds without a row after which a live source has died, which is an alarm."""
     figures: int = 4
     """How many of the most surprising episodes are drawn."""
 
     def __post_init__(self) -> None:
         check_number("figures", self.figures, low=1, whole=True)
+        check_number("silence", self.silence, above=0)
         if self.rate is not None:
             check_number("rate", self.rate, above=0)
 
@@ -169,32 +171,6 @@ def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Trac
     )
 
 
-def row_of(line: str, number: int, spec: StreamSpec) -> NDArray[np.float64]:
-    """The numbers (D,) of a JSON line; NaN where one was lost. Raises ValueError where it is no row."""
-    try:
-        said: Any = json.loads(line)
-        row = _by_name(said, number, spec) if isinstance(said, dict) else np.asarray(said, np.float64)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"line {number} is no row of numbers: {error}") from error
-    if row.shape != (spec.size,):
-        raise ValueError(f"line {number} must hold {spec.size} numbers, got the shape {row.shape}")
-    return row
-
-
-def _by_name(said: dict[str, Any], number: int, spec: StreamSpec) -> NDArray[np.float64]:
-    """The numbers (D,) by the names of channels or of single numbers; the first row has to hold them all."""
-    parts, missing = [], []
-    said = {label_of(name): value for name, value in said.items()} | said
-    for channel in spec.channels:
-        values = said[channel.name] if channel.name in said else [said.get(label) for label in channel.labels]
-        if channel.name not in said and not set(channel.labels) <= set(said):
-            missing.append(channel.name)
-        parts.append(np.ravel(np.asarray(values, np.float64)))  # null is NaN
-    if missing and number == 1:
-        raise ValueError(f"it lacks {', '.join(missing)}")
-    return np.concatenate(parts)
-
-
 def follow(lines: Iterable[str], monitor: Any, console: Console) -> int:
     """Watches rows as they come, in constant memory: prints every alarm as it is raised."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
@@ -204,27 +180,30 @@ def follow(lines: Iterable[str], monitor: Any, console: Console) -> int:
     latencies: deque[float] = deque(maxlen=LATENCIES)
     rows = alarms = 0
     before = False
-    for line in lines:
-        if not line.strip():
-            continue
-        start = time.perf_counter()
-        rows += 1
-        state, surprise = monitor.observe(state, row_of(line, rows, spec)[None])
-        value = float(surprise.value[0])
-        latencies.append(1e3 * (time.perf_counter() - start))
-        if value > monitor.threshold and not before:
-            alarms += 1
-            channel = spec.labels[int(np.argmax(surprise.attribution[0]))]
-            excess = value / monitor.threshold
-            say(
-                f"{rows * spec.dt:.3f} s  {channel}  {excess:.2f} thresholds  {latencies[-1]:.2f} ms after the row came"
-            )
-        before = value > monitor.threshold
+    try:
+        for (row, lost), came in RowReader(spec).rows(lines):
+            if lost:
+                state, _ = monitor.observe(state, np.full((1, spec.size), np.nan))
+                say(f"{(rows + 1) * spec.dt:.3f} s  {lost} row{'s' * (lost != 1)} lost: an alarm")
+                alarms += 1
+            rows += 1 + lost
+            state, surprise = monitor.observe(state, row[None])
+            value = float(surprise.value[0])
+            latencies.append(1e3 * (time.perf_counter() - came))
+            if value > monitor.threshold and not before:
+                alarms += 1
+                channel = spec.labels[int(np.argmax(surprise.attribution[0]))]
+                late = f"{latencies[-1]:.2f} ms after the row came"
+                say(f"{rows * spec.dt:.3f} s  {channel}  {value / monitor.threshold:.2f} thresholds  {late}")
+            before = value > monitor.threshold
+    except SourceDied as error:
+        alarms += 1
+        say(f"{rows * spec.dt:.3f} s  the source has died, {error}: an alarm")
     if not rows:
         raise ValueError("no row came")
-    median, late = np.percentile(latencies, [50, 99])
+    median, late_ms = np.percentile(latencies, [50, 99])
     counted = f"{rows} rows, {alarms} alarm{'s' * (alarms != 1)}"
-    say(f"{counted}; a row took {median:.2f} ms, 99 % of the newest under {late:.2f} ms")
+    say(f"{counted}; a row took {median:.2f} ms, 99 % of the newest under {late_ms:.2f} ms")
     return BAD_NEWS if alarms else DONE
 
 
@@ -233,7 +212,9 @@ def watch(args: Args, console: Console) -> int:
     monitor: Any = load_monitor(args.monitor)
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
-    return follow(sys.stdin, monitor, console) if args.source == "-" else review(args, monitor, console)
+    if is_live(args.source):
+        return follow(lines_from(args.source, sys.stdin, args.silence), monitor, console)
+    return review(args, monitor, console)
 
 
 def main(argv: list[str] | None = None) -> int:
