@@ -8,7 +8,7 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 
 from asm_gym.faults import Fault
-from asm_gym.policies.holding import Hold
+from asm_gym.policies.holding import Begun, Hold
 
 
 class IdealReflex(gym.Wrapper[Any, Any, Any, Any]):
@@ -22,6 +22,7 @@ class IdealReflex(gym.Wrapper[Any, Any, Any, Any]):
     def __init__(self, env: gym.Env[Any, Any], faults: Sequence[Fault]) -> None:
         super().__init__(env)
         self._faults, self._hold = tuple(faults), Hold(env)
+        self._state: Begun | None = None
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         self._steps, self._state = 0, None

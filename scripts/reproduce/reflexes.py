@@ -48,6 +48,8 @@ class Args:
 
     run: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
     """Folder of an evaluation, whose nominal episodes the memory learns from at the control rate."""
+    memory: Path | None = None
+    """A calibrated memory to watch with, in place of one that learns from the evaluation's recordings."""
     tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan", "Door")
     """Names of tasks; at the control rate the evaluation must have recorded them."""
     robot: str = "Panda"
@@ -90,6 +92,8 @@ class Args:
         for name in ("episodes", "fit_episodes", "calibration_episodes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.memory is not None and self.monitor_freq is not None:
+            raise ValueError("with a memory of its own no episodes are recorded: leave out monitor_freq")
         if not self.max_override_s > 0:
             raise ValueError(f"max_override_s must be > 0, got {self.max_override_s}")
 
@@ -239,9 +243,9 @@ def _react(args: Args, console: Console) -> Table:
     if args.monitor_freq is not None:
         with stage("recording", console, seconds) as progress:
             record_nominal(args, progress)
+    memory = args.out / "memory.asm"
     with stage("fitting and calibrating", console, seconds):
-        memory = args.out / "memory.asm"
-        learned_from(args).save(memory)
+        (learned_from(args) if args.memory is None else NeuralASM.load(args.memory)).save(memory)
     with stage("acting", console, seconds) as progress:
         run = partial(watch, config=args.config, memory=memory.resolve())
         traces = parallel_map(run, trials(args), args.parallel, progress)
