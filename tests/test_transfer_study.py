@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from asm_gym.episodes import Episode, EpisodeLabel
 from asm_gym.scripts.cli import main as asm_gym
-from asm_gym.scripts.reproduce import transfer
-from asm_gym.scripts.reproduce.transfer import ADAPTIVE, Args, Judge
+from asm_gym.scripts.reproduce import transfer_judge
+from asm_gym.scripts.reproduce.transfer import Args
+from asm_gym.scripts.reproduce.transfer_judge import ADAPTIVE, Judge
 from asm_gym.scripts.reproduce.transfer_report import alarmed, detection, drawn, per_hour, tables
 from asm_gym.scripts.reproduce.transfer_watched import KNOWN, POLICIES, Watched
 from asm_gym.stream import Channel, StreamSpec
@@ -54,7 +53,7 @@ OWN = {
 
 
 def test_healthy_episodes_are_counted_by_memory_group_and_success():
-    records = Judge(Args(), OWN, 0).records("m", Says(), (LIFT, SAC))
+    records = Judge(1.0, OWN, 0).records("m", Says(), (LIFT, SAC))
     assert alarmed(records, group=KNOWN, solved=True) == (1, 2)
     assert alarmed(records, group=POLICIES, solved=True) == (0, 2)
     assert alarmed(records, solved=False) == (1, 1)
@@ -74,20 +73,18 @@ def broken(policy):
 
 
 def test_faults_that_an_ideal_observer_could_see_are_looked_for_within_the_window():
-    judge = Judge(Args(window=1.0), broken(SAC), 0)
+    judge = Judge(1.0, broken(SAC), 0)
     (push,) = (r for r in judge.records("m", Says(), (SAC,)) if "found" in r)
     assert (push["kind"], push["found"], push["auroc"]) == ("push", True, 1.0)
     (push,) = (r for r in judge.records("m", Says(9.0), (SAC,)) if "found" in r)
     assert (push["found"], push["auroc"]) == (False, 1.0)
-    both = Judge(Args(window=2.0), broken(SAC), 0).records("m", Says(), (SAC,))
+    both = Judge(2.0, broken(SAC), 0).records("m", Says(), (SAC,))
     assert detection(both) == ("1.000", "100 % of 2")
 
 
 def test_a_running_threshold_goes_on_from_policy_to_policy():
-    args = replace(Args(), quick=True)
-    quick = args.watched
-    own = {quick[0]: [nominal(2.0, n) for n in range(3)], quick[1]: [nominal(1.2, n) for n in range(3)]}
-    records = Judge(args, own, 0).adaptive("m", Says())
+    own = {LIFT: [nominal(2.0, n) for n in range(3)], SAC: [nominal(1.2, n) for n in range(3)]}
+    records = Judge(1.0, own, 0).adaptive("m", Says())
     raised = np.exp(ADAPTIVE.step * (1 - ADAPTIVE.rate))
     assert [r["alarms"] for r in records] == [1, 1, 1, 0, 0, 0]
     assert records[1]["threshold"] == pytest.approx(raised)
@@ -96,17 +93,17 @@ def test_a_running_threshold_goes_on_from_policy_to_policy():
 
 def test_a_fault_that_shows_only_in_a_missing_sense_is_left_out():
     hidden, open_ = (episode(np.zeros(9), "faulty", affected=a) for a in (["b"], ["b", "a[0]"]))
-    assert not transfer._shows(hidden, {"b"})
-    assert transfer._shows(open_, {"b"})
-    assert transfer._shows(episode(np.zeros(9)), {"b"})
+    assert not transfer_judge._shows(hidden, {"b"})
+    assert transfer_judge._shows(open_, {"b"})
+    assert transfer_judge._shows(episode(np.zeros(9)), {"b"})
     spec = StreamSpec(SPEC.channels[1:], SPEC.dt)
-    cut = transfer._cut(episode([1.0, 2.0]), spec)
+    cut = transfer_judge._cut(episode([1.0, 2.0]), spec)
     assert cut.spec == spec
     assert cut.stream.shape == (2, 2)
 
 
 def test_tables_and_figure_have_a_row_and_a_point_for_each_memory():
-    judge = Judge(Args(), {LIFT: OWN[LIFT], SAC: [*OWN[SAC], *broken(SAC)[SAC]]}, 0)
+    judge = Judge(1.0, {LIFT: OWN[LIFT], SAC: [*OWN[SAC], *broken(SAC)[SAC]]}, 0)
     records = [*judge.records("of one policy", Says(), (LIFT, SAC)), *judge.records("gru", Says(9.0), (LIFT, SAC))]
     by_memory, by_policy, by_sense = tables(records, judge.records("without the wrist", Says(), (LIFT,)), Args())
     assert [row[0] for row in by_memory.rows] == ["of one policy", "gru"]
@@ -147,7 +144,7 @@ def test_twins_with_faults_share_the_seeds_of_healthy_episodes():
     [
         ({"without": ("Wipe",)}, "task to leave out"),
         ({"rivals": ("oracle",)}, "monitor"),
-        ({"lessons": 3}, "needs 33 episodes"),
+        ({"lessons": 3}, "needs 19 episodes"),
         ({"faults": ("ghost",)}, "kind of fault"),
         ({"nominal_episodes": 0}, "nominal_episodes"),
     ],

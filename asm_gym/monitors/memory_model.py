@@ -113,7 +113,7 @@ class MemoryModel(StreamModel):
         changes = np.ascontiguousarray(inputs[:, senses.changes])
         layout = senses.groups, senses.changes, self._units_each(senses)
         now = specialise(self.network.association, inputs, changes, *layout)
-        kept = {"mean", "spread", "change", "energy", *self.network.weights._fields}
+        kept = {"mean", "spread", "change", "energy", "moments", *self.network.weights._fields}
         return self.restore({**{n: a for n, a in self.learned_.items() if n in kept}, **now._asdict()})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
