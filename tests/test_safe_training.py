@@ -9,17 +9,20 @@ import pytest
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from asm_gym.episodes import Episode
+from asm_gym.episodes import Episode, save_episode
+from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.training.exploration import Explorer, Gentle, until_contact
 from asm_gym.rollouts.training.learners import NOVICE_LOG_STD, make_learner, make_novice
 from asm_gym.rollouts.training.outcome import COUNTED, TrainingOutcome, count
 from asm_gym.rollouts.training.safe_run import AT_LIMIT, read_outcome
 from asm_gym.rollouts.training.violations import TorqueWatch
 from asm_gym.scripts.cli import main
+from asm_gym.scripts.reproduce import safe_training
 from asm_gym.scripts.reproduce.training_report import counts_table, learning_figure, worth, worth_table
 from asm_gym.stream import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from tests.fakes import CueMonitor, FakeEnv
+from tests.streams import sine_episodes, sine_spec
 
 
 def outcome(condition="alone", seed=0, success=0.5, **counts):
@@ -179,6 +182,19 @@ def test_what_makes_no_sense_is_refused(arguments, message, tmp_path, capsys):
     assert main(["train-safely", *arguments, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_memory_that_is_there_already_watches_and_nothing_is_explored_for_it(tmp_path):
+    spec = sine_spec()
+    expert = [save_episode(tmp_path / f"{n}.npz", e) for n, e in enumerate(sine_episodes(18, 0, spec))]
+    body = tmp_path / "body.asm"
+    NeuralASM(spec, 8, 8, epochs=1).fit(sine_episodes(10, 1, spec)).calibrate(sine_episodes(9, 2, spec), 0.1).save(body)
+    args = safe_training.Args(memory=str(body), quick=True, out=tmp_path / "out").scaled()
+    found = safe_training.memories(args, safe_training.Recorded(expert, [], []))
+    assert list(found) == ["the body", "the expert"]  # the first watches
+    assert found["the body"] == body
+    with pytest.raises(FileNotFoundError):
+        safe_training.Args(memory=str(tmp_path / "nothing.asm"))
 
 
 @pytest.mark.slow
