@@ -1,8 +1,8 @@
 """A robot that notices when something is wrong: the whole safety loop on one robosuite task.
 
-Collects nominal episodes, fits and calibrates a Neural ASM, then runs nominal and faulty episodes with the policy
-alone and under the safety wrapper, paired by seed. Prints one table and writes a report, its plots, a video, the
-fitted memory and every figure as JSON.
+Shows first what the shipped memory of the body notices, with nothing fitted. Then collects nominal episodes, fits and
+calibrates a Neural ASM, and runs nominal and faulty episodes with the policy alone and under the safety wrapper, paired
+by seed. Prints one table and writes a report, its plots, a video, the fitted memory and every figure as JSON.
 """
 
 from __future__ import annotations
@@ -43,10 +43,11 @@ from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.trial import RolloutConfig, Trial, watch_pair
+from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged, watch_pair
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
 from asm_gym.scripts.command import run
 from asm_gym.tasks import task
+from asm_gym.wrappers import NeuralASMSafety
 
 WINDOW_S = 1.0
 """How soon after its onset a fault must be noticed to count as detected [s]."""
@@ -136,6 +137,36 @@ def trials(args: Args) -> list[Trial]:
         Trial(args.task, seed, name, faults=faulty, acting=args.on_alarm)
         for (name, faulty), seed in zip(cases, seeds, strict=True)
     ]
+
+
+def without_fitting(args: Args) -> str:
+    """What the shipped memory of the body makes of a healthy episode and of a push, before anything is learned.
+
+    Nothing where no shipped memory fits.
+    """
+    seed = episode_seeds(args.seed, 1, stage=3)[0]
+    push = Push(body="robot0_link5", newtons=20.0, direction=(0.0, 1.0, 0.0), onset=PUSHED_AT, duration=10)
+    surprises = []
+    for faults in ((), (push,)):
+        infos: list[dict[str, Any]] = []
+        with staged(Trial(args.task, seed, faults=faults), RolloutConfig()) as env:
+            try:
+                watched = NeuralASMSafety(env, on_alarm="monitor", on_overrun="ignore")
+            except ValueError:
+                return ""
+            play(Trial(args.task, seed), RolloutConfig(), watched, infos.append)
+            surprises.append(np.array([info["asm"]["surprise"] for info in infos]) / watched.threshold)
+    healthy, pushed = surprises
+    noticed = np.flatnonzero(pushed[PUSHED_AT:] > 1.0)
+    when = f"noticed after {1e3 * (noticed[0] + 1) * watched.monitor.spec.dt:.0f} ms" if len(noticed) else "not noticed"
+    return (
+        f"{watched.monitor!r} came with the package. In a healthy episode surprise reaches {healthy.max():.0%} of its "
+        f"threshold; a push of 20 N is {when}."
+    )
+
+
+PUSHED_AT = 40
+"""Step in which the arm is pushed before anything is learned."""
 
 
 def fit(args: Args, folder: Path, timed: Callable[[str], Any]) -> tuple[NeuralASM, Share]:
@@ -245,6 +276,9 @@ def demonstrate(args: Args, console: Console) -> None:
     seconds: dict[str, float] = {}
     timed = partial(stage, console=console, seconds=seconds)
 
+    with timed("watching without fitting"):
+        said = without_fitting(args)
+    console.print(said or f"No shipped memory fits {args.task}.", highlight=False)
     can_show = args.video and can_record_video(console)
     memory, expert = fit(args, folder, timed)
     todo = trials(args)

@@ -74,11 +74,23 @@ def test_an_arm_that_pauses_keeps_its_grip():
 
 def test_what_presses_twice_as_hard_as_the_undisturbed_expert_is_cut_out_with_what_is_near():
     calm = [lesson_of([5, 9, 0] * 20, [1, 2, 3] * 20, number=n) for n in (0, 4)]
-    hits = lesson_of([18] * 27 + [18.1] + [0] * 32, [6] * 60, noise=0.5, number=1)
-    at_stop = lesson_of([0] * 60, [6] * 22 + [6.1] + [0] * 37, noise=0.1, number=2)
-    found = healthy([*calm, hits, at_stop])
-    assert [len(e) for e in found.fit] == [60, 60, 23, 28]  # 4 steps, a fifth of a second, on either side
-    assert [len(e) for e in found.calibration] == [33]  # of 18 and 33 steps; fewer than 20 are not worth keeping
+    hits = lesson_of([18] * 27 + [18.1] + [0] * 32, [6] * 60, noise=0.1, number=1)
+    at_stop = lesson_of([0] * 60, [6] * 22 + [6.1] + [0] * 37, noise=0.1, number=3)
+    assert [len(e) for e in healthy([*calm, hits, at_stop, undisturbed()]).fit] == [60, 60, 23, 28, 33]
+
+
+def undisturbed(**about):
+    """A lesson to calibrate on."""
+    return replace(lesson_of([5, 9, 0] * 20, [1, 2, 3] * 20, number=2), **about)
+
+
+def test_a_threshold_is_set_on_solved_lessons_that_nothing_disturbed_and_that_press_as_usual():
+    learned = [lesson_of([9, 0] * 30, [3] * 60, number=n) for n in (0, 1, 3)]
+    hard = lesson_of([9] * 25 + [9.1] + [0] * 34, [3] * 60, number=5)
+    noisy = lesson_of([9] * 60, [3] * 60, noise=0.1, number=8)
+    found = healthy([*learned, undisturbed(), hard, noisy, undisturbed(success=False)])
+    assert [len(e) for e in found.calibration] == [60, 21, 30]
+    assert len(found.fit) == 3
 
 
 def test_forces_of_steps_cut_streams_of_many_rows_a_step():
@@ -97,11 +109,12 @@ def test_a_task_needs_a_solved_lesson_without_noise_and_something_must_be_left()
 
 
 def test_an_exam_pairs_every_fault_with_a_healthy_twin():
-    labels = Exam("Lift", "scripted", known=False).labels(episodes=3, faults=2, seed=5)
+    labels = Exam("Lift", "scripted", known=False).labels(3, ["push", "slip"], seed=5)
     nominal = [n for n in labels if n.role == "nominal"]
-    assert [n.seed for n in nominal] == [n.seed for n in Exam("Lift", "lift_sac", known=True).labels(3, 0, 5)]
+    assert [n.seed for n in nominal] == [n.seed for n in Exam("Lift", "lift_sac", known=True).labels(3, [], 5)]
     faulty = [n for n in labels if n.role == "faulty"]
-    assert {n.seed for n in faulty} == {n.seed for n in nominal[:2]}
+    assert [n.kind for n in faulty] == ["push", "push", "slip", "slip"]
+    assert {n.seed for n in faulty} == {n.seed for n in nominal}
     assert all(n.onset is not None and n.onset >= 10 for n in faulty)
 
 

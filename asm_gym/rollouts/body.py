@@ -13,7 +13,6 @@ from asm_gym.episodes import Episode, EpisodeLabel
 from asm_gym.evaluation.comparison import visible_kinds
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.trace import NOMINAL, Trace
-from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import CalibratedMonitor, NeuralASM
 from asm_gym.monitors.base import Progress
 from asm_gym.rollouts.benchmark import detectability_of, traces_of
@@ -24,8 +23,8 @@ from asm_gym.tasks import task as task_spec
 
 CALIBRATED_ON = 3
 """One in so many lessons of a task is not learned from: the threshold is set on those."""
-TWICE = 2.0
-"""How many times what an undisturbed expert usually feels may be felt, before it counts as a hit."""
+LEARNED_UP_TO = 2.0
+"""How many times what an undisturbed expert usually feels at most may be felt in what is learned from."""
 AROUND_S = 0.2
 """What is left out before and after a hit [s]."""
 PASSES = 4
@@ -35,36 +34,43 @@ SEVERITIES = "medium", "strong"
 
 
 class Lessons(NamedTuple):
-    """Recordings of babbling, as far as they are healthy: to learn from, and others to calibrate on."""
+    """Recordings of babbling, as far as they are healthy.
+
+    Attributes:
+        fit: to learn from.
+        calibration: of lessons that are not learned from, those that are as healthy as a policy that does its task: the
+            expert's own course, and solved.
+    """
 
     fit: list[Episode]
     calibration: list[Episode]
 
 
 def healthy(recordings: Sequence[Episode]) -> Lessons:
-    """What of each recording presses less than twice as hard as the undisturbed expert of its task usually does.
+    """What of each recording presses no harder than is usual, as told by undisturbed experts of its task.
 
     Noise drives arms into tables and joints into their stops. That is no fault of the body, but a memory that takes it
-    for usual would be blind to every collision.
+    for usual would be blind to every collision. So learning goes up to twice what they usually feel at most, and the
+    threshold is set on what stays below once that.
 
     Raises:
         ValueError: a task has no undisturbed lesson that was solved, to measure by, or too little is left.
     """
     felt: dict[str, list[tuple[float, float]]] = {}
     for episode in recordings:
-        if _lesson(episode)["noise"] == 0.0 and episode.success:
+        if _undisturbed(episode):
             most = float(np.nanmax(episode.contact_force)), float(peak_torques(episode).max())
             felt.setdefault(episode.labelled.task, []).append(most)
     missing = {e.labelled.task for e in recordings} - set(felt)
     if missing:
-        raise ValueError(
-            f"no undisturbed lesson of {', '.join(sorted(missing))} was solved and says what is usual there"
-        )
+        raise ValueError(f"no undisturbed lesson of {', '.join(sorted(missing))} was solved, to say what is usual")
     found = Lessons([], [])
     for episode in recordings:
-        limit = Gentle(*(TWICE * np.median(felt[episode.labelled.task], axis=0)))
-        learned = _lesson(episode)["number"] % CALIBRATED_ON < CALIBRATED_ON - 1
-        (found.fit if learned else found.calibration).extend(gentle_pieces(episode, limit))
+        usual = np.median(felt[episode.labelled.task], axis=0)
+        if _lesson(episode)["number"] % CALIBRATED_ON < CALIBRATED_ON - 1:
+            found.fit.extend(gentle_pieces(episode, Gentle(*(LEARNED_UP_TO * usual))))
+        elif _undisturbed(episode):
+            found.calibration.extend(gentle_pieces(episode, Gentle(*usual)))
     if not all(found):
         raise ValueError(f"{len(recordings)} lessons leave too little that is healthy: record more")
     return found
@@ -83,6 +89,11 @@ def gentle_pieces(episode: Episode, limit: Gentle) -> list[Episode]:
         for a, b in zip(edges[::2], edges[1::2], strict=True)
         if b - a >= SHORTEST
     ]
+
+
+def _undisturbed(episode: Episode) -> bool:
+    """Whether an expert did its task in its own way."""
+    return episode.success and _lesson(episode)["noise"] == 0.0
 
 
 def _lesson(episode: Episode) -> dict[str, Any]:
@@ -113,20 +124,16 @@ class Exam(NamedTuple):
         who = "expert" if self.policy == "scripted" else self.policy
         return f"{self.task}, {who}" + ("" if self.known else " (left out)")
 
-    def labels(self, episodes: int, faults: int, seed: int) -> list[EpisodeLabel]:
-        """Nominal episodes, and twins of the first of them with a fault of each kind and severity.
-
-        Args:
-            faults: of each kind and severity.
-        """
+    def labels(self, episodes: int, kinds: Sequence[str], seed: int) -> list[EpisodeLabel]:
+        """Nominal episodes; and a twin of the first for each of ``kinds`` and severity, the second for the next."""
         seeds = role_seeds(seed, self.task, "nominal", episodes)
         horizon = task_spec(self.task).horizon
         nominal = [EpisodeLabel(self.task, "nominal", seed=s) for s in seeds]
+        faults = [(kind, severity) for kind in kinds for severity in SEVERITIES]
+        twins = [seeds[n % episodes] for n in range(len(faults))]
         return nominal + [
-            EpisodeLabel(self.task, "faulty", kind, severity, s, draw_onset(s, horizon))
-            for kind in KINDS
-            for severity in SEVERITIES
-            for s in seeds[:faults]
+            EpisodeLabel(self.task, "faulty", *fault, s, draw_onset(s, horizon))
+            for fault, s in zip(faults, twins, strict=True)
         ]
 
 
