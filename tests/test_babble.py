@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
+from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.babbling import ALONE, DRIVEN, LEADING, LED, Babbler, Lesson, curriculum, record_lesson
 from asm_gym.rollouts.body import Exam, healthy
 from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.trial import RolloutConfig
+from asm_gym.scripts.babble import Args, main
 from asm_gym.stream import Channel, StreamSpec
 from tests.fakes import FakeEnv
 
@@ -136,3 +138,46 @@ def test_a_recorded_lesson_is_the_same_again_and_leaves_the_simulator_as_it_was(
 def replace_weight(lesson):
     """The lesson with a heavier thing."""
     return lesson._replace(weight=1.4, seed=lesson.seed + 1)
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({"robot": "Pandas"}, "did you mean 'Panda'"),
+        ({"tasks": ("Wipe",)}, "unknown task of one arm with a gripper 'Wipe'"),
+        ({"exam_tasks": ("TwoArmLift",)}, "unknown task of one arm with a gripper 'TwoArmLift'"),
+        ({"tasks": ()}, "at least one task"),
+        ({"guides": ("lift",)}, "unknown agent 'lift'"),
+        ({"exam_faults": ("pushes",)}, "unknown kind of fault 'pushes'"),
+        ({"exam_episodes": -1}, "exam_episodes must be at least 0, got -1"),
+        ({"window": 0.0}, "window must be > 0 s, got 0"),
+        ({"episodes": 18, "tasks": ("Lift",)}, "needs 19 undisturbed lessons .* hold about 2"),
+    ],
+)
+def test_the_command_refuses_what_makes_no_sense(given, why):
+    with pytest.raises(ValueError, match=why):
+        Args(**given)
+
+
+def test_agents_are_examined_where_they_were_trained_and_nowhere_else():
+    panda = {(e.task, e.policy): e.known for e in Args(guides=("door_sac",)).exams}
+    assert panda["Lift", "lift_sac"] is False
+    assert panda["Door", "door_sac"] is True
+    assert panda["PickPlaceMilk", "scripted"] is False
+    assert panda["PickPlaceCan", "scripted"] is True
+    assert {e.policy for e in Args(robot="Sawyer").exams} == {"scripted"}
+
+
+@pytest.mark.slow  # 36 episodes of two tasks, and a fit
+def test_the_command_makes_a_memory_of_a_body_and_goes_on_where_it_was(tmp_path):
+    folder = tmp_path / "run"
+    assert main(["--quick", "--workers", "1", "--out", str(folder)]) == 0
+    memory = NeuralASM.load(folder / "panda.asm")
+    assert memory.about["controller"] == "OSC_POSE"
+    assert memory.threshold > 0
+    assert "healthy episodes alarm" in (folder / "card.md").read_text(encoding="utf-8")
+    written = {f: f.stat().st_mtime_ns for f in folder.rglob("*.npz")}
+    assert len(written) == 2 * (18 + 2)
+    assert main(["--quick", "--workers", "1", "--out", str(folder)]) == 0
+    assert {f: f.stat().st_mtime_ns for f in folder.rglob("*.npz")} == written
+    assert main(["--quick", "--workers", "1", "--robot", "Sawyer", "--out", str(folder)]) == 2  # it is another's

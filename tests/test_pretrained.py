@@ -1,5 +1,6 @@
 """Memories that come with the package: found by name and by the body they know, and refused where they do not fit."""
 
+import re
 from dataclasses import replace
 
 import gymnasium as gym
@@ -7,7 +8,8 @@ import pytest
 
 from asm_gym.checkpoint import read_header
 from asm_gym.monitors import NeuralASM, make_monitor, pretrained, pretrained_for
-from asm_gym.wrappers import NeuralASMSafety
+from asm_gym.scripts.demo import Args, without_fitting
+from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from tests.fakes import FakeEnv
 from tests.streams import sine_episodes, sine_spec
 
@@ -75,8 +77,18 @@ def test_every_shipped_memory_is_what_its_name_says(name):
     assert pretrained()[name].stat().st_size < 8e6
 
 
-@pytest.mark.skipif("panda" not in pretrained(), reason="no memory of the Panda is shipped")
 def test_an_environment_of_the_panda_is_watched_by_the_memory_of_its_body():
     env = NeuralASMSafety(gym.make("asm_gym/Lift-v0"))
-    assert env.monitor.about["name"] == "panda"
+    envs = VectorNeuralASMSafety(gym.make_vec("asm_gym/Lift-v0", 1, vectorization_mode="sync"))
+    assert env.monitor.about["name"] == envs.monitor.about["name"] == "panda"
+    assert env.threshold == envs.threshold == NeuralASM.pretrained("panda").threshold
     env.close()
+    envs.close()
+
+
+def test_nothing_fitted_a_push_is_noticed_and_a_healthy_episode_is_quiet():
+    said = without_fitting(Args(seed=0))
+    reached, late = re.search(r"reaches (\d+)% of its threshold; .* noticed after (\d+) ms", said).groups()
+    assert int(reached) < 100
+    assert int(late) <= 500  # the push lasts that long
+    assert without_fitting(Args(task="asm_gym/TwoArmLift-v0")) == ""

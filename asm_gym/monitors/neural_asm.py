@@ -201,7 +201,7 @@ class NeuralASM(CalibratedMonitor):
         other.model, kept = self.model.fewer(spec)
         other.detection = evidence.fewer(spec, kept.left, kept.widened, kept.narrower)
         other.detections = {other.detection.name: other.detection}
-        other.threshold_ = self.threshold_
+        other.threshold_, other.about = self.threshold_, self.about
         other._prepare()
         return other
 
