@@ -35,6 +35,9 @@ from asm_gym.scripts.reproduce.transfer_report import drawn, tables
 from asm_gym.scripts.reproduce.transfer_watched import KNOWN, WATCHED, Watched, record_watched
 from asm_gym.tasks import task as task_spec
 
+SHIPPED = "panda"
+"""The memory of this body that comes with the package, at the rate that it was shipped with."""
+
 
 @dataclass(frozen=True)
 class Args(Common):
@@ -148,11 +151,6 @@ def leads(number: int) -> bool:
     return number % CALIBRATED_ON == CALIBRATED_ON - 1 and LEADING[number % len(LEADING)] == LED
 
 
-def undisturbed(lessons: Sequence[Episode]) -> list[Episode]:
-    """Those that no noise drove off their course: what healthy policies are like."""
-    return [e for e in lessons if e.info["lesson"]["noise"] == 0.0]
-
-
 def specialised(body: NeuralASM, own: Sequence[Episode], rate: float) -> NeuralASM:
     """The memory of the body after a few episodes of one policy, calibrated on as many others of it."""
     few = role(own, "calibration")
@@ -188,11 +186,9 @@ def judged(
 
     everywhere, lessons = args.watched, healthy(babbled)
     records = judge.records("of one policy", made("neural_asm", **shown), everywhere)
-    harsh = learn_body(lessons, args.false_alarm_rate, judge.seed, lambda done, total: None)
-    records += judge.records("of the body, all lessons", harsh, everywhere)
-    calm = undisturbed(lessons.calibration)
-    body = copy.deepcopy(harsh).calibrate(calm, args.false_alarm_rate)
+    body = learn_body(lessons, args.false_alarm_rate, judge.seed, lambda done, total: None)
     records += judge.records("of the body", body, everywhere)
+    records += judge.records("of the body, as shipped", NeuralASM.pretrained(SHIPPED), everywhere)
     records += judge.adaptive("of the body, adaptive", body)
     for watched in everywhere:
         if watched.policy in args.specialised:
@@ -201,11 +197,10 @@ def judged(
     for task in args.without:
         others = healthy([e for e in babbled if e.labelled.task != task])
         less = learn_body(others, args.false_alarm_rate, judge.seed, lambda done, total: None)
-        less.calibrate(undisturbed(others.calibration), args.false_alarm_rate)
         records += judge.records(f"of the body, without {task}", less, [w for w in everywhere if w.task == task])
     for rival in args.rivals:
         for name in (rival, rival + EVIDENCE):
-            records += judge.records(name, made(name, lessons.fit, calm), everywhere)
+            records += judge.records(name, made(name, *lessons), everywhere)
     return records, fewer_senses(body, judge)
 
 
