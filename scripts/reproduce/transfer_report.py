@@ -73,7 +73,7 @@ def tables(records: Sequence[Record], senses: Sequence[Record], args: Any) -> li
             f"and those that failed; alarms in an hour of solved episodes of what it never met; AUROC against the same "
             f"steps of healthy episodes, and faults found within {args.window:g} s, of medium and strong severity that "
             f"an ideal observer could see; {rate}. The first memory is of the experts, all others learned from "
-            f"babbling, the shipped one from more of it, at a rate of its own. +evidence is a rival under our detection.",
+            f"babbling, the shipped one from more of it, at a rate of its own. +evidence: under our detection.",
             heads,
             rows,
         )
