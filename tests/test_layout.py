@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from asm_gym.monitors import pretrained
 from tests.wheel import LINKS, ROOT, build_wheel
 
 LAYERS = ("core", "policies", "wrappers", "rollouts", "scripts")  # each may import itself and what stands before it
@@ -143,3 +144,4 @@ def test_a_wheel_holds_real_files_under_one_name(tmp_path: Path) -> None:
     assert {f"{name.replace('.', '/')}.py" for name in MODULES} <= names
     agents = (ROOT / "policies" / "agents").iterdir()
     assert {f"asm_gym/policies/agents/{agent.name}" for agent in agents} <= names
+    assert {f"asm_gym/pretrained/{file.name}" for file in pretrained().values()} <= names
