@@ -37,6 +37,20 @@ def report(
     Args:
         executed: (A,) the action that was done last; None before the first step.
         failed: what failed before the step; empty where nothing did.
+
+    Returns:
+        ``surprise``: the largest of this step; infinite where something failed. ``threshold``, and ``alarm``: it is
+        over it. ``intervened``: something else than the policy acted, or slowed it down, in a part of this step at
+        least. ``gave_up``: it has acted for ``max_override`` steps, or was to stop, and the episode ends.
+        ``transition``: who acts from now on, ``"override"``, ``"release"``, ``"trial"``, ``"give_up"``, or how the
+        policy goes on, ``"go on"``, ``"complete"``, ``"slow"``; empty where nothing changes. They go to the log
+        ``asm_gym.safety`` with the cause. ``failure``: what failed in this step, ``policy: …``, ``stream: …``,
+        ``monitor: …``, ``completion: …`` or ``reflex: …``; or empty. ``cause``: at an alarm, ``family`` (one of
+        ``asm_gym.monitors.diagnosis.FAMILIES``), ``part``, ``probability`` of the family, ``probabilities`` of all,
+        and for a contact ``force``: the link, the force's size [N] and its vector. ``response``: what is done about it
+        under ``"graded"``. ``executed_action``: the last one. ``attribution``: what each number of the stream adds to
+        surprise. ``surprises`` (n,) of all rows in this step. ``latency_us``: the longest time that the monitor took
+        for one. The wrapper adds ``completed``, the sensors that are not believed now.
     """
     surprises = np.array([row.surprise.value[0] for row in rows])
     worst = rows[int(np.argmax(surprises))].surprise

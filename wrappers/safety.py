@@ -45,16 +45,13 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     missing, a policy whose action is not finite, which is not done. A reflex that fails is replaced by staying; its
     actions are clipped to the box. Where an exception leaves ``reset`` or ``step``, the episode has ended.
 
-    ``info["asm"]`` holds ``surprise`` (the largest of this step; infinite where something failed), ``threshold``,
-    ``alarm`` (surprise is over the threshold), ``intervened`` (something else than the policy acted in this step, or in
-    a part of it), ``gave_up`` (it has acted for ``max_override`` steps, and the episode ends), ``transition`` (who acts
-    from now on: ``"override"``, ``"release"``, ``"trial"``, ``"give_up"``, or empty where nothing changes; they go to
-    the log ``asm_gym.safety`` as well), ``failure`` (what failed in this step, ``policy: …``, ``stream: …``, ``monitor:
-    …`` or ``reflex: …``; or empty), ``executed_action`` (the last one), ``attribution`` (what each number of the stream
-    adds to surprise), ``surprises`` (n,) of all rows in this step, and ``latency_us`` (the longest time that the
-    monitor took for one). For loggers the same stands beside it as NumPy scalars: ``info["asm_surprise"]``,
-    ``info["asm_alarm"]``, ``info["asm_intervened"]``, and ``info["cost"]``, which is 1.0 on every step with an alarm
-    and 0.0 otherwise, as safe-RL libraries expect.
+    What is wrong is named at every alarm, by monitors that can: ``info["asm"]["cause"]``. Under ``"graded"`` it decides
+    what is done, and from the step after an alarm about a sensor on observation and stream hold what that sensor should
+    say, completed from all others, until it has been well for a second.
+
+    ``info["asm"]`` says what came of a step: see ``asm_gym.wrappers.reports.report``. For loggers the same stands
+    beside it as NumPy scalars: ``info["asm_surprise"]``, ``info["asm_alarm"]``, ``info["asm_intervened"]``, and
+    ``info["cost"]``, which is 1.0 on every step with an alarm and 0.0 otherwise, as safe-RL libraries expect.
 
     Args:
         env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream. No
@@ -62,9 +59,9 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that ``env`` moves.
         on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip, in environments of this package under
             every controller and wrapper; ``"retract"`` goes back along the path; ``"comply"`` yields to what presses;
-            ``"recall"`` goes on as the memory expects; ``"graded"`` stays, yields to what keeps pressing, hands back on
-            trial, and ends the episode where trials fail; ``"terminate"`` ends the episode; any other policy acts
-            itself, and where it raises, or returns what is no finite action, the robot holds.
+            ``"recall"`` goes on as the memory expects; ``"graded"`` does what the cause asks for (``responses``), hands
+            back on trial, and ends the episode where trials fail; ``"terminate"`` ends the episode; any other policy
+            acts itself, and where it raises, or returns what is no finite action, the robot holds.
         release_after: control steps of quiet after which control is handed back.
         release_below: share of the threshold, in (0, 1], that surprise must be under to count as quiet.
         max_override: control steps for which a reflex may act, after which the episode ends; an alarm that is back
@@ -85,10 +82,13 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             alarm. Not counted are alarms above the ceiling, those that went on while the reflex acted, and those that
             ``confirm_alarm`` was called for. None for a threshold that stays.
 
+        responses: under ``"graded"``, what is done about which cause, where it is not what
+            ``asm_gym.wrappers.responses.DEFAULT`` says: ``{"contact": "yield"}``.
+
     Raises:
-        ValueError: an unknown ``on_alarm``, a monitor fitted for another stream or rate (the message names what
-            differs), no monitor where no shipped memory fits (the message lists them), a rate that does not fit,
-            ``"recall"`` with a monitor that expects no action, or a wrapper inside that changes actions, where the
+        ValueError: an unknown ``on_alarm``, cause or response, a monitor fitted for another stream or rate (the message
+            names what differs), no monitor where no shipped memory fits (the message lists them), a rate that does not
+            fit, ``"recall"`` with a monitor that expects no action, or a wrapper inside that changes actions, where the
             reflex cannot know what reaches the robot. Nothing is changed then.
         RuntimeError: the monitor is not calibrated.
     """

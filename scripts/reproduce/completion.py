@@ -108,14 +108,14 @@ def by_autoassociation(senses: StreamScaler, streams: Sequence[Floats], seed: in
     net = torch.nn.Sequential(*layers, torch.nn.Linear(HIDDEN, D))
     optimiser = torch.optim.Adam(net.parameters(), RATE)
     for _ in range(epochs):
-        for batch in torch.randperm(len(rows)).split(256):
+        for batch in torch.split(torch.randperm(len(rows)), 256):  # type: ignore[no-untyped-call]
             x = rows[batch]
             # Rows of which some senses are another's, so that it learns to do without them.
             lost = torch.rand_like(x) < 0.1
             broken = torch.where(lost, x[torch.randperm(len(x))], x)
             loss = torch.mean((net(broken) - x) ** 2)
             optimiser.zero_grad()
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
 
     def complete(stream: Floats, missing: NDArray[np.bool_], onset: int) -> Floats:
