@@ -108,7 +108,7 @@ def by_autoassociation(senses: StreamScaler, streams: Sequence[Floats], seed: in
     net = torch.nn.Sequential(*layers, torch.nn.Linear(HIDDEN, D))
     optimiser = torch.optim.Adam(net.parameters(), RATE)
     for _ in range(epochs):
-        for batch in torch.split(torch.randperm(len(rows)), 256):  # type: ignore[no-untyped-call]
+        for batch in torch.split(torch.randperm(len(rows)), 256):
             x = rows[batch]
             # Rows of which some senses are another's, so that it learns to do without them.
             lost = torch.rand_like(x) < 0.1
