@@ -16,6 +16,7 @@ BROUGHT_BY = {
     **dict.fromkeys(("distributed", "dask", "ray"), "cluster"),
     **dict.fromkeys(("moviepy",), "video"),
     **dict.fromkeys(("rosbags",), "ros"),
+    **dict.fromkeys(("rerun",), "rerun"),
 }
 """The extra of asm-gym that installs a package, by the name it is imported under."""
 

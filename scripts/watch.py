@@ -29,6 +29,7 @@ from asm_gym.evaluation.report import write_report
 from asm_gym.evaluation.tables import Table
 from asm_gym.evaluation.trace import Trace, TraceDetail, spans
 from asm_gym.live import RowReader, SourceDied, is_live, lines_from
+from asm_gym.live_view import LiveView
 from asm_gym.logs import Layout, Log, read_logs
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
@@ -59,6 +60,8 @@ class Args:
     """Rows of logs a second [Hz]; by default their column called time says it, or else the memory."""
     silence: float = 2.0
     """Seconds without a row after which a live source has died, which is an alarm."""
+    rerun: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
+    """Where to write the most surprising episodes of a recording for Rerun's viewer."""
     figures: int = 4
     """How many of the most surprising episodes are drawn."""
 
@@ -138,6 +141,8 @@ def review(args: Args, monitor: Any, console: Console) -> int:
             progress(episodes, episodes)
     said = f"{len(alarms)} alarm{'s' * (len(alarms) != 1)} in {len({a.log for a in alarms})} of {episodes} episodes"
     publish(args, said, alarms, worst)
+    if args.rerun is not None:
+        write_rerun(args.rerun, worst, monitor)
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     shown = sorted(alarms, key=lambda alarm: -alarm.excess)[:SHOWN_ROWS]
     say(said + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} greatest:"))
@@ -169,6 +174,20 @@ def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Trac
         drawn,
         details={"command": f"asm-gym watch {args.source} --monitor {args.monitor}"},
     )
+
+
+def write_rerun(path: Path, traces: Sequence[Trace], monitor: Any) -> None:
+    """Writes episodes for Rerun's viewer, one after another."""
+    seconds = 0.0
+    with LiveView(path, monitor.spec, getattr(monitor, "model", None)) as view:
+        for trace in traces:
+            assert trace.detail is not None
+            view.begin()
+            for row, surprise, shares in zip(
+                trace.detail.stream, trace.surprise, trace.detail.attribution, strict=True
+            ):
+                seconds += trace.dt
+                view.row(seconds, row, float(surprise), trace.threshold, shares)
 
 
 def follow(lines: Iterable[str], monitor: Any, console: Console) -> int:
