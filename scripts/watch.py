@@ -182,6 +182,7 @@ def write_rerun(path: Path, traces: Sequence[Trace], monitor: Any) -> None:
     with LiveView(path, monitor.spec, getattr(monitor, "model", None)) as view:
         for trace in traces:
             assert trace.detail is not None
+            assert trace.detail.stream is not None
             view.begin()
             for row, surprise, shares in zip(
                 trace.detail.stream, trace.surprise, trace.detail.attribution, strict=True
