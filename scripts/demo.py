@@ -60,7 +60,7 @@ class Args:
     task: str = "asm_gym/Lift-v0"
     """Environment id."""
     on_alarm: str = "hold"
-    """What the wrapper does on an alarm: hold or terminate."""
+    """What the wrapper does on an alarm: hold, graded (what the cause asks for) or terminate."""
     false_alarm_rate: float = 0.05
     """Share of nominal episodes that may raise an alarm."""
     fit_episodes: int = 60
@@ -85,8 +85,8 @@ class Args:
     """A third of the episodes: to see that everything runs, not to judge the figures."""
 
     def __post_init__(self) -> None:
-        if self.on_alarm not in ("hold", "terminate"):
-            raise ValueError(f"on_alarm must be hold or terminate, got {self.on_alarm!r}")
+        if self.on_alarm not in ("hold", "graded", "terminate"):
+            raise ValueError(f"on_alarm must be hold, graded or terminate, got {self.on_alarm!r}")
         for name in ("fit_episodes", "calibration_episodes", "nominal_episodes", "faulty_episodes", "epochs"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")

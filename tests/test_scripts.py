@@ -102,7 +102,7 @@ def test_a_hard_push_raises_an_alarm_even_in_a_memory_that_has_learned_little(fo
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--on-alarm", "dance"], "hold or terminate"),
+        (["--on-alarm", "dance"], "hold, graded or terminate"),
         (["--epochs", "0"], "epochs"),
         (["--task", "asm_gym/Juggle-v0"], "Juggle"),
         (["--calibration-episodes", "10"], "19"),

@@ -57,6 +57,7 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._alarm: list[bool] = []
         self._fault: list[bool] = []
         self._intervened = False
+        self._cause = self._completed = ""  # named at the last alarm
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
@@ -78,6 +79,11 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._alarm.append(bool(asm["alarm"]))
         self._fault.append(bool(info.get("fault")))
         self._intervened = bool(asm["intervened"])
+        cause = asm.get("cause") or {}
+        if cause.get("family"):
+            self._cause = " ".join(filter(None, (cause["family"], cause["part"])))
+        completed = asm.get("completed") or ()
+        self._completed = f"{', '.join(completed)} completed" if completed else ""
         return observation, reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8]:
@@ -94,7 +100,7 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def _line(self) -> str:
         time = f"{len(self._ratio) * self._dt:.2f} s"
         acting = "override acting" if self._intervened else "policy acting"
-        return "   ".join(part for part in (self.caption, time, acting) if part)
+        return "   ".join(part for part in (self.caption, time, acting, self._completed or self._cause) if part)
 
 
 def _control_period(env: gym.Env[Any, Any]) -> float:
