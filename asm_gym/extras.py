@@ -15,6 +15,7 @@ BROUGHT_BY = {
     **dict.fromkeys(("pyarrow", "sklearn", "loky", "packaging"), "report"),
     **dict.fromkeys(("distributed", "dask", "ray"), "cluster"),
     **dict.fromkeys(("moviepy",), "video"),
+    **dict.fromkeys(("gymnasium_robotics", "shimmy", "dm_control"), "environments"),
     **dict.fromkeys(("rosbags",), "ros"),
     **dict.fromkeys(("rerun",), "rerun"),
 }
