@@ -12,7 +12,7 @@ pytest = $(one_thread) $(bin)/python -m pytest -n $(JOBS) --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo reproduce doctor test test-all check format docs page stale clean
+.PHONY: help demo reproduce doctor test test-all soak check format docs page stale clean
 
 help: ## list the commands
 	@sed -nE 's/^([a-z-]+):.* ## (.*)/  make \1\t\2/p' Makefile | expand -t 20
@@ -32,6 +32,9 @@ test: $(stamp) ## the tests that take seconds
 
 test-all: $(stamp) ## every test, those that take minutes too
 	$(pytest) $(ARGS)
+
+soak: $(stamp) ## calls in any order, a hundred times as long as in the tests
+	SOAK=100 $(pytest) tests/test_fuzz_machines.py $(ARGS)
 
 check: $(stamp) ## formatting, lint and types
 	$(bin)/ruff format --check .
