@@ -233,6 +233,10 @@ class Diagnosis:
         columns = named.columns if named is not None and family == "sensor" else np.zeros(0, np.intp)
         return Cause(family, named.part if named else "", probabilities[family], probabilities, columns)
 
+    def is_stuck(self, rows: NDArray[np.floating[Any]], attribution: NDArray[np.float64]) -> bool:
+        """Whether a sensor is at fault beyond doubt, for it repeats itself and surprises by that."""
+        return self._stuck(rows, attribution) is not None
+
     def _stuck(
         self, rows: NDArray[np.floating[Any]], attribution: NDArray[np.float64]
     ) -> tuple[str, NDArray[np.intp]] | None:
