@@ -69,7 +69,7 @@ class Examples(NamedTuple):
 
     def of(self, chosen: NDArray[np.bool_]) -> Examples:
         """Some of them."""
-        return Examples(*(array[chosen] for array in self))
+        return Examples(self.evidence[chosen], self.classes[chosen], self.kinds[chosen], self.episodes[chosen])
 
     @property
     def weight(self) -> NDArray[np.float64]:
