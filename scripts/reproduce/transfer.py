@@ -106,7 +106,7 @@ class Args(Common):
             tasks=("Lift", "Stack", "Door"),
             lessons=12,
             demonstrations=4,
-            calibration_episodes=3,
+            calibration_episodes=5,
             nominal_episodes=2,
             own_episodes=4,
             specialised=("lift_sac",),
