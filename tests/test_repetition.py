@@ -9,6 +9,7 @@ import pytest
 
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.repetition import (
+    MOST_BEYOND,
     REPETITION_OFFSET,
     STUCK,
     Repetition,
@@ -23,10 +24,11 @@ from asm_gym.monitors import NeuralASM
 from tests.streams import frozen, sine_episodes, sine_spec
 
 
-def run(rows: np.ndarray, counted: np.ndarray) -> list[Repetition]:
+def run(rows: np.ndarray, counted: np.ndarray, most: float = np.inf) -> list[Repetition]:
     state, states = unrepeated(1, rows.shape[1]), []
+    bound = np.full(rows.shape[1], most)
     for row in rows:
-        state = Repetition(*repeated(*state, row[None], evidence_steps(counted[:2])))
+        state = Repetition(*repeated(*state, row[None], evidence_steps(counted[:2]), bound))
         states.append(state)
     return states
 
@@ -84,6 +86,14 @@ def test_a_sensor_at_rest_may_repeat_itself_by_chance_and_is_found_all_the_same_
     assert (fresh < REPETITION_OFFSET).all()
     stuck = [s.unlikely[0, 0] for s in run(np.ones((20, 1)), counted)]
     assert np.argmax(np.array(stuck) > REPETITION_OFFSET) == pytest.approx(10, abs=1)
+
+
+def test_what_was_stuck_for_long_is_believed_again_soon():
+    p = np.full((2, 1), 1e-4)
+    states = run(np.concatenate([np.ones(5000), np.arange(20)])[:, None], -np.log(p), REPETITION_OFFSET + MOST_BEYOND)
+    n = np.array([s.unlikely[0, 0] for s in states])
+    assert n.max() == n[4999] == REPETITION_OFFSET + MOST_BEYOND
+    assert n[5015] < REPETITION_OFFSET
 
 
 def test_nothing_is_held_against_a_sense_that_nominal_episodes_showed():

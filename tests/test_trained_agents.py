@@ -17,7 +17,7 @@ from gymnasium import spaces
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
 from asm_gym.checkpoint import write_checkpoint
-from asm_gym.policies import make_policy, rollout
+from asm_gym.policies import POLICIES, make_policy, rollout
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.registry import SHIPPED, agents
 from asm_gym.policies.sb3 import read_archive
@@ -278,7 +278,7 @@ def test_what_a_network_reads_and_draws_by_must_fit_it(fields, message):
 
 
 def test_unknown_policies_are_refused_with_the_shipped_ones_named(lift):
-    with pytest.raises(ValueError, match=", ".join(("scripted", "hold", *agents()))):
+    with pytest.raises(ValueError, match=", ".join((*POLICIES, *agents()))):
         make_policy("teleop", lift)
 
 

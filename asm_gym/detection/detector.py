@@ -23,6 +23,7 @@ from asm_gym.detection.base import Array, Arrays, ModelOutput, Nominal, Place
 from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, accumulate, no_evidence, pool, strength
 from asm_gym.detection.habituation import usual_levels
 from asm_gym.detection.repetition import (
+    MOST_BEYOND,
     REPETITION_OFFSET,
     Repetition,
     count_repetitions,
@@ -285,7 +286,7 @@ class EvidenceDetection:
                 f"the repetition of evidence should be (3, {senses}) numbers of at least 0, found {shown(counted)}"
             )
         offset = counted[2]
-        self._steps, self._offset = evidence_steps(counted[:2]), offset
+        self._steps, self._offset, self._most = evidence_steps(counted[:2]), offset, offset + MOST_BEYOND
         self.learned_, self.detector_ = learned, detector
         return self
 
@@ -305,7 +306,7 @@ class EvidenceDetection:
         assert self.detector_ is not None
         evidence, _, parts = self.detector_.step(state.evidence, *output)
         senses = self.spec.sensory
-        repetition = Repetition(*repeated(*state.repetition, rows[:, senses], self._steps))
+        repetition = Repetition(*repeated(*state.repetition, rows[:, senses], self._steps, self._most))
         found = place(parts)
         if repetition.unlikely.any():
             ratios = np.zeros_like(found)

@@ -1,7 +1,8 @@
 """Repetition: a sense that is stuck says the same again and again, as a working one seldom does.
 
     p_i = P(x_t,i = x_{t-1,i}), counted apart for senses that repeated themselves the time before and that did not
-    n_t = max(0, n_{t-1} + log ρ/p) after a repetition, max(0, n_{t-1} + log (1 - ρ)/(1 - p)) after a change
+    n_t = max(0, n_{t-1} + log ρ/p) after a repetition, max(0, n_{t-1} + log (1 - ρ)/(1 - p)) after a change,
+          and at most n_0 + 24, so that a sense that works again is believed again within some ten rows
     r_t = exp(ξ_0 (n_t - n_0)) where n_t > 0, else 0                 beside the ratios of ``tails``, with their ξ_0
 
 What predicts a change finds nothing odd in one that is just 0. Yet noise carries a working sensor from one of its
@@ -28,6 +29,9 @@ STUCK = 0.9
 
 REPETITION_OFFSET = 12.0
 """n_0: one in 160,000, which among a hundred senses happens once in some thousand steps."""
+
+MOST_BEYOND = 24.0
+"""How far n may pass n_0: what is stuck for an hour is no more stuck than what is stuck for a second."""
 
 
 class Repetition(NamedTuple):
@@ -65,7 +69,7 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
     for stream in streams:
         state = unrepeated(1, len(noisy))
         for row in np.asarray(stream, np.float64):
-            state = Repetition(*repeated(*state, row[None], steps))
+            state = Repetition(*repeated(*state, row[None], steps, np.full(len(noisy), np.inf)))
             offset = np.maximum(offset, state.unlikely[0])
     return np.concatenate([counted, offset[None]])
 
@@ -91,13 +95,13 @@ def improbability(repetition: Repetition, offset: NDArray[np.float64]) -> NDArra
 
 
 @compiled
-def repeated(row: Any, again: Any, unlikely: Any, rows: Any, steps: Any) -> Any:
-    """The fields of a ``Repetition`` after the next rows (B, X), with ``evidence_steps``."""
+def repeated(row: Any, again: Any, unlikely: Any, rows: Any, steps: Any, most: Any) -> Any:
+    """The fields of a ``Repetition`` after the next rows (B, X), with ``evidence_steps`` and the most n (X,) may be."""
     B, X = rows.shape
     now, evidence = np.zeros((B, X), np.bool_), np.zeros((B, X))
     for n in range(B):
         for i in range(X):
             now[n, i] = rows[n, i] == row[n, i]
             step = steps[1 if again[n, i] else 0, 1 if now[n, i] else 0, i]
-            evidence[n, i] = max(unlikely[n, i] + step, 0.0)
+            evidence[n, i] = min(max(unlikely[n, i] + step, 0.0), most[i])
     return rows, now, evidence
