@@ -99,21 +99,23 @@ def train(
             real = torch.from_numpy(batch.active[:, None] > np.arange(x.shape[1])).float()[:, :, None]
             rows = shifted(x, a)
             noisy = rows + noise * torch.randn(rows.shape, generator=own)
-            sensed, acted, _ = step_by_step(network, noisy, a) if truncated else network(noisy, a)
+            sensed, acted = step_by_step(network, noisy, a) if truncated else network(noisy, a)[:2]
             error = ((x - sensed) ** 2).sum(-1, keepdim=True) + ((a - acted) ** 2).sum(-1, keepdim=True)
             descend((error * real).sum() / real.sum(), optimiser, schedule)
             done += 1
     return network.eval().requires_grad_(False)
 
 
-def step_by_step(network: Recurrent, rows: Tensor, commands: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """What the network makes of all rows, with no way back from a step to the one before."""
-    state, sensed, acted = None, [], []
-    for t in range(len(rows)):
-        x, a, state = network(rows[t : t + 1], commands[t : t + 1], None if state is None else state.detach())
-        sensed.append(x)
-        acted.append(a)
-    return torch.cat(sensed), torch.cat(acted), state
+def step_by_step(network: Recurrent, rows: Tensor, commands: Tensor) -> tuple[Tensor, Tensor]:
+    """x̂ (T, B, S) and â (T, B, A) of all rows, with no way back from a step to the one before.
+
+    The states are run through first; each step is then one of its own, side by side with all others.
+    """
+    with torch.no_grad():
+        h, _ = network.cell(rows)  # (T, B, H)
+        before = torch.cat([torch.zeros_like(h[:1]), h[:-1]])
+    sensed, acted, _ = network(rows.flatten(0, 1)[None], commands.flatten(0, 1)[None], before.flatten(0, 1)[None])
+    return sensed.reshape(*rows.shape[:2], -1), acted.reshape(*rows.shape[:2], -1)
 
 
 def shifted(senses: Tensor, commands: Tensor) -> Tensor:
