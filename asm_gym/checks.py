@@ -118,6 +118,12 @@ def check_flag(name: str, value: object) -> bool:
     return bool(value)
 
 
+def as_float32(values: ArrayLike) -> NDArray[np.float32]:
+    """``values`` as a stream and an action hold them: what is too large for that is infinite, and nothing is said."""
+    with np.errstate(over="ignore"):
+        return np.asarray(values, np.float32)
+
+
 def shown(value: object) -> str:
     """``value`` as a message shows it: in full where it is short."""
     try:

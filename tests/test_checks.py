@@ -6,7 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from asm_gym.checks import check_flag, check_number, check_numbers, check_text
+from asm_gym.checks import as_float32, check_flag, check_number, check_numbers, check_text
 
 
 @pytest.mark.parametrize("value", [True, np.True_, None, "1", 1j, [1.0], np.zeros(1), np.array(1.0), math.nan, np.nan])
@@ -72,3 +72,8 @@ def test_names_and_flags_are_what_they_say():
     for value in (None, 0, 1, "True"):
         with pytest.raises(ValueError, match="noisy must be True or False"):
             check_flag("noisy", value)
+
+
+def test_what_is_too_large_for_a_stream_is_infinite_without_a_warning(recwarn):
+    np.testing.assert_array_equal(as_float32([1e39, -1e300, 0.5]), np.float32([np.inf, -np.inf, 0.5]))
+    assert not recwarn.list

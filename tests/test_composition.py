@@ -154,7 +154,7 @@ def test_the_threshold_at_any_rate_is_the_conformal_rank_of_the_kept_maxima(kalm
             assert monitor.threshold_at(rate) == conformal_threshold(maxima, rate)
         with pytest.raises(ValueError, match=r"rate of 0\.01 needs at least 99 nominal episodes, got 60"):
             monitor.threshold_at(0.01)
-        with pytest.raises(ValueError, match=r"false_alarm_rate must be in \(0, 1\), got 2"):
+        with pytest.raises(ValueError, match=r"false_alarm_rate must be a number in \(0, 1\), got 2"):
             monitor.threshold_at(2.0)
     with pytest.raises(RuntimeError, match="call calibrate"):
         kalman.with_detection("evidence").threshold_at(0.05)

@@ -215,10 +215,16 @@ def test_a_rate_needs_its_inverse_in_episodes_less_one(rate, episodes):
         conformal_threshold(np.arange(episodes - 1), rate)
 
 
-@pytest.mark.parametrize("rate", [0.0, 1.0, -0.1, 1.5, np.nan])
+@pytest.mark.parametrize("rate", [0.0, 1.0, -0.1, 1.5, np.nan, True, None, "0.1", 10**400])
 def test_a_rate_that_is_no_probability_is_refused(rate):
-    with pytest.raises(ValueError, match="false_alarm_rate must be in"):
+    with pytest.raises(ValueError, match=r"false_alarm_rate must be a number in \(0, 1\), got"):
         conformal_episodes(rate)
+
+
+@pytest.mark.parametrize("rate", [5e-324, 2.2250738585e-313, 1e-300])
+def test_the_smallest_rates_there_are_need_more_episodes_than_there_are(rate):
+    with pytest.raises(ValueError, match=r"needs at least \d{15} nominal episodes, got 20"):
+        conformal_threshold(np.arange(20.0), rate)
 
 
 def test_threshold_is_the_hand_computed_rank():

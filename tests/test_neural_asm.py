@@ -379,7 +379,7 @@ def test_calibration_says_how_many_episodes_it_needs(asm):
     before = asm.threshold
     with pytest.raises(ValueError, match="at least 99 nominal episodes, got 5"):
         asm.calibrate(sine_episodes(5))
-    with pytest.raises(ValueError, match=r"false_alarm_rate must be in \(0, 1\), got 1.5"):
+    with pytest.raises(ValueError, match=r"false_alarm_rate must be a number in \(0, 1\), got 1.5"):
         asm.calibrate(sine_episodes(5), 1.5)
     assert asm.threshold == before
 

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import shown
+from asm_gym.checks import as_float32, shown
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Graded, Hold, Recall, Reflex
 from asm_gym.wrappers.patience import Patience
@@ -155,7 +155,7 @@ class Arbiter:
                 observation, state=self._state, episode_start=start, deterministic=True
             )
             self._fresh = False
-            chosen = np.asarray(chosen, dtype=np.float32)
+            chosen = as_float32(chosen)
             if chosen.shape != self._space.shape or not np.isfinite(chosen).all():
                 raise ValueError(f"a finite action of shape {self._space.shape} was needed, got {chosen}")
         except Exception as error:

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.checks import shown
+from asm_gym.checks import as_float32, shown
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import Fault
 from asm_gym.stream import MOTOR, StreamSpec, flat
@@ -63,7 +63,7 @@ class FaultyInterface(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         box: Any = self.action_space
         delivered = action
         for deliver in self.deliveries:
-            changed = deliver(np.ravel(np.asarray(delivered, np.float32))).reshape(box.shape)
+            changed = deliver(np.ravel(as_float32(delivered))).reshape(box.shape)
             delivered = np.clip(changed, box.low, box.high)
         observation, reward, terminated, truncated, info = self.env.step(delivered)
         if self._source.own and self.deliveries:

@@ -10,6 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import NormalizeObservation
 from numpy.typing import NDArray
 
+from asm_gym.checks import as_float32
 from asm_gym.episodes import Episode
 from asm_gym.stream import StreamSpec, control_period, flat
 
@@ -51,8 +52,7 @@ class StreamSource:
             return row
         spaces = self._env.observation_space, self._env.action_space
         parts = [flat(space, value) for space, value in zip(spaces, (observation, action), strict=True)]
-        both: NDArray[np.float32] = np.concatenate(parts).astype(np.float32)
-        return both
+        return as_float32(np.concatenate(parts))
 
     def first(self, observation: Any, info: dict[str, Any]) -> NDArray[np.float32]:
         """(D,) what was sensed after ``reset``, when nothing had been commanded."""
@@ -127,7 +127,7 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         observation, reward, terminated, truncated, info = self.env.step(action)
         info["stream"] = self._source.row(observation, action, info)
         self._observations.append(observation)
-        self._actions.append(np.atleast_1d(np.asarray(action, np.float32)))
+        self._actions.append(np.atleast_1d(as_float32(action)))
         self._rewards.append(float(reward))
         rows = self._source.rows(observation, action, info)
         self._rows += list(rows)

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_flag, check_number, shown
+from asm_gym.checks import as_float32, check_flag, check_number, shown
 from asm_gym.choices import check_choice
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import LearnsOnTheJob, Monitor, Surprise
@@ -191,7 +191,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._ended:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
         if self._box is not None:
-            action = np.asarray(action, dtype=np.float32)
+            action = as_float32(action)
             if action.shape != self._box.shape:
                 raise ValueError(f"an action has the shape {self._box.shape}, got {action.shape}")
         self._ended = True  # where anything raises, nobody knows what was done
@@ -243,7 +243,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def _sensed(self, observation: Any, info: dict[str, Any]) -> tuple[NDArray[np.float32], str]:
         """The row (D,) that ends a step, or NaN and what failed."""
         try:
-            row = np.asarray(self._source.row(observation, self._executed, info), np.float32)
+            row = as_float32(self._source.row(observation, self._executed, info))
             if row.shape != (self.monitor.spec.size,):
                 raise ValueError(f"a row has the shape {(self.monitor.spec.size,)}, got {row.shape}")
         except Exception as error:

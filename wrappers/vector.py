@@ -11,7 +11,7 @@ from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
 from asm_gym.abilities import HoldsItself
-from asm_gym.checks import check_flag
+from asm_gym.checks import as_float32, check_flag
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.base import Policy
@@ -175,7 +175,7 @@ class VectorNeuralASMSafety(VectorWrapper):
 
     def _command(self, actions: Any, begun: Mask) -> tuple[NDArray[np.float32], list[Command]]:
         """(n, A) what is done, and how it came to that in each."""
-        chosen = np.array(actions, dtype=np.float32)
+        chosen = as_float32(actions).copy()
         if chosen.shape != self.env.action_space.shape:
             raise ValueError(f"actions have the shape {self.env.action_space.shape}, got {chosen.shape}")
         rest = Command(nearest_to_rest(self._space))  # where an episode begins, nothing is done
@@ -215,10 +215,9 @@ class VectorNeuralASMSafety(VectorWrapper):
             there = said.get("_stream")
             if "stream" not in said or not (there is None or there[i]):
                 raise KeyError('info has no "stream"')
-            return np.asarray(said["stream"][i], np.float32)
+            return as_float32(said["stream"][i])
         sensed = infos["final_obs"][i] if last else observations[i]
-        both: NDArray[np.float32] = np.concatenate([np.ravel(sensed), np.ravel(executed[i])]).astype(np.float32)
-        return both
+        return as_float32(np.concatenate([np.ravel(sensed), np.ravel(executed[i])]))
 
     def _decide(
         self,

@@ -13,14 +13,17 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.special import betaincinv
 
+from asm_gym.checks import check_number
 from asm_gym.detection.base import Array
+
+LEAST_RATE = 1e-15
+"""What needs more episodes than anybody records; of the smallest numbers there are, the inverse is infinite."""
 
 
 def conformal_episodes(rate: float) -> int:
     """How many nominal episodes a false-alarm rate needs at least: ⌈1/rate⌉ - 1."""
-    if not 0.0 < rate < 1.0:
-        raise ValueError(f"false_alarm_rate must be in (0, 1), got {rate}")
-    return math.ceil(1.0 / rate - 1e-9) - 1
+    check_number("false_alarm_rate", rate, above=0.0, below=1.0)
+    return math.ceil(1.0 / max(rate, LEAST_RATE) - 1e-9) - 1
 
 
 def conformal_threshold(maxima: Array, rate: float) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.checks import as_float32
 from asm_gym.stream import StreamSpec
 
 # What of the robot a policy sees: its configuration and motion, not its torques.
@@ -61,8 +62,7 @@ class Layout:
 
     def stream(self, row: NDArray[np.float64]) -> NDArray[np.float32]:
         """(D,) what of a row the stream carries."""
-        with np.errstate(over="ignore"):  # what is too large becomes infinite, which ends the episode
-            return row[self._to_stream].astype(np.float32)
+        return as_float32(row[self._to_stream])  # what is too large becomes infinite, which ends the episode
 
 
 def _box(size: int) -> spaces.Space[Any]:

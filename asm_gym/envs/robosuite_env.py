@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_flag, check_number, check_numbers, check_text, shown
+from asm_gym.checks import as_float32, check_flag, check_number, check_numbers, check_text, shown
 from asm_gym.choices import check_choice
 from asm_gym.envs import backend
 from asm_gym.envs.cameras import RENDER_MODES, Pictures
@@ -285,8 +285,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         reward = self._rewards(self._action)
         self._row = self.measure()
         # As float32, for a number that is too large for the stream is infinite there.
-        with np.errstate(over="ignore"):
-            rows = [*self._rows, self._row.astype(np.float32)]
+        rows = [*self._rows, as_float32(self._row)]
         if unstable := self._bad_count() != self._warnings or not all(np.isfinite(row).all() for row in rows):
             # What the simulation holds now, MuJoCo's initial state as a rule, is nothing that the robot could sense.
             self._row[:] = np.nan
@@ -356,7 +355,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         return action
 
     def _checked(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        action = np.asarray(action, dtype=np.float32)
+        action = as_float32(action)
         if action.shape != self.action_space.shape:
             raise ValueError(f"{self.task.name} takes an action of shape {self.action_space.shape}, got {action.shape}")
         if not np.isfinite(action).all():
