@@ -20,6 +20,9 @@ def rollout(
 ) -> bool:
     """One episode, from ``reset(seed)`` until it is terminated or truncated; whether it succeeded at some step.
 
+    In steps in which another acted, as ``info["overridden"]`` says, the policy's state stays what it was, so that it
+    resumes where it was left.
+
     Args:
         on_step: is shown every step's ``info``.
         steps: where to leave it, if it has not ended before.
@@ -28,9 +31,10 @@ def rollout(
     state, success, done, taken = None, False, False, 0
     start = np.ones(1, dtype=bool)
     while not done:
-        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=False)
+        action, next_state = policy.predict(observation, state=state, episode_start=start, deterministic=False)
         observation, _, terminated, truncated, info = env.step(action)
-        start = np.zeros(1, dtype=bool)
+        if not info.get("overridden", False):
+            state, start = next_state, np.zeros(1, dtype=bool)
         taken += 1
         done = bool(terminated or truncated) or taken == steps
         success = success or bool(info.get("success", False))

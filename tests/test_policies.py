@@ -163,3 +163,26 @@ def test_reflexes_that_need_changes_refuse_other_actions():
     with pytest.raises(ValueError, match="external_torque"):
         Comply(env)
     env.close()
+
+
+class Overridden(FakeEnv):
+    """Says that another acted in steps 3 to 6."""
+
+    def step(self, action):
+        *rest, info = super().step(action)
+        return *rest, info | {"overridden": 3 <= self.t <= 6}
+
+
+class Counting:
+    """Its state is how often it has acted."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        state = 0 if episode_start[0] else state
+        self.state = state + 1
+        return np.zeros(3, np.float32), self.state
+
+
+def test_a_policy_resumes_where_it_was_left_when_another_has_acted():
+    policy, seen = Counting(), []
+    rollout(Overridden(length=9), policy, on_step=lambda info: seen.append(policy.state))
+    assert seen == [1, 2, 3, 3, 3, 3, 3, 4, 5]

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from asm_gym.evaluation.contact import ContactForce, contact_force, within_limits
 from asm_gym.evaluation.intervention import compare, share_of_ideal
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, InterventionOutcome, Trace
-from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, staged
+from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, staged, watch_each
 from asm_gym.scripts.evaluate import main as evaluate
 from asm_gym.scripts.reproduce.reflexes import Args, main, trials
 
@@ -42,14 +43,36 @@ def test_what_is_no_pair_is_refused():
         compare([], [])
 
 
-def test_every_reflex_has_the_twin_of_the_policy_alone():
-    args = Args(tasks=("Lift", "Door"), reflexes=("hold", "retract"), faults=(NOMINAL, PASSING), episodes=3)
+def test_every_task_and_fault_is_tried_at_the_same_seeds():
+    args = Args(tasks=("Lift", "Door"), faults=(NOMINAL, PASSING), episodes=3)
     made = trials(args)
-    assert len(set(made)) == len(made) == 2 * 2 * 3 * 4
-    seeds = {(b.task, b.acting): set() for b in made}
-    for b in made:
-        seeds[b.task, b.acting].add(b.seed)
-    assert all(seeds["Lift", r] == seeds["Lift", POLICY_ALONE] for r in ("hold", "retract"))
+    assert len(set(made)) == len(made) == 2 * 2 * 3
+    seeds = {fault: {(t.task, t.seed) for t in made if t.kind == fault} for fault in args.faults}
+    assert seeds[NOMINAL] == seeds[PASSING]
+
+
+@pytest.mark.parametrize(
+    ("kind", "alarmed", "runs"),
+    [
+        ("collision", True, ["policy alone", "ideal", "hold"]),
+        ("collision", False, ["policy alone", "ideal"]),
+        ("encoder_bias", False, ["policy alone", "ideal"]),
+        ("stuck_joint", True, ["policy alone", "hold"]),
+        (NOMINAL, False, ["policy alone"]),
+    ],
+)
+def test_only_episodes_that_may_differ_are_run(monkeypatch, kind, alarmed, runs):
+    run = []
+
+    def one(trial, config, memory):
+        run.append(trial.acting)
+        return trace(trial.seed, trial.acting, delay=2 if alarmed else 99)
+
+    monkeypatch.setattr("asm_gym.rollouts.trial.watch", one)
+    trial = Trial("asm_gym/Lift-v0", 0, kind, "" if kind == NOMINAL else "strong")
+    made = watch_each(trial, (POLICY_ALONE, "ideal", "hold"), RolloutConfig(), Path("none"))
+    assert run == runs
+    assert [t.acting for t in made] == [POLICY_ALONE, "ideal", "hold"]
 
 
 def test_a_share_of_the_ideal_reflexs_gain_is_between_none_and_all():

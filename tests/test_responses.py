@@ -72,6 +72,14 @@ def test_what_is_done_follows_from_the_cause(family, response):
     assert said[9]["cause"]["family"] == ""
 
 
+def test_by_default_the_cause_decides_where_the_monitor_names_one_and_the_robot_holds_where_it_does_not():
+    for monitor, actions in ((Judge({10}, "object"), [ACT] * 12), (CueMonitor({10}), [ACT] * 11 + [0 * ACT])):
+        inner = Acting()
+        monitor.spec = Judge({10}).spec
+        infos(NeuralASMSafety(inner, monitor), 12)
+        np.testing.assert_array_equal(inner.actions, actions)
+
+
 def test_a_table_of_ones_own_is_followed():
     env = NeuralASMSafety(Acting(), Judge({10}, "contact"), on_alarm="graded", responses={"contact": "go on"})
     said = infos(env, 20)
@@ -188,13 +196,24 @@ def test_going_slowly_halves_what_moves_the_arm_and_keeps_the_grip():
     env.close()
 
 
-def test_control_goes_back_soon_once_a_contact_is_over():
+def held_by_a_contact():
     env = FakeEnv()
-    arbiter = Arbiter(Graded(env), 1.0, Patience(release_after=10), make_fallback(env), env.action_space)
-    act, row = np.ones(3, np.float32), np.zeros(5)
-    assert arbiter.decide(2.0, row, act, response="hold").transition == "override"
-    said = [arbiter.decide(0.9, row, act, over=True).transition for _ in range(3)]
-    assert said == ["", "", "release"]
+    arbiter = Arbiter(Graded(env), 1.0, Patience(10, try_after=10), make_fallback(env), env.action_space)
+    assert arbiter.decide(2.0, np.zeros(5), np.ones(3, np.float32), response="hold").transition == "override"
+    return lambda surprise, **kw: arbiter.decide(surprise, np.zeros(5), np.ones(3, np.float32), **kw).transition
+
+
+def test_control_goes_back_once_nothing_presses_though_surprise_is_not_quiet_and_later_each_time_it_was_too_early():
+    decide = held_by_a_contact()
+    assert [decide(0.9, pressed=False) for _ in range(5)] == [*[""] * 4, "release"]
+    assert decide(2.0, response="hold") == "override"
+    assert [decide(0.9, pressed=False) for _ in range(10)] == [*[""] * 9, "release"]
+
+
+def test_control_does_not_go_back_while_something_presses_though_surprise_is_quiet():
+    decide = held_by_a_contact()
+    assert {decide(0.0, pressed=True) for _ in range(30)} == {""}
+    assert "release" in [decide(0.0, pressed=None) for _ in range(1)]
 
 
 def test_the_force_of_a_push_is_found_where_it_pushes():

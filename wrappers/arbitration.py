@@ -24,9 +24,6 @@ _log = logging.getLogger("asm_gym.safety")
 GOING_ON = ("go on", "complete", "slow")
 """Responses to an alarm under which the policy acts."""
 
-OVER_AFTER = 3
-"""Rows for which a contact must be over before control goes back, though surprise is not quiet."""
-
 
 class Command(NamedTuple):
     """What is to be done in a step.
@@ -107,7 +104,8 @@ class Arbiter:
         self._fresh = self._refused = False
         self._slowed = False  # the policy acts slowly
         self._response = ""  # to the last alarm
-        self._past = 0  # rows for which what was responded to has been over
+        self._free = 0  # rows for which nothing has pressed
+        self._returned = 0  # so often in a row it went back too early
         self._warned: set[str] = set()
         self._last = np.zeros(self._space.shape, np.float32)  # (A,) executed last
         self._before = self._last  # (A,) executed last before the override
@@ -177,7 +175,7 @@ class Arbiter:
         feel: bool = True,
         expected: NDArray[np.float32] | None = None,
         response: str = "",
-        over: bool = False,
+        pressed: bool | None = None,
         why: str = "",
     ) -> Decision:
         """Decides who acts next, after ``executed`` (A,) was done and ``row`` (D,) was sensed.
@@ -187,7 +185,8 @@ class Arbiter:
             feel: lets the reflex feel the row: once a control step.
             expected: (A,) what the memory expects to be commanded next, for reflexes that go on with it.
             response: what a ``Graded`` reflex is to do about an alarm, in place of taking over as it did last.
-            over: what was responded to is over, so that control may go back though it was not quiet for long.
+            pressed: whether the contact that was responded to is still there, where that is known: control goes back
+                once it is not, though surprise is not quiet, and not before, though it is.
             why: the cause, for the log.
         """
         alarm, intervened = not surprise <= self.threshold, self.overriding or self._refused
@@ -208,8 +207,8 @@ class Arbiter:
             self._handed_back += 1
             if self._handed_back > self._patience.release_after:
                 self._handed_back = None
-        self._past = self._past + 1 if over and intervened else 0
-        transition = self._next(alarm, executed, response) or ("override" if begun else "")
+        self._free = self._free + 1 if pressed is False and intervened else 0
+        transition = self._next(alarm, executed, response, pressed) or ("override" if begun else "")
         if transition:
             because = f" ({why})" if why else ""
             _log.info("%s: surprise %.3g, threshold %.3g%s", transition, surprise, self.threshold, because)
@@ -227,7 +226,7 @@ class Arbiter:
             return failure
         return ""
 
-    def _next(self, alarm: bool, executed: NDArray[np.float32], response: str) -> str:
+    def _next(self, alarm: bool, executed: NDArray[np.float32], response: str, pressed: bool | None) -> str:
         """Who acts next, as a transition."""
         if not self.overriding:
             return self._begin(alarm, executed, response)
@@ -236,13 +235,15 @@ class Arbiter:
             return response
         if alarm and response not in ("", *GOING_ON):
             self._choose(response)
-        if self._quiet >= self._patience.release_after or (self._past >= OVER_AFTER and self._response != "stop"):
+        gone = self._free >= self._patience.free_after << self._returned and self._response != "stop"
+        if gone or (self._quiet >= self._patience.release_after and not pressed):
             self.overriding, self._handed_back, self._tried = False, 0, False
+            self._slowed, self._quiet = gone, 0
             return "release"
         stopped = self._response == "stop" and self._held >= (self._patience.try_after or self._patience.release_after)
         if stopped or self._acted >= (self._patience.max_override or math.inf):
             return "give_up"
-        if self._held >= self._wait:
+        if self._held >= self._wait and pressed is None:
             self.overriding, self._handed_back, self._tried = False, 0, True
             return "trial"
         return ""
@@ -269,8 +270,9 @@ class Arbiter:
 
     def _take_over(self, executed: NDArray[np.float32]) -> None:
         if self._handed_back is None:
-            self._acted, self._wait = 0, self._patience.try_after or math.inf
-        elif self._tried:
-            self._wait *= 2
+            self._acted, self._wait, self._returned = 0, self._patience.try_after or math.inf, 0
+        else:
+            self._wait *= 2 if self._tried else 1
+            self._returned += 1
         self._held, self._before = 0, executed
         self.overriding = self._fresh = True

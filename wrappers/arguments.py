@@ -10,7 +10,7 @@ import gymnasium as gym
 
 from asm_gym.abilities import SensesWithinSteps
 from asm_gym.checks import check_number, shown
-from asm_gym.monitors import ExpectsActions, Monitor, NeuralASM, pretrained_for
+from asm_gym.monitors import ExpectsActions, ExplainsItself, Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract, nearest_to_rest
 from asm_gym.stream import StreamSpec, control_period
@@ -78,6 +78,11 @@ def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
         raise TypeError(f"monitor must have initial_state() and observe(), got {shown(monitor)}")
     monitor.spec.require(watched, "the monitor")
     return check_number("the monitor's threshold", monitor.threshold)
+
+
+def names_causes(monitor: Monitor) -> bool:
+    """Whether the monitor says what is wrong, and not only that something is."""
+    return isinstance(monitor, ExplainsItself) and monitor.diagnosis_ is not None
 
 
 def body_memory(env: gym.Env[Any, Any], watched: StreamSpec) -> NeuralASM:

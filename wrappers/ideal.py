@@ -29,10 +29,12 @@ class IdealReflex(gym.Wrapper[Any, Any, Any, Any]):
         return self.env.reset(**kwargs)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        if any(fault.active(self._steps) for fault in self._faults):
+        touched = any(fault.active(self._steps) for fault in self._faults)
+        if touched:
             self._state = self._state or self._hold.begin(action)
             action, self._state = self._hold.predict(None, self._state)
         else:
             self._state = None
         self._steps += 1
-        return self.env.step(action)
+        *rest, info = self.env.step(action)
+        return *rest, info | {"overridden": touched}

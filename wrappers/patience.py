@@ -21,12 +21,15 @@ class Patience:
         try_after: control steps after which control is handed back on trial though surprise is not quiet, for a robot
             that holds still where it never did may surprise itself; after each trial that fails, twice as many. None
             for no trials.
+        free_after: control steps in which nothing presses any more, after which a contact is over though surprise is
+            not quiet; after each hand-back that was too early, twice as many.
     """
 
     release_after: int = 10
     release_below: float = 0.8
     max_override: int | None = None
     try_after: int | None = None
+    free_after: int = 5
 
     def __post_init__(self) -> None:
         check_number("release_after", self.release_after, low=1, whole=True)
@@ -40,4 +43,5 @@ class Patience:
         """The same, counted in rows of a stream that has ``each`` of them in a control step."""
         longest = None if self.max_override is None else each * self.max_override
         wait = None if self.try_after is None else each * self.try_after
-        return replace(self, release_after=each * self.release_after, max_override=longest, try_after=wait)
+        rows = {"release_after": each * self.release_after, "free_after": each * self.free_after}
+        return replace(self, max_override=longest, try_after=wait, **rows)

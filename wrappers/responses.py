@@ -46,7 +46,7 @@ QUIET_S = 1.0
 SURE = 0.5
 """A family that is less probable is unknown."""
 
-PRESSING = 6.0
+PRESSING = 2.5
 """Something presses where an external torque is so many of its completion's standard deviations off."""
 
 
@@ -56,12 +56,13 @@ class Response(NamedTuple):
     Attributes:
         name: one of ``RESPONSES``; empty where there is nothing to respond to, or nothing is to be done by the table.
         cause: as ``info["asm"]["cause"]`` says it.
-        over: the contact that was responded to is over.
+        pressed: whether the contact that was responded to is still there; None where that is not known, and where it
+            has lasted for so long that it may never end.
     """
 
     name: str
     cause: dict[str, Any]
-    over: bool = False
+    pressed: bool | None = None
 
     @property
     def why(self) -> str:
@@ -190,23 +191,22 @@ class Responder:
         self._quiet = 0 if alarm else self._quiet + 1
         if self._quiet > QUIET_S / dt:
             self._forget()
-        over = self._repairs and self._over()
+        pressed = self._pressed() if self._repairs else None
         for family in self._since:
             self._since[family] += 1
         if not alarm:
-            return Response("", as_info(None), over)
+            return Response("", as_info(None), pressed)
         cause = self._believed(self._cause(failed, attribution))
         self._named = cause
         family = cause.family if cause is not None and cause.probability >= SURE else "unknown"
         self._since.setdefault(family, 0)
-        lasting = self._since[family] >= LASTING.get(family, np.inf) / dt
-        name = self._table[f"lasting {family}" if lasting else family]
+        name = self._table[f"lasting {family}" if self._lasts(family) else family]
         if name == "complete" and not self._complete(cause):
             name = self._table["unknown"]
         said = as_info(cause, self._force(family))
         if cause is None or family != cause.family:
             said |= {"family": family, "part": ""}
-        return Response(name if self._repairs else "", said, over)
+        return Response(name if self._repairs else "", said, pressed)
 
     def _cause(self, failed: bool, attribution: NDArray[np.float64]) -> Cause | None:
         if failed or self._diagnosis is None or not all(np.isfinite(row).all() for row in self._rows):
@@ -253,12 +253,17 @@ class Responder:
         self._usual = self._touch.error[own]
         return found
 
-    def _over(self) -> bool:
-        """Whether nothing presses any more."""
+    def _pressed(self) -> bool | None:
+        """Whether what touched the body still does."""
         if self._named is None or self._named.family != "contact":
-            return False
+            return None
         torque = self._pressing()
-        return torque is not None and bool((np.abs(torque) < PRESSING * self._usual).all())
+        if torque is None or (np.abs(torque) < PRESSING * self._usual).all():
+            return None if torque is None else False
+        return None if self._lasts("contact") else True
+
+    def _lasts(self, family: str) -> bool:
+        return self._since.get(family, 0) >= LASTING.get(family, np.inf) / self._spec.dt
 
     def _force(self, family: str) -> dict[str, Any] | None:
         """The link that is pressed, and the force (3,) on it [N], in the world's axes."""

@@ -26,6 +26,7 @@ from asm_gym.wrappers.arguments import (
     make_fallback,
     make_patience,
     make_reflex,
+    names_causes,
 )
 from asm_gym.wrappers.observer import Observer, joined
 from asm_gym.wrappers.recording import StreamSource
@@ -52,6 +53,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     ``info["asm"]`` says what came of a step: see ``asm_gym.wrappers.reports.report``. For loggers the same stands
     beside it as NumPy scalars: ``info["asm_surprise"]``, ``info["asm_alarm"]``, ``info["asm_intervened"]``, and
     ``info["cost"]``, which is 1.0 on every step with an alarm and 0.0 otherwise, as safe-RL libraries expect.
+    ``info["overridden"]`` is True after a step that began with another than the policy in charge: a policy with a state
+    then resumes where it was left, if it is given the state from before, as ``asm_gym.policies.rollout`` does.
 
     Args:
         env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream. No
@@ -61,7 +64,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             every controller and wrapper; ``"retract"`` goes back along the path; ``"comply"`` yields to what presses;
             ``"recall"`` goes on as the memory expects; ``"graded"`` does what the cause asks for (``responses``), hands
             back on trial, and ends the episode where trials fail; ``"terminate"`` ends the episode; any other policy
-            acts itself, and where it raises, or returns what is no finite action, the robot holds.
+            acts itself, and where it raises, or returns what is no finite action, the robot holds. None for
+            ``"graded"`` with a monitor that names causes, and for ``"hold"`` with any other.
         release_after: control steps of quiet after which control is handed back.
         release_below: share of the threshold, in (0, 1], that surprise must be under to count as quiet.
         max_override: control steps for which a reflex may act, after which the episode ends; an alarm that is back
@@ -97,7 +101,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self,
         env: gym.Env[Any, Any],
         monitor: Monitor | None = None,
-        on_alarm: str | Policy = "hold",
+        on_alarm: str | Policy | None = None,
         *,
         release_after: int = 10,
         release_below: float = 0.8,
@@ -146,13 +150,15 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         threshold = check_monitor(monitor, watched)
         self._running = None if adapt is None else adapt.start(threshold)
         self.monitor = monitor
+        if on_alarm is None:
+            on_alarm = "graded" if names_causes(monitor) else "hold"
         self._ends = "truncated" if check_flag("truncate", truncate) else "terminated"
         self._on_alarm = on_alarm if isinstance(on_alarm, str) else "policy"
         reflex = make_reflex(on_alarm, env)
         self._observer = Observer(monitor, recalls=check_expectation(reflex, monitor))
         table = responses_from(responses)
         if responses is not None and on_alarm != "graded":
-            raise ValueError(f"responses are those of on_alarm='graded', got on_alarm={on_alarm!r}")
+            raise ValueError(f"responses are those of on_alarm='graded', got on_alarm={shown(on_alarm)}")
         self._responder = Responder(env, monitor, table, repairs=on_alarm == "graded")
         patience = make_patience(reflex, env, release_after, release_below, max_override, try_after)
         fallback = None if self._box is None else make_fallback(env)
@@ -197,6 +203,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._ended = True  # where anything raises, nobody knows what was done
         self._failed = ""
         self._command(action)
+        overridden = self._arbiter.overriding or self._refused
         self._rows: list[RowReport] = []
         with self._within_steps():
             observation, reward, terminated, truncated, info = self.env.step(self._executed)
@@ -205,6 +212,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         repaired = self._responder.row()
         if repaired is not None and "stream" in info:
             info["stream"] = repaired
+        info["overridden"] = overridden or bool(info.get("overridden"))
         asm = self._report(info, self._rows, self._executed)["asm"]
         if asm["gave_up"] or (asm["alarm"] and self._on_alarm == "terminate"):
             terminated, truncated = terminated or self._ends == "terminated", truncated or self._ends == "truncated"
@@ -275,7 +283,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             ends_step,
             None if expected is None else expected[0],
             response.name,
-            response.over,
+            response.pressed,
             response.why,
         )
         if not decision.intervened:

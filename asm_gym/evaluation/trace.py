@@ -38,8 +38,8 @@ class InterventionOutcome(NamedTuple):
         success: the task was solved at some step.
         ended_by_alarm: the wrapper ended the episode.
         contact_force: the greatest contact force [N].
-        external_force: the greatest external force on an arm since the onset [N].
-        impulse: its time integral since the onset [N s].
+        external_force: the greatest external force on an arm while the fault lasts, or would [N].
+        impulse: its time integral over the same time [N s].
         acted_s: time in which the reflex acted [s].
         contact: the greatest force of the first contact since the onset: at first, and after half a second.
         cause: the family of causes that was named at the first alarm since the onset; empty without one.

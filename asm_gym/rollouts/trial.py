@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -282,8 +282,10 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> Trace:
     fault = np.repeat([bool(info.get("fault")) for info in infos], rows)
     attribution = np.repeat([list(a["attribution"].values()) for a in asm], rows, axis=0)  # the step's greatest
 
-    def felt(name: str, since: int) -> list[float]:
-        return [info.get(name, math.nan) for info in infos[since:]]
+    def felt(name: str, since: int, until: int | None = None) -> list[float]:
+        return [info.get(name, math.nan) for info in infos[since:until]]
+
+    lasted = max((t + 1 for t, info in enumerate(infos) if info.get("fault")), default=None)
 
     named = next((a["cause"] for a in asm[began:] if a["cause"]["family"]), asm[0]["cause"])
     trace = Trace(
@@ -300,8 +302,8 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> Trace:
             success,
             ended_by_alarm=bool(asm[-1]["gave_up"] or (trial.acting == "terminate" and asm[-1]["alarm"])),
             contact_force=float(np.max(felt("contact_force", 0))),
-            external_force=float(np.nanmax(felt("external_force", began), initial=0.0)),
-            impulse=float(np.nansum(felt("external_impulse", began))),
+            external_force=float(np.nanmax(felt("external_force", began, lasted), initial=0.0)),
+            impulse=float(np.nansum(felt("external_impulse", began, lasted))),
             acted_s=sum(a["intervened"] for a in asm) * dt,
             contact=contact_force(np.array(felt("external_force", began)), dt),
             cause=named["family"],
@@ -313,11 +315,28 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> Trace:
 
 
 def watch_pair(trial: Trial, config: RolloutConfig, memory: Path) -> list[Trace]:
-    """The traces of one trial with the policy alone, and as it says.
+    """The traces of one trial with the policy alone, and as it says."""
+    return watch_each(replace(trial, acting=POLICY_ALONE), (POLICY_ALONE, trial.acting), config, memory)
 
-    The wrapper acts only after an alarm, so without one both are the same episode, and it runs once.
+
+def watch_each(trial: Trial, actings: Sequence[str], config: RolloutConfig, memory: Path) -> list[Trace]:
+    """The traces of one trial with each of ``actings``, of which those that must be the same run once.
+
+    The wrapper acts only after an alarm, so without one any reflex's episode is that of the policy alone; the ideal
+    reflex's is, where nothing touches the body and no sense is at fault.
     """
     alone = watch(replace(trial, acting=POLICY_ALONE), config, memory)
-    if alone.alarm.any():
-        return [alone, watch(trial, config, memory)]
-    return [alone, replace(alone, acting=trial.acting)]
+
+    def found(acting: str) -> Trace:
+        told = acting == IDEAL and concerns_ideal(trial, config)
+        if acting == POLICY_ALONE or not (told or (acting != IDEAL and alone.alarm.any())):
+            return replace(alone, acting=acting)
+        return watch(replace(trial, acting=acting), config, memory)
+
+    return [found(acting) for acting in actings]
+
+
+def concerns_ideal(trial: Trial, config: RolloutConfig) -> bool:
+    """Whether an ideal reflex has anything to do about what goes wrong."""
+    faults = trial.faults_in(environment(trial.env_id, config.settings), config)
+    return any(touches_body(fault) or corrupts_senses(fault) for fault in faults)

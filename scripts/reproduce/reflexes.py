@@ -34,7 +34,7 @@ from asm_gym.rollouts.folder import claimed, files_in, locked, make_missing
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress, parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, record, watch
+from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, record, watch_each
 from asm_gym.scripts.command import run
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers.arguments import ON_ALARM
@@ -137,13 +137,12 @@ def record_nominal(args: Args, progress: Progress) -> None:
 
 
 def trials(args: Args) -> list[Trial]:
-    """Every episode, those that share a task and a fault side by side."""
+    """Every episode with the policy alone, those that share a task and a fault side by side."""
     return [
-        Trial(task_spec(task).id, seed, fault, "" if fault in (NOMINAL, PASSING) else "strong", acting=acting)
+        Trial(task_spec(task).id, seed, fault, "" if fault in (NOMINAL, PASSING) else "strong")
         for task in args.tasks
         for fault in args.faults
         for seed in role_seeds(args.seed, task, "react", args.episodes)
-        for acting in (POLICY_ALONE, IDEAL, *args.reflexes)
     ]
 
 
@@ -199,11 +198,11 @@ def table(found: Sequence[Measured], args: Args) -> Table:
     ]
     return Table(
         f"Reflexes against the policy alone, paired by seed, {args.episodes} episodes of each of "
-        f"{', '.join(args.tasks)}; force on the arm from outside since the onset; in brackets 95 % bootstrap "
-        "intervals. The ideal reflex is told of the fault: it stays from the first physics substep of a contact to its "
-        "end, and its senses are never at fault. Shares of what it gains are of success / peak / impulse, from the "
-        "policy alone (0) to it (1). Within limits: contacts under the forces of ISO/TS 15066 for the "
-        f"{args.region}, which is no claim of conformity.",
+        f"{', '.join(args.tasks)}, {args.policy}; force on the arm from outside while the fault lasts; in brackets "
+        "95 % bootstrap intervals. The ideal reflex is told of the fault: it stays from the first physics substep of a "
+        "contact to its end, and its senses are never at fault. Shares of what it gains are of success / peak / "
+        "impulse, from the policy alone (0) to it (1). Within limits: contacts under the forces of ISO/TS 15066 for "
+        f"the {args.region}, which is no claim of conformity.",
         headings,
         rows,
     )
@@ -247,8 +246,9 @@ def _react(args: Args, console: Console) -> Table:
     with stage("fitting and calibrating", console, seconds):
         (learned_from(args) if args.memory is None else NeuralASM.load(args.memory)).save(memory)
     with stage("acting", console, seconds) as progress:
-        run = partial(watch, config=args.config, memory=memory.resolve())
-        traces = parallel_map(run, trials(args), args.parallel, progress)
+        actings = (POLICY_ALONE, IDEAL, *args.reflexes)
+        run = partial(watch_each, actings=actings, config=args.config, memory=memory.resolve())
+        traces = [trace for each in parallel_map(run, trials(args), args.parallel, progress) for trace in each]
     found = comparisons(traces, args)
     made = table(found, args)
     (args.out / "reactions.md").write_text(markdown(made) + "\n", encoding="utf-8")
