@@ -14,17 +14,19 @@ import numba
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def compiled(function: F, fastmath: bool = False) -> F:
+def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = ()) -> F:
     """Compiles ``function``, once a machine.
 
     Args:
         fastmath: lets loops use vector registers; inputs must then be finite.
+        calls: folders of the package, beside its own, that hold functions which it calls; ``"."`` for the package's.
     """
     dispatcher: Any = numba.njit(cache=True, fastmath=fastmath, error_model="numpy")(function)
     cache = _cache_of(dispatcher)
     if cache is not None:
         # numba looks at the function's own file alone, and would keep code that another file's change made stale.
-        cache._source_stamp = _digest(Path(function.__code__.co_filename).parent)
+        own, package = Path(function.__code__.co_filename).parent, Path(__file__).parent
+        cache._source_stamp = "".join(map(_digest, (own, *(package / name for name in calls))))
     return cast(F, dispatcher)
 
 

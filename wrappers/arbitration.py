@@ -85,6 +85,7 @@ class Arbiter:
         space: gym.spaces.Box | None,
     ) -> None:
         self._reflex, self._patience, self._fallback = reflex, patience, fallback
+        self._feeling = reflex if isinstance(reflex, Reflex) else None
         self._space = gym.spaces.Box(-1.0, 1.0, (0,)) if space is None else space
         self.threshold = threshold
         """May be set between episodes."""
@@ -109,8 +110,8 @@ class Arbiter:
         self._warned: set[str] = set()
         self._last = np.zeros(self._space.shape, np.float32)  # (A,) executed last
         self._before = self._last  # (A,) executed last before the override
-        if isinstance(self._reflex, Reflex):
-            self._reflex.reset()
+        if self._feeling is not None:
+            self._feeling.reset()
 
     def warn(self, failure: str, instead: str) -> None:
         """Says what failed, and what happens instead: once an episode for each that can fail."""
@@ -148,7 +149,7 @@ class Arbiter:
             start = np.array([self._fresh])
             if self._fresh:
                 # Reflexes start from what was last done; any other policy starts as in a new episode.
-                self._state = self._reflex.begin(self._before) if isinstance(self._reflex, Reflex) else None
+                self._state = None if self._feeling is None else self._feeling.begin(self._before)
             chosen, self._state = self._reflex.predict(
                 observation, state=self._state, episode_start=start, deterministic=True
             )
@@ -194,7 +195,7 @@ class Arbiter:
         begun, self._refused = self._refused, False
         if self._reflex is None:
             return Decision(alarm, intervened, False, False)
-        failure = self._tell(row, executed, intervened) if feel and isinstance(self._reflex, Reflex) else ""
+        failure = self._tell(row, executed, intervened) if feel else ""
         if expected is not None and isinstance(self._reflex, Recall):
             self._reflex.expects(expected)
         quiet = surprise <= self.threshold * (self._patience.release_below if intervened else 1.0)
@@ -216,10 +217,11 @@ class Arbiter:
         return Decision(alarm, intervened or slowed, transition == "give_up", acted_on, failure, transition)
 
     def _tell(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], intervened: bool) -> str:
-        """Lets the reflex feel the row; what failed at that."""
-        assert isinstance(self._reflex, Reflex)
+        """Lets the reflex feel the row, if it can; what failed at that."""
+        if self._feeling is None:
+            return ""
         try:
-            self._reflex.feel(row, executed, intervened)
+            self._feeling.feel(row, executed, intervened)
         except Exception as error:
             failure = f"reflex: {error!r}"
             self.warn(failure, "it has not felt this row")

@@ -38,7 +38,11 @@ class Observer:
     """
 
     def __init__(self, monitor: Monitor, batch: int = 1, recalls: bool = False) -> None:
-        self._monitor, self._batch, self._recalls = monitor, batch, recalls
+        self._monitor, self._batch = monitor, batch
+        # Asked once: whether an object has what a protocol asks for takes longer than most of what follows.
+        self._forgets = monitor if isinstance(monitor, ForgetsEvidence) else None
+        self._learns = monitor if isinstance(monitor, LearnsOnTheJob) else None
+        self._recalls = monitor if recalls and isinstance(monitor, ExpectsActions) else None
 
     def begin(self) -> None:
         """New episodes in all streams."""
@@ -71,10 +75,10 @@ class Observer:
 
     def forget(self, acted_on: Mask) -> str:
         """Lets the evidence begin anew in the streams of ``acted_on`` (n,); what failed at that."""
-        if not isinstance(self._monitor, ForgetsEvidence) or not acted_on.any():
+        if self._forgets is None or not acted_on.any():
             return ""
         try:
-            state = self._monitor.reset_evidence(self._state)
+            state = self._forgets.reset_evidence(self._state)
             self._state = state if acted_on.all() else choose(acted_on, state, self._state)
         except Exception as error:
             return f"monitor: {error!r}"
@@ -83,8 +87,8 @@ class Observer:
     def learn(self, rows: NDArray[np.float32], surprise: Surprise, rate: float) -> str:
         """Lets the monitor learn from the rows that were observed last; what failed at that."""
         try:
-            if isinstance(self._monitor, LearnsOnTheJob):
-                self._monitor.adapt(self._before, rows, surprise, rate)
+            if self._learns is not None:
+                self._learns.adapt(self._before, rows, surprise, rate)
         except Exception as error:
             return f"monitor: {error!r}"
         return ""
@@ -100,9 +104,9 @@ class Observer:
         return surprise._replace(value=value, attribution=attribution)
 
     def _expected(self, state: Any) -> NDArray[np.float32] | None:
-        if not self._recalls or not isinstance(self._monitor, ExpectsActions):
+        if self._recalls is None:
             return None
-        expected = np.asarray(self._monitor.expected_action(state), np.float32)
+        expected = np.asarray(self._recalls.expected_action(state), np.float32)
         if expected.shape != (self._batch, self._monitor.spec.motor.size):
             raise ValueError(f"expected_action has the shape {expected.shape}")
         return expected
@@ -115,6 +119,8 @@ def joined(*failures: str) -> str:
 
 def _infinite(surprise: Surprise, failures: tuple[str, ...]) -> Surprise:
     """Infinite, and attributed to nothing, where there are failures."""
+    if not any(failures):
+        return surprise
     failed = np.array([bool(f) for f in failures])
     value = np.where(failed, np.inf, surprise.value)
     return surprise._replace(value=value, attribution=np.where(failed[:, None], 0.0, surprise.attribution))

@@ -52,13 +52,14 @@ def report(
         surprise. ``surprises`` (n,) of all rows in this step. ``latency_us``: the longest time that the monitor took
         for one. The wrapper adds ``completed``, the sensors that are not believed now.
     """
-    surprises = np.array([row.surprise.value[0] for row in rows])
-    worst = rows[int(np.argmax(surprises))].surprise
+    surprises = [float(row.surprise.value[0]) for row in rows]
+    largest = max(surprises)
+    worst = rows[surprises.index(largest)].surprise
     caused = next((row.response for row in reversed(rows) if row.response.why), NO_RESPONSE)
     return {
-        "surprise": float(worst.value[0]),
+        "surprise": largest,
         "threshold": threshold,
-        "alarm": bool((surprises > threshold).any()),
+        "alarm": largest > threshold,
         "intervened": any(row.decision.intervened for row in rows),
         "gave_up": any(row.decision.gave_up for row in rows),
         "transition": next((t for row in reversed(rows) if (t := row.decision.transition)), ""),
@@ -67,6 +68,6 @@ def report(
         "response": caused.name,
         "executed_action": executed,
         "attribution": dict(zip(spec.labels, worst.attribution[0].tolist(), strict=True)),
-        "surprises": surprises,
+        "surprises": np.array(surprises),
         "latency_us": 1e6 * max(row.latency for row in rows),
     }

@@ -274,10 +274,11 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             surprise = surprise if not failure else surprise._replace(value=np.full(1, np.inf))
         if failure:
             self._arbiter.warn(failure, "which counts as an alarm")
-        alarm = not surprise.value[0] <= self.threshold
+        value = float(surprise.value[0])
+        alarm = not value <= self.threshold
         response = self._responder.respond(alarm, bool(failure), surprise.attribution[0])
         decision = self._arbiter.decide(
-            float(surprise.value[0]),
+            value,
             row,
             self._executed,
             ends_step,
@@ -287,7 +288,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             response.why,
         )
         if not decision.intervened:
-            self._largest = max(self._largest or 0.0, float(surprise.value[0]))
+            self._largest = max(self._largest or 0.0, value)
         forgot = self._observer.forget(np.array([decision.acted_on or self._responder.settling]))
         failure = joined(failure, decision.failure, forgot)
         self._rows.append(RowReport(surprise, decision, latency, failure, response))

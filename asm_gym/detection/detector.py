@@ -48,6 +48,10 @@ MOST_ROWS = 60_000
 FAINTEST = 1e-9
 """Lower bound of s where its logarithm is taken."""
 
+LEAST = math.log(TINY)
+NOTHING = -50.0
+"""Logarithm of a share that no double has room for beside 1."""
+
 
 @compiled
 def _step(
@@ -68,29 +72,32 @@ def _step(
     B, X = errors.shape
     G, C = len(gains), context.shape[1]
     new, recent, value = np.empty((B, G, X)), np.empty((B, C)), np.empty(B)
-    ratios, shares = np.empty((G, X)), np.zeros((B, X))
+    ratios, shares = np.empty((G, X)), np.zeros((B, X))  # of ratios their logarithms
     whitened = np.dot(errors / np.sqrt(1.0 + (errors / bound) ** 2), whitening)
     for n in range(B):
-        greatest = TINY
+        greatest = LEAST
         for g in range(G):
             a = gains[g]
             variance = a / (2.0 - a) * (1.0 - (1.0 - a) ** (2 * (steps[n] + 1)))
             for i in range(X):
                 w = vector[n, g, i] + a * (whitened[n, i] - vector[n, g, i])
                 new[n, g, i] = w
-                ratios[g, i] = (w * w / variance / ceiling[g, i]) ** tail[g, i]
+                ratios[g, i] = tail[g, i] * np.log(w * w / (variance * ceiling[g, i]))
                 greatest = max(greatest, ratios[g, i])
         total = 0.0
         for g in range(G):
             for i in range(X):
-                part = (ratios[g, i] / greatest) ** POWER
-                shares[n, i] += part
-                total += part
+                below = POWER * (ratios[g, i] - greatest)
+                if not below < NOTHING:  # what is not a number goes on, and is an alarm
+                    part = np.exp(below)
+                    shares[n, i] += part
+                    total += part
         drive = context_quantile[2 * C]
         for c in range(C):
             recent[n, c] = lately[n, c] + CONTEXT_GAIN * (context[n, c] - lately[n, c])
             drive += context[n, c] * context_quantile[c] + recent[n, c] * context_quantile[C + c]
-        value[n] = greatest * total ** (1.0 / POWER) / np.exp(min(max(drive, context_range[0]), context_range[1]))
+        usual = min(max(drive, context_range[0]), context_range[1])
+        value[n] = np.exp(greatest) * total ** (1.0 / POWER) / np.exp(usual)
         for i in range(X):
             shares[n, i] *= value[n] / max(total, TINY)
     return (new, recent, steps + 1), value, shares
@@ -289,6 +296,11 @@ class EvidenceDetection:
         self._steps, self._offset, self._most = evidence_steps(counted[:2]), offset, offset + MOST_BEYOND
         self.learned_, self.detector_ = learned, detector
         return self
+
+    @property
+    def repeating(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What changes and repetitions add up by (2, 2, X), and what they must exceed (X,)."""
+        return self._steps, self._offset
 
     @property
     def reach(self) -> float:

@@ -94,6 +94,15 @@ def synapses(groups: NDArray[np.intp], changes: slice, inputs: int, size: int) -
     return Change(V, (groups[:, None] == unit_group).astype(np.float32), D)
 
 
+def spans(U: Array) -> NDArray[np.intp]:
+    """(X, 2) where the synapses of each row of ``U`` (X, M) begin and end: those from its own group alone."""
+    if not U.size:
+        return np.zeros((len(U), 2), np.intp)
+    exists = U != 0
+    begins, ends = exists.argmax(axis=1), U.shape[1] - exists[:, ::-1].argmax(axis=1)
+    return np.where(exists.any(axis=1)[:, None], np.stack([begins, ends], axis=1), 0).astype(np.intp)
+
+
 def existing(association: Association) -> Change:
     """1 where a memory has a synapse, 0 elsewhere."""
     return Change(*((W != 0).astype(np.float32) for W in (association.V, association.U, association.D)))
@@ -124,10 +133,23 @@ def normalised_errors(
     W_S: Array,
     b_S: Array,
     remainder: Array,
+    spans: NDArray[np.intp],
 ) -> tuple[Array, Array]:
-    """(Δ - Δ̂)/(s σ) (B, X) for inputs (B, I) and changes (B, X); 0 where ``whole`` (B, 1) is. And f(h) (B, M)."""
+    """(Δ - Δ̂)/(s σ) (B, X) for inputs (B, I) and changes (B, X); 0 where ``whole`` (B, 1) is. And f(h) (B, M).
+
+    Args:
+        spans: (X, 2) of ``U``, outside of which nothing is read.
+    """
     f = hidden_units(inputs, V)
-    out = complete(f, inputs, U, D)
+    out = outward(inputs, D)
+    if inputs.shape[0] > 1:
+        out += outward(f, U)
+    else:
+        for i in range(U.shape[0]):
+            total = np.float32(0)
+            for j in range(spans[i, 0], spans[i, 1]):
+                total += f[0, j] * U[i, j]
+            out[0, i] += total
     spread = log_variance(f, W_S, b_S)
     for n in range(out.shape[0]):
         for i in range(out.shape[1]):

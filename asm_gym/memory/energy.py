@@ -58,13 +58,23 @@ def activate(z: Array) -> Array:
 def outward(a: Array, W: Array) -> Array:
     """a @ W.T: (B, P) from (B, Q), along the synapses ``W`` (P, Q).
 
-    A single row is summed here and not by BLAS, whose threads cost more than so small a product.
+    A single row is summed here and not by BLAS, whose threads cost more than so small a product; four synapses at a
+    time, for which the processor fetches weights faster than for one.
     """
     out = np.empty((a.shape[0], W.shape[0]), a.dtype)
     if a.shape[0] > 1:
         np.dot(a, W.T, out)
         return out
-    for i in range(W.shape[0]):
+    whole = W.shape[0] - W.shape[0] % 4
+    for i in range(0, whole, 4):
+        p = q = r = s = np.float32(0)
+        for j in range(W.shape[1]):
+            p += a[0, j] * W[i, j]
+            q += a[0, j] * W[i + 1, j]
+            r += a[0, j] * W[i + 2, j]
+            s += a[0, j] * W[i + 3, j]
+        out[0, i], out[0, i + 1], out[0, i + 2], out[0, i + 3] = p, q, r, s
+    for i in range(whole, W.shape[0]):
         total = np.float32(0)
         for j in range(W.shape[1]):
             total += a[0, j] * W[i, j]

@@ -18,10 +18,13 @@ from typing import NamedTuple
 import numpy as np
 
 from asm_gym.memory.energy import Array, Scalar, activate, energy_gradient, kernel, outward
-from asm_gym.memory.traces import DECAYS
+from asm_gym.memory.traces import DECAYS, advance
 
 STRIDE = np.float32(1.5)
 """Length of an inference step over the inverse of the curvature; from 2 on it would diverge."""
+
+STILL = np.float32(1e-8)
+"""The energy has come to rest where no unit moves further in a step."""
 
 
 class Weights(NamedTuple):
@@ -66,16 +69,62 @@ def sense(z: Array, W_F: Array) -> Array:
 
 @kernel
 def infer(mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array, curvature: Scalar, iterations: int) -> Array:
-    """z_t (B, H): ``iterations`` steps down the energy, from ``mu`` on; arguments as in ``energy``.
+    """z_t (B, H): steps down the energy, from ``mu`` on, until it is still; arguments as in ``energy``.
 
     Args:
         curvature: Π_z + max Π_x ‖W_F‖², spectral norm.
+        iterations: how many steps, at most.
     """
     z = mu.copy()
     for _ in range(iterations):
         gradient, bend = energy_gradient(z, mu, x, W_F, pi_z, pi_x)
+        farthest = np.float32(0)
         for n in range(z.shape[0]):
             step = STRIDE / (curvature + bend[n])
             for j in range(z.shape[1]):
-                z[n, j] -= step * gradient[n, j]
+                move = step * gradient[n, j]
+                z[n, j] -= move
+                farthest = max(farthest, abs(move))
+        if farthest < STILL:
+            break
     return z
+
+
+@kernel
+def carry(
+    c: Array,
+    u: Array,
+    x: Array,
+    seen: Array,
+    W_C: Array,
+    W_F: Array,
+    W_D: Array,
+    gains: Array,
+    pi_z: Scalar,
+    pi_x: Scalar,
+    curvature: Scalar,
+    iterations: int,
+    context: bool,
+) -> tuple[Array, Array]:
+    """f(μ_t) (B, H) and c_t (B, I): what is needed to watch. Only what is unseen must be inferred.
+
+    Args:
+        c, u, x, seen: (B, I), (B, A + 1), (B, S), (B, S) as in ``Network.follow``.
+        context: whether f(μ_t) is wanted; where it is not, and all is seen, it is left 0.
+    """
+    B, S = x.shape
+    rows = np.hstack((x, u))
+    whole = seen.all()
+    if whole and not context:
+        return np.zeros((B, W_C.shape[0]), c.dtype), advance(c, rows, gains)
+    mu = expect(c, W_C)
+    if not whole:
+        past = outward(np.hstack((c, u)), W_D)  # (B, S + A)
+        left, precision = rows[:, :-1] - past, np.full((B, past.shape[1]), pi_x, c.dtype)
+        precision[:, :S] *= seen
+        found = sense(infer(mu, left, W_F, pi_z, precision, curvature, iterations), W_F)
+        for n in range(B):
+            for i in range(S):
+                if seen[n, i] == 0:
+                    rows[n, i] = past[n, i] + found[n, i]
+    return activate(mu), advance(c, rows, gains)

@@ -13,9 +13,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import TICKS, Association, learn_association, normalised_errors
-from asm_gym.memory.energy import Array, activate
-from asm_gym.memory.inference import Weights, direct, expect, infer, sense, weight_shapes
+from asm_gym.memory.association import TICKS, Association, learn_association, normalised_errors, spans
+from asm_gym.memory.energy import Array, Scalar
+from asm_gym.memory.inference import Weights, carry, direct, expect, infer, sense, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory, passes
 from asm_gym.memory.precision import PRECISION_EPOCHS
 from asm_gym.memory.scheduled_sampling import learn
@@ -61,7 +61,7 @@ class Network:
         prior_precision: float,
         sensory_precision: float,
     ) -> None:
-        self.weights, self.association = weights, association
+        self.weights, self.association, self.spans = weights, association, spans(association.U)
         self.iterations = iterations
         # Of single precision all of them, or the compiled loops would compute in double.
         self.prior_precision, self.sensory_precision = np.float32(prior_precision), np.float32(sensory_precision)
@@ -71,7 +71,7 @@ class Network:
     def with_association(self, association: Association) -> Self:
         """The same network with other synapses between senses; this one keeps its own."""
         other = copy.copy(self)
-        other.association = association
+        other.association, other.spans = association, spans(association.U)
         return other
 
     @property
@@ -80,7 +80,7 @@ class Network:
 
     def associate(self, reading: ScaledRows) -> tuple[Array, Array]:
         """(Δ_t - Δ̂_t)/σ_t (B, X), 0 where a row was not whole; and f(h_t) (B, M) of association."""
-        error, units = normalised_errors(reading.inputs, reading.changes, reading.whole, *self.association)
+        error, units = normalised_errors(reading.inputs, reading.changes, reading.whole, *self.association, self.spans)
         return error, units
 
     def at_rest(self, batch: int) -> NDArray[np.float32]:
@@ -105,11 +105,14 @@ class Network:
         return Step(mu, past + sense(mu, w.W_F), z, advance(c, np.hstack([whole, u]), w.gains))
 
     def carry_on(self, c: Array, u: Array, x: Array, seen: Array) -> tuple[Array, Array]:
-        """f(μ_t) (B, H) and c_t (B, I): what of ``follow`` is needed to watch. Only what is unseen must be inferred."""
-        if seen.all():
-            return activate(expect(c, self.weights.W_C)), advance(c, np.hstack([x, u]), self.weights.gains)
-        step = self.follow(c, u, x, seen)
-        return activate(step.mu), step.traces
+        """f(μ_t) (B, H) and c_t (B, I): what of ``follow`` is needed to watch."""
+        expected, traces = carry(c, u, x, seen, *self.weights, *self.inference, True)
+        return expected, traces
+
+    @property
+    def inference(self) -> tuple[Scalar, Scalar, Scalar, int]:
+        """Π_z, Π_x, the curvature, and iterations."""
+        return self.prior_precision, self.sensory_precision, self.curvature, self.iterations
 
     def run_on(self, c: Array) -> Step:
         """A row that is not read: the action is the network's own, and so are the senses it leads to."""

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array
+from asm_gym.memory.energy import Array, kernel, outward
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 
 UPDATES = 6000
@@ -25,8 +25,8 @@ UPDATES = 6000
 BATCH = 512
 RATE = 1e-2
 
-FORGOTTEN = 0.1
-"""λ."""
+KEPT = np.float32(0.9)
+"""1 - λ."""
 
 SMALLEST = np.float32(1e-6)
 """Lower bound of p where its logarithm is taken."""
@@ -40,9 +40,13 @@ def certainty(units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
     return shares
 
 
-def add_up(L: Array, units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
-    """L_t (B, K) from L_{t-1}, which is 0 before the first row."""
-    added: NDArray[np.float32] = np.float32(1 - FORGOTTEN) * L + np.log(certainty(units, W_K, b_K) + SMALLEST)
+@kernel
+def add_up(L: Array, units: Array, W_K: Array, b_K: Array) -> Array:
+    """L_t (B, K) from L_{t-1}, which is 0 before the first row; p as in ``certainty``."""
+    drive, added = outward(units, W_K) + b_K, np.empty_like(L)
+    for n in range(L.shape[0]):
+        strength = np.exp(drive[n] - drive[n].max())
+        added[n] = KEPT * L[n] + np.log(strength / strength.sum() + SMALLEST)
     return added
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import Association
+from asm_gym.memory.association import Association, spans
 from asm_gym.memory.energy import Array, activate, outward
 from asm_gym.memory.inference import infer
 from asm_gym.memory.network import Network, Step
@@ -47,7 +47,8 @@ class RecurrentNetwork(Network):
         prior_precision: float,
         sensory_precision: float,
     ) -> None:
-        self.recurrent, self.association, self.iterations = weights, association, iterations
+        self.recurrent, self.iterations = weights, iterations
+        self.association, self.spans = association, spans(association.U)
         self.prior_precision, self.sensory_precision = np.float32(prior_precision), np.float32(sensory_precision)
         norm = float(np.linalg.norm(weights.W_F.astype(np.float64), 2))
         self.curvature = np.float32(prior_precision + sensory_precision * norm**2)

@@ -228,11 +228,7 @@ class CalibratedMonitor:
             stream: (B, D) one row a stream.
         """
         self._fitted()
-        rows = np.asarray(stream, np.float64)
-        self.spec.check_row(rows)
-        batch = batch_of(state)
-        if rows.shape != (batch, self.spec.size):
-            raise ValueError(f"stream must have the shape {(batch, self.spec.size)}, got {rows.shape}")
+        rows = self._rows(state, stream)
         model, output = self.model.predict(state.model, rows)
         detection, attribution = self.detection.attribute_step(state.detection, output, rows, self._place)
         finite = np.isfinite(rows)
@@ -339,6 +335,15 @@ class CalibratedMonitor:
     def _fitted(self) -> None:
         if not self.model.learned_ or (self.detection.arrays and not self.detection.learned_):
             raise RuntimeError(f"this {self._name} has learned nothing yet: call fit(episodes) first")
+
+    def _rows(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+        """(B, D) the rows, of a layout that compiled code knows."""
+        rows = np.ascontiguousarray(stream, np.float64)
+        batch = batch_of(state)
+        if rows.shape != (batch, self.spec.size):
+            self.spec.check_row(rows)
+            raise ValueError(f"stream must have the shape {(batch, self.spec.size)}, got {rows.shape}")
+        return rows
 
     def _outputs(self, episodes: Sequence[Episode]) -> list[ModelOutput]:
         return model_outputs(self.model, episodes)

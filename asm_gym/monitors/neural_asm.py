@@ -28,6 +28,7 @@ from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState, restored
 from asm_gym.monitors.nominal import check_nominal
+from asm_gym.monitors.row import CompiledRow
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.scaling import StreamScaler
 from asm_gym.stream import StreamSpec
@@ -109,6 +110,8 @@ class NeuralASM(CalibratedMonitor):
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule)
         super().__init__(model, EvidenceDetection(spec, gains, bound, shrinkage, habituates), seed=seed)
         self._diagnosis: Diagnosis | None = None
+        self._row: CompiledRow | None = None
+        self._row_of: tuple[Any, ...] | None = None
 
     @property
     def network_(self) -> Network | None:
@@ -175,10 +178,20 @@ class NeuralASM(CalibratedMonitor):
         return cls.load(pretrained_file(name))
 
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
-        state, surprise = super().observe(state, stream)
+        row = self._compiled()
+        state, surprise = super().observe(state, stream) if row is None else row(state, self._rows(state, stream))
         if self.skills_:
             surprise = surprise._replace(skill=np.array(self.skills_)[state.model.skill.argmax(axis=1)])
         return state, surprise
+
+    def _compiled(self) -> CompiledRow | None:
+        """``observe`` in one call, of the weights as they are now."""
+        evidence = self.detection
+        now = self.model.network_, evidence.detector_ if isinstance(evidence, EvidenceDetection) else None, self.skills_
+        if self._row_of is None or any(a is not b for a, b in zip(self._row_of, now, strict=True)):
+            self._fitted()
+            self._row, self._row_of = CompiledRow.of(self.model, self.detection), now
+        return self._row
 
     def for_stream(self, spec: StreamSpec) -> Self:
         """A smaller memory, for a stream that lacks channels of this one; those that are left stand in for them.

@@ -98,7 +98,7 @@ class PlainTorch:
         return float(((pooled / usual) ** POWER + (repeated**POWER).sum()) ** (1 / POWER))
 
 
-def synthetic(channels: int, episodes: int, skills: int = 1, seed: int = 0) -> list[Episode]:
+def synthetic(channels: int, episodes: int, skills: int = 1, seed: int = 0, dt: float = 0.05) -> list[Episode]:
     """Streams of as many sensory channels in five groups, smooth and noisy, and seven actions."""
     sizes = [len(part) for part in np.array_split(np.arange(channels), 5)]
     spec = StreamSpec(
@@ -106,7 +106,7 @@ def synthetic(channels: int, episodes: int, skills: int = 1, seed: int = 0) -> l
             *(Channel(f"sense_{g}", n, noise=0.01, group=f"group_{g}") for g, n in enumerate(sizes)),
             Channel("action", ACTIONS, group=MOTOR),
         ),
-        dt=0.05,
+        dt=dt,
     )
     rng = np.random.default_rng(seed)
     mixing = rng.normal(size=(skills, 12, channels))
