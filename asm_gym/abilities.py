@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.stream import StreamSpec
+from asm_gym.stream import Channel, StreamSpec
 
 
 @runtime_checkable
@@ -50,6 +50,28 @@ class SensesWithinSteps(Protocol):
 
     def command(self, action: NDArray[np.float32]) -> None:
         """From within a hook: another action for the rest of the control step."""
+        ...
+
+
+@runtime_checkable
+class FeelsWithinSteps(Protocol):
+    """It compares what its arms feel with what is expected, in every physics substep."""
+
+    felt_channels: tuple[Channel, ...]
+    substeps: int
+
+    @property
+    def felt(self) -> NDArray[np.float64]:
+        """(K, N) in each substep of the last control step."""
+        ...
+
+    @property
+    def left_band_s(self) -> float | None:
+        """When in the last step it was something else than expected, after the step began [s]; None where never."""
+        ...
+
+    def expect(self, low: NDArray[np.float64], high: NDArray[np.float64], stays: bool = True) -> None:
+        """Says what the arms are to feel in the next step (N,); they stay from the substep after they feel more."""
         ...
 
 

@@ -298,9 +298,9 @@ class EvidenceDetection:
         return self
 
     @property
-    def repeating(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What changes and repetitions add up by (2, 2, X), and what they must exceed (X,)."""
-        return self._steps, self._offset
+    def repeating(self) -> tuple[NDArray[np.float64], ...]:
+        """What changes and repetitions add up by (2, 2, X), what they may come to, and what they must exceed (X,)."""
+        return self._steps, self._most, self._offset
 
     @property
     def reach(self) -> float:

@@ -19,7 +19,22 @@ from numba import types
 
 from asm_gym.compilation import compiled
 from asm_gym.envs.control import control, hand_velocity, set_goal
-from asm_gym.envs.views import JOINTS, Arms, Floats, Goals, Ints, Nominal, Views
+from asm_gym.envs.views import (
+    ACTS,
+    ARMED,
+    FELT,
+    JOINTS,
+    LEFT,
+    PASSED,
+    STAYED,
+    Arms,
+    Band,
+    Floats,
+    Goals,
+    Ints,
+    Nominal,
+    Views,
+)
 
 # What one arm's sensors give in a substep, side by side.
 EXTERNAL = slice(0, JOINTS)
@@ -99,11 +114,36 @@ def sample(views: Views, nominal: Nominal, arms: Arms, k: int, samples: Floats) 
 
 
 @compiled
+def feel(arms: Arms, band: Band, k: int, samples: Floats) -> None:
+    """Compares what the arms felt in substep ``k`` with what they were to feel; what is not a number is outside."""
+    state = band.state
+    if state[ARMED] and state[LEFT] < 0:
+        for a in range(len(arms.joints)):
+            for i in range(FELT):
+                value = samples[a, k, i if i < JOINTS else i - JOINTS + WRENCH.start]
+                used = i >= JOINTS or i < arms.joints[a]
+                if used and not (band.low[a, i] <= value <= band.high[a, i]):
+                    state[LEFT] = state[PASSED]
+    state[PASSED] += 1
+
+
+@compiled
+def must_stay(band: Band) -> bool:
+    """Whether the arms are to be told now to stay, which they are once."""
+    state = band.state
+    now = state[ACTS] and state[LEFT] >= 0 and not state[STAYED]
+    if now:
+        state[STAYED] = 1
+    return bool(now)
+
+
+@compiled
 def run(
     views: Views,
     nominal: Nominal,
     arms: Arms,
     goals: Goals,
+    band: Band,
     deltas: Floats,
     turns: Floats,
     fresh: bool,
@@ -114,6 +154,7 @@ def run(
     """Runs ``count`` physics substeps, controllers and sensors included.
 
     Args:
+        band: from the substep after it is left, the arms stay where they are, if that is asked for.
         deltas: (A, JOINTS) the action in metres and radians.
         turns: (A, 3, 3) the rotation it asks for, under operational space control.
         fresh: the set-points are to be moved by these in the first of these substeps.
@@ -124,12 +165,16 @@ def run(
         _step1(views.model, views.data)
         if nominal.model != 0:
             _believe(views, nominal)
+        stay = must_stay(band)
         for a in range(len(arms.joints)):
-            if fresh and k == first:
+            if stay:
+                set_goal(views, arms, goals, a, np.zeros(JOINTS), np.eye(3))
+            elif fresh and k == first:
                 set_goal(views, arms, goals, a, deltas[a], turns[a])
             control(views, nominal, arms, goals, a)
         _step2(views.model, views.data)
         sample(views, nominal, arms, k, samples)
+        feel(arms, band, k, samples)
 
 
 @compiled

@@ -133,6 +133,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.holding = False
         """Set, the arms stay in the next control step, and the grippers keep what they were told, whatever action
         arrives; from within a hook, in the rest of the step that runs. The step unsets it."""
+        self._expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self._stays = False
         self.substeps = backend.PHYSICS_FREQ // control_freq
         self._groups = tuple(stream)
         self._flat = observation == "flat"
@@ -183,6 +185,9 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         dt, source = self._row_substeps / backend.PHYSICS_FREQ, "+".join(self.robots)
         self.measured_spec = StreamSpec(everything, dt, source)
         """Everything that is measured, whether or not the stream carries it."""
+        ends = "external_torque", "wrist_force"
+        self.felt_channels = tuple(c for c in everything if c.name.endswith(ends))
+        """Of what the arms feel: external torque of the joints and force at the wrist, of one arm after another."""
         self._noise = self.measured_spec.noise * self.sensor_noise
         steps = self.measured_spec.resolution
         self._counted = np.flatnonzero(steps if self.sensor_noise else np.zeros_like(steps))
@@ -276,10 +281,13 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
         env = self.robosuite_env
         env.timestep += 1
-        self.simulation.begin()
+        self.simulation.begin(self._expected, self._stays)
+        self._expected = None
         self.command(action)
         self._rows: list[NDArray[np.float32]] = []
         self._advance()
+        if self._stays and self.simulation.left_band is not None:
+            self._action = self._resting()  # what was done last is what the stream says was commanded
         env.cur_time += env.control_timestep
         self._steps += 1
         reward = self._rewards(self._action)
@@ -325,6 +333,33 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         held, self.holding = self.holding, False
         self._action = self._resting() if held else action
         self.simulation.command(self._delivered(self._action), held)
+
+    def expect(self, low: NDArray[np.float64], high: NDArray[np.float64], stays: bool = True) -> None:
+        """Says what the arms are to feel in every physics substep of the next control step, and of that alone.
+
+        Args:
+            low, high: (N,) as ``felt`` lays it out.
+            stays: the arms stay, in the rest of the step, from the substep after one in which they felt anything else.
+
+        Raises:
+            ValueError: a wrong shape, or a band that is empty or not a number.
+        """
+        bounds = np.asarray(low, np.float64), np.asarray(high, np.float64)
+        size = sum(c.size for c in self.felt_channels)
+        if any(b.shape != (size,) for b in bounds) or not (bounds[0] <= bounds[1]).all():
+            raise ValueError(f"a band needs a least and a most for each of {size} numbers, got {shown(bounds)}")
+        self._expected, self._stays = bounds, stays
+
+    @property
+    def felt(self) -> NDArray[np.float64]:
+        """(K, N) what the arms felt in each physics substep since the row began, noiseless; see ``felt_channels``."""
+        return self.simulation.felt
+
+    @property
+    def left_band_s(self) -> float | None:
+        """When in the last step the arms felt what was not expected, after its beginning [s]; None where never."""
+        left = self.simulation.left_band
+        return None if left is None else (left + 1) / backend.PHYSICS_FREQ
 
     def _resting(self) -> NDArray[np.float32]:
         """(A,) the action that changes nothing, where there is one, with the grippers as they were told last."""

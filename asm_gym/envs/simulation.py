@@ -15,7 +15,7 @@ from asm_gym.compilation import must_compile
 from asm_gym.envs import kernels
 from asm_gym.envs.arms import bodies, compilable, describe
 from asm_gym.envs.sensors import Proprioception
-from asm_gym.envs.views import JOINTS, Goals, Nominal, Views
+from asm_gym.envs.views import ACTS, ARMED, FELT, JOINTS, LEFT, Band, Goals, Nominal, Views
 
 # What the controllers and the torque estimate know of the robot. Whoever edits these in the model edits the world, not
 # the robot's knowledge of it.
@@ -51,6 +51,8 @@ class Simulation:
         self._pristine = Nominal(0, 0, v.qpos, v.qvel, v.mass, v.bias, v.damping.copy())
         self._believed: tuple[mujoco.MjModel, mujoco.MjData, Nominal] | None = None
         self._samples = np.zeros((len(self._parts), substeps, kernels.SAMPLE))
+        n = len(self._parts)
+        self._band = Band(np.zeros((n, FELT)), np.zeros((n, FELT)), np.zeros(5, np.int64))
         self.proprioception = Proprioception(self._parts, self._views, self.data)
         self.contact_force = self.external_force = self.mean_external_force = 0.0
         """The largest net contact force on an arm within the control step [N]: the norm of the summed contact forces on
@@ -76,6 +78,9 @@ class Simulation:
             for name in ("_ref_joint_pos_indexes", "_ref_joint_vel_indexes")
         )
         n = len(self._parts)
+        self._band.state[:] = 0, 0, 0, -1, 0
+        # Where the numbers of ``felt`` stand in a band: arm, and place.
+        self._felt_places = np.nonzero([[i >= JOINTS or i < n for i in range(FELT)] for n in self._arms.joints])
         self._goals = Goals(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, JOINTS)))
         self._deltas = np.zeros((n, JOINTS))
         self._turns = np.tile(np.eye(3), (n, 1, 1))
@@ -88,9 +93,19 @@ class Simulation:
 
     # ------------------------------------------------------------------ control steps
 
-    def begin(self) -> None:
-        """Begins a control step."""
+    def begin(self, expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None, acts: bool = True) -> None:
+        """Begins a control step.
+
+        Args:
+            expected: the least and the most (N,) that the arms are to feel in its substeps, as ``felt`` lays it out.
+            acts: the arms stay from the substep after that in which they felt anything else.
+        """
         self._done = self._row_began = 0
+        self._band.state[:] = 0, 0, 0, -1, 0
+        if expected is not None:
+            for bound, values in zip(self._band[:2], expected, strict=True):
+                bound[self._felt_places] = values
+            self._band.state[[ARMED, ACTS]] = 1, acts
         self._felt = (0.0, 0.0, 0.0)
 
     def command(self, action: NDArray[np.float64], hold: bool = False) -> None:
@@ -130,6 +145,9 @@ class Simulation:
                     self._brake(self._anchor)
                 self.env.sim.step2()
                 kernels.sample(self._views, self._nominal(), self._arms, k - self._row_began, self._samples)
+                kernels.feel(self._arms, self._band, k - self._row_began, self._samples)
+                if kernels.must_stay(self._band):
+                    self._anchor = self.data.qpos[self._joints]
                 self._fresh = False
         self._fresh = False
         self._done += count
@@ -150,7 +168,22 @@ class Simulation:
 
     def _run(self, count: int) -> None:
         steps = (self._fresh, self._done - self._row_began, count, self._samples)
-        kernels.run(self._views, self._nominal(), self._arms, self._goals, self._deltas, self._turns, *steps)
+        goals = self._goals, self._band, self._deltas, self._turns
+        kernels.run(self._views, self._nominal(), self._arms, *goals, *steps)
+
+    @property
+    def left_band(self) -> int | None:
+        """The first substep of the control step in which the arms felt what was not expected; None for none."""
+        left = int(self._band.state[LEFT])
+        return None if left < 0 else left
+
+    @property
+    def felt(self) -> NDArray[np.float64]:
+        """(K, N) what the arms felt in each substep since the row began, noiseless: of each arm the external torque of
+        its joints [N m], then the force at its wrist [N]."""
+        count, wrist = self._done - self._row_began, slice(kernels.WRENCH.start, kernels.WRENCH.start + 3)
+        parts = [[s[:count, :n], s[:count, wrist]] for s, n in zip(self._samples, self._arms.joints, strict=True)]
+        return np.hstack([part for arm in parts for part in arm])
 
     def sense(self) -> NDArray[np.float64]:
         """What the arms' sensors read now, summarised over the substeps since the row began; noiseless."""

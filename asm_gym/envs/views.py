@@ -13,6 +13,9 @@ Ints = NDArray[np.int64]
 JOINTS = 7
 """The most joints an arm may have; shorter arms leave the rest unused."""
 
+FELT = JOINTS + 3
+"""What an arm feels of its surroundings: external torque of its joints, then force at the wrist."""
+
 OSC_POSE, JOINT_POSITION = 0, 1
 
 
@@ -83,3 +86,16 @@ class Goals(NamedTuple):
     position: Floats  # (A, 3) relative to the base
     orientation: Floats  # (A, 3, 3) relative to the base
     joints: Floats  # (A, JOINTS)
+
+
+class Band(NamedTuple):
+    """What the arms are expected to feel in every substep of a control step; changed in place."""
+
+    low: Floats  # (A, FELT) [N m], [N]
+    high: Floats  # (A, FELT)
+    state: Ints  # (5,) see below
+
+
+ARMED, ACTS, PASSED, LEFT, STAYED = range(5)
+"""Of ``Band.state``: whether it is looked at; whether the arms stay once it is left; substeps since the control step
+began; in which of them it was first left, -1 for none; whether they were told to stay."""

@@ -125,8 +125,8 @@ def _observe(
     errors, context = error.astype(np.float64), new[1].astype(np.float64)
     (new[6][:], new[7][:], new[8][:]), _, shares = _step(vector, lately, counted, errors, context, *detector)
     now = rows[:, sensory]
-    new[9][:], new[10][:], new[11][:] = repeated(said, again, unlikely, now, repeating[0])
-    _attribute(shares, new[11], repeating[1], sensory, finite, *found)
+    new[9][:], new[10][:], new[11][:] = repeated(said, again, unlikely, now, repeating[0], repeating[1])
+    _attribute(shares, new[11], repeating[2], sensory, finite, *found)
 
 
 @compiled
