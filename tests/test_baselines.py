@@ -31,8 +31,13 @@ def fitted(model):
     """Once, for it is the same under every detection; with few updates, for the contract asks for no skill."""
     kwargs = {"epochs": 4, "hidden_size": 16, "seed": 1} if model == "neural_asm" else {"seed": 1}
     with pytest.MonkeyPatch.context() as less:
-        for module in (association_mlp, fail_detect, gru, lstm_vae):
-            less.setattr(module, "UPDATES", 300)
+        for module, how_much in (
+            (association_mlp, "UPDATES"),
+            (fail_detect, "UPDATES"),
+            (gru, "EPOCHS"),
+            (lstm_vae, "EPOCHS"),
+        ):
+            less.setattr(module, how_much, 300 if how_much == "UPDATES" else 100)
         return make_monitor(model, SPEC, **kwargs).fit(episodes(20))
 
 
@@ -168,3 +173,21 @@ def test_the_parts_of_the_memory_expect_what_it_does():
     X = len(SPEC.sensory)
     assert np.square(left)[20:, 0, :X].mean() < 0.5 * np.square(all_of_it)[20:, 0, :X].mean()
     assert whole.model.kind == "neural_asm"
+
+
+def test_training_slows_down_at_plateaus_ends_where_nothing_is_gained_and_keeps_the_best():
+    torch = pytest.importorskip("torch")
+    from asm_gym.monitors.baselines.torch_model import PATIENCE, converge
+
+    module, rates = torch.nn.Linear(1, 1, bias=False), []
+    losses = [5.0, 3.0, *[4.0] * 200]
+
+    def epoch(optimiser):
+        rates.append(optimiser.param_groups[0]["lr"])
+        with torch.no_grad():
+            module.weight.fill_(float(len(rates)))
+
+    converge(module, epoch, lambda: torch.tensor(losses[len(rates) - 1]), 200, lambda done, total: None)
+    assert float(module.weight) == 2.0
+    assert len(rates) == 2 + 3 * (PATIENCE + 1)
+    np.testing.assert_allclose(sorted(set(rates)), [9e-5, 3e-4, 1e-3])

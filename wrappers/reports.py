@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,9 +40,11 @@ def report(
         failed: what failed before the step; empty where nothing did.
 
     Returns:
-        ``surprise``: the largest of this step; infinite where something failed. ``threshold``, and ``alarm``: it is
-        over it. ``intervened``: something else than the policy acted, or slowed it down, in a part of this step at
-        least. ``gave_up``: it has acted for ``max_override`` steps, or was to stop, and the episode ends.
+        ``surprise``: the largest of this step; infinite where something failed. ``surprise_body`` and
+        ``surprise_skill``: the largest at what no body does, and at what no skill that was shown does, not a number
+        where the monitor does not listen for it. ``threshold``, and ``alarm``: ``surprise`` is over it.
+        ``intervened``: something else than the policy acted, or slowed it down, in a part of this step at least.
+        ``gave_up``: it has acted for ``max_override`` steps, or was to stop, and the episode ends.
         ``transition``: who acts from now on, ``"override"``, ``"release"``, ``"trial"``, ``"give_up"``, or how the
         policy goes on, ``"go on"``, ``"complete"``, ``"slow"``; empty where nothing changes. They go to the log
         ``asm_gym.safety`` with the cause. ``failure``: what failed in this step, ``policy: …``, ``stream: …``,
@@ -58,6 +61,8 @@ def report(
     caused = next((row.response for row in reversed(rows) if row.response.why), NO_RESPONSE)
     return {
         "surprise": largest,
+        "surprise_body": _largest((row.surprise.of_body for row in rows), largest),
+        "surprise_skill": _largest((row.surprise.of_skill for row in rows), math.nan),
         "threshold": threshold,
         "alarm": largest > threshold,
         "intervened": any(row.decision.intervened for row in rows),
@@ -71,3 +76,9 @@ def report(
         "surprises": np.array(surprises),
         "latency_us": 1e6 * max(row.latency for row in rows),
     }
+
+
+def _largest(parts: Iterable[NDArray[np.float64] | None], unknown: float) -> float:
+    """Of one part of the surprise in each row; ``unknown`` where no monitor said it."""
+    said = [float(part[0]) for part in parts if part is not None]
+    return max(said) if said else unknown

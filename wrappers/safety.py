@@ -268,7 +268,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._late(latency):
             surprise = surprise._replace(value=np.full(1, np.inf))
         if self._responder.settling and not failure:
-            surprise = Surprise(np.zeros(1), np.zeros_like(surprise.attribution))
+            surprise = surprise.silenced(np.ones(1, np.bool_))
         if self.learning_rate > 0 and not self._arbiter.overriding and not failure:
             failure = self._observer.learn(row[None], surprise, self.learning_rate)
             surprise = surprise if not failure else surprise._replace(value=np.full(1, np.inf))

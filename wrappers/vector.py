@@ -231,8 +231,8 @@ class VectorNeuralASMSafety(VectorWrapper):
         refused = (c.failure if c.refused else "" for c in commands)
         known = (joined(r, f) if not b else "" for r, f, b in zip(refused, failures, begun, strict=True))
         surprise, expected, failed, _ = self._observer.observe(rows, tuple(known))
-        value = np.where(begun, 0.0, surprise.value)
-        surprise = surprise._replace(value=value, attribution=np.where(begun[:, None], 0.0, surprise.attribution))
+        surprise = surprise.silenced(begun)
+        value = surprise.value
         decisions: list[Decision] = []
         self._failures = [""] * self.num_envs
         for i, arbiter in enumerate(self._arbiters):
@@ -284,9 +284,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         if ended.any():
             self._report(infos["final_info"], surprise, executed, decisions, ended)
             self._begin(ended)
-            surprise = Surprise(
-                np.where(ended, 0.0, surprise.value), np.where(ended[:, None], 0.0, surprise.attribution)
-            )
+            surprise = surprise.silenced(ended)
             executed = np.where(ended[:, None], np.float32(np.nan), executed)
             decisions = [NOTHING if e else d for e, d in zip(ended, decisions, strict=True)]
         self._report(infos, surprise, executed, decisions, np.ones(self.num_envs, bool))
@@ -304,8 +302,11 @@ class VectorNeuralASMSafety(VectorWrapper):
         alarm = surprise.value > threshold
         decisions = decisions or [NOTHING] * self.num_envs
         intervened = np.array([d.intervened for d in decisions])
+        body, skill = surprise.parts
         infos["asm"] = {
             "surprise": surprise.value,
+            "surprise_body": body,
+            "surprise_skill": skill,
             "threshold": threshold,
             "alarm": alarm,
             "intervened": intervened,

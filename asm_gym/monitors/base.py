@@ -29,11 +29,31 @@ class Surprise(NamedTuple):
         value: (B,) what the threshold applies to; ``inf`` where the row was not finite.
         attribution: (B, D) each number's share; adds up to ``value`` along the last axis.
         skill: (B,) the name of the skill that seems to be running, for people to read; None where none was named.
+        of_body: (B,) at what no body does, where a monitor tells it from ``of_skill``; None where that is all of it.
+        of_skill: (B,) at what no skill that was shown does; None where nobody listens for it.
     """
 
     value: NDArray[np.float64]
     attribution: NDArray[np.float64]
     skill: NDArray[np.str_] | None = None
+    of_body: NDArray[np.float64] | None = None
+    of_skill: NDArray[np.float64] | None = None
+
+    @property
+    def parts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(B,) at the body, and (B,) at the skill, not a number where nobody listens for that."""
+        body = self.value if self.of_body is None else self.of_body
+        return body, np.full(len(body), np.nan) if self.of_skill is None else self.of_skill
+
+    def silenced(self, where: NDArray[np.bool_]) -> Surprise:
+        """No surprise ``where`` (B,) nothing is judged."""
+
+        def kept(value: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+            return None if value is None else np.where(where, 0.0, value)
+
+        shares = np.where(where[:, None], 0.0, self.attribution)
+        value = np.where(where, 0.0, self.value)
+        return self._replace(value=value, attribution=shares, of_body=kept(self.of_body), of_skill=kept(self.of_skill))
 
 
 class Monitor(Protocol):

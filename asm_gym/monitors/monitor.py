@@ -37,6 +37,7 @@ class MonitorState(NamedTuple):
 
     model: State
     detection: State
+    skill: State = ()  # of what listens for skills, where there is one
 
 
 class CalibratedMonitor:
@@ -202,9 +203,13 @@ class CalibratedMonitor:
         self._fitted()
         conformal_episodes(false_alarm_rate)  # refuses a bad rate before the work begins
         check_nominal(episodes, self.spec, self.model.shortest)
-        maxima = np.array([s.value.max() for s in self.score_episodes(episodes)])
+        maxima = self._greatest(self.score_episodes(episodes))
         self.threshold_, self.maxima_ = conformal_threshold(maxima, false_alarm_rate), maxima
         return self
+
+    def _greatest(self, scores: Sequence[Surprise]) -> NDArray[np.float64]:
+        """(n,) the largest surprise in each of n episodes."""
+        return np.array([s.value.max() for s in scores])
 
     def initial_state(self, batch: int = 1, skills: Sequence[str] = ()) -> MonitorState:
         """The state before the first row of ``batch`` streams.
@@ -247,7 +252,7 @@ class CalibratedMonitor:
         return self.reset_evidence(state)
 
     def score(self, episode: Episode) -> Surprise:
-        """The surprise of each step of an episode: value (T,), attribution (T, D)."""
+        """The surprise of each step of an episode: value (T,), attribution (T, D); no names of skills."""
         return self.score_episodes([episode])[0]
 
     def score_episodes(self, episodes: Sequence[Episode]) -> list[Surprise]:
@@ -262,6 +267,9 @@ class CalibratedMonitor:
                     mine = steps[: len(episodes[i])]
                     value, attribution = (np.array([s[k][n] for s in mine]) for k in range(2))
                     scores[i] = Surprise(value, attribution.reshape(-1, self.spec.size))
+                    if mine and mine[0].of_skill is not None:
+                        body, skill = np.array([[part[n] for part in s.parts] for s in mine]).T
+                        scores[i] = scores[i]._replace(of_body=body, of_skill=skill)
         return scores
 
     def save(self, path: str | Path) -> None:

@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from asm_gym.checkpoint import read_checkpoint
-from asm_gym.checks import check_number
+from asm_gym.checkpoint import Checkpoint, read_checkpoint
+from asm_gym.checks import check_number, shown
+from asm_gym.choices import check_choice
 from asm_gym.detection import Detector, EvidenceDetection
 from asm_gym.detection.detector import BOUND, GAINS
 from asm_gym.episodes import Episode
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
 from asm_gym.memory.network import Network
-from asm_gym.monitors.base import Surprise
+from asm_gym.monitors.base import Progress, Surprise
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.model import parameter_names
@@ -30,11 +31,15 @@ from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState, restored
 from asm_gym.monitors.nominal import check_nominal
 from asm_gym.monitors.row import CompiledRow
 from asm_gym.monitors.shipped import pretrained_file
+from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise
 from asm_gym.scaling import StreamScaler
 from asm_gym.stream import StreamSpec
 
 MOST_ITERATIONS = 1000
 """Of inference in a row: twenty are enough, and a file that asks for a thousand million would never answer."""
+
+SKILL = "skill."
+"""What the names of arrays begin with in a checkpoint that are of ``skill_``."""
 
 
 class NeuralASM(CalibratedMonitor):
@@ -66,6 +71,7 @@ class NeuralASM(CalibratedMonitor):
     Attributes:
         threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
         maxima_: largest surprise in each episode that ``calibrate`` was given; None before.
+        skill_: what listens for skills; None before ``learn_skills``.
     """
 
     kind = MemoryModel.kind
@@ -112,6 +118,7 @@ class NeuralASM(CalibratedMonitor):
         self._diagnosis: Diagnosis | None = None
         self._row: CompiledRow | None = None
         self._row_of: tuple[Any, ...] | None = None
+        self.skill_: SkillSurprise | None = None
 
     @property
     def network_(self) -> Network | None:
@@ -178,10 +185,13 @@ class NeuralASM(CalibratedMonitor):
         return cls.load(pretrained_file(name))
 
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
-        row = self._compiled()
+        before, row = state.skill, self._compiled()
         state, surprise = super().observe(state, stream) if row is None else row(state, self._rows(state, stream))
         if self.skills_:
             surprise = surprise._replace(skill=np.array(self.skills_)[state.model.skill.argmax(axis=1)])
+        if self.skill_ is not None:
+            after, skill = self.skill_.monitor.observe(before, stream)
+            state, surprise = state._replace(skill=after), self.skill_.joined(surprise, skill, self.alarm_on)
         return state, surprise
 
     def _compiled(self) -> CompiledRow | None:
@@ -192,6 +202,89 @@ class NeuralASM(CalibratedMonitor):
             self._fitted()
             self._row, self._row_of = CompiledRow.of(self.model, self.detection), now
         return self._row
+
+    def initial_state(self, batch: int = 1, skills: Sequence[str] = ()) -> MonitorState:
+        state = super().initial_state(batch, skills)
+        return state if self.skill_ is None else state._replace(skill=self.skill_.monitor.initial_state(batch))
+
+    def reset_evidence(self, state: MonitorState) -> MonitorState:
+        state = super().reset_evidence(state)
+        return state if self.skill_ is None else state._replace(skill=self.skill_.monitor.reset_evidence(state.skill))
+
+    @property
+    def learned_(self) -> dict[str, NDArray[Any]]:
+        found = super().learned_
+        return found if self.skill_ is None else found | {SKILL + n: a for n, a in self.skill_.arrays.items()}
+
+    def restore(self, saved: Checkpoint) -> Self:
+        skill = {n.removeprefix(SKILL): a for n, a in saved.arrays.items() if n.startswith(SKILL)}
+        declared = {n: s for n, s in saved.header["shapes"].items() if not n.startswith(SKILL)}
+        arrays = {n: a for n, a in saved.arrays.items() if not n.startswith(SKILL)}
+        super().restore(Checkpoint({**saved.header, "shapes": declared}, arrays))
+        self.skill_ = SkillSurprise.found(self.spec, skill, self.seed) if skill else None
+        if self.alarm_on != "body" and self.skill_ is None:
+            raise ValueError(f"the checkpoint alarms on {shown(self.alarm_on)} surprise, and holds no skills")
+        check_choice("alarm_on", self.alarm_on, ALARMS_ON)
+        return self
+
+    def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
+        self.skill_ = None  # it was weighed against the memory as it was
+        super()._learn(episodes, progress, warm_start)
+
+    def _greatest(self, scores: Sequence[Surprise]) -> NDArray[np.float64]:
+        if self.skill_ is not None:
+            self.skill_ = self.skill_.heard(scores)
+        return super()._greatest(scores)
+
+    @property
+    def alarm_on(self) -> str:
+        """Which surprise ``value`` and an alarm go by; one of ``ALARMS_ON``."""
+        return str(self.about.get("alarm_on", "body"))
+
+    def learn_skills(self, episodes: Sequence[Episode]) -> Self:
+        """Learns how the skills of the policy that is guarded go on, so that each row has a skill surprise too.
+
+        The surprise of the body, its threshold and its alarms stay as they are: ``with_alarm_on`` chooses others.
+
+        Args:
+            episodes: nominal ones, of one skill or many; those of ``fit`` will do.
+
+        Raises:
+            RuntimeError: the memory has not learned anything yet.
+            ValueError: as ``fit``; or there are more channels than can be weighed against all traces.
+        """
+        self._check(episodes)
+        body = self.with_alarm_on("body")
+        body.skill_ = None
+        self.skill_ = SkillSurprise.learned(episodes, body.score_episodes(episodes), self.seed)
+        self.threshold_, self.maxima_, self.about = body.threshold_, body.maxima_, body.about
+        return self
+
+    def with_alarm_on(self, which: str) -> Self:
+        """The same memory with alarms on another surprise; this one keeps its own.
+
+        ``"body"`` is what no body does, ``"skill"`` what no skill that was shown does; ``"either"`` goes by the larger
+        of the two, and ``"both"`` by the smaller. Each has the threshold of the rate that ``calibrate`` was given, and
+        none where the skills were learned after it.
+
+        Raises:
+            ValueError: an unknown name; the message lists what exists.
+            RuntimeError: the skills have not been learned yet: ``learn_skills`` comes first.
+        """
+        check_choice("alarm_on", which, ALARMS_ON)
+        other = self._copy()
+        if which == self.alarm_on:
+            return other
+        if self.skill_ is None:
+            raise RuntimeError(f"alarm_on={which!r} takes a skill surprise: call learn_skills(episodes) first")
+        other.about = {**self.about, "alarm_on": which}
+        known, threshold, maxima = self.skill_.maxima, self.threshold_, self.maxima_
+        other.threshold_ = other.maxima_ = None
+        if known is not None and threshold is not None and maxima is not None:
+            other.maxima_ = known[ALARMS_ON.index(which)]
+            below = int((maxima <= threshold).sum())
+            other.threshold_ = float(np.sort(other.maxima_)[below - 1]) if below else 0.0
+        return other
 
     def for_stream(self, spec: StreamSpec) -> Self:
         """A smaller memory, for a stream that lacks channels of this one; those that are left stand in for them.
@@ -205,9 +298,11 @@ class NeuralASM(CalibratedMonitor):
         Raises:
             ValueError: it has senses that this memory never met (the message names them), or another rate; the memory
                 was saved by an older asm-gym, or has lost channels before.
-            RuntimeError: the memory has not learned anything yet.
+            RuntimeError: the memory has not learned anything yet, or alarms on skills, which takes all senses.
         """
         self._fitted()
+        if self.alarm_on != "body":
+            raise RuntimeError('skill surprise takes all senses: with_alarm_on("body") does with fewer')
         evidence = self.detections["evidence"]
         assert isinstance(evidence, EvidenceDetection)
         other = type(self)(spec, **self.get_params())

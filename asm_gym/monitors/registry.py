@@ -109,8 +109,9 @@ _BASELINES = {
 }
 
 PARTS = {
-    name: MonitorKind(f"asm_gym.monitors.baselines.memory_parts:{part}")
-    for name, part in {"memory_temporal": "TemporalPart", "memory_association": "AssociationPart"}.items()
+    "memory_temporal": MonitorKind("asm_gym.monitors.baselines.memory_parts:TemporalPart"),
+    "memory_association": MonitorKind("asm_gym.monitors.baselines.memory_parts:AssociationPart"),
+    "memory_skill": MonitorKind("asm_gym.monitors.skill:SkillModel"),
 }
 """Of the Neural ASM, each alone: for an ablation."""
 

@@ -22,7 +22,7 @@ from asm_gym.memory.association import synapses
 from asm_gym.memory.linear import check_inputs
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
-from asm_gym.monitors.baselines.torch_model import TorchModel, steps_of
+from asm_gym.monitors.baselines.torch_model import FRESH, TorchModel, steps_of
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
 from asm_gym.stream import StreamSpec
 
@@ -32,9 +32,6 @@ UNITS = 960
 UPDATES, BATCH, RATE = 12_000, 256, 1e-3
 CHECK, PATIENCE = 200, 10
 """Updates between two looks at the fresh rows, and how many looks without a gain end the training."""
-
-FRESH = 5
-"""One in so many episodes is not trained on, but says when to stop."""
 
 CLOSEST = 20.0
 """Largest error, in standard deviations, whose full weight training feels."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -77,13 +79,59 @@ def adam(module: nn.Module, updates: int, rate: float = 1e-3) -> tuple[torch.opt
     return optimiser, torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
 
 
-def descend(loss: Tensor, optimiser: torch.optim.Optimizer, schedule: Any, clip: float = 1.0) -> None:
+FRESH = 5
+"""One in so many episodes is not trained on, but says when to stop."""
+
+PATIENCE, SLOWER, SLOWEST = 5, 0.3, 3e-5
+"""Epochs without a gain after which the step size is cut to a share; below the smallest, training has converged."""
+
+
+def parted(episodes: int, rng: np.random.Generator) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Which episodes to train on, and which say when to stop; all of them do where they are too few to part."""
+    order = rng.permutation(episodes).astype(np.intp)
+    kept = episodes // FRESH
+    return order[kept:], order[:kept] if kept else order
+
+
+def converge(
+    module: nn.Module,
+    epoch: Callable[[torch.optim.Optimizer], None],
+    fresh: Callable[[], Tensor],
+    most: int,
+    tell: Callable[[int, int], object],
+    rate: float = 1e-3,
+) -> None:
+    """Adam, slowed down at every plateau of the fresh loss, until the smallest step brings no gain; keeps the best.
+
+    Args:
+        epoch: trains once on everything.
+        fresh: the loss in episodes that are not trained on.
+        most: epochs.
+    """
+    optimiser = torch.optim.Adam(module.parameters(), rate)
+    plateaus = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=SLOWER, patience=PATIENCE)
+    best, kept = math.inf, copy.deepcopy(module.state_dict())
+    for n in range(most):
+        tell(n, most)
+        epoch(optimiser)
+        with torch.no_grad():
+            now = float(fresh())
+        if now < best:
+            best, kept = now, copy.deepcopy(module.state_dict())
+        plateaus.step(now)
+        if optimiser.param_groups[0]["lr"] < SLOWEST:
+            break
+    module.load_state_dict(kept)
+
+
+def descend(loss: Tensor, optimiser: torch.optim.Optimizer, schedule: Any = None, clip: float = 1.0) -> None:
     """One update, its gradient cut off at ``clip``."""
     optimiser.zero_grad()
     loss.backward()  # type: ignore[no-untyped-call]
     nn.utils.clip_grad_norm_([p for group in optimiser.param_groups for p in group["params"]], clip)
     optimiser.step()
-    schedule.step()
+    if schedule is not None:
+        schedule.step()
 
 
 def padded(episodes: Sequence[NDArray[np.float32]]) -> tuple[Tensor, Tensor]:

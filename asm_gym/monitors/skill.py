@@ -1,0 +1,194 @@
+"""Skill surprise: whether this is how any skill that was shown goes on, whatever the body does.
+
+    [x̂_t, â_t] = D [c_{t-1}, 1]        c: the traces of ``memory.traces``; D by ridge regression, in closed form
+    ε_t = ([x_t, a_t] - [x̂_t, â_t]) / s
+
+There is no efference copy: what is commanded is judged too. A body does what it always does under a policy that is
+lost, after a grasp that failed, or where a thing is missing; but no skill that was shown goes on like that.
+
+Source: Hoerl and Kennard 1970 for ridge regression; ``memory.linear`` for how its penalty is chosen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.checkpoint import Checkpoint
+from asm_gym.checks import check_number
+from asm_gym.detection import EvidenceDetection, ModelOutput
+from asm_gym.detection.base import Arrays
+from asm_gym.episodes import Episode
+from asm_gym.memory.linear import check_inputs, learn_linear
+from asm_gym.memory.state import newest, past
+from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
+from asm_gym.monitors.base import Progress, Surprise
+from asm_gym.monitors.model import StreamModel
+from asm_gym.monitors.monitor import CalibratedMonitor
+from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
+from asm_gym.stream import StreamSpec
+
+FAINTEST = 1e-4
+"""Smallest spread of an error, in standard deviations of what is expected."""
+
+GAINS = (0.8, 0.2, 0.05)
+"""Of the evidence that errors add up to."""
+
+ALARMS_ON = ("body", "skill", "either", "both")
+"""Which surprise an alarm may be about."""
+
+SMALLEST = 1e-9
+"""Lower bound of a surprise that another is divided by."""
+
+Rows = NDArray[np.float64]
+
+
+class SkillState(NamedTuple):
+    """Where a skill is, one entry a stream; a value, never changed in place."""
+
+    traces: NDArray[np.float32]  # (B, I) c
+    before: Rows  # (B, l, D) the rows seen last, the oldest first
+    earlier: Rows  # (B, l, D) those before
+    steps: NDArray[np.int64]  # (B,) how many rows were seen
+
+
+class SkillModel(StreamModel):
+    """Ridge regression of the next row on the traces; it has no context.
+
+    Attributes:
+        senses_: how it reads a row.
+    """
+
+    kind = "memory_skill"
+    senses_: StreamScaler
+
+    def __init__(self, spec: StreamSpec) -> None:
+        super().__init__(spec)
+        self.lag = rows_apart(spec.dt)
+        self.shortest = 1 + self.lag
+
+    @property
+    def error_columns(self) -> NDArray[np.intp]:
+        """Of values, of the changes of slow channels, and of the command."""
+        return np.concatenate([self.spec.sensory, self.senses_.slow, self.spec.motor])
+
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        streams = [e.stream for e in episodes]
+        senses = StreamScaler.fit(self.spec, streams, self.lag)
+        N = senses.size + len(self.spec.motor)
+        check_inputs(N + len(DECAYS) * (N + 1) + 1)
+        rows = [_row(senses.read_episode(s))[:: self.lag] for s in streams]
+        gains = fit_gains(rows)
+        before = np.concatenate([_traces(r, gains)[:-1] for r in rows])
+        now = np.concatenate([r[1:, :N] for r in rows])
+        known = np.hstack([now, before, np.ones((len(now), 1), np.float32)])
+        D = learn_linear(known, np.zeros(N, np.intp), slice(0, N))[:, N:]
+        left = np.sqrt(np.mean((now - known[:, N:] @ D.T) ** 2, axis=0))
+        standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change}
+        return self.restore({**standard, "gains": gains, "D": D, "remainder": np.maximum(left, FAINTEST)})
+
+    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        self.senses_ = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
+        N = self.senses_.size + len(self.spec.motor)
+        shape = N, len(DECAYS) * (N + 1) + 1
+        if learned["D"].shape != shape:
+            raise ValueError(f"D of a skill should be of shape {shape}, found {learned['D'].shape}")
+        return super().restore(learned, skills)
+
+    def start(self, batch: int, skills: Sequence[str] = ()) -> SkillState:
+        nothing = np.zeros((batch, self.lag, self.spec.size))
+        width = self.senses_.size + len(self.spec.motor) + 1
+        return SkillState(at_rest(batch, width), nothing, nothing, np.zeros(batch, np.int64))
+
+    def predict(self, state: SkillState, rows: Rows) -> tuple[SkillState, ModelOutput]:
+        before, earlier = past(state, rows)
+        reading, found = self.senses_.read(rows, before, earlier), self.learned_
+        row, N = _row(reading), found["D"].shape[0]
+        expected = state.traces @ found["D"][:, :-1].T + found["D"][:, -1]  # (B, N)
+        seen = np.hstack([reading.seen, reading.finite[:, self.spec.motor]])
+        error = seen * (row[:, :N] - expected) / found["remainder"]
+        # Nothing is expected of the first row, nor of rows in between, which the traces do not take up.
+        due = (state.steps % self.lag == 0)[:, None]
+        error[~due[:, 0] | (state.steps == 0)] = 0.0
+        row[:, :N] = np.where((seen > 0) | (state.steps == 0)[:, None], row[:, :N], expected)
+        traces = np.where(due, advance(state.traces, row, found["gains"]), state.traces)
+        rows_seen = newest(state.before, rows), newest(state.earlier, before), state.steps + 1
+        return SkillState(traces, *rows_seen), ModelOutput(error, np.zeros((len(rows), 0)))
+
+
+def _row(reading: ScaledRows) -> NDArray[np.float32]:
+    """(B, N + 1) what the traces take up: senses, command and 1."""
+    return np.hstack([reading.senses, reading.commands])
+
+
+def _traces(rows: NDArray[np.float32], gains: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(T, I) c_t of rows (T, R)."""
+    c, found = at_rest(1, rows.shape[1]), []
+    for row in np.ascontiguousarray(rows):
+        c = advance(c, row[None], gains)
+        found.append(c[0])
+    return np.array(found)
+
+
+@dataclass(frozen=True)
+class SkillSurprise:
+    """What listens for skills beside a memory of the body.
+
+    Args:
+        monitor: of skills, fitted.
+        weight: what brings skill surprise to the scale of the body's, where the two are compared.
+        maxima: (4, n) the largest surprise of each of ``ALARMS_ON`` in the n episodes of the calibration; None before.
+    """
+
+    monitor: CalibratedMonitor
+    weight: float
+    maxima: NDArray[np.float64] | None = None
+
+    @classmethod
+    def learned(cls, episodes: Sequence[Episode], body: Sequence[Surprise], seed: int) -> Self:
+        """From nominal episodes, and the surprise of the body at each."""
+        monitor = _monitor(episodes[0].spec, seed).fit(episodes)
+        skill = monitor.score_episodes(episodes)
+        at_worst = [float(np.median([s.value.max() for s in scores])) for scores in (body, skill)]
+        return cls(monitor, at_worst[0] / max(at_worst[1], SMALLEST))
+
+    def ways(self, body: NDArray[np.float64], skill: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(4, …) what each of ``ALARMS_ON`` goes by."""
+        weighed = self.weight * skill
+        return np.array([body, skill, np.maximum(body, weighed), np.minimum(body, weighed)])
+
+    def joined(self, body: Surprise, skill: Surprise, alarm_on: str) -> Surprise:
+        """The surprise that one of ``ALARMS_ON`` goes by, attributed as that part of it is which it comes from."""
+        value = self.ways(body.value, skill.value)[ALARMS_ON.index(alarm_on)]
+        first = value == body.value if alarm_on != "skill" else np.zeros(len(value), np.bool_)
+        scale = 1.0 if alarm_on == "skill" else self.weight
+        shares = np.where(first[:, None], body.attribution, scale * skill.attribution)
+        return body._replace(value=value, attribution=shares, of_body=body.value, of_skill=skill.value)
+
+    def heard(self, scores: Sequence[Surprise]) -> Self:
+        """With the maxima of what was made of nominal episodes."""
+        return replace(self, maxima=np.array([self.ways(*s.parts).max(axis=1) for s in scores]).T)
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All that a checkpoint needs of it, by name."""
+        maxima = {} if self.maxima is None else {"maxima": self.maxima}
+        return {**self.monitor.learned_, **maxima, "weight": np.array(self.weight)}
+
+    @classmethod
+    def found(cls, spec: StreamSpec, arrays: Arrays, seed: int) -> Self:
+        """As ``arrays`` say. Raises ValueError or KeyError where they do not fit together."""
+        weight = check_number("the weight of skill surprise", float(arrays["weight"]), above=0.0)
+        learned = {n: a for n, a in arrays.items() if n not in ("maxima", "weight")}
+        shapes = {name: array.shape for name, array in learned.items()}
+        header = {"shapes": shapes, "skills": (), "threshold": None, "detection": EvidenceDetection.name}
+        return cls(_monitor(spec, seed).restore(Checkpoint(header, learned)), weight, arrays.get("maxima"))
+
+
+def _monitor(spec: StreamSpec, seed: int) -> CalibratedMonitor:
+    """Not yet fitted."""
+    return CalibratedMonitor(SkillModel(spec), EvidenceDetection(spec, GAINS, habituates=False), seed=seed)
