@@ -1,10 +1,11 @@
 """The study of causes: which class a kind belongs to, and what every family counts."""
 
 import numpy as np
+import pytest
 
 from asm_gym.faults.suite import KINDS
 from asm_gym.monitors.diagnosis import CLASSES, EVIDENCE, Readout
-from asm_gym.scripts.reproduce.diagnosis import FAMILY, Examples, class_of, main
+from asm_gym.scripts.reproduce.diagnosis import FAMILY, Examples, asked, class_of, main
 
 
 def test_every_kind_of_the_suite_has_a_class_and_nothing_else_has():
@@ -14,11 +15,31 @@ def test_every_kind_of_the_suite_has_a_class_and_nothing_else_has():
     assert list(CLASSES)[class_of("harmless")] == "unknown"
 
 
+def rows_of(classes, kinds, episodes, located=True):
+    n = len(classes)
+    zeros, where = np.zeros((n, 2)), np.full((n, len(CLASSES)), located)
+    return Examples(zeros, np.asarray(classes), np.asarray(kinds), np.asarray(episodes), np.zeros(n, int), where)
+
+
 def test_families_kinds_and_episodes_count_alike_however_many_rows_they_have():
     classes = np.array([class_of(k) for k in ("push", "push", "push", "payload", "slip")])
     kinds = np.array(["push", "push", "push", "payload", "slip"])
-    weight = Examples(np.zeros((5, 2)), classes, kinds, np.array([0, 0, 1, 2, 3])).weight
+    weight = rows_of(classes, kinds, np.array([0, 0, 1, 2, 3])).weight
     np.testing.assert_allclose(weight, [0.125, 0.125, 0.25, 0.5, 1.0])
+
+
+def test_what_is_believed_is_the_mean_of_an_episodes_diagnoses_and_a_half_sure_one_is_unknown():
+    sensor, contact = (list(CLASSES).index(name) for name in ("sensor", "contact"))
+    told = np.eye(len(CLASSES))[[sensor, contact, contact, contact]]
+    rows = rows_of([contact] * 4, ["push"] * 4, [0, 0, 0, 1])
+    made = asked(lambda evidence: told, rows, "seeds", 0)
+    assert [r["p"] for r in made] == [1.0, 0.5, pytest.approx(2 / 3), 1.0]
+    assert [r["right"] for r in made] == [False, False, True, True]
+    assert [r["part"] for r in made] == [r["right"] for r in made]
+    vague = np.full((1, len(CLASSES)), 1 / len(CLASSES))
+    (one,) = asked(lambda evidence: vague, rows.of(np.arange(4) == 3), "seeds", 0)
+    assert one["unknown"]
+    assert not one["right"]
 
 
 def test_the_shipped_readout_fits_what_is_weighed():

@@ -118,7 +118,7 @@ def test_a_sensor_that_is_completed_already_and_surprises_still_is_held(monkeypa
     env = NeuralASMSafety(Acting(offset), Judge({21, 30}, "sensor"), on_alarm="graded", release_after=2)
     diagnosis = env.monitor.diagnosis_
     same = diagnosis.hypotheses[0]
-    monkeypatch.setattr(type(diagnosis), "_named", lambda *_: same)
+    monkeypatch.setattr(type(diagnosis), "named", lambda *_: same)
     assert [s["response"] for s in infos(env, 40) if s["response"]] == ["complete", "hold"]
 
 

@@ -13,7 +13,7 @@ from asm_gym.abilities import LocatesForces
 from asm_gym.checks import shown
 from asm_gym.choices import check_choice
 from asm_gym.monitors import ExplainsItself, Monitor
-from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, as_info
+from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, as_info, averaged
 from asm_gym.stream import StreamSpec
 from asm_gym.wrappers.arbitration import GOING_ON
 from asm_gym.wrappers.completion import ObservationMap, Repair
@@ -223,8 +223,8 @@ class Responder:
         if cause is None:
             return None
         self._diagnoses += 1
-        newest, share = np.array([cause.probabilities[name] for name in FAMILIES]), max(1 / self._diagnoses, 0.1)
-        self._belief = self._belief + share * (newest - self._belief)
+        newest = np.array([cause.probabilities[name] for name in FAMILIES])
+        self._belief = averaged(self._belief, newest, self._diagnoses)
         family = FAMILIES[int(self._belief.argmax())]
         self._latest[cause.family] = cause
         said = self._latest.get(family, cause)

@@ -137,6 +137,11 @@ class Readout:
         return cls(**{name: np.array(saved[name]) for name in ("mean", "spread", "weights", "bias")})
 
 
+def averaged(belief: NDArray[np.float64], newest: NDArray[np.float64], diagnoses: int) -> NDArray[np.float64]:
+    """(F,) the mean of all ``diagnoses`` of families so far, of which the newest counts a tenth at least."""
+    return belief + max(1 / diagnoses, 0.1) * (newest - belief)
+
+
 def softmax(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Along the last axis."""
     powers = np.exp(x - x.max(axis=-1, keepdims=True))
@@ -229,7 +234,7 @@ class Diagnosis:
             probabilities[family] += float(q)
         family = max(probabilities, key=lambda name: probabilities[name])
         which = max((q, name) for (name, (own, _)), q in zip(CLASSES.items(), p, strict=True) if own == family)[1]
-        named = self._named(which, evidence, best)
+        named = self.named(which, evidence, best)
         columns = named.columns if named is not None and family == "sensor" else np.zeros(0, np.intp)
         return Cause(family, named.part if named else "", probabilities[family], probabilities, columns)
 
@@ -247,8 +252,8 @@ class Diagnosis:
         most = max(self.completion.sensors, key=lambda sensor: float(attribution[sensor[1]].sum()))
         return most if same[most[1]].any() else None
 
-    def _named(self, which: str, evidence: NDArray[np.float64], best: dict[str, int]) -> Hypothesis | None:
-        """The part that explains most, of those that a class has."""
+    def named(self, which: str, evidence: NDArray[np.float64], best: dict[str, int]) -> Hypothesis | None:
+        """The part that explains most, of those that a class has, by what ``evidence`` returned."""
         able = [kind for kind in CLASSES[which][1] if kind in best]
         if not able:
             return None

@@ -1,7 +1,8 @@
-"""Telling causes apart: a read-out of where surprise is and of what explains it, asked for kinds it never saw.
+"""Telling causes apart: a read-out of where surprise is and of what explains it, asked for what it never saw.
 
-Learns from the faulty episodes of an evaluation, in the rows in which a memory is in alarm. Writes the read-out that
-learned from all kinds beside the table, as ``causes.json``; ``asm_gym/monitors/causes.json`` is such a file.
+Learns from the faulty episodes of an evaluation, in the rows in which a memory is in alarm, and is asked for episodes
+of other seeds, and for kinds of faults that were left out. Writes the read-out that learned from all beside the table,
+as ``causes.json``; ``asm_gym/monitors/causes.json`` is such a file.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from rich.console import Console
 from asm_gym.episodes import Episode, load_episode
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.diagnosis import CLASSES, FAMILIES, WINDOW, Diagnosis, Readout
+from asm_gym.monitors.diagnosis import CLASSES, FAMILIES, WINDOW, Diagnosis, Hypothesis, Readout, averaged
 from asm_gym.rollouts.folder import files_in
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce
@@ -41,10 +42,16 @@ KINDS_OF = {
 """Which kinds of faults each class has, by how their names begin; harmless variations are unknown. Backlash is a
 joint's, and looks like its encoder's, which is what can be completed."""
 
+SEEDS_OUT, KINDS_OUT = "seeds", "kinds"
+"""What was left out."""
+
 ROWS, HARMLESS_ROWS = 14, 4
 """Rows learned from of a faulty and of a harmless episode, at most: the first in alarm, the most surprising."""
 
-SHRINKAGE, STEPS, RATE = 1e-3, 5000, 2.0
+SHRINKAGE, STEPS, RATE = 1e-3, 1500, 2.0
+
+FOLDS = 3
+"""So many times a part of the seeds is left out."""
 
 
 @dataclass(frozen=True)
@@ -53,23 +60,25 @@ class Args(Common):
 
     run: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
     """Folder of an evaluation, whose faulty episodes are learned from."""
-    memory: Path = Path("runs/react/memory.asm")
-    """A calibrated memory of these tasks, such as asm-gym react leaves."""
+    memory: Path | None = None
+    """A calibrated memory, such as asm-gym react leaves; by default the one that ships with the Panda."""
     tasks: tuple[str, ...] = ("Lift", "Stack", "Door")
     """Names of tasks."""
 
 
 class Examples(NamedTuple):
-    """N rows in alarm."""
+    """N rows in alarm, those of an episode side by side and in order."""
 
     evidence: NDArray[np.float64]  # (N, F)
     classes: NDArray[np.intp]  # (N,)
     kinds: NDArray[np.str_]  # (N,)
     episodes: NDArray[np.intp]  # (N,)
+    folds: NDArray[np.intp]  # (N,) episodes of one seed are left out together
+    located: NDArray[np.bool_]  # (N, C) whether what a class would name is where the fault is
 
     def of(self, chosen: NDArray[np.bool_]) -> Examples:
         """Some of them."""
-        return Examples(self.evidence[chosen], self.classes[chosen], self.kinds[chosen], self.episodes[chosen])
+        return Examples(*(part[chosen] for part in self))
 
     @property
     def weight(self) -> NDArray[np.float64]:
@@ -97,7 +106,10 @@ def class_of(kind: str) -> int:
 
 def examples(memory: NeuralASM, diagnosis: Diagnosis, episodes: Sequence[Episode]) -> Examples:
     """The rows in alarm, those aside whose sensor is known to be stuck."""
-    found: list[tuple[NDArray[np.float64], int, str, int]] = []
+    found: list[tuple[NDArray[np.float64], int, str, int, int, list[bool]]] = []
+    seeds = {
+        e.labelled.task: sorted({o.seed for o in episodes if o.labelled.task == e.labelled.task}) for e in episodes
+    }
     for n, (episode, surprise) in enumerate(zip(episodes, memory.score_episodes(episodes), strict=True)):
         label = episode.labelled
         faulty = label.role == "faulty"
@@ -105,19 +117,48 @@ def examples(memory: NeuralASM, diagnosis: Diagnosis, episodes: Sequence[Episode
         level = memory.threshold if faulty else 0.5 * memory.threshold
         rows = [int(t) for t in np.flatnonzero(surprise.value > level) if t >= onset]
         rows = rows[:ROWS] if faulty else sorted(rows, key=lambda t: -surprise.value[t])[:HARMLESS_ROWS]
-        kind = label.kind if faulty else "harmless"
+        kind, fold = label.kind if faulty else "harmless", seeds[label.task].index(episode.seed) % FOLDS
         lifted = diagnosis.completion.lift(episode.stream)
         for t in rows:
             window, where = slice(max(0, t - WINDOW), t + 1), surprise.attribution[t]
             if not diagnosis.is_stuck(episode.stream[window], where):
-                found.append((diagnosis.evidence(lifted[window], where)[0], class_of(kind), kind, n))
-    evidence, classes, kinds, numbers = (np.array(part) for part in zip(*found, strict=True))
-    return Examples(evidence, classes.astype(np.intp), kinds, numbers.astype(np.intp))
+                evidence, best = diagnosis.evidence(lifted[window], where)
+                named = [diagnosis.named(name, evidence, best) for name in CLASSES]
+                here = [h is not None and located(h, kind, label.affected_channels, diagnosis) for h in named]
+                found.append((evidence, class_of(kind), kind, n, fold, here))
+    return Examples(*(np.array(part) for part in zip(*found, strict=True)))
+
+
+def located(named: Hypothesis, kind: str, affected: frozenset[str], diagnosis: Diagnosis) -> bool:
+    """Whether a part that was named has a channel that the fault changes; what becomes of a command has none."""
+    if named.part == "command":
+        return list(CLASSES)[class_of(kind)] == "command"
+    labels = diagnosis.completion.spec.labels
+    return any(labels[column] in affected for column in named.columns)
 
 
 def families(readout: Readout, evidence: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, families) probabilities."""
     return np.asarray(readout(evidence) @ np.eye(len(FAMILIES))[FAMILY])
+
+
+def asked(readout: Readout, rows: Examples, left_out: str, seed: int) -> list[Record]:
+    """What is believed after each row, by all diagnoses of its episode so far."""
+    each, records = readout(rows.evidence), list[Record]()
+    belief, n, episode = np.zeros(len(FAMILIES)), 0, -1
+    for i, p in enumerate(families(readout, rows.evidence)):
+        if rows.episodes[i] != episode:
+            belief, n, episode = np.zeros(len(FAMILIES)), 0, int(rows.episodes[i])
+        n += 1
+        belief = averaged(belief, p, n)
+        family = int(belief.argmax())
+        unknown = bool(belief[family] < SURE or family == FAMILIES.index("unknown"))
+        right = bool(family == FAMILY[rows.classes[i]]) and not unknown
+        which = int(np.where(family == FAMILY, each[i], -1.0).argmax())
+        said = {"right": right, "unknown": unknown, "part": right and bool(rows.located[i, which])}
+        kind = str(rows.kinds[i])
+        records.append({"seed": seed, "left_out": left_out, "kind": kind, "p": float(belief[family]), **said})
+    return records
 
 
 def learned(known: Examples) -> Readout:
@@ -130,26 +171,25 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     paths = files_in(args.run, args.tasks, "faulty", "harmless")
     if not paths:
         raise ValueError(f"{args.run} has no faulty recordings of {', '.join(args.tasks)}: run asm-gym evaluate first")
-    memory = NeuralASM.load(args.memory)
+    memory = NeuralASM.pretrained("panda") if args.memory is None else NeuralASM.load(args.memory)
     own = memory.diagnosis_
     if own is None:
         raise ValueError(f"{args.memory} was saved before there was completion: fit it anew")
     with stage("weighing", console, seconds):
         known = examples(memory, own, [load_episode(path) for path in paths])
-    kinds = [kind for kind in dict.fromkeys(known.kinds.tolist()) if kind != "harmless"]
-    kinds = kinds[:: max(1, len(kinds) // 4)] if args.quick else kinds
+    faulty = known.kinds != "harmless"
+    kinds = list(dict.fromkeys(known.kinds[faulty].tolist()))
     records: list[Record] = []
+    with stage("leaving seeds out", console, seconds):
+        for fold in range(1 if args.quick else FOLDS):
+            out = known.folds == fold
+            records += asked(learned(known.of(~out)), known.of(out & faulty), SEEDS_OUT, args.seed)
     with stage("leaving kinds out", console, seconds) as progress:
-        for n, kind in enumerate(kinds):
-            asked = known.of(known.kinds == kind)
-            p = families(learned(known.of(known.kinds != kind)), asked.evidence)
-            sure, named = p.max(axis=1), p.argmax(axis=1)
-            right, unsure = named == FAMILY[asked.classes], (sure < SURE) | (named == FAMILIES.index("unknown"))
-            records += [
-                {"seed": args.seed, "kind": kind, "right": bool(r and not u), "unknown": bool(u), "p": float(q)}
-                for r, u, q in zip(right, unsure, sure, strict=True)
-            ]
-            progress(n + 1, len(kinds))
+        left = kinds[:: max(1, len(kinds) // 4)] if args.quick else kinds
+        for n, kind in enumerate(left):
+            out = known.kinds == kind
+            records += asked(learned(known.of(~out)), known.of(out), KINDS_OUT, args.seed)
+            progress(n + 1, len(left))
     shipped = learned(known)
     saved = {name: np.round(getattr(shipped, name), 5).tolist() for name in ("mean", "spread", "weights", "bias")}
     (args.out / "causes.json").write_text(json.dumps(saved), encoding="utf-8")
@@ -157,23 +197,31 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
 
 
 def table(records: Sequence[Record], kinds: Sequence[str]) -> Table:
-    """A row for each kind that was left out."""
+    """A row for each kind, and one for all."""
+
+    def share(mine: Sequence[Record], *names: str) -> str:
+        return f"{np.mean([any(r[name] for name in names) for r in mine]):.2f}" if mine else ""
+
     rows = []
-    for kind in kinds:
-        mine = [r for r in records if r["kind"] == kind]
-        family = FAMILIES[FAMILY[class_of(kind)]]
-        right, unknown = (float(np.mean([r[what] for r in mine])) for what in ("right", "unknown"))
-        rows.append((kind.replace("_", " "), family, f"{len(mine)}", f"{right:.2f}", f"{unknown:.2f}"))
+    for kind in (*kinds, "all"):
+        of = [r for r in records if kind in (r["kind"], "all")]
+        seeds, left = ([r for r in of if r["left_out"] == out] for out in (SEEDS_OUT, KINDS_OUT))
+        family = "" if kind == "all" else FAMILIES[FAMILY[class_of(kind)]]
+        told = share(seeds, "right"), share(seeds, "part"), share(seeds, "unknown")
+        rows.append((kind.replace("_", " "), family, f"{len(seeds)}", *told, share(left, "right", "unknown")))
     return Table(
-        "Rows in alarm of kinds of faults that the read-out never saw: the share of which it names the family, and the "
-        "share it calls unknown",
-        ("Kind left out", "Family", "Rows", "Right", "Unknown"),
+        "Rows in alarm, by what is believed after all diagnoses of the episode so far: the share of which family, and "
+        "family and part, are right, and that of unknown ones, in episodes of seeds that the read-out did not learn "
+        "from; and, where it did not learn from the kind at all, the share that is right or unknown. Of all: each row "
+        "counts alike.",
+        ("Kind", "Family", "Rows", "Family right", "and part", "Unknown", "Kind left out: right or unknown"),
         rows,
     )
 
 
 def figure(records: Sequence[Record]) -> Figure:
-    """How often it is right, by how sure it is."""
+    """How often it is right about other seeds, by how sure it is."""
+    records = [r for r in records if r["left_out"] == SEEDS_OUT]
     drawn = Figure(figsize=(4, 4), layout="constrained")
     axes: Any = drawn.add_subplot()
     edges = np.linspace(SURE, 1.0, 6)
