@@ -191,3 +191,24 @@ def test_training_slows_down_at_plateaus_ends_where_nothing_is_gained_and_keeps_
     assert float(module.weight) == 2.0
     assert len(rates) == 2 + 3 * (PATIENCE + 1)
     np.testing.assert_allclose(sorted(set(rates)), [9e-5, 3e-4, 1e-3])
+
+
+def test_boosted_trees_say_what_scikit_learn_says_of_them():
+    """Of the inputs that they saw, whatever the others are; more than one change, side by side."""
+    ensemble = pytest.importorskip("sklearn.ensemble")
+    from asm_gym.monitors.baselines.association_boosted import _Forest, _said
+
+    rng = np.random.default_rng(0)
+    a = rng.normal(size=(400, 5))
+    seen = [np.array([0, 1, 3]), np.array([2, 4])]
+    targets = np.sin(3 * a[:, 0]) + a[:, 3] ** 2, np.abs(a[:, 2] - a[:, 4])
+    boosted = [
+        ensemble.HistGradientBoostingRegressor(max_iter=20, max_leaf_nodes=7, random_state=0).fit(a[:, own], target)
+        for own, target in zip(seen, targets, strict=True)
+    ]
+    forest = _Forest()
+    for trees, own in zip(boosted, seen, strict=True):
+        forest.grow(trees, own)
+    fresh = rng.normal(size=(100, 5))
+    expected = np.stack([trees.predict(fresh[:, own]) for trees, own in zip(boosted, seen, strict=True)], axis=1)
+    np.testing.assert_allclose(_said(fresh, **forest.arrays), expected, atol=1e-12)

@@ -102,6 +102,7 @@ _BASELINES = {
     "gru": _row("gru:GRU", "mahalanobis"),
     "kalman": _row("kalman:Kalman", "mahalanobis"),
     "association_linear": _row("association_linear:LinearAssociation", "mahalanobis"),
+    "association_boosted": _row("association_boosted:BoostedAssociation", "mahalanobis"),
     "association_mlp": _row("association_mlp:MLPAssociation", "mahalanobis"),
     "window_pca": _row("window_pca:WindowPCA", "squares"),
     "autoregression": _row("autoregression:Autoregression", "mahalanobis"),
