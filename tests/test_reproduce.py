@@ -296,6 +296,7 @@ def test_spread_is_over_seeds_and_not_over_measurements():
     ("study", "arguments", "message"),
     [
         ("memorise_and_recall", ["--cues", "60"], "shorter than the letter, 1 to 59 steps, got 60"),
+        ("memorise_and_recall", ["--dims", "3"], "in 2 dimensions, or in 2 and 3, got \\(3,\\)"),
         ("memorise_and_recall", ["--repertoires", "0"], "1 to 32 skills, got 0"),
         ("memorise_and_recall", ["--hidden", "3"], "at least the number of channels, 6, got 3"),
         ("memorise_and_recall", ["--robot-hidden", "20"], "at least the number of channels, 75, got 20"),

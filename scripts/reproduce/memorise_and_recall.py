@@ -72,6 +72,8 @@ class Args(Common):
     """Hidden units, for a repertoire of eight."""
     hidden: int = 64
     """Hidden units for the other repertoires."""
+    dims: tuple[int, ...] = (2, 3)
+    """Dimensions to write in; 3 with a repertoire of eight only."""
     robot_hidden: int = 256
     """Hidden units for the robosuite skills."""
     cues: tuple[int, ...] = (1, 2, 5, 10, 20, 30)
@@ -101,6 +103,8 @@ class Args(Common):
         for name in ("writings", "steps", "updates"):
             at_least_one(name, getattr(self, name))
         at_least(0, "robot_episodes", self.robot_episodes)
+        if 2 not in self.dims or not set(self.dims) <= {2, 3}:
+            raise ValueError(f"letters are written in 2 dimensions, or in 2 and 3, got {self.dims}")
 
     def scaled(self) -> Args:
         """With ``quick``, little of everything."""
@@ -123,7 +127,7 @@ def conditions(args: Args) -> list[Condition]:
     """Repertoires, then widths, then three dimensions."""
     middle = 8 if 8 in args.repertoires else max(args.repertoires)
     plan = [(n, args.hidden, 2) for n in args.repertoires] + [(middle, h, 2) for h in args.widths]
-    plan.append((middle, args.hidden, 3))
+    plan += [(middle, args.hidden, d) for d in args.dims if d > 2]
     return [Condition(s, *p) for s in args.repetitions for p in dict.fromkeys(plan)]
 
 
@@ -165,12 +169,15 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
     units = f"{args.hidden} units, cue of {longest}; mean ± SD over seeds"
     made = [
         Table(f"Offline error [cm] by skills, {units}", sizes, rows("skills", args.repertoires)),
+        Table(f"Right skill recalled [share] by skills, {units}", sizes, rows("skills", args.repertoires, "right")),
         Table("Online error [cm] by skills", sizes, rows("skills", args.repertoires, cue=STEPS)),
         Table(f"Offline error [cm] by hidden units, {middle} skills", widths, rows("hidden", args.widths)),
         Table(f"Offline error [cm] by cue, {middle} skills", cues, rows("cue", args.cues)),
         Table(f"Right skill recalled [share] by cue, {middle} skills", cues, rows("cue", args.cues, "right")),
-        Table(f"Offline error [cm] by dimensions, {middle} skills", ("", "2", "3"), rows("dims", (2, 3))),
     ]
+    if len(args.dims) > 1:
+        heads = ("", *map(str, args.dims))
+        made.append(Table(f"Offline error [cm] by dimensions, {middle} skills", heads, rows("dims", args.dims)))
     if args.robot_episodes:
         names = {**CALLED, "mean": "mean demonstration, told the skill"}
         made.append(
