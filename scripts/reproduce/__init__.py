@@ -20,8 +20,10 @@ class Study(NamedTuple):
 STUDIES = {
     "memorise_and_recall": Study("one network learns skills, recalls each from a cue"),
     "contextual_inference": Study("the state says which skill is running, untold"),
+    "unnamed_skills": Study("how many skills a stream holds, and where each begins"),
     "express_skills": Study("one memory's own motor prediction drives the arm"),
     "local_learning": Study("local updates against backpropagation through time"),
+    "retention": Study("skills learned one after another, with and without replay"),
     "speed_accuracy": Study("more inference, or slower movements, for more accuracy"),
     "fault_detection": Study("surprise, against a library that is told the skill"),
     "safe_training": Study("an agent trained alone, and under the safety wrapper"),

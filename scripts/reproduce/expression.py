@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from asm_gym.episodes import Episode
 from asm_gym.memory.association import Association, association_shapes
+from asm_gym.memory.inference import Weights
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, initial_weights
 from asm_gym.memory.recall import Recalled, follow, run_on, to_rows
@@ -72,14 +73,30 @@ class Memory:
             steps: in which its synapses change, with 64 episodes side by side.
             free: ``free_running_probability`` of ``NeuralASM``, which explains the others too.
         """
+        blank = cls.untaught(episodes, hidden, rng, iterations, prior_precision)
+        return blank.taught(episodes, rng, steps, free, rate)
+
+    @classmethod
+    def untaught(
+        cls, episodes: Sequence[Episode], hidden: int, rng: np.random.Generator, iterations: int, prior_precision: float
+    ) -> Memory:
+        """That knows how large the numbers of these episodes are, and nothing else of them."""
         reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
-        learned = trajectories(reader, episodes)
         weights = initial_weights(hidden, reader.size, len(reader.spec.motor), rng)
-        weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in learned])
-        size = 64
-        epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
-        learn(weights, learned, Schedule(epochs, size, rate, iterations, prior_precision, 1.0, free), rng, lambda: None)
+        weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in trajectories(reader, episodes)])
         return cls(reader, Network(weights, unassociated(), iterations, prior_precision, 1.0))
+
+    def taught(
+        self, episodes: Sequence[Episode], rng: np.random.Generator, steps: int, free: float = 0.6, rate: float = 3e-3
+    ) -> Memory:
+        """What it becomes by going on to learn from these; arguments as in ``learned``."""
+        net, size = self.network, 64
+        weights = Weights(*(w.copy() for w in net.weights))
+        how = net.iterations, float(net.prior_precision), float(net.sensory_precision)
+        epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
+        schedule = Schedule(epochs, size, rate, *how, free)
+        learn(weights, trajectories(self.reader, episodes), schedule, rng, lambda: None)
+        return Memory(self.reader, Network(weights, net.association, *how))
 
     def hidden(self, streams: Rows) -> NDArray[np.float32]:
         """The inferred states (T, B, H) of streams (T, B, D)."""
@@ -210,16 +227,19 @@ def mean_demonstrations(train: Sequence[Episode], dims: int) -> NDArray[np.float
     return np.stack([np.mean([e.stream[:, :dims] for e in train if e.info["skill"] == n], axis=0) for n in names])
 
 
-def recalled(model: Expresser, tests: Sequence[Episode], means: NDArray[np.float64], cue: int) -> tuple[float, float]:
+def recalled(
+    model: Expresser, tests: Sequence[Episode], means: NDArray[np.float64], cue: int, skills: Sequence[str] = ()
+) -> tuple[float, float]:
     """Mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
 
     Args:
         tests: of one length.
         means: (K, T, P) mean demonstration of each skill, in order of name.
         cue: the whole length for online recall.
+        skills: their names; those of the tests, where it is empty.
     """
     streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)  # (T, B, D)
-    dims, names = means.shape[2], sorted({str(e.info["skill"]) for e in tests})
+    dims, names = means.shape[2], sorted(skills or {str(e.info["skill"]) for e in tests})
     first = cue if cue < len(streams) else 1
     hand = model.express(streams, cue)[first:, :, :dims]  # (T', B, P)
     error = np.linalg.norm(hand - streams[first:, :, :dims], axis=2).mean()
