@@ -23,8 +23,10 @@ from asm_gym.scripts.reproduce import (
     express_skills,
     fault_detection,
     memorise_and_recall,
+    retention,
     robot_recall,
     speed_accuracy,
+    unnamed_skills,
 )
 from asm_gym.scripts.reproduce.apprentices import DISTURBANCE, demonstrate, stream_of
 from asm_gym.scripts.reproduce.common import Common, over_seeds, shown
@@ -419,3 +421,45 @@ def test_the_same_seed_gives_the_same_numbers(tmp_path):
     # To rounding, which depends on where arrays lie in memory, and can turn a close decision.
     again, other = np.abs(runs[0]["0"] - runs[1]["0"]).mean(), np.abs(runs[0]["0"] - runs[0]["1"]).mean()
     assert again < 0.1 * other
+
+
+def test_a_replay_knows_no_more_of_a_letter_than_the_rows_that_begin_it():
+    train, _ = letters_of(2, each=4)
+    rng = np.random.default_rng(0)
+    memory = Memory.untaught(train, 16, rng, 5, 30.0).taught(train, rng, 300)
+    other = [
+        Episode.from_stream(np.r_[e.stream[: retention.BEGUN], 0 * e.stream[retention.BEGUN :]], e.spec) for e in train
+    ]
+    for way in retention.WAYS[2:]:
+        first, second = (
+            retention.replayed(memory, known, way, 2, np.random.default_rng(1)) for known in (train[::4], other[::4])
+        )
+        assert len(first) == (4 if way == "replay from a cue" else 2)
+        for a, b in zip(first, second, strict=True):
+            np.testing.assert_array_equal(a.stream, b.stream)
+    assert retention.replayed(memory, train, "one after another", 2, rng) == []
+
+
+@pytest.mark.slow
+def test_replay_keeps_what_is_lost_without_it():
+    records = retention.one_seed(0, retention.Args(skills=4, blocks=2, hidden=32, writings=6, steps=4000))
+    first = {way: over_seeds(records, "error_cm", way=way, last=True, block=1).mean for way in retention.WAYS}
+    assert first["replay from a cue"] < 0.6 * first["one after another"]
+    assert first["at once"] < 0.6 * first["one after another"]
+
+
+def test_a_stream_of_letters_is_parted_and_counted_without_a_label():
+    records = unnamed_skills.one((0, 3), unnamed_skills.Args(hidden=32, steps=4000, length=4))
+    state = next(r for r in records if r["source"] == "state")
+    assert state["found"] > 0.9
+    assert state["true"] > 0.9
+    assert state["index"] > 0.8
+    assert state["skills_found"] in (3, 4)
+
+
+def test_a_segment_is_clustered_by_its_states_and_every_step_gets_its_cluster():
+    values = np.repeat([[0.0], [5.0], [0.1], [5.1], [0.05]], 12, axis=0)
+    named, count = unnamed_skills.unnamed(values, np.arange(0, 60, 12), 4)
+    assert count == 2
+    assert named.reshape(5, 12).std(axis=1).max() == 0.0
+    assert named[0] == named[24] == named[48] != named[12] == named[36]

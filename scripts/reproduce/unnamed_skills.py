@@ -53,8 +53,14 @@ USUAL = 0.999
 SHORTEST = 10
 """Steps between two beginnings at least."""
 
+CONVINCED = 0.5
+"""Share of the error of going on that beginning anew must stay below."""
+
 AHEAD = 5
 """Steps by which it is settled whether something has begun."""
+
+EARLY = 10
+"""A segment is known by its states from this step on, for as many: all segments are long enough."""
 
 NEAR = 3
 """Steps that a beginning may be off to count as found."""
@@ -145,13 +151,14 @@ def read_on(memory: Memory, stream: Rows, usual: float) -> tuple[NDArray[np.floa
     rest = memory.network.at_rest(1)
     c, begins, states = rest, [0], []
     for t in range(len(stream)):
-        ahead = senses[t : t + 1 + AHEAD], commands[t : t + 1 + AHEAD]
-        wrong, now = errors(memory, c, ahead[0][:1], ahead[1][:1])
-        if wrong[0, 0] > usual and t - begins[-1] >= SHORTEST:
-            anew, on = (errors(memory, traces, *ahead)[0][1:].sum() for traces in (rest, c))
-            if anew < on:
+        on, now = errors(memory, c, senses[t : t + 1], commands[t : t + 1])
+        if on[0, 0] > usual and t - begins[-1] >= SHORTEST:
+            on = errors(memory, c, senses[t : t + 1 + AHEAD], commands[t : t + 1 + AHEAD])[0]
+            fresh = read(memory.reader, stream[t : t + 1 + AHEAD, None])  # nothing has moved yet
+            anew = errors(memory, rest, *fresh)[0]
+            if anew[1:].sum() < CONVINCED * on[1:].sum():
                 begins.append(t)
-                now = errors(memory, rest, ahead[0][:1], ahead[1][:1])[1]
+                now = errors(memory, rest, fresh[0][:1], fresh[1][:1])[1]
         c = now.traces
         states.append(now.hidden[0, 0])
     return np.stack(states), np.array(begins)
@@ -166,7 +173,8 @@ def unnamed(values: NDArray[np.floating], found: NDArray[np.intp], most: int) ->
         most: skills that are thought possible.
     """
     lengths = np.diff([*found, len(values)])
-    segments = np.stack([part[len(part) // 3 :].mean(axis=0) for part in np.split(values, found[1:])])
+    parts = np.split(values, found[1:])
+    segments = np.stack([part[min(EARLY, len(part) // 2) : 2 * EARLY].mean(axis=0) for part in parts])
     best = (-1.0, np.zeros(len(segments), np.intp))
     for count in range(2, min(most, len(segments) - 1) + 1):
         clusters = AgglomerativeClustering(count).fit_predict(segments)
