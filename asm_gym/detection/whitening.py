@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from asm_gym.detection.base import Array
 
+MOST_ERRORS = 8192
+"""Their covariance takes 0.5 GiB, and its eigenvectors minutes."""
+
 
 def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
     """The symmetric (ZCA) matrix M (X, X) that makes ``errors`` (N, X) white; of all, it turns them the least.
@@ -22,6 +25,11 @@ def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
         shrinkage: λ in [0, 1], towards equal variance and no correlation. Above 0 a channel that is constant, or a
             copy of another, is no trouble.
     """
+    if errors.shape[1] > MOST_ERRORS:
+        raise ValueError(
+            f"every error is weighed against every other in whitening, at most {MOST_ERRORS} of them, but this stream "
+            f"makes {errors.shape[1]}: leave channels out, or reduce them before"
+        )
     if not 0.0 <= shrinkage <= 1.0:
         raise ValueError(f"shrinkage must be in [0, 1], got {shrinkage}")
     exact = np.asarray(errors, np.float64)

@@ -74,8 +74,8 @@ def check_inputs(count: int) -> None:
     """Raises ValueError where there are too many to weigh each against every other."""
     if count > MOST_INPUTS:
         raise ValueError(
-            f"association weighs every number of a stream against every other, and reads at most {MOST_INPUTS} of them "
-            f"(values, changes, actions), but this stream makes {count}: leave channels out, or reduce them before"
+            f"every number of a stream is weighed against every other here, at most {MOST_INPUTS} of them (values, "
+            f"changes, actions, rows), but this stream makes {count}: leave channels out, or reduce them before"
         )
 
 

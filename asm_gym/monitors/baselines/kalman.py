@@ -17,6 +17,7 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 
 from asm_gym.detection import ModelOutput
 from asm_gym.episodes import Episode
+from asm_gym.memory.linear import check_inputs
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.base import Standard, no_context
 from asm_gym.monitors.model import StreamModel
@@ -39,6 +40,7 @@ class Kalman(StreamModel):
     kind = "kalman"
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        check_inputs(self.spec.size + 1)
         streams = [e.stream for e in episodes]
         standard = Standard.fit(self.spec, streams)
         xs = [standard(s.astype(np.float64)) for s in streams]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.episodes import Episode
+from asm_gym.memory.linear import check_inputs
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.base import no_context
 from asm_gym.monitors.model import StreamModel
@@ -41,6 +42,7 @@ class WindowPCA(StreamModel):
     shortest = ROWS
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        check_inputs(ROWS * self.spec.size)
         rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)
         mean, spread = rows.mean(axis=0), np.maximum(rows.std(axis=0), 1e-6)
         windows = np.concatenate([_windows((e.stream - mean) / spread) for e in episodes])  # (N, ROWS D)

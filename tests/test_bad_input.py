@@ -1,0 +1,100 @@
+"""Streams that tell little, or too much: what cannot be learned from is refused with what is missing, all else fits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from asm_gym.episodes import Episode
+from asm_gym.monitors import NeuralASM, make_monitor
+from asm_gym.stream import MOTOR, Channel, StreamSpec
+from tests.streams import sine_episodes
+
+NAMES = ("neural_asm", "memory_skill", "association_linear+evidence", "window_pca+evidence", "kalman+evidence")
+
+
+def fresh(name, spec):
+    small = {"hidden_size": 8, "association_size": 24, "epochs": 2} if name == "neural_asm" else {}
+    return make_monitor(name, spec, **small)
+
+
+def changed(episodes, change):
+    def one(episode):
+        stream = episode.stream.copy()
+        change(stream)
+        return replace(episode, stream=stream)
+
+    return [one(episode) for episode in episodes]
+
+
+def constant(stream):
+    stream[:, 3] = 0.7
+
+
+def copied(stream):
+    stream[:, 4] = stream[:, 5]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("change", [constant, copied])
+def test_a_sense_that_never_moves_and_one_that_is_another_s_copy_are_watched_too(name, change):
+    """Fresh episodes are judged as learned ones are, and the sense is blamed once it does otherwise."""
+    monitor = fresh(name, sine_episodes(1)[0].spec).fit(changed(sine_episodes(12), change))
+    nominal = [s.value.max() for s in monitor.score_episodes(changed(sine_episodes(6, seed=1), change))]
+    assert np.isfinite(nominal).all()
+    column, stream = {constant: 3, copied: 4}[change], changed(sine_episodes(1, seed=2), change)[0].stream.copy()
+    stream[20:, column] += 5.0
+    score = monitor.score(Episode.from_stream(stream, sine_episodes(1)[0].spec))
+    assert score.value[20:].max() > 2 * max(nominal)
+    assert np.argmax(score.attribution[20:23].sum(axis=0)) in ({3} if change is constant else {4, 5})
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_episode_fits_and_says_what_its_threshold_lacks(name):
+    (only,) = sine_episodes(1)
+    monitor = fresh(name, only.spec).fit([only])
+    assert np.isfinite(monitor.score(only).value).all()
+    with pytest.raises(ValueError, match=r"needs at least 19 nominal episodes, got 1, which can promise 0\.5 at best"):
+        monitor.calibrate([only], 0.05)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_episodes_of_one_row_are_refused_with_how_many_it_takes(name):
+    rows = [replace(e, stream=e.stream[:1]) for e in sine_episodes(5)]
+    with pytest.raises(ValueError, match=r"episode 0 must be at least [2-9] steps long, got 1"):
+        fresh(name, rows[0].spec).fit(rows)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_micro_units_beside_mega_units_are_judged_alike(name):
+    spec = sine_episodes(1)[0].spec
+    units = np.ones(spec.size)
+    units[[0, 1]] = 1e-6, 1e6
+
+    def scores(factor):
+        learned, others = (
+            [replace(e, stream=(e.stream * factor).astype(np.float32)) for e in sine_episodes(n, seed)]
+            for n, seed in ((16, 0), (2, 1))
+        )
+        return np.maximum(
+            1e-9, np.concatenate([s.value for s in fresh(name, spec).fit(learned).score_episodes(others)])
+        )
+
+    np.testing.assert_allclose(np.log(scores(units)), np.log(scores(1.0)), atol=0.3)
+
+
+@pytest.mark.parametrize("name", [*NAMES, "elapsed_time"])
+def test_ten_thousand_senses_are_refused_at_once_with_what_to_do(name):
+    spec = StreamSpec((Channel("pixels", 10_000), Channel("command", 1, group=MOTOR)), dt=0.05)
+    episode = Episode.from_stream(np.random.default_rng(0).normal(size=(6, 10_001)), spec)
+    with pytest.raises(ValueError, match=r"at most 8192 of them.* makes \d+: leave channels out"):
+        fresh(name, spec).fit([episode])
+
+
+def test_skills_are_learned_from_one_episode_and_from_constant_and_copied_senses():
+    episodes = changed(changed(sine_episodes(6), constant), copied)
+    asm = NeuralASM(episodes[0].spec, hidden_size=8, association_size=24, epochs=2).fit(episodes)
+    for learned in (episodes, episodes[:1]):
+        assert np.isfinite(asm.learn_skills(learned).score(episodes[1]).of_skill).all()
