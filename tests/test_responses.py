@@ -148,6 +148,20 @@ def test_all_senses_lost_is_held():
     assert said[-1]["cause"]["family"] == "unknown"
 
 
+def test_a_stream_that_stops_for_a_second_is_held_for_as_long_without_a_trial_and_the_policy_resumes():
+    class Stopping(gym.Wrapper):
+        def step(self, action):
+            observation, *rest = self.env.step(action)
+            return observation[:2] if 20 < self.unwrapped.t <= 40 else observation, *rest
+
+    env = NeuralASMSafety(Stopping(Acting()), Judge(()), release_after=5)
+    with pytest.warns(UserWarning, match="stream: ValueError"):
+        said = infos(env, 60)
+    assert [t for t, s in enumerate(said) if s["intervened"]] == list(range(21, 45))
+    assert [t for t, s in enumerate(said) if s["failure"].startswith("stream: ")] == list(range(20, 40))
+    assert [(t, s["transition"]) for t, s in enumerate(said) if s["transition"]] == [(20, "override"), (44, "release")]
+
+
 def test_a_diagnosis_that_raises_is_answered_as_the_unknown_is():
     monitor = Judge({10}, "object")
     object.__setattr__(monitor.diagnosis_, "readout", lambda evidence: 1 / 0)

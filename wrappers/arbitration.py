@@ -201,7 +201,8 @@ class Arbiter:
         quiet = surprise <= self.threshold * (self._patience.release_below if intervened else 1.0)
         self._quiet = self._quiet + 1 if quiet else 0
         if intervened:
-            self._acted, self._held = self._acted + 1, self._held + 1
+            # Where nobody knows what is sensed, no trial comes nearer.
+            self._acted, self._held = self._acted + 1, self._held + 1 if math.isfinite(surprise) else 0
             # What the arm feels when it changes over to the reflex confirms nothing yet.
             self.confirmed = self.confirmed or (alarm and self._held > self._patience.release_after)
         elif self._handed_back is not None:
