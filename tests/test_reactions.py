@@ -75,6 +75,12 @@ def test_only_episodes_that_may_differ_are_run(monkeypatch, kind, alarmed, runs)
     assert [t.acting for t in made] == [POLICY_ALONE, "ideal", "hold"]
 
 
+def test_each_task_has_the_agent_that_was_trained_in_it():
+    args = Args(policy="agents")
+    assert [args.config(task).policy for task in ("Lift", "Stack", "Door")] == ["lift_sac", "stack_sac", "door_sac"]
+    assert Args().config("Lift").policy == "scripted"
+
+
 def test_a_share_of_the_ideal_reflexs_gain_is_between_none_and_all():
     alone = [trace(n, POLICY_ALONE, external_force=40.0, impulse=8.0, success=n < 2) for n in range(4)]
     ideal = [trace(n, "ideal", external_force=20.0, impulse=8.0) for n in range(4)]
@@ -121,6 +127,8 @@ def test_the_ideal_reflex_stays_while_something_touches_and_is_told_no_lies():
         (["--max-override-s", "0"], "max_override_s"),
         (["--tasks", "Lift"], "run asm-gym evaluate first"),
         (["--tasks", "Juggle"], "Juggle.*Lift"),
+        (["--tasks", "PickPlaceCan", "--policy", "agents"], "agents"),
+        (["--tasks", "Lift", "--memory", "missing.asm"], "missing.asm"),
         (["--tasks", "Lift", "--policy", "missing.zip"], "missing.zip"),
         (["--tasks", "Lift", "--policy", "missing.zip", "--monitor-freq", "100"], "missing.zip"),
     ],

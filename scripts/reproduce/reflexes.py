@@ -27,7 +27,8 @@ from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table, console_table, markdown
 from asm_gym.evaluation.trace import IDEAL, NOMINAL, POLICY_ALONE, Trace
 from asm_gym.faults.suite import KINDS
-from asm_gym.monitors import NeuralASM
+from asm_gym.monitors import NeuralASM, pretrained
+from asm_gym.policies.registry import agents
 from asm_gym.rollouts.benchmark import fitted
 from asm_gym.rollouts.collect import check
 from asm_gym.rollouts.folder import claimed, files_in, locked, make_missing
@@ -39,6 +40,9 @@ from asm_gym.scripts.command import run
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers.arguments import ON_ALARM
 
+AGENTS = "agents"
+"""As a policy: of each task the agent that was trained in it."""
+
 FAULTS = (NOMINAL, PASSING, "collision", "held_by_person", "stuck_joint", "encoder_bias")
 
 
@@ -48,14 +52,15 @@ class Args:
 
     run: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
     """Folder of an evaluation, whose nominal episodes the memory learns from at the control rate."""
-    memory: Path | None = None
-    """A calibrated memory to watch with, in place of one that learns from the evaluation's recordings."""
+    memory: str | None = None
+    """A calibrated memory to watch with, in place of one that learns from the evaluation's recordings: the body whose
+    memory ships, such as panda, or a path."""
     tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan", "Door")
     """Names of tasks; at the control rate the evaluation must have recorded them."""
     robot: str = "Panda"
     """The arm."""
     policy: str = "scripted"
-    """What acts: scripted, or the path of an agent."""
+    """What acts: scripted, agents for the shipped agent of each task, or the path of an agent."""
     reflexes: tuple[str, ...] = ("hold", "retract", "comply", "recall", "graded", "terminate")
     """Names of reflexes: what the safety wrapper does on an alarm."""
     faults: tuple[str, ...] = FAULTS
@@ -97,9 +102,12 @@ class Args:
         if not self.max_override_s > 0:
             raise ValueError(f"max_override_s must be > 0, got {self.max_override_s}")
 
-    @property
-    def config(self) -> RolloutConfig:
-        return RolloutConfig(self.policy, self.robot, self.monitor_freq, self.max_override_s)
+    def config(self, task: str) -> RolloutConfig:
+        """How the episodes of a task are made."""
+        policy = self.policy
+        if policy == AGENTS:
+            policy = next((name for name in agents() if name.startswith(f"{task.lower()}_")), policy)
+        return RolloutConfig(policy, self.robot, self.monitor_freq, self.max_override_s)
 
 
 def learned_from(args: Args) -> NeuralASM:
@@ -132,8 +140,12 @@ def record_nominal(args: Args, progress: Progress) -> None:
         for role, n in roles.items()
         for s in role_seeds(args.seed, task, role, n)
     ]
-    make = partial(record, config=args.config, folder=args.out.resolve())
+    make = partial(_record, args=args)
     make_missing(make, wanted, lambda label: args.out / label.path, args.parallel, progress)
+
+
+def _record(label: EpisodeLabel, args: Args) -> Path:
+    return record(label, args.config(label.task), args.out.resolve())
 
 
 def trials(args: Args) -> list[Trial]:
@@ -152,6 +164,7 @@ class Measured(NamedTuple):
     comparison: Comparison
     ideal: IdealShare
     harmless: Share  # contacts within the limits
+    settled: Share  # episodes that were solved, or ended by the wrapper
     named: Counter[str]  # families of causes at the first alarm
 
 
@@ -166,7 +179,8 @@ def comparisons(traces: Sequence[Trace], args: Args) -> list[Measured]:
         ideal = share_of_ideal(alone, acted, of(fault, IDEAL))
         named = Counter(t.outcome.cause for t in acted if t.outcome.cause)
         contacts = within_limits([t.outcome.contact for t in acted], args.region)
-        return Measured(compare(alone, acted, args.seed), ideal, contacts, named)
+        settled = Share.of([t.outcome.success or t.outcome.ended_by_alarm for t in acted])
+        return Measured(compare(alone, acted, args.seed), ideal, contacts, settled, named)
 
     return [measured(fault, reflex) for fault in args.faults for reflex in (*args.reflexes, IDEAL)]
 
@@ -175,7 +189,7 @@ def table(found: Sequence[Measured], args: Args) -> Table:
     """A row for each fault and reflex."""
     headings = (
         *("Fault", "Reflex", "Success", "alone", "gained", "Peak force less by", "Impulse less by"),
-        *("Of the ideal reflex's", "Within limits", "In alarm [s]", "Ended", "Median delay [ms]", "Cause named"),
+        *("Of the ideal reflex's", "Within limits", "Solved or ended", "Median delay [ms]", "Cause named"),
     )
     rows = [
         (
@@ -188,8 +202,7 @@ def table(found: Sequence[Measured], args: Args) -> Table:
             c.impulse.percent() if c.kind != NOMINAL else "",
             " / ".join("" if math.isnan(share) else f"{share:.2f}" for share in asdict(m.ideal).values()),
             f"{m.harmless.k} of {m.harmless.n}",
-            f"{c.alarm_s:.2f}",
-            f"{c.ended.k} of {c.ended.n}",
+            f"{m.settled.k} of {m.settled.n}",
             "" if c.kind == NOMINAL else f"{c.median_delay_ms:.0f}" if math.isfinite(c.median_delay_ms) else "missed",
             ", ".join(f"{family} {n}" for family, n in m.named.most_common(3)),
         )
@@ -228,10 +241,19 @@ def _row(trace: Trace) -> dict[str, Any]:
     }
 
 
+def _watch(trial: Trial, args: Args, memory: Path) -> list[Trace]:
+    return watch_each(trial, (POLICY_ALONE, IDEAL, *args.reflexes), args.config(trial.task), memory)
+
+
+def memory_of(named: str) -> NeuralASM:
+    """The memory that ships with a body, or one that was saved."""
+    return NeuralASM.pretrained(named) if named in pretrained() else NeuralASM.load(named)
+
+
 def react(args: Args, console: Console) -> Table:
     """Fits, runs, compares and writes."""
     for task in args.tasks:
-        check(task_spec(task).id, args.config)  # what does not fit is refused before anything runs
+        check(task_spec(task).id, args.config(task))  # what does not fit is refused before anything runs
     settings = {"robot": args.robot, "policy": args.policy, "seed": args.seed, "monitor_freq": args.monitor_freq}
     with claimed(args.out, "recordings.json", settings) if args.monitor_freq is not None else locked(args.out):
         return _react(args, console)
@@ -244,10 +266,9 @@ def _react(args: Args, console: Console) -> Table:
             record_nominal(args, progress)
     memory = args.out / "memory.asm"
     with stage("fitting and calibrating", console, seconds):
-        (learned_from(args) if args.memory is None else NeuralASM.load(args.memory)).save(memory)
+        (learned_from(args) if args.memory is None else memory_of(args.memory)).save(memory)
     with stage("acting", console, seconds) as progress:
-        actings = (POLICY_ALONE, IDEAL, *args.reflexes)
-        run = partial(watch_each, actings=actings, config=args.config, memory=memory.resolve())
+        run = partial(_watch, args=args, memory=memory.resolve())
         traces = [trace for each in parallel_map(run, trials(args), args.parallel, progress) for trace in each]
     found = comparisons(traces, args)
     made = table(found, args)
