@@ -131,7 +131,11 @@ def test_skills_are_learned_first_and_forgotten_where_the_memory_learns_anew():
         both().with_alarm_on("neither")
     with pytest.raises(RuntimeError, match="calibrate"):
         _ = memory().with_alarm_on("body").learn_skills([carried(s) for s in range(5)]).with_alarm_on("skill").threshold
-    asm = both().with_alarm_on("either").fit([carried(s) for s in range(3)])
+    asm = both().with_alarm_on("either")
+    with pytest.raises(ValueError, match="at least 19"):
+        asm.calibrate([carried(100 + s) for s in range(5)], 0.05)
+    assert asm.with_alarm_on("skill").threshold == both().with_alarm_on("skill").threshold
+    asm.fit([carried(s) for s in range(3)])
     assert asm.alarm_on == "body"
     assert asm.skill_ is None
     assert both().skill_ is not None

@@ -203,13 +203,13 @@ class CalibratedMonitor:
         self._fitted()
         conformal_episodes(false_alarm_rate)  # refuses a bad rate before the work begins
         check_nominal(episodes, self.spec, self.model.shortest)
-        maxima = self._greatest(self.score_episodes(episodes))
-        self.threshold_, self.maxima_ = conformal_threshold(maxima, false_alarm_rate), maxima
+        self._set_threshold(self.score_episodes(episodes), false_alarm_rate)
         return self
 
-    def _greatest(self, scores: Sequence[Surprise]) -> NDArray[np.float64]:
-        """(n,) the largest surprise in each of n episodes."""
-        return np.array([s.value.max() for s in scores])
+    def _set_threshold(self, scores: Sequence[Surprise], rate: float) -> None:
+        """By what was made of nominal episodes. Raises ValueError, and changes nothing, where they are too few."""
+        maxima = np.array([s.value.max() for s in scores])
+        self.threshold_, self.maxima_ = conformal_threshold(maxima, rate), maxima
 
     def initial_state(self, batch: int = 1, skills: Sequence[str] = ()) -> MonitorState:
         """The state before the first row of ``batch`` streams.

@@ -231,10 +231,10 @@ class NeuralASM(CalibratedMonitor):
         self.skill_ = None  # it was weighed against the memory as it was
         super()._learn(episodes, progress, warm_start)
 
-    def _greatest(self, scores: Sequence[Surprise]) -> NDArray[np.float64]:
+    def _set_threshold(self, scores: Sequence[Surprise], rate: float) -> None:
+        super()._set_threshold(scores, rate)
         if self.skill_ is not None:
             self.skill_ = self.skill_.heard(scores)
-        return super()._greatest(scores)
 
     @property
     def alarm_on(self) -> str:
