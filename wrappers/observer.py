@@ -48,6 +48,11 @@ class Observer:
         """New episodes in all streams."""
         self._state = self._before = self._initial = self._monitor.initial_state(batch=self._batch)
 
+    @property
+    def state(self) -> Any:
+        """The monitor's, after the last rows."""
+        return self._state
+
     def begin_in(self, begun: Mask) -> None:
         """New episodes in the streams of ``begun`` (n,)."""
         self._state = self._initial if begun.all() else choose(begun, self._initial, self._state)

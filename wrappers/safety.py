@@ -15,6 +15,7 @@ from asm_gym.checks import as_float32, check_flag, check_number, shown
 from asm_gym.choices import check_choice
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import LearnsOnTheJob, Monitor, Surprise
+from asm_gym.monitors.spinal import SpinalBand
 from asm_gym.policies.base import Policy
 from asm_gym.wrappers.arbitration import NOTHING, Arbiter
 from asm_gym.wrappers.arguments import (
@@ -32,6 +33,7 @@ from asm_gym.wrappers.observer import Observer, joined
 from asm_gym.wrappers.recording import StreamSource
 from asm_gym.wrappers.reports import RowReport, report
 from asm_gym.wrappers.responses import Responder, responses_from
+from asm_gym.wrappers.spinal import Left, SpinalCord
 
 
 class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -88,6 +90,10 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
         responses: under ``"graded"``, what is done about which cause, where it is not what
             ``asm_gym.wrappers.responses.DEFAULT`` says: ``{"contact": "yield"}``.
+        spinal: a calibrated band on what the arm feels, made with ``monitor``. It is compared in every physics substep
+            of the policy's steps; once it is left, the arm stays from the next substep on, and the step is an alarm.
+            ``info["asm"]["spinal_s"]`` says when in the step that was [s], or None. What it promises comes beside what
+            ``monitor`` does. Elsewhere than in this package it is compared once a step, and a warning says so.
 
     Raises:
         ValueError: an unknown ``on_alarm``, cause or response, a monitor fitted for another stream or rate (the message
@@ -113,6 +119,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         on_overrun: Literal["warn", "alarm", "ignore"] = "warn",
         adapt: AdaptiveThreshold | None = None,
         responses: Mapping[str, str] | None = None,
+        spinal: SpinalBand | None = None,
     ) -> None:
         RecordConstructorArgs.__init__(
             self,
@@ -129,6 +136,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             on_overrun=on_overrun,
             adapt=adapt,
             responses=responses,
+            spinal=spinal,
         )
         gym.Wrapper.__init__(self, env)
         self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
@@ -162,6 +170,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._responder = Responder(env, monitor, table, repairs=on_alarm == "graded")
         patience = make_patience(reflex, env, release_after, release_below, max_override, try_after)
         fallback = None if self._box is None else make_fallback(env)
+        acts = on_alarm != "monitor" and self._box is not None
+        self._spinal = None if spinal is None else SpinalCord(env, spinal, monitor, acts)
         if monitor_freq is not None:
             sensing.stream_freq = monitor_freq  # nothing changes before everything is known to fit
         self._rows_per_step = self._source.rows_per_step
@@ -189,6 +199,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._follow()
         self._arbiter.reset()
         self._responder.reset()
+        if self._spinal is not None:
+            self._spinal.reset()
         none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))
         self._ended = False
         return observation, self._report(info, [RowReport(none, NOTHING)], None)
@@ -205,6 +217,9 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._command(action)
         overridden = self._arbiter.overriding or self._refused
         self._rows: list[RowReport] = []
+        self._left: Left | None = None
+        if self._spinal is not None and not overridden:
+            self._spinal.send(self._observer.state, self._executed)
         with self._within_steps():
             observation, reward, terminated, truncated, info = self.env.step(self._executed)
         self._look(*self._sensed(observation, info), ends_step=True)
@@ -274,6 +289,10 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             surprise = surprise if not failure else surprise._replace(value=np.full(1, np.inf))
         if failure:
             self._arbiter.warn(failure, "which counts as an alarm")
+        watched = float(surprise.value[0])
+        if self._spinal is not None and ends_step:
+            self._left = self._spinal.left(row)
+            surprise = surprise if self._left is None else self._left.added_to(surprise, self.threshold)
         value = float(surprise.value[0])
         alarm = not value <= self.threshold
         response = self._responder.respond(alarm, bool(failure), surprise.attribution[0])
@@ -288,7 +307,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             response.why,
         )
         if not decision.intervened:
-            self._largest = max(self._largest or 0.0, value)
+            self._largest = max(self._largest or 0.0, watched)
         forgot = self._observer.forget(np.array([decision.acted_on or self._responder.settling]))
         failure = joined(failure, decision.failure, forgot)
         self._rows.append(RowReport(surprise, decision, latency, failure, response))
@@ -310,6 +329,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         failed = self._failed if executed is not None else ""
         asm = report(rows, self.monitor.spec, self.threshold, executed, failed)
         asm["completed"] = self._responder.completed
+        if self._spinal is not None:
+            asm["spinal_s"] = None if executed is None or self._left is None else self._left.after_s
         if self._running is not None:
             asm |= {"ceiling": self._running.ceiling, "level": self._running.level}
         info["asm"] = asm
