@@ -199,8 +199,8 @@ def table(records: Sequence[Record], learned: int, replayed: int) -> Table:
             rows.append((lost, way, shown(records, "rmse", 4, lost=lost, way=way), f"{worse} of {len(mine)}"))
     return Table(
         "Senses missing from a third of an episode to its end: root mean square error of what completes them [rad, N, "
-        "m], of the network mean and standard deviation over seeds; episodes in which the last value would have done better. Learned "
-        f"from {learned} healthy episodes, replayed on {replayed} others.",
+        "m], of the network mean and standard deviation over seeds; episodes in which the last value would have done "
+        f"better. Learned from {learned} healthy episodes, replayed on {replayed} others.",
         ("Missing", "Completed by", "Error", "Worse than the last value"),
         rows,
     )

@@ -78,7 +78,7 @@ class Examples(NamedTuple):
 
     def of(self, chosen: NDArray[np.bool_]) -> Examples:
         """Some of them."""
-        return Examples(*(part[chosen] for part in self))
+        return Examples._make(part[chosen] for part in self)
 
     @property
     def weight(self) -> NDArray[np.float64]:
@@ -107,9 +107,9 @@ def class_of(kind: str) -> int:
 def examples(memory: NeuralASM, diagnosis: Diagnosis, episodes: Sequence[Episode]) -> Examples:
     """The rows in alarm, those aside whose sensor is known to be stuck."""
     found: list[tuple[NDArray[np.float64], int, str, int, int, list[bool]]] = []
-    seeds = {
-        e.labelled.task: sorted({o.seed for o in episodes if o.labelled.task == e.labelled.task}) for e in episodes
-    }
+    seeds: dict[str, set[int]] = {}
+    for label in (episode.labelled for episode in episodes):
+        seeds.setdefault(label.task, set()).add(label.seed)
     for n, (episode, surprise) in enumerate(zip(episodes, memory.score_episodes(episodes), strict=True)):
         label = episode.labelled
         faulty = label.role == "faulty"
@@ -117,7 +117,7 @@ def examples(memory: NeuralASM, diagnosis: Diagnosis, episodes: Sequence[Episode
         level = memory.threshold if faulty else 0.5 * memory.threshold
         rows = [int(t) for t in np.flatnonzero(surprise.value > level) if t >= onset]
         rows = rows[:ROWS] if faulty else sorted(rows, key=lambda t: -surprise.value[t])[:HARMLESS_ROWS]
-        kind, fold = label.kind if faulty else "harmless", seeds[label.task].index(episode.seed) % FOLDS
+        kind, fold = label.kind if faulty else "harmless", sorted(seeds[label.task]).index(label.seed) % FOLDS
         lifted = diagnosis.completion.lift(episode.stream)
         for t in rows:
             window, where = slice(max(0, t - WINDOW), t + 1), surprise.attribution[t]
@@ -126,7 +126,7 @@ def examples(memory: NeuralASM, diagnosis: Diagnosis, episodes: Sequence[Episode
                 named = [diagnosis.named(name, evidence, best) for name in CLASSES]
                 here = [h is not None and located(h, kind, label.affected_channels, diagnosis) for h in named]
                 found.append((evidence, class_of(kind), kind, n, fold, here))
-    return Examples(*(np.array(part) for part in zip(*found, strict=True)))
+    return Examples._make(np.array(part) for part in zip(*found, strict=True))
 
 
 def located(named: Hypothesis, kind: str, affected: frozenset[str], diagnosis: Diagnosis) -> bool:
