@@ -91,7 +91,7 @@ class Args(Common):
         if not self.quick:
             return self
         monitors = tuple(name for name in self.monitors if name in _QUICKLY) or self.monitors[:1]
-        return replace(self, tasks=self.tasks[:1], monitors=monitors, episodes=QUICK)
+        return replace(self, tasks=self.tasks[:1], monitors=monitors, episodes=QUICK, false_alarm_rate=0.5)
 
 
 class Weakened:
@@ -166,9 +166,8 @@ def watched(name: str, seed: int, recordings: Sequence[Episode], args: Args) -> 
     def of(role: str) -> list[Episode]:
         return [e for e in recordings if e.labelled.role == role and e.success]
 
-    monitor = make_monitor(name, recordings[0].spec, seed=seed).fit(of("fit"))
-    rate = args.false_alarm_rate if not args.quick else max(args.false_alarm_rate, 1.0 / (len(of("calibration")) + 1))
-    monitor.calibrate(of("calibration"), rate)
+    monitor = make_monitor(name, recordings[0].spec, seed=seed)
+    monitor.fit(of("fit")).calibrate(of("calibration"), args.false_alarm_rate)
     roles = {how.replace(" ", "_"): how for how in TESTED}
     tested = [e for e in recordings if e.labelled.role in roles]
     found = []

@@ -1,0 +1,71 @@
+"""The study of failures: its figures by hand, and what weakens an agent."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from asm_gym.policies.network import NetworkPolicy
+from asm_gym.scripts.reproduce.failure import AGENTS, Args, Watched, Weakened, early, labels, order, separated, ways
+
+INF = float("inf")
+
+
+def seen(failed, how, half, alarmed=INF):
+    return Watched(failed, how, (0.0, half, half), alarmed)
+
+
+WATCHED = [
+    seen(False, "as it is", 1.0),
+    seen(False, "as it is", 2.0, alarmed=0.9),
+    seen(True, "as it is", 3.0, alarmed=0.6),
+    seen(False, "weakened", 1.5),
+    seen(True, "weakened", 4.0, alarmed=0.4),
+    seen(True, "disturbed", 1.75),
+]
+
+
+def test_failures_are_told_from_successes_by_rank_and_nothing_is_said_where_all_are_alike():
+    assert separated(WATCHED, 1).value == pytest.approx(8 / 9)  # one of nine pairs is the wrong way round
+    assert separated(WATCHED, 0).value == 0.5
+    assert np.isnan(separated([w for w in WATCHED if w.failed], 1).value)
+
+
+def test_the_tables_count_what_was_known_by_when_and_in_which_order():
+    (row,) = early({"one": WATCHED}, Args()).rows
+    assert row[2].startswith("0.889 (")
+    assert row[4:] == ("1 of 3", "2 of 3", "1 of 2")
+    table = ways({"one": WATCHED})
+    assert table.headings[1:] == ("as it is, 1 of 3 failed", "weakened, 1 of 2 failed", "disturbed, 1 of 1 failed")
+    assert [cell[:5] for cell in table.rows[0][1:]] == ["1.000", "1.000", ""]
+    assert order({"one": WATCHED}).rows[0][1:] == ("1 of 2", "0 of 1", "1 of 1", "1 of 2")
+
+
+def test_an_agent_is_weakened_anew_by_each_seed_and_alike_by_the_same():
+    rng = np.random.default_rng(0)
+    agent = NetworkPolicy([(rng.normal(size=(2, 3)).astype(np.float32), np.zeros(2, np.float32))], "relu", "tanh")
+    whole, policy, said = agent.predict(np.ones(3))[0], Weakened(agent), []
+    for seed in (1, 2, 1):
+        policy.set_random_seed(seed)
+        said.append(policy.predict(np.ones(3))[0])
+    np.testing.assert_array_equal(said[0], said[2])
+    assert len({tuple(a) for a in (whole, *said)}) == 3
+
+
+def test_roles_and_repetitions_share_no_seed_and_every_disturbance_has_its_turn():
+    args = Args(tasks=tuple(AGENTS), episodes=8)
+    made = [*labels(args, 0), *labels(args, 1)]
+    assert len({(x.task, x.seed) for x in made}) == len(made) == 2 * 3 * 5 * 8
+    assert len({(x.task, x.kind) for x in made if x.role == "disturbed"}) == 12
+    assert {x.role for x in made if x.onset is None} == {"fit", "calibration", "as_it_is", "weakened"}
+
+
+def test_settings_that_cannot_be_judged_are_refused():
+    for wrong, says in (
+        ({"tasks": ("Wipe",)}, "Lift, Stack, Door"),
+        ({"monitors": ("none",)}, "memory_skill"),
+        ({"episodes": 1}, "two episodes"),
+        ({"false_alarm_rate": 0.0}, "false_alarm_rate"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            Args(**wrong)
