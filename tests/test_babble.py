@@ -8,6 +8,7 @@ import pytest
 
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.monitors import NeuralASM
+from asm_gym.rollouts import harmless
 from asm_gym.rollouts.babbling import ALONE, DRIVEN, LEADING, LED, Babbler, Lesson, curriculum, record_lesson
 from asm_gym.rollouts.body import Exam, healthy
 from asm_gym.rollouts.folder import make_missing
@@ -100,6 +101,18 @@ def test_forces_of_steps_cut_streams_of_many_rows_a_step():
     hits = lesson_of([0] * 25 + [11] * 5, [1] * 90, noise=0.5, number=1, rows=3)
     turned = lesson_of([0] * 30, [1] * 81 + [3] * 9, noise=0.5, number=4, rows=3)
     assert [len(e) for e in healthy([*calm, hits, turned]).fit] == [90, 72, 78]
+
+
+def test_of_a_policys_own_episodes_crashes_are_left_out_and_what_is_kept_is_whole_stretches():
+    calm = [lesson_of([5, 9, 0] * 20, [1, 2, 3] * 20) for _ in range(3)]
+    crash = lesson_of([0] * 27 + [18.1] + [0] * 32, [3] * 60)
+    assert [len(e) for e in harmless([*calm, crash])] == [60, 60, 60, 23, 28]
+    unfelt = [
+        replace(e, contact_force=np.zeros(0, np.float32)) for e in [*calm, lesson_of([0] * 60, [3] * 40 + [6.1] * 20)]
+    ]
+    assert [len(e) for e in harmless(unfelt)] == [60, 60, 60, 36]
+    acted = replace(calm[0], actions=np.zeros((60, 1), np.float32), observations=np.zeros((61, 2), np.float32))
+    np.testing.assert_array_equal(harmless([acted])[0].stream, acted.stream)
 
 
 def test_a_task_needs_a_solved_lesson_without_noise_and_something_must_be_left():

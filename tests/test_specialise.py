@@ -87,6 +87,14 @@ def test_a_specialised_memory_is_quiet_where_the_body_was_not_and_still_finds_wh
     assert body.about == {"name": "sines"}
 
 
+def test_how_errors_become_evidence_is_not_learned_anew_from_a_few(body):
+    asm = body.with_threshold(body.threshold).fit(worn(sine_episodes(10, seed=2)), warm_start=True)
+    for name, learned in body.detection.learned_.items():
+        np.testing.assert_array_equal(asm.detection.learned_[name], learned)
+    with pytest.raises(RuntimeError, match="no threshold"):
+        _ = asm.threshold
+
+
 def test_only_what_knows_something_and_can_go_on_does(body):
     with pytest.raises(RuntimeError, match="has learned nothing yet"):
         NeuralASM(sine_spec(), **SIZES).fit(sine_episodes(4), warm_start=True)

@@ -151,6 +151,7 @@ class CalibratedMonitor:
             episodes: of this spec.
             progress: called as ``progress(done, total)`` while learning.
             warm_start: go on from what it knows, for a model that can specialise: 10 to 50 episodes are enough then.
+                How its errors become evidence stays as it is, for so few do not tell how bad the usual can be.
 
         Raises:
             ValueError: no episode, one that is too short or of another spec, or a number that is not finite.
@@ -173,13 +174,14 @@ class CalibratedMonitor:
         order = rng.permutation(len(episodes)) if one_in else np.arange(len(episodes))
         kept = len(episodes) // one_in if one_in else 0
         held_out, learned = ([episodes[i] for i in part] for part in (order[:kept], order[kept:]))
+        self.threshold_ = self.maxima_ = None
         # One thread: products this small are slowed down by several, and ruined by several that share a core.
         with threadpool_limits(1):
             if warm_start and isinstance(self.model, Specialises):
-                self.model.specialise(learned)
-            else:
-                self.model.fit(learned, rng, progress)
-            self.threshold_ = self.maxima_ = None
+                self.model.specialise(episodes)
+                self._prepare()
+                return
+            self.model.fit(learned, rng, progress)
             self._prepare()
             nominal = Nominal(episodes, learned, held_out or learned, self._outputs)
             for detection in self.detections.values():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -76,16 +75,33 @@ def healthy(recordings: Sequence[Episode]) -> Lessons:
     return found
 
 
+def harmless(episodes: Sequence[Episode]) -> list[Episode]:
+    """The stretches of a policy's own episodes in which nothing presses twice as hard as it usually does at most.
+
+    Agents crash now and then in episodes that they solve. A memory that is specialised on those would take a crash for
+    usual, and a threshold that is set on them would be a crash's. What it promises then holds for harmless episodes.
+
+    Args:
+        episodes: of one task, at least half of them harmless; where no contact force is known, joints alone tell.
+    """
+    torque = float(np.median([peak_torques(episode).max() for episode in episodes]))
+    known = [float(np.nanmax(e.contact_force)) for e in episodes if len(e.contact_force)]
+    limit = Gentle(*(LEARNED_UP_TO * n for n in (np.median(known) if known else np.inf, torque)))
+    return [piece for episode in episodes for piece in gentle_pieces(episode, limit)]
+
+
 def gentle_pieces(episode: Episode, limit: Gentle) -> list[Episode]:
-    """The stretches of an episode in which nothing presses harder, those that are long enough to learn from."""
-    rows = len(episode) // len(episode.contact_force)  # of the stream, in a step
+    """The stretches of a stream in which nothing presses harder, those that are long enough to learn from."""
+    forces = episode.contact_force if len(episode.contact_force) else np.zeros(len(episode), np.float32)
+    rows = len(episode) // len(forces)  # of the stream, in a step
     torques = peak_torques(episode).reshape(-1, rows).max(axis=1)
-    hit = ~((episode.contact_force <= limit.force) & (torques <= limit.torque))
+    hit = ~((forces <= limit.force) & (torques <= limit.torque))
     around = round(AROUND_S / (rows * episode.spec.dt))
     near = np.convolve(hit, np.ones(2 * around + 1), "same") > 0.5
     edges = np.flatnonzero(np.diff(np.concatenate([[True], near, [True]]).astype(int)))
+    about = {name: getattr(episode, name) for name in ("spec", "success", "seed", "label", "info")}
     return [
-        replace(episode, stream=episode.stream[rows * a : rows * b], contact_force=episode.contact_force[a:b])
+        Episode(episode.stream[rows * a : rows * b], contact_force=forces[a:b], **about)
         for a, b in zip(edges[::2], edges[1::2], strict=True)
         if b - a >= SHORTEST
     ]

@@ -24,7 +24,7 @@ from asm_gym.faults.suite import kinds_of
 from asm_gym.monitors import EVIDENCE, MONITORS, CalibratedMonitor, NeuralASM
 from asm_gym.rollouts.babbling import LEADING, LED, curriculum, record_lesson
 from asm_gym.rollouts.benchmark import fitted
-from asm_gym.rollouts.body import CALIBRATED_ON, healthy, learn_body
+from asm_gym.rollouts.body import CALIBRATED_ON, harmless, healthy, learn_body
 from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.trial import RolloutConfig
@@ -153,9 +153,9 @@ def leads(number: int) -> bool:
 
 def specialised(body: NeuralASM, own: Sequence[Episode], rate: float) -> NeuralASM:
     """The memory of the body after a few episodes of one policy, calibrated on as many others of it."""
-    few = role(own, "calibration")
+    shown, few = harmless(role(own, "fit")), harmless(role(own, "calibration"))
     least = 1.0 / (len(few) + 1)  # what so few can promise
-    return copy.deepcopy(body).fit(role(own, "fit"), warm_start=True).calibrate(few, max(rate, least))
+    return copy.deepcopy(body).fit(shown, warm_start=True).calibrate(few, max(rate, least))
 
 
 def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
