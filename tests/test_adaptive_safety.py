@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -143,3 +145,19 @@ def test_a_policy_that_changes_alarms_no_more_than_was_promised_and_a_fault_stil
     env.reset(seed=1)
     env.unwrapped.max_torque = 0.0  # the motor fails
     assert any(env.step(np.full(1, 2.0, np.float32))[-1]["asm"]["alarm"] for _ in range(20))
+
+
+@pytest.mark.parametrize("on_alarm", ["monitor", "hold"])
+def test_a_policy_so_strange_that_most_of_its_steps_alarm_is_named_once_with_what_to_do(on_alarm):
+    strange = ScriptedMonitor(dict.fromkeys(range(0, 4000, 2), 2.0) | dict.fromkeys(range(0, 4000, 3), 2.0))
+    env = NeuralASMSafety(FakeEnv(8000), strange, on_alarm=on_alarm, release_after=1, on_overrun="ignore")
+    with pytest.warns(UserWarning, match=r"of the first 200 rows under this policy alarm: .* warm_start=True") as said:
+        episode(env, 4000)
+    assert len(said) == 1
+
+
+def test_a_fault_that_passes_makes_no_policy_strange():
+    passing = ScriptedMonitor(dict.fromkeys(range(20, 110), 2.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        episode(NeuralASMSafety(FakeEnv(400), passing, on_alarm="monitor", on_overrun="ignore"), 300)

@@ -11,7 +11,7 @@ from asm_gym.scripts.reproduce import transfer_judge
 from asm_gym.scripts.reproduce.transfer import Args
 from asm_gym.scripts.reproduce.transfer_judge import ADAPTIVE, Judge
 from asm_gym.scripts.reproduce.transfer_report import alarmed, detection, drawn, per_hour, tables
-from asm_gym.scripts.reproduce.transfer_watched import KNOWN, POLICIES, Watched
+from asm_gym.scripts.reproduce.transfer_watched import KNOWN, POLICIES, WATCHED, Watched
 from asm_gym.stream import Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("a", 2, group="a"), Channel("b", 1, group="b"), Channel("action", 1, group="action")), 0.05)
@@ -139,9 +139,24 @@ def test_twins_with_faults_share_the_seeds_of_healthy_episodes():
     assert not [x for x in SAC.labels(3, 0, ("push",), 0) if x.role != "nominal"]
 
 
+def test_fewer_episodes_to_learn_from_are_the_first_of_more():
+    few, many = (SAC.labels(1, own, (), 0, calibration=2) for own in (2, 5))
+    assert [x for x in many if x.role == "fit"][:2] == [x for x in few if x.role == "fit"]
+    assert [x for x in many if x.role != "fit"] == [x for x in few if x.role != "fit"]
+
+
+def test_agents_of_ones_own_are_watched_besides(tmp_path):
+    watched = Args(agents=(("Lift", str(tmp_path / "td3" / "clone.npz")),)).watched
+    assert watched[:-1] == WATCHED
+    assert watched[-1].name == "Lift, td3 clone"
+    assert watched[-1].folder == "Lift-td3_clone"
+    assert watched[-1].group == POLICIES
+
+
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
+        ({"agents": (("Lifts", "a.npz"),)}, "Lift"),
         ({"without": ("Wipe",)}, "task to leave out"),
         ({"rivals": ("oracle",)}, "monitor"),
         ({"lessons": 3}, "needs 19 episodes"),

@@ -25,6 +25,10 @@ GOING_ON = ("go on", "complete", "slow")
 """Responses to an alarm under which the policy acts."""
 
 
+STRANGE_AFTER = 200
+"""Rows under the policy after which it is said that most of them alarm."""
+
+
 class Command(NamedTuple):
     """What is to be done in a step.
 
@@ -89,6 +93,7 @@ class Arbiter:
         self._space = gym.spaces.Box(-1.0, 1.0, (0,)) if space is None else space
         self.threshold = threshold
         """May be set between episodes."""
+        self._judged = self._alarmed = 0  # rows under the policy, whatever the episode
         self.reset()
 
     def reset(self) -> None:
@@ -191,6 +196,8 @@ class Arbiter:
             why: the cause, for the log.
         """
         alarm, intervened = not surprise <= self.threshold, self.overriding or self._refused
+        if not intervened and math.isfinite(surprise):
+            self._estranged(alarm)
         slowed = self._slowed
         begun, self._refused = self._refused, False
         if self._reflex is None:
@@ -216,6 +223,17 @@ class Arbiter:
             _log.info("%s: surprise %.3g, threshold %.3g%s", transition, surprise, self.threshold, because)
         acted_on = alarm or transition == "trial"
         return Decision(alarm, intervened or slowed, transition == "give_up", acted_on, failure, transition)
+
+    def _estranged(self, alarm: bool) -> None:
+        """Says once, and early, that most of what the policy does alarms."""
+        self._judged, self._alarmed = self._judged + 1, self._alarmed + alarm
+        if self._judged == STRANGE_AFTER and 2 * self._alarmed > self._judged:
+            gym.logger.warn(
+                f"{self._alarmed} of the first {self._judged} rows under this policy alarm: something is wrong all the "
+                'time, or the memory does not know this policy, task or set-up. Look with on_alarm="monitor" which '
+                'channels info["asm"]["attribution"] names; if all is well, record episodes of it, and '
+                "monitor.fit(episodes, warm_start=True).calibrate(others, 0.05)"
+            )
 
     def _tell(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], intervened: bool) -> str:
         """Lets the reflex feel the row, if it can; what failed at that."""

@@ -86,7 +86,8 @@ def harmless(episodes: Sequence[Episode]) -> list[Episode]:
     """
     torque = float(np.median([peak_torques(episode).max() for episode in episodes]))
     known = [float(np.nanmax(e.contact_force)) for e in episodes if len(e.contact_force)]
-    limit = Gentle(*(LEARNED_UP_TO * n for n in (np.median(known) if known else np.inf, torque)))
+    force = float(np.median(known)) if known else np.inf
+    limit = Gentle(LEARNED_UP_TO * force, LEARNED_UP_TO * torque)
     return [piece for episode in episodes for piece in gentle_pieces(episode, limit)]
 
 

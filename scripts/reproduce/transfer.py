@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,7 @@ from asm_gym.scripts.reproduce import adoption
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, at_least, at_least_one, demonstrations, reproduce
 from asm_gym.scripts.reproduce.transfer_judge import Judge, Own, fewer_senses, role
 from asm_gym.scripts.reproduce.transfer_report import drawn, tables
-from asm_gym.scripts.reproduce.transfer_watched import KNOWN, WATCHED, Watched, record_watched
+from asm_gym.scripts.reproduce.transfer_watched import KNOWN, POLICIES, WATCHED, Watched, record_watched
 from asm_gym.tasks import task as task_spec
 
 SHIPPED = "panda"
@@ -63,6 +63,10 @@ class Args(Common):
     """Episodes of a policy to specialise on, and as many to calibrate on."""
     specialised: tuple[str, ...] = ("lift_sac", "stack_sac")
     """Policies to specialise on."""
+    scratch_episodes: int = 0
+    """Episodes of such a policy for a memory that learns of it alone, from scratch, to compare with; 0 for none."""
+    agents: tuple[tuple[str, str], ...] = ()
+    """Further agents to watch: a task and the file of an agent for each, such as ``Lift runs/train/clone.npz``."""
     broken: tuple[str, ...] = ("lift_sac", "stack_sac", "door_sac")
     """Policies under which there are faults."""
     faults: tuple[str, ...] = ("test",)
@@ -84,6 +88,9 @@ class Args(Common):
             task_spec(name)
         for name in self.without:
             check_choice("task to leave out", name, self.tasks)
+        for name, _ in self.agents:
+            task_spec(name)
+        at_least(0, "scratch_episodes", self.scratch_episodes)
         for name in self.rivals:
             check_choice("monitor", name, MONITORS)
         kinds_of(self.faults)
@@ -119,14 +126,16 @@ class Args(Common):
 
     @property
     def watched(self) -> tuple[Watched, ...]:
-        return (WATCHED[0], WATCHED[3]) if self.quick else WATCHED
+        given = tuple(Watched(task, str(Path(file).resolve()), group=POLICIES) for task, file in self.agents)
+        return ((WATCHED[0], WATCHED[3]) if self.quick else WATCHED) + given
 
 
 def labels(watched: Watched, args: Args) -> list[EpisodeLabel]:
     """What is recorded of it."""
     own = args.own_episodes if watched.policy in args.specialised else 0
     faulty = args.faulty_episodes if watched.policy in args.broken else 0
-    return watched.labels(args.nominal_episodes, own, args.faults, faulty)
+    learned = max(own, args.scratch_episodes) if own else 0
+    return watched.labels(args.nominal_episodes, learned, args.faults, faulty, calibration=own)
 
 
 def recordings(args: Args, console: Console, seconds: dict[str, float]) -> tuple[list[Episode], Own]:
@@ -151,11 +160,23 @@ def leads(number: int) -> bool:
     return number % CALIBRATED_ON == CALIBRATED_ON - 1 and LEADING[number % len(LEADING)] == LED
 
 
-def specialised(body: NeuralASM, own: Sequence[Episode], rate: float) -> NeuralASM:
-    """The memory of the body after a few episodes of one policy, calibrated on as many others of it."""
-    shown, few = harmless(role(own, "fit")), harmless(role(own, "calibration"))
-    least = 1.0 / (len(few) + 1)  # what so few can promise
-    return copy.deepcopy(body).fit(shown, warm_start=True).calibrate(few, max(rate, least))
+def of_its_own(
+    bodies: Mapping[str, NeuralASM], own: Sequence[Episode], args: Args, seed: int
+) -> Iterator[tuple[str, CalibratedMonitor]]:
+    """Memories of one policy, by name: of a body, specialised on a few of its episodes, and from scratch on many.
+
+    All are calibrated on the same few others.
+    """
+    few, few_others = (
+        harmless([e for e in own if e.labelled.role == r and e.success][: args.own_episodes])
+        for r in ("fit", "calibration")
+    )
+    rate = max(args.false_alarm_rate, 1.0 / (len(few_others) + 1))  # what so few can promise
+    for name, body in bodies.items():
+        yield f"{name}, specialised", copy.deepcopy(body).fit(few, warm_start=True).calibrate(few_others, rate)
+    if args.scratch_episodes:
+        scratch = fitted(args.out.resolve(), "neural_asm", harmless(role(own, "fit")), seed)
+        yield "of its own policy, from scratch", scratch.calibrate(few_others, rate)
 
 
 def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
@@ -188,12 +209,14 @@ def judged(
     records = judge.records("of one policy", made("neural_asm", **shown), everywhere)
     body = learn_body(lessons, args.false_alarm_rate, judge.seed, lambda done, total: None)
     records += judge.records("of the body", body, everywhere)
-    records += judge.records("of the body, as shipped", NeuralASM.pretrained(SHIPPED), everywhere)
+    shipped = NeuralASM.pretrained(SHIPPED)
+    records += judge.records("of the body, as shipped", shipped, everywhere)
     records += judge.adaptive("of the body, adaptive", body)
     for watched in everywhere:
         if watched.policy in args.specialised:
-            own = specialised(body, judge.own[watched], args.false_alarm_rate)
-            records += judge.records("of the body, specialised", own, [watched])
+            bodies = {"of the body": body, "of the body, as shipped": shipped}
+            for name, memory in of_its_own(bodies, judge.own[watched], args, judge.seed):
+                records += judge.records(name, memory, [watched])
     for task in args.without:
         others = healthy([e for e in babbled if e.labelled.task != task])
         less = learn_body(others, args.false_alarm_rate, judge.seed, lambda done, total: None)

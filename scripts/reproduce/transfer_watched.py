@@ -28,7 +28,7 @@ class Watched(NamedTuple):
 
     Attributes:
         task: its name.
-        policy: a name; the expert's at another speed or with noise where those say so.
+        policy: a name or a file; the expert's at another speed or with noise where those say so.
         speed: relative to the expert's own.
         noise: standard deviation of smooth noise on the commands [action units].
         group: what of it the memory of the body has met.
@@ -43,7 +43,7 @@ class Watched(NamedTuple):
     @property
     def name(self) -> str:
         """For people."""
-        who = "expert" if self.policy == "scripted" else self.policy
+        who = "expert" if self.policy == "scripted" else " ".join(Path(self.policy).with_suffix("").parts[-2:])
         how = f" at {self.speed:g} of its speed" if self.speed != 1.0 else ""
         return f"{self.task}, {who}{how}" + (" with smooth noise" if self.noise else "")
 
@@ -57,17 +57,20 @@ class Watched(NamedTuple):
         lesson = Lesson(self.task, 0, seed, noise=self.noise, smoothness=SMOOTH[1], speed=self.speed)
         return Babbler(env, lesson)
 
-    def labels(self, nominal: int, own: int, faults: Sequence[str], faulty: int) -> list[EpisodeLabel]:
+    def labels(
+        self, nominal: int, own: int, faults: Sequence[str], faulty: int, calibration: int | None = None
+    ) -> list[EpisodeLabel]:
         """Healthy episodes, twins of the first of them with faults, and others to specialise on.
 
         Args:
             nominal: healthy episodes to watch.
-            own: to learn from, and as many to calibrate on.
+            own: to learn from.
+            calibration: to calibrate on, by default as many; fewer to learn from are the first of more.
             faults: kinds, or halves of the suite.
             faulty: episodes of each kind and severity.
         """
         task = self.task
-        roles = {"nominal": nominal, "fit": own, "calibration": own}
+        roles = {"nominal": nominal, "fit": own, "calibration": own if calibration is None else calibration}
         found = [EpisodeLabel(task, r, seed=s) for r, n in roles.items() for s in role_seeds(0, task, r, n)]
         if not faulty:
             return found
