@@ -1,5 +1,6 @@
 """The benchmarks of watching: what they time is what they say."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from asm_gym.scripts.benchmark import main
 from asm_gym.scripts.benchmark.experts import Attempt, _row, attempt
 from asm_gym.scripts.benchmark.fit import errors
 from asm_gym.scripts.benchmark.memory import PlainTorch, synthetic
+from asm_gym.scripts.benchmark.turns import BusyError, Turns, check_quiet
 
 
 @pytest.mark.parametrize("channels", [5, 23])
@@ -27,12 +29,35 @@ def test_the_torch_rival_computes_the_same_surprise(channels):
 
 
 def test_both_print_their_ratios(capsys):
-    assert main(["memory", "--hidden", "16", "--channels", "10", "--steps", "5", "--no-sweep"]) == 0
-    assert main(["safety", "--hidden", "16", "--steps", "3"]) == 0
+    assert main(["memory", "--hidden", "16", "--channels", "10", "--steps", "5", "--no-sweep", "--even-if-busy"]) == 0
+    assert main(["safety", "--hidden", "16", "--steps", "3", "--even-if-busy"]) == 0
     shown = capsys.readouterr().out
     assert shown.count("×") >= 5
     assert "plain torch" in shown
     assert "under the wrapper" in shown
+    assert "cores, of one of which this process had" in shown
+
+
+def test_a_busy_machine_prints_no_figures(capsys, monkeypatch):
+    monkeypatch.setattr("asm_gym.scripts.benchmark.turns.os.getloadavg", lambda: (9.0, 9.0, 9.0))
+    assert main(["memory", "--hidden", "16", "--channels", "10", "--steps", "5", "--no-sweep"]) == 1
+    shown = capsys.readouterr().out
+    assert "too busy to tell" in shown
+    assert "×" not in shown
+
+
+@pytest.mark.parametrize(("share", "load", "busy"), [(0.99, 1.1, False), (0.6, 1.0, True), (0.99, 3.5, True)])
+def test_what_is_busy(share, load, busy):
+    with pytest.raises(BusyError) if busy else nullcontext():
+        check_quiet(share, load, cores=2)
+
+
+def test_a_ratio_is_of_medians_and_its_spread_over_repetitions():
+    one, other = np.repeat(np.arange(1.0, 11.0), 3), np.ones(30)
+    one[::3] = 100.0  # a hiccup in each repetition
+    found = Turns({"a": one, "b": other}, 1.0).ratio("a", "b")
+    assert found.mean == pytest.approx(5.5)
+    assert found.sd == pytest.approx(np.std(np.arange(1, 11), ddof=1))
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from asm_gym.scripts.benchmark.coverage import Coverage
 from asm_gym.scripts.benchmark.experts import Experts
 from asm_gym.scripts.benchmark.fit import Fit
 from asm_gym.scripts.benchmark.memory import Memory, Safety
-from asm_gym.scripts.benchmark.turns import take_turns
+from asm_gym.scripts.benchmark.turns import BusyError, take_turns
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 from asm_gym.tasks import task as task_spec
 
@@ -46,24 +46,34 @@ class Env:
     """Resets of each rival."""
     seed: int = 0
     """Seed of the actions."""
+    even_if_busy: bool = False
+    """Print figures though the machine has too much else to do."""
 
     def run(self, console: Console) -> int:
         """Prints the table."""
-        steps = take_turns(self._rivals(), self.steps, console)
-        physics, theirs = steps["mj_step only"], steps["robosuite"]
+        steps = take_turns(self._rivals(), self.steps, console, self.even_if_busy)
         table = Table(
             f"{self.task}, {self.robot}, {self.controller}, 20 Hz: median of {self.steps} control steps",
             ("", "ms", "steps/s", "against robosuite", "against mj_step"),
             [
-                (name, f"{1e3 * s:.2f}", f"{1 / s:.0f}", f"{theirs / s:.2f}×", f"{s / physics:.2f}×")
-                for name, s in steps.items()
+                (
+                    name,
+                    f"{1e3 * steps.median(name):.2f}",
+                    f"{1 / steps.median(name):.0f}",
+                    steps.faster(name, "robosuite"),
+                    steps.times(name, "mj_step only"),
+                )
+                for name in steps.seconds
             ],
         )
         console.print(console_table(table))
-        resets = take_turns(self._resets(), self.resets, console)
-        default = resets["robosuite, hard (its default)"]
-        rows = [(name, f"{1e3 * s:.1f}", f"{default / s:.1f}×") for name, s in resets.items()]
+        resets, default = (
+            take_turns(self._resets(), self.resets, console, self.even_if_busy),
+            "robosuite, hard (its default)",
+        )
+        rows = [(name, f"{1e3 * resets.median(name):.1f}", resets.faster(name, default)) for name in resets.seconds]
         console.print(console_table(Table(f"median of {self.resets} resets", ("", "ms", "against robosuite"), rows)))
+        console.print(steps.where())
         return DONE
 
     def _make(self, **kwargs: Any) -> Any:
@@ -193,7 +203,11 @@ class Args:
 
 def measure(args: Args, console: Console) -> int:
     """Runs the one that was asked for."""
-    return args.what.run(console)
+    try:
+        return args.what.run(console)
+    except BusyError as busy:
+        console.print(str(busy))
+        return BAD_NEWS
 
 
 def main(argv: list[str] | None = None) -> int:

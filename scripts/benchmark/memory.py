@@ -21,7 +21,9 @@ from asm_gym.episodes import Episode
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.memory.traces import DECAYS
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.spinal import SpinalBand
 from asm_gym.rollouts.collect import collect
+from asm_gym.rollouts.felt import felt_episodes
 from asm_gym.scripts.benchmark.turns import take_turns
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
@@ -166,6 +168,8 @@ class Memory:
     """Calls of each rival."""
     sweep: bool = True
     """Also print the cost against hidden units, channels and named skills."""
+    even_if_busy: bool = False
+    """Print figures though the machine has too much else to do."""
 
     def run(self, console: Console) -> int:
         """Prints the tables."""
@@ -178,14 +182,15 @@ class Memory:
                 "asm_gym, 64 streams": watching(asm, episode, 64),
                 "plain torch, one stream": watching_plainly(asm, episode),
             }
-            seconds = take_turns(rivals, self.steps, console)
+            turns = take_turns(rivals, self.steps, console, self.even_if_busy)
         finally:
             torch.set_num_threads(threads)
-        seconds["asm_gym, 64 streams"] /= 64
-        title = f"{self.hidden} hidden units, {self.channels} channels, {asm.iterations} iterations: a stream's row"
-        plain = seconds["plain torch, one stream"]
-        rows = [(name, f"{1e6 * s:.0f}", f"{plain / s:.1f}×") for name, s in seconds.items()]
+        turns.seconds["asm_gym, 64 streams"] /= 64
+        title = f"{self.hidden} hidden units, {self.channels} channels: a stream's row, of which nothing is missing"
+        plain = "plain torch, one stream"
+        rows = [(name, f"{1e6 * turns.median(name):.0f}", turns.faster(name, plain)) for name in turns.seconds]
         console.print(console_table(Table(title, ("", "µs", "against torch"), rows)))
+        console.print(turns.where())
         if self.sweep:
             self._sweep(console)
         return 0
@@ -198,9 +203,8 @@ class Memory:
         }
         for what, (make, sizes) in makers.items():
             rivals = {str(size): watching(*make(size), 1) for size in sizes}
-            seconds = take_turns(rivals, max(1, self.steps // 4), console)
-            least = seconds[str(sizes[0])]
-            rows = [(name, f"{1e6 * s:.0f}", f"{s / least:.1f}×") for name, s in seconds.items()]
+            turns = take_turns(rivals, max(1, self.steps // 4), console, self.even_if_busy)
+            rows = [(name, f"{1e6 * turns.median(name):.0f}", turns.times(name, str(sizes[0]))) for name in rivals]
             console.print(console_table(Table(f"one stream, by {what}", (what, "µs", f"against {sizes[0]}"), rows)))
 
 
@@ -216,11 +220,16 @@ class Safety:
     """Control steps of each rival."""
     monitor_freq: int = 100
     """Rows watched a second, where it watches within control steps [Hz]."""
+    even_if_busy: bool = False
+    """Print figures though the machine has too much else to do."""
 
     def run(self, console: Console) -> int:
         """Prints the table."""
         plain = self._make(None)
-        envs = {"step": plain, "step under the wrapper": NeuralASMSafety(self._make(None), self._memory(None))}
+        memory = self._memory(None)
+        envs = {"step": plain, "step under the wrapper": NeuralASMSafety(self._make(None), memory)}
+        band = self._band(memory)
+        envs["step under the wrapper and a band"] = NeuralASMSafety(self._make(None), memory, spinal=band)
         rate = self.monitor_freq
         watched = NeuralASMSafety(self._make(rate), self._memory(rate), monitor_freq=rate)
         envs |= {f"step, stream at {rate} Hz": self._make(rate), f"step under the wrapper at {rate} Hz": watched}
@@ -228,10 +237,11 @@ class Safety:
         for env in envs.values():
             env.reset(seed=0)
         rivals: dict[str, Callable[[], Any]] = {name: partial(env.step, action) for name, env in envs.items()}
-        seconds = take_turns(rivals, self.steps, console)
+        turns = take_turns(rivals, self.steps, console, self.even_if_busy)
         caption = f"{self.task}, 20 Hz, {self.hidden} hidden units: a control step"
-        rows = [(name, f"{1e3 * s:.2f}", f"{s / seconds['step']:.2f}×") for name, s in seconds.items()]
+        rows = [(name, f"{1e3 * turns.median(name):.2f}", turns.times(name, "step")) for name in rivals]
         console.print(console_table(Table(caption, ("", "ms", "against step"), rows)))
+        console.print(turns.where())
         return 0
 
     def _make(self, rate: int | None) -> gym.Env[Any, Any]:
@@ -243,4 +253,11 @@ class Safety:
         env_id = f"asm_gym/{self.task}-v0"
         episodes = collect(env_id, episodes=4, workers=1, horizon=40, stream_freq=rate)
         asm = NeuralASM(episodes[0].spec, hidden_size=self.hidden, epochs=1).fit(episodes)
-        return asm.with_threshold(1e9)  # beyond any surprise of these rows: nothing is to be held
+        return asm.with_threshold(1e300)  # beyond any surprise of these rows: nothing is to be held
+
+    def _band(self, memory: NeuralASM) -> SpinalBand:
+        """One that has learned little and is as wide as can be: the cost is the same."""
+        felt = felt_episodes(self._make(None), range(6), steps=20)
+        band = SpinalBand(memory).fit(felt[:4]).calibrate(felt[4:], 0.5)
+        band.scale_ = 1e30
+        return band
