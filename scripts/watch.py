@@ -27,7 +27,7 @@ from asm_gym.checks import check_number
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.report import write_report
 from asm_gym.evaluation.tables import Table
-from asm_gym.evaluation.trace import Trace, TraceDetail, spans
+from asm_gym.evaluation.trace import Trace, TraceDetail
 from asm_gym.live import RowReader, SourceDied, is_live, lines_from
 from asm_gym.live_view import LiveView
 from asm_gym.logs import Layout, Log, read_logs
@@ -38,6 +38,9 @@ from asm_gym.stream import StreamSpec
 
 AT_ONCE = 64
 """Episodes scored side by side."""
+
+MOMENTS = 6
+"""Worst moments drawn."""
 
 SHOWN_ROWS = 20
 """Alarms printed; the file holds them all."""
@@ -99,14 +102,12 @@ HEADINGS = ("log", "from [s]", "to [s]", "channel", "thresholds")
 
 def alarms_of(trace: Trace) -> list[Alarm]:
     """Every alarm of an episode, in order."""
-    assert trace.detail is not None
-    found = []
-    for start, stop in spans(trace.alarm):
-        worst = start + int(np.argmax(trace.surprise[start:stop]))
-        channel = trace.detail.channels[int(np.argmax(trace.detail.attribution[worst]))]
-        excess = float(trace.surprise[worst] / trace.threshold)
-        found.append(Alarm(trace.kind, (start + 1) * trace.dt, stop * trace.dt, channel, excess))
-    return found
+    detail = trace.detail
+    assert detail is not None
+    return [
+        Alarm(trace.kind, (m.start + 1) * trace.dt, m.stop * trace.dt, detail.channels[m.channel], m.excess)
+        for m in figures.moments_of(trace)
+    ]
 
 
 def traces_of(logs: Sequence[Log], monitor: Any) -> list[Trace]:
@@ -160,18 +161,23 @@ def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Trac
     with (args.out / "alarms.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([HEADINGS, *(alarm.cells() for alarm in alarms)])
     drawn = {
-        "Surprise over time in the most surprising episodes": figures.surprise_figure(worst),
-        "Where the surprise came from in the most surprising one": figures.attribution_figure(worst[0]),
-        "What its most surprising channels sensed": figures.stream_figure(worst[0]),
+        "surprise": ("Surprise over time in the most surprising episodes", figures.surprise_figure(worst)),
+        "attribution": ("Where surprise came from in the most surprising one", figures.attribution_figure(worst[0])),
+        "stream": ("What its most surprising channels sensed", figures.stream_figure(worst[0])),
     }
-    for name, figure in zip(("surprise", "attribution", "stream"), drawn.values(), strict=True):
+    moments = sorted((m for trace in worst for m in figures.moments_of(trace)), key=lambda m: -m.excess)[:MOMENTS]
+    if moments:
+        drawn = {
+            "moments": ("The worst moments, in multiples of the threshold", figures.moments_figure(moments))
+        } | drawn
+    for name, (_, figure) in drawn.items():
         figures.save(figure, args.out / f"{name}.png")
     write_report(
         args.out / "report.html",
         f"asm-gym watch: {args.source}",
         f"{said}, as {args.monitor} sees them.",
         [Table("Alarms", HEADINGS, [alarm.cells() for alarm in alarms])] if alarms else [],
-        drawn,
+        dict(drawn.values()),
         details={"command": f"asm-gym watch {args.source} --monitor {args.monitor}"},
     )
 

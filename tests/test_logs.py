@@ -257,9 +257,10 @@ def test_a_fitted_memory_alarms_for_a_stuck_joint_and_not_for_a_normal_log(memor
     how = ["--monitor", str(memory), "--out", str(tmp_path / "out")]
     assert main(["watch", str(tmp_path / "good.csv"), *how]) == 0
     assert "0 alarms in 0 of 1 episodes" in capsys.readouterr().out
+    assert not (tmp_path / "out" / "moments.png").exists()
     assert main(["watch", str(tmp_path / "stuck.csv"), *how]) == 1
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
-        *("alarms.csv", "report.html", "surprise.png", "attribution.png", "stream.png"),
+        *("alarms.csv", "report.html", "surprise.png", "attribution.png", "stream.png", "moments.png"),
     }
     alarms = read_table(tmp_path / "out" / "alarms.csv")
     assert 40 / RATE < alarms["from [s]"][0] < 60 / RATE

@@ -119,6 +119,29 @@ def test_attribution_shows_the_channels_with_the_greatest_share_first(traces: li
     assert labels == [trace.detail.channels[i] for i in np.argsort(-peaks)[:3]]
 
 
+def test_a_strip_shows_each_alarm_at_its_worst_row_and_the_channel_that_surprised():
+    surprise, attribution = np.ones(100), np.ones((100, 2))
+    surprise[[20, 21, 60]] = 30.0, 50.0, np.inf
+    attribution[21] = 10.0, 40.0
+    stream = np.arange(200.0).reshape(100, 2)
+    detail = TraceDetail(attribution, ("q", "torque"), np.zeros(100, np.bool_), stream)
+    trace = Trace("log.csv", 0, 0.01, 20.0, surprise, detail=detail)
+    moments = figures.moments_of(trace)
+    assert [(m.start, m.stop, m.row, m.channel, m.excess) for m in moments] == [
+        (20, 22, 21, 1, 2.5),
+        (60, 61, 60, 0, np.inf),
+    ]
+    first, second, third = figures.moments_figure(moments).axes
+    assert first.get_title(loc="left") == "torque, 0.22 s, 2.5×"
+    sensed = first.lines[0]
+    np.testing.assert_array_equal(sensed.get_ydata(), stream[:72, 1])
+    assert first.lines[1].get_xdata()[0] == pytest.approx(0.22)
+    assert second.get_title(loc="left") == "q, 0.61 s, inf×"
+    assert not third.get_visible()
+    with pytest.raises(ValueError, match="without the detail"):
+        figures.moments_of(dataclasses.replace(trace, detail=None))
+
+
 def test_the_stream_is_shown_beside_its_twin_and_the_most_surprising_channel_first(traces: list[Trace]):
     trace = next(t for t in traces if t.delay is not None)
     rng = np.random.default_rng(0)
