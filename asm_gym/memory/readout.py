@@ -1,9 +1,11 @@
 """Readout: what skill the memory's units say is running, for people to read; nothing depends on it.
 
-    p_t = softmax(W_K f(h_t) + b_K)          ΔW_K ∝ n_k (1_k - p_t) f(h_t)ᵀ
+    r_t = [f(h_t), f(μ_t)]
+    p_t = softmax(W_K r_t + b_K)             ΔW_K ∝ n_k (1_k - p_t) r_tᵀ
     L_t = (1 - λ) L_{t-1} + log p_t          the skill named is that with the largest L
 
-h are the units of ``association``; n_k makes rare skills count as much as frequent ones. The delta rule is local. What
+h are the units of ``association``, which know the moment, and μ is the state of the temporal network, which knows what
+came before; n_k makes rare skills count as much as frequent ones. The delta rule is local. What
 single moments say adds up, and is forgotten, so that a change of skill is followed. Names come from whoever knows them.
 
 Source: Wald and Wolfowitz 1948 for adding up log likelihoods.
@@ -33,7 +35,7 @@ SMALLEST = np.float32(1e-6)
 
 
 def certainty(units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
-    """p (B, K) for firing rates of the units (B, M)."""
+    """p (B, K) for firing rates of units (B, M)."""
     drive = units @ W_K.T + b_K
     strength = np.exp(drive - drive.max(axis=1, keepdims=True))
     shares: NDArray[np.float32] = (strength / strength.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -41,22 +43,21 @@ def certainty(units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
 
 
 @kernel
-def add_up(L: Array, units: Array, W_K: Array, b_K: Array) -> Array:
-    """L_t (B, K) from L_{t-1}, which is 0 before the first row; p as in ``certainty``."""
-    drive, added = outward(units, W_K) + b_K, np.empty_like(L)
+def add_up(L: Array, units: Array, state: Array, W_K: Array, b_K: Array) -> Array:
+    """L_t (B, K) from L_{t-1}, which is 0 before the first row; p as in ``certainty``.
+
+    Args:
+        units: (B, M) f(h).
+        state: (B, H) f(μ), which a memory does not look at whose names were learned from ``units`` alone.
+    """
+    told, M = np.empty((L.shape[0], W_K.shape[1]), units.dtype), units.shape[1]
+    told[:, :M] = units
+    told[:, M:] = state[:, : W_K.shape[1] - M]
+    drive, added = outward(told, W_K) + b_K, np.empty_like(L)
     for n in range(L.shape[0]):
         strength = np.exp(drive[n] - drive[n].max())
         added[n] = KEPT * L[n] + np.log(strength / strength.sum() + SMALLEST)
     return added
-
-
-def running(units: Array, W_K: Array, b_K: Array) -> NDArray[np.intp]:
-    """(T,) the skill that seems to run in each step, from the units (T, M) of a stream."""
-    L, named = np.zeros((1, len(b_K)), np.float32), []
-    for f in units:
-        L = add_up(L, f[None], W_K, b_K)
-        named.append(L.argmax())
-    return np.array(named, dtype=np.intp)
 
 
 def learn_readout(

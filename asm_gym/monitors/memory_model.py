@@ -23,13 +23,13 @@ from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs
 from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
 from asm_gym.memory.network import Network, train
-from asm_gym.memory.readout import add_up, learn_readout, running
+from asm_gym.memory.readout import add_up, learn_readout
 from asm_gym.memory.recall import continued
 from asm_gym.memory.recurrent import RecurrentNetwork, RecurrentWeights, recurrent_shapes
 from asm_gym.memory.specialise import specialise
 from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.model import StreamModel, skills_of
+from asm_gym.monitors.model import StreamModel, model_outputs, skills_of
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.stream import StreamSpec
 
@@ -126,7 +126,9 @@ class MemoryModel(StreamModel):
         temporal = (recurrent_shapes if older else weight_shapes)(self.hidden_size, senses.size, A)
         shapes = temporal | association_shapes(senses.inputs, units, X)
         if skills:
-            shapes |= {"W_K": (len(skills), units), "b_K": (len(skills),)}
+            both = units + self.hidden_size
+            told = units if learned["W_K"].shape[-1] == units else both  # named before the state was asked
+            shapes |= {"W_K": (len(skills), told), "b_K": (len(skills),)}
         for name, shape in shapes.items():
             if learned[name].shape != shape:
                 raise ValueError(f"{name} should be of shape {shape}, found {learned[name].shape}")
@@ -153,7 +155,7 @@ class MemoryModel(StreamModel):
             error[state.steps < self.lag] = 0.0  # nothing came before, so that no change is known
         skill = state.skill
         if self.skills_:
-            skill = add_up(skill, units, self.learned_["W_K"], self.learned_["b_K"])
+            skill = add_up(skill, units, expected, self.learned_["W_K"], self.learned_["b_K"])
         seen = newest(state.before, rows), newest(state.earlier, before), state.steps + 1
         return MemoryState(traces, expected, *seen, skill), ModelOutput(error, expected)
 
@@ -173,14 +175,17 @@ class MemoryModel(StreamModel):
             raise ValueError(f"two skills at least are needed to tell them apart, got {', '.join(known)}")
         inputs = np.concatenate([self.senses_.read_episode(e.stream).inputs for e in episodes])
         skills = np.repeat([known.index(name) for name in names], [len(e) for e in episodes])
-        V = self.network.association.V
-        W_K, b_K = learn_readout(lambda i: hidden_units(inputs[i], V), skills, len(known), rng)
+        states, V = np.concatenate([o.contexts for o in model_outputs(self, episodes)]), self.network.association.V
+        W_K, b_K = learn_readout(lambda i: np.hstack([hidden_units(inputs[i], V), states[i]]), skills, len(known), rng)
         return self.restore({**self.learned_, "W_K": W_K, "b_K": b_K}, tuple(known))
 
     def skills(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.str_]:
         """(T,) the skill that seems to run in each step of a stream (T, D), once some have a name."""
-        units = hidden_units(self.senses_.read_episode(np.asarray(stream)).inputs, self.network.association.V)
-        return np.array(self.skills_)[running(units, self.learned_["W_K"], self.learned_["b_K"])]
+        state, named = self.start(1), []
+        for row in np.asarray(stream, np.float64):
+            state, _ = self.predict(state, row[None])
+            named.append(self.skills_[int(state.skill.argmax())])
+        return np.array(named)
 
     def adapt(
         self, before: MemoryState, rows: NDArray[np.float64], quiet: NDArray[np.bool_], rate: float

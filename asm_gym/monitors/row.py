@@ -120,7 +120,7 @@ def _observe(
         if steps[n] < lag:
             error[n] = 0.0  # nothing came before, so that no change is known
     if len(readout[1]):
-        new[5][:] = add_up(skill, units, *readout)
+        new[5][:] = add_up(skill, units, new[1], *readout)
 
     errors, context = error.astype(np.float64), new[1].astype(np.float64)
     (new[6][:], new[7][:], new[8][:]), _, shares = _step(vector, lately, counted, errors, context, *detector)
