@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.files import regular_file, written_whole
+from asm_gym.typed import typed
 
 FORMAT = "asm-gym"
 VERSION = 1
@@ -59,6 +60,7 @@ class Checkpoint(NamedTuple):
         return array
 
 
+@typed
 def write_checkpoint(
     path: str | Path, kind: str, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> None:
@@ -81,6 +83,7 @@ def write_checkpoint(
                 _npy.write_array(member, array, allow_pickle=False)
 
 
+@typed
 def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
     """Reads a checkpoint of that kind.
 
@@ -114,6 +117,7 @@ def read_header(path: str | Path) -> dict[str, Any]:
         return _header(file)
 
 
+@typed
 def kind_of(path: str | Path) -> str:
     """What a file is a checkpoint of. Raises FileNotFoundError, or ValueError where it is none."""
     try:
@@ -125,6 +129,7 @@ def kind_of(path: str | Path) -> str:
         raise ValueError(f"{path} is damaged or not a checkpoint of asm-gym: {error}") from error
 
 
+@typed
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
     """Every array of an ``.npz``, by name. Raises FileNotFoundError, or ValueError where it is damaged."""
     with _opened(path, "is damaged", expanded=MOST_EXPANDED) as file:

@@ -30,11 +30,13 @@ from asm_gym.files import require_space
 from asm_gym.hdf5 import opened_hdf5
 from asm_gym.stream import StreamSpec, control_period, flat_rows
 from asm_gym.tasks import TASKS
+from asm_gym.typed import typed
 
 METADATA, ARRAYS, CHECKSUMS = "metadata.json", "main_data.hdf5", "SHA256SUMS"
 """What a dataset's folder ``data`` holds; the first two are Minari's."""
 
 
+@typed
 def write_dataset(
     root: Path, dataset_id: str, episodes: Sequence[Episode], env: gym.Env[Any, Any], details: dict[str, Any]
 ) -> Path:
@@ -155,6 +157,7 @@ def _columns(episode: Episode) -> dict[str, Any]:
     }
 
 
+@typed
 def read_dataset(path: str | Path, env_id: str | None = None, dt: float | None = None) -> list[Episode]:
     """The episodes of a Minari dataset, whoever recorded them.
 

@@ -19,6 +19,7 @@ from asm_gym.checkpoint import read_arrays, read_checkpoint, write_checkpoint
 from asm_gym.files import regular_file
 from asm_gym.stream import StreamSpec
 from asm_gym.tables import stream_of
+from asm_gym.typed import typed
 
 KIND = "episode"
 
@@ -112,6 +113,7 @@ class Episode:
         return cls(np.ascontiguousarray(x, dtype=np.float32), spec, **fields)
 
     @classmethod
+    @typed
     def from_table(
         cls,
         frame: Any,
@@ -146,6 +148,7 @@ def check_recorded(episode: Episode) -> None:
         raise ValueError(f"the reward of step {bad[0]} must be finite, got {episode.rewards[bad[0]]}")
 
 
+@typed
 def save_episode(path: str | Path, episode: Episode) -> Path:
     """Writes one episode to a file of its own, which appears only when it is complete; returns where it is."""
     check_recorded(episode)
@@ -163,6 +166,7 @@ def save_episode(path: str | Path, episode: Episode) -> Path:
     return Path(path)
 
 
+@typed
 def load_episode(path: str | Path, spec: StreamSpec | None = None) -> Episode:
     """What ``save_episode`` wrote, or what the three formats before it held.
 

@@ -18,6 +18,7 @@ from asm_gym.datasets import METADATA, read_dataset
 from asm_gym.episodes import Episode, load_episode
 from asm_gym.lerobot import INFO, read_lerobot
 from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 
 
 class Log(NamedTuple):
@@ -66,6 +67,7 @@ READERS: dict[str, Callable[[Path, Layout], Episode]] = {
 """By the suffix of a file."""
 
 
+@typed
 def read_logs(path: str | Path, layout: Layout | None = None) -> Iterator[Log]:
     """The episodes at ``path``, in the order of their names, each read when it is asked for.
 

@@ -7,7 +7,6 @@ commanded during it (the efference copy). A :class:`StreamSpec` names every numb
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -16,6 +15,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+
+from asm_gym.checks import check_number, shown
+from asm_gym.typed import typed
 
 MOTOR = "action"
 """The group that holds the commanded action."""
@@ -46,12 +48,11 @@ class Channel:
     resolution: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.size < 1:
-            raise ValueError(f"channel {self.name!r} must have a size of at least 1, got {self.size}")
-        if not self.noise >= 0.0:
-            raise ValueError(f"channel {self.name!r}: noise must be >= 0, got {self.noise}")
-        if not 0.0 <= self.resolution < math.inf:
-            raise ValueError(f"channel {self.name!r}: resolution must be >= 0 and finite, got {self.resolution}")
+        check_number(f"channel {self.name!r}: size", self.size, low=1, whole=True)
+        check_number(f"channel {self.name!r}: noise", self.noise, low=0.0, infinite=True)
+        check_number(f"channel {self.name!r}: resolution", self.resolution, low=0.0)
+        if not isinstance(self.elements, tuple):
+            raise TypeError(f"channel {self.name!r}: elements must be a tuple of names, got {shown(self.elements)}")
         if self.elements and len(self.elements) != self.size:
             raise ValueError(f"channel {self.name!r} has size {self.size} but {len(self.elements)} element names")
 
@@ -79,13 +80,14 @@ class StreamSpec:
     source: str = ""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.channels, tuple) or not all(isinstance(c, Channel) for c in self.channels):
+            raise TypeError(f"channels must be a tuple of Channel objects, got {shown(self.channels)}")
         names = [c.name for c in self.channels]
         if len(set(names)) != len(names):
             raise ValueError(f"channel names must be unique, got {names}")
         if not any(c.group != MOTOR for c in self.channels):
             raise ValueError("a stream needs at least one channel that is not an action")
-        if not self.dt > 0:
-            raise ValueError(f"dt must be > 0, got {self.dt}")
+        check_number("dt", self.dt, above=0.0)
 
     @cached_property
     def size(self) -> int:
@@ -190,12 +192,14 @@ class StreamSpec:
         return json.dumps(asdict(self))
 
     @classmethod
+    @typed
     def from_json(cls, text: str) -> StreamSpec:
         raw = json.loads(text)
         channels = tuple(Channel(**{**c, "elements": tuple(c["elements"])}) for c in raw["channels"])
         return cls(channels, raw["dt"], raw["source"])
 
     @classmethod
+    @typed
     def from_spaces(cls, observation: spaces.Space[Any], action: spaces.Space[Any], dt: float = 1.0) -> StreamSpec:
         """The spec of an environment that has no stream of its own: its observation, then the action.
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number
+from asm_gym.checks import check_number, shown
 from asm_gym.columns import as_array, read_table
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.timing import noise_of, period, regular
@@ -119,7 +119,9 @@ def label_of(column: str) -> str:
 def _columns(frame: Any) -> dict[str, Column]:
     """The columns of numbers by name, (T,) or (T, k) each."""
     # A dictionary has keys, an Arrow table column_names, pandas and Polars have columns.
-    names = frame if isinstance(frame, Mapping) else getattr(frame, "column_names", None) or frame.columns
+    names = frame if isinstance(frame, Mapping) else getattr(frame, "column_names", getattr(frame, "columns", None))
+    if names is None or callable(names):
+        raise TypeError(f"a table must be a dictionary of columns, or a frame of them, got {shown(frame)}")
     columns = {str(name): as_array(frame[name]) for name in names}
     if len(columns) < len(list(names)):
         raise ValueError(f"columns must have different names, got {', '.join(map(str, names))}")

@@ -19,6 +19,7 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import State
 from asm_gym.policies.grip import Grip, Readout
 from asm_gym.stream import MOTOR, StreamSpec, control_period
+from asm_gym.typed import typed
 
 OBJECT = "object"
 """The group of what lies about; the objects of other tasks are out of play, and read 0."""
@@ -114,6 +115,7 @@ class NeuralASMPolicy:
         RuntimeError: the memory has learned nothing yet.
     """
 
+    @typed
     def __init__(self, memory: NeuralASM, env: gym.Env[Any, Any]) -> None:
         self.memory = memory
         self._size = require_motor(memory.spec, env)

@@ -26,6 +26,7 @@ from asm_gym.policies.scripted.transport import TransportExpert
 from asm_gym.policies.scripted.two_arm_lift import TwoArmLiftExpert
 from asm_gym.policies.scripted.wipe import WipeExpert
 from asm_gym.tasks import TaskSpec
+from asm_gym.typed import typed
 
 EXPERTS: dict[str, Callable[..., Policy]] = {
     "Lift": LiftExpert,
@@ -55,6 +56,7 @@ def agents() -> tuple[str, ...]:
     return tuple(sorted(f.stem for f in SHIPPED.glob("*.npz")))
 
 
+@typed
 def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kwargs: Any) -> Policy:
     """The policy called ``name`` for ``env``.
 

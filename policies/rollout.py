@@ -9,8 +9,10 @@ import gymnasium as gym
 import numpy as np
 
 from asm_gym.policies.base import Policy
+from asm_gym.typed import typed
 
 
+@typed
 def rollout(
     env: gym.Env[Any, Any],
     policy: Policy,

@@ -388,7 +388,7 @@ def test_rows_of_the_wrong_shape_are_refused(asm):
     for shape in ((1, 13), (14,), (2, 14), (1, 1, 14)):
         with pytest.raises(ValueError, match="shape"):
             asm.observe(asm.initial_state(1), np.zeros(shape))
-    with pytest.raises(ValueError, match="batch must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="batch must be a whole number of at least 1, got 0"):
         asm.initial_state(0)
 
 

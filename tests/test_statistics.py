@@ -37,9 +37,9 @@ def test_wilson_knows_nothing_from_no_trials_and_is_symmetric():
 
 
 def test_wilson_refuses_impossible_counts():
-    with pytest.raises(ValueError, match=r"k must be in \[0, n\], got 3 of 2"):
+    with pytest.raises(ValueError, match=r"k must be a whole number in \[0, 2\], got 3"):
         wilson_interval(3, 2)
-    with pytest.raises(ValueError, match=r"confidence must be in \(0, 1\), got 95"):
+    with pytest.raises(ValueError, match=r"confidence must be a number in \(0, 1\), got 95"):
         wilson_interval(1, 2, confidence=95)
 
 

@@ -16,6 +16,7 @@ from asm_gym.checks import as_float32, shown
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import Fault
 from asm_gym.stream import MOTOR, StreamSpec, flat
+from asm_gym.typed import typed
 from asm_gym.wrappers.recording import StreamSource
 
 
@@ -106,6 +107,7 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             two that contradict each other.
     """
 
+    @typed
     def __init__(self, env: gym.Env[Any, Any], faults: Sequence[Fault]) -> None:
         RecordConstructorArgs.__init__(self, faults=faults)
         theirs = env.unwrapped

@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.special import betaincinv
 
-from asm_gym.checks import check_number
+from asm_gym.checks import check_number, shown
 from asm_gym.detection.base import Array
 
 LEAST_RATE = 1e-15
@@ -36,6 +36,9 @@ def conformal_threshold(maxima: Array, rate: float) -> float:
         maxima: (n,) the largest value in each nominal episode.
         rate: P(any alarm in a nominal episode).
     """
+    maxima = np.asarray(maxima)
+    if maxima.ndim != 1 or maxima.dtype.kind not in "iuf" or np.isnan(maxima).any():
+        raise ValueError(f"maxima must be numbers in the shape (n,), got {shown(maxima)}")
     n, needed = len(maxima), conformal_episodes(rate)
     if n < needed:
         raise ValueError(

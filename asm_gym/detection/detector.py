@@ -35,6 +35,7 @@ from asm_gym.detection.repetition import (
 from asm_gym.detection.tails import worst_case
 from asm_gym.detection.whitening import bounded, whitening
 from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 
 GAINS = (0.8, 0.2, 0.05)
 BOUND = 100.0
@@ -234,6 +235,7 @@ class EvidenceDetection:
     name = "evidence"
     arrays: tuple[str, ...] = ("whitening", "ceiling", "tail", "context_quantile", "context_range", "repetition")
 
+    @typed
     def __init__(
         self,
         spec: StreamSpec,

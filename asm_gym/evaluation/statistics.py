@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from asm_gym.checks import check_number, shown
+
 Floats = NDArray[np.floating[Any]]
 
 RESAMPLES = 2000
@@ -73,8 +75,8 @@ def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
 
     ``(p + z²/2n ± z √(p(1-p)/n + z²/4n²)) / (1 + z²/n)``
     """
-    if not 0 <= k <= n:
-        raise ValueError(f"k must be in [0, n], got {k} of {n}")
+    check_number("n", n, low=0, whole=True)
+    check_number("k", k, low=0, high=n, whole=True)
     if n == 0:
         return 0.0, 1.0
     z = NormalDist().inv_cdf(0.5 + _check_confidence(confidence) / 2)
@@ -90,10 +92,8 @@ def binomial_interval(n: int, p: float, confidence: float = 0.95) -> tuple[int, 
 
     For checking a calibration: alarms in n nominal episodes at the false-alarm rate p.
     """
-    if not 0 <= p <= 1:
-        raise ValueError(f"p must be in [0, 1], got {p}")
-    if n < 0:
-        raise ValueError(f"n must be >= 0, got {n}")
+    check_number("p", p, low=0, high=1)
+    check_number("n", n, low=0, whole=True)
     tail = (1 - _check_confidence(confidence)) / 2
     if p in (0.0, 1.0):
         return round(n * p), round(n * p)
@@ -114,8 +114,9 @@ def auroc(scores_pos: ArrayLike, scores_neg: ArrayLike) -> float:
     pos, neg = np.asarray(scores_pos, np.float64), np.asarray(scores_neg, np.float64)
     if not pos.size or not neg.size:
         raise ValueError(f"auroc needs scores of both kinds, got {pos.size} positive and {neg.size} negative")
-    if np.isnan(pos).any() or np.isnan(neg).any():
-        raise ValueError("scores must not be NaN")
+    for name, scores in (("scores_pos", pos), ("scores_neg", neg)):
+        if np.isnan(scores).any():
+            raise ValueError(f"{name}: scores must not be NaN, got {shown(scores)}")
     neg = np.sort(neg)
     lower, not_higher = np.searchsorted(neg, pos, "left"), np.searchsorted(neg, pos, "right")  # (P,)
     return float((lower + not_higher).sum() / (2 * pos.size * neg.size))
@@ -150,6 +151,4 @@ def reduction(pairs: Floats) -> Floats:
 
 
 def _check_confidence(confidence: Any) -> float:
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence must be in (0, 1), got {confidence}")
-    return float(confidence)
+    return check_number("confidence", confidence, above=0, below=1)

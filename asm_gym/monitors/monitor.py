@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint, write_checkpoint
-from asm_gym.checks import check_flag, check_number
+from asm_gym.checks import check_flag, check_number, shown
 from asm_gym.choices import check_choice
 from asm_gym.detection import Detection, ModelOutput, Nominal, Promise, conformal_episodes, conformal_threshold
 from asm_gym.detection.detector import ANYTHING
@@ -22,6 +22,7 @@ from asm_gym.monitors.base import Model, Progress, Specialises, State, Surprise
 from asm_gym.monitors.model import batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.nominal import check_nominal
 from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 
 M = TypeVar("M", bound="CalibratedMonitor")
 
@@ -92,6 +93,7 @@ class CalibratedMonitor:
             raise RuntimeError(f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first")
         return self.threshold_
 
+    @typed
     def threshold_at(self, false_alarm_rate: float) -> float:
         """What the threshold would be at another rate, from the episodes that ``calibrate`` was given.
 
@@ -119,12 +121,14 @@ class CalibratedMonitor:
             raise RuntimeError(f"this {self._name} knows no calibration: call calibrate(nominal_episodes) first")
         return Promise.of(self.maxima_, self.threshold)
 
+    @typed
     def with_threshold(self, value: float) -> Self:
         """The same monitor with another threshold, ``inf`` for none that could be exceeded; this one keeps its own."""
         other = self._copy()
         other.threshold_ = check_number("threshold", value, infinite=True)
         return other
 
+    @typed
     def with_detection(self, detection: str | Detection) -> Self:
         """The same model under another detection: a new one, which needs ``fit``, or the name of one fitted before.
 
@@ -144,6 +148,7 @@ class CalibratedMonitor:
         found = {n: getattr(p, n) for p in parts for n in parameter_names(type(p)) if n != "seed"}
         return found | {"seed": self.seed}
 
+    @typed
     def fit(self, episodes: Sequence[Episode], progress: Progress | None = None, *, warm_start: bool = False) -> Self:
         """Learns from whole nominal episodes of any number of skills; no labels.
 
@@ -190,6 +195,7 @@ class CalibratedMonitor:
                     raise ValueError(f"{self.model.kind} and {detection.name} both learn {', '.join(sorted(taken))}")
                 detection.fit(nominal, rng)
 
+    @typed
     def calibrate(self, episodes: Sequence[Episode], false_alarm_rate: float = 0.01) -> Self:
         """Sets the threshold from nominal episodes that ``fit`` has not seen; P(any alarm in one) <= the rate.
 
@@ -213,14 +219,14 @@ class CalibratedMonitor:
         maxima = np.array([s.value.max() for s in scores])
         self.threshold_, self.maxima_ = conformal_threshold(maxima, rate), maxima
 
+    @typed
     def initial_state(self, batch: int = 1, skills: Sequence[str] = ()) -> MonitorState:
         """The state before the first row of ``batch`` streams.
 
         Args:
             skills: which runs in each, for a model that has to be told; others do not look.
         """
-        if batch < 1:
-            raise ValueError(f"batch must be at least 1, got {batch}")
+        check_number("batch", batch, low=1, whole=True)
         self._fitted()
         return MonitorState(self.model.start(batch, skills), self.detection.start(batch, len(self.model.error_columns)))
 
@@ -244,6 +250,7 @@ class CalibratedMonitor:
             attribution[broken] = np.where(finite[broken], 0.0, np.inf)
         return MonitorState(model, detection), Surprise(attribution.sum(axis=1), attribution)
 
+    @typed
     def reset_evidence(self, state: MonitorState) -> MonitorState:
         """The state with the evidence so far forgotten, after an alarm that was acted on; the model goes on."""
         return state._replace(detection=self.detection.reset(state.detection))
@@ -253,6 +260,7 @@ class CalibratedMonitor:
         warnings.warn("resynchronise is now reset_evidence", DeprecationWarning, stacklevel=2)
         return self.reset_evidence(state)
 
+    @typed
     def score(self, episode: Episode) -> Surprise:
         """The surprise of each step of an episode: value (T,), attribution (T, D); no names of skills."""
         return self.score_episodes([episode])[0]
@@ -274,6 +282,7 @@ class CalibratedMonitor:
                         scores[i] = scores[i]._replace(of_body=body, of_skill=skill)
         return scores
 
+    @typed
     def save(self, path: str | Path) -> None:
         """Writes everything learned to one file: arrays and JSON."""
         self._fitted()
@@ -348,6 +357,8 @@ class CalibratedMonitor:
 
     def _rows(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """(B, D) the rows, of a layout that compiled code knows."""
+        if not isinstance(state, MonitorState):
+            raise TypeError(f"state must be what initial_state or observe gave, got {shown(state)}")
         rows = np.ascontiguousarray(stream, np.float64)
         batch = batch_of(state)
         if rows.shape != (batch, self.spec.size):

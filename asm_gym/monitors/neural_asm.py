@@ -34,6 +34,7 @@ from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise
 from asm_gym.scaling import StreamScaler
 from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 
 MOST_ITERATIONS = 1000
 """Of inference in a row: twenty are enough, and a file that asks for a thousand million would never answer."""
@@ -77,6 +78,7 @@ class NeuralASM(CalibratedMonitor):
     kind = MemoryModel.kind
     model: MemoryModel
 
+    @typed
     def __init__(
         self,
         spec: StreamSpec,
@@ -164,6 +166,7 @@ class NeuralASM(CalibratedMonitor):
         return schedule | sizes | detections | {"seed": self.seed}
 
     @classmethod
+    @typed
     def load(cls, path: str | Path) -> Self:
         """Reads what ``save`` wrote.
 
@@ -174,6 +177,7 @@ class NeuralASM(CalibratedMonitor):
         return restored(path, read_checkpoint(path, cls.kind), cls)
 
     @classmethod
+    @typed
     def pretrained(cls, name: str) -> Self:
         """A memory of a body that comes with the package, calibrated: ``NeuralASM.pretrained("panda")``.
 
@@ -336,6 +340,7 @@ class NeuralASM(CalibratedMonitor):
             raise RuntimeError("no skill has a name yet: call name_skills(episodes) first")
         return self.model.skills(stream)
 
+    @typed
     def adapt(
         self,
         before: MonitorState,

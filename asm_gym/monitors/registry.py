@@ -14,6 +14,7 @@ from asm_gym.extras import needed_for
 from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import RENAMED, CalibratedMonitor, restored
 from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 
 EVIDENCE = "+evidence"
 """What the name of a monitor ends in where its errors are judged by the detection of the Neural ASM."""
@@ -127,6 +128,7 @@ MONITORS: dict[str, MonitorKind] = {
 as those of the Neural ASM are. ``+`` and the name of any other detection will do as well."""
 
 
+@typed
 def register_monitor(model: type[Any], detection: str = "evidence") -> None:
     """Makes a model of one's own known under its ``kind``, and under ``kind+evidence``.
 
@@ -145,6 +147,7 @@ def register_monitor(model: type[Any], detection: str = "evidence") -> None:
     MONITORS.update({name: row, name + EVIDENCE: row.under("evidence")})
 
 
+@typed
 def monitor_class(name: str) -> MonitorKind:
     """What makes and loads the monitors of that name; torch is imported only for those that need it.
 
@@ -163,6 +166,7 @@ def monitor_class(name: str) -> MonitorKind:
     return kind
 
 
+@typed
 def make_monitor(
     name: str, spec: StreamSpec, detection: str | Detection | None = None, **hyperparameters: Any
 ) -> CalibratedMonitor:
@@ -184,6 +188,7 @@ def make_monitor(
     return made if detection is None or isinstance(detection, str) else made.with_detection(detection)
 
 
+@typed
 def load_monitor(path: str | Path) -> CalibratedMonitor:
     """Reads what any monitor has saved, with the detection that it had.
 

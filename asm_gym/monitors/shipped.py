@@ -11,6 +11,7 @@ from typing import Any
 from asm_gym.checkpoint import read_header
 from asm_gym.choices import check_choice
 from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 
 SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
 """Where they lie."""
@@ -34,6 +35,7 @@ def pretrained_file(name: str) -> Path:
     return known[name]
 
 
+@typed
 def pretrained_for(spec: StreamSpec, controller: str = "") -> str:
     """The name of the shipped memory of this body; a stream may lack channels that it knows.
 

@@ -16,9 +16,11 @@ from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import PolicySource, RolloutConfig, Trial, environment, play, policy_for, staged
 from asm_gym.tasks import env_spec
+from asm_gym.typed import typed
 from asm_gym.wrappers import StreamRecorder
 
 
+@typed
 def collect(
     env_id: str,
     policy: PolicySource = "scripted",

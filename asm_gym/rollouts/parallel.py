@@ -21,8 +21,10 @@ import cloudpickle
 from loky import get_reusable_executor
 from threadpoolctl import threadpool_limits
 
+from asm_gym.checks import check_number
 from asm_gym.choices import check_choice
 from asm_gym.extras import require
+from asm_gym.typed import typed
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -60,8 +62,7 @@ class ParallelConfig:
     address: str | None = None
 
     def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise ValueError(f"workers must be at least 1, got {self.workers}")
+        check_number("workers", self.workers, low=1, whole=True)
         check_choice("backend", self.backend, BACKENDS)
         if self.backend == "dask" and self.address is None:
             raise ValueError("backend='dask' needs the address of its scheduler, such as tcp://host:8786")
@@ -72,6 +73,7 @@ class ParallelConfig:
 TWO_PROCESSES, THIS_PROCESS = ParallelConfig(), ParallelConfig(1)
 
 
+@typed
 def parallel_map(
     task: Callable[[Item], Result],
     items: Sequence[Item],
@@ -89,7 +91,7 @@ def parallel_map(
         ConnectionError: there is no cluster at the address.
         ChildProcessError: a process was killed.
     """
-    parallel = ParallelConfig(parallel) if isinstance(parallel, int) else parallel
+    parallel = parallel if isinstance(parallel, ParallelConfig) else ParallelConfig(parallel)
     tell = progress or (lambda done, total: None)
     if parallel.backend == "loky" and parallel.workers == 1:
         results = []

@@ -6,21 +6,29 @@ import zlib
 
 import numpy as np
 
+from asm_gym.checks import check_number
+
 
 def episode_seeds(seed: int, episodes: int, stage: int = 0) -> list[int]:
     """One seed an episode; lists of different ``stage`` have nothing in common."""
-    return _drawn([seed, stage], episodes)
+    return _drawn([_natural("seed", seed), _natural("stage", stage)], episodes)
 
 
 def role_seeds(seed: int, task: str, role: str, episodes: int) -> list[int]:
     """One seed an episode; those of different tasks and roles have nothing in common."""
-    return _drawn([seed, zlib.crc32(f"{task}/{role}".encode())], episodes)
+    return _drawn([_natural("seed", seed), zlib.crc32(f"{task}/{role}".encode())], episodes)
 
 
 def draw_onset(seed: int, horizon: int) -> int:
     """When a fault begins in the episode of ``seed``: after its first 10 steps, in its first half."""
-    return int(np.random.default_rng([seed, 1]).integers(10, max(11, horizon // 2)))
+    latest = max(11, check_number("horizon", horizon, low=0, high=1e9, whole=True) // 2)
+    return int(np.random.default_rng([_natural("seed", seed), 1]).integers(10, latest))
 
 
-def _drawn(entropy: list[int], count: int) -> list[int]:
-    return [int(s) for s in np.random.SeedSequence(entropy).generate_state(count, np.uint32) // 2]
+def _natural(name: str, value: int) -> int:
+    return check_number(name, value, low=0, whole=True)
+
+
+def _drawn(entropy: list[int], episodes: int) -> list[int]:
+    check_number("episodes", episodes, low=0, high=10**9, whole=True)
+    return [int(s) for s in np.random.SeedSequence(entropy).generate_state(episodes, np.uint32) // 2]

@@ -10,6 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_number
+
 Vector = NDArray[np.float64]
 
 # What one unit of action moves the hand's set-point by, in robosuite's OSC_POSE: 5 cm, 0.5 rad.
@@ -36,10 +38,8 @@ class Style:
 
     def __post_init__(self) -> None:
         for name in ("noise", "speed_spread", "spread"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
-        if not self.speed > 0:
-            raise ValueError(f"speed must be > 0, got {self.speed}")
+            check_number(name, getattr(self, name), low=0)
+        check_number("speed", self.speed, above=0)
 
     def pace(self, usual: float, rng: np.random.Generator) -> float:
         """The speed of one episode, where ``usual`` is the expert's own."""
