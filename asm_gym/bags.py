@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.columns import check_declared
 from asm_gym.extras import require
 from asm_gym.files import regular_file
 
@@ -52,14 +53,33 @@ MESSAGES: dict[str, Callable[[Any], Numbers]] = {
 """What is read, by the type of a message."""
 
 
+MCAP_MAGIC, MCAP_CHUNK = 8, 0x06
+"""Bytes before the first record of an MCAP file, and the opcode of a chunk (mcap.dev/spec)."""
+
+
+def _in_chunks(path: Path, size: int) -> int:
+    """[bytes] that the chunks of an MCAP file say they hold, none of them expanded."""
+    total = 0
+    with path.open("rb") as file:
+        file.seek(MCAP_MAGIC)
+        while len(head := file.read(9)) == 9:  # opcode, length
+            end = file.tell() + min(int.from_bytes(head[1:], "little"), size)
+            if head[0] == MCAP_CHUNK:
+                total += int.from_bytes(file.read(24)[16:], "little")  # after two times
+            file.seek(end)
+    return total
+
+
 def read_bag(path: Path) -> dict[str, NDArray[np.float64]]:
     """The columns of a bag (``.mcap``, ``.db3``, ``.bag``), ``time`` among them [s].
 
     Raises:
-        ValueError: it is damaged, or holds no JointState; the message lists its topics.
+        ValueError: it is damaged, declares far more than it holds, or has no JointState; the message lists its topics.
         ImportError: rosbags is not installed.
     """
-    regular_file(path)
+    size = regular_file(path)
+    if path.suffix == ".mcap":
+        check_declared(path, _in_chunks(path, size), size)
     highlevel, typesys = (require(f"rosbags.{name}", what="a ROS bag") for name in ("highlevel", "typesys"))
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     try:

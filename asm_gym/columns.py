@@ -125,7 +125,8 @@ def as_array(column: Any) -> NDArray[Any]:
 
 def read_array(path: Path) -> dict[str, NDArray[Any]]:
     """The array of a ``.npy`` file, (T,) or (T, k), as the column ``value``. Raises ValueError where it is damaged."""
-    regular_file(path)
+    if not regular_file(path):
+        raise ValueError(f"{path} is empty")
     array = np.load(path, mmap_mode="r", allow_pickle=False)  # which refuses a file shorter than it declares
     if array.ndim not in (1, 2):
         raise ValueError(f"{path} must hold rows of numbers, got an array of shape {array.shape}")

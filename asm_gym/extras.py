@@ -16,6 +16,7 @@ BROUGHT_BY = {
     **dict.fromkeys(("distributed", "dask", "ray"), "cluster"),
     **dict.fromkeys(("moviepy",), "video"),
     **dict.fromkeys(("gymnasium_robotics", "shimmy", "dm_control"), "environments"),
+    **dict.fromkeys(("torchrl", "wandb"), "learners"),
     **dict.fromkeys(("rosbags",), "ros"),
     **dict.fromkeys(("rerun",), "rerun"),
 }

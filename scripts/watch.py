@@ -81,8 +81,8 @@ class Alarm(NamedTuple):
     Attributes:
         log: in which.
         start, end: from when to when [s]; a row is known at the end of its step.
-        channel: which number surprised most, at its worst row.
-        excess: how surprising that row was, in thresholds; infinite where it was not finite.
+        channel: which number surprised most when it was raised.
+        excess: how surprising its worst row was, in thresholds; infinite where it was not finite.
     """
 
     log: str
@@ -168,7 +168,10 @@ def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Trac
     moments = sorted((m for trace in worst for m in figures.moments_of(trace)), key=lambda m: -m.excess)[:MOMENTS]
     if moments:
         drawn = {
-            "moments": ("The worst moments, in multiples of the threshold", figures.moments_figure(moments))
+            "moments": (
+                "How the worst alarms began; × the threshold that each reached",
+                figures.moments_figure(moments),
+            )
         } | drawn
     for name, (_, figure) in drawn.items():
         figures.save(figure, args.out / f"{name}.png")

@@ -13,15 +13,17 @@ DOCS = ROOT / "docs"
 
 FENCE = re.compile(r"^```([\w{}-]*)\n(.*?)^```\s*$", re.M | re.S)
 BEFORE = re.compile(r"<!-- before\n(.*?)-->", re.S)
+NEEDS = re.compile(r"<!-- needs: ([\w. ]+) -->\n\Z")
 SMALL = re.compile(r"<!-- small: ([^\n]*) -->\n\Z")
 
 
 class Block(NamedTuple):
-    """A fenced block: its language, its text, and the line it begins in."""
+    """A fenced block: its language, its text, the line it begins in, and the modules it runs with only."""
 
     language: str
     text: str
     line: int
+    needs: tuple[str, ...] = ()
 
 
 def written() -> list[Path]:
@@ -61,7 +63,9 @@ def blocks(path: Path) -> list[Block]:
     for match in (*FENCE.finditer(text), *BEFORE.finditer(text)):
         above = text[: match.start()]
         language, code = match.groups() if match.re is FENCE else ("python", match[1])
-        found.append((match.start(), Block(language, small(code, above), above.count("\n") + 2)))
+        needs = NEEDS.search(above)
+        named = tuple(needs[1].split()) if needs else ()
+        found.append((match.start(), Block(language, small(code, above), above.count("\n") + 2, named)))
     return [block for _, block in sorted(found)]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -51,6 +52,12 @@ def registries():
         registry.update(before)
 
 
+def is_there(module: str) -> bool:
+    """It is installed. A library that is there and broken is for the block to find out."""
+    package, _, rest = module.partition(".")
+    return find_spec(package) is not None and (not rest or find_spec(module) is not None)
+
+
 @pytest.mark.parametrize("page", PYTHON)
 @pytest.mark.usefixtures("registries")
 def test_the_code_of_a_page_runs_from_top_to_bottom(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -58,7 +65,7 @@ def test_the_code_of_a_page_runs_from_top_to_bottom(page: Path, tmp_path: Path, 
     module = ModuleType("page")
     monkeypatch.setitem(sys.modules, "page", module)
     for block in documents.blocks(page):
-        if block.language == "python":
+        if block.language == "python" and all(map(is_there, block.needs)):
             below = "\n" * (block.line - 1) + block.text  # so that tracebacks name the lines of the page
             exec(compile(below, str(page), "exec", dont_inherit=True), vars(module))
 
@@ -117,6 +124,14 @@ def test_a_command_with_a_wrong_argument_is_found(monkeypatch: pytest.MonkeyPatc
         check("asm-gym demo --no-such-thing", monkeypatch)
     with pytest.raises(AssertionError):
         check("make no-such-thing", monkeypatch)
+
+
+def test_a_block_that_needs_a_library_says_so(tmp_path: Path):
+    page = tmp_path / "page.md"
+    page.write_text("<!-- needs: ray.rllib -->\n```python\nx\n```\n\n```python\ny\n```\n")
+    assert [block.needs for block in documents.blocks(page)] == [("ray.rllib",), ()]
+    assert is_there("json.decoder")
+    assert not is_there("no_such_library.at_all")
 
 
 def test_a_comment_that_makes_a_block_small_must_match_it():

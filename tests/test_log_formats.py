@@ -162,6 +162,13 @@ def test_a_damaged_parquet_file_is_named(damage, message, tmp_path):
         list(read_logs(path))
 
 
+@pytest.mark.parametrize("name", ["x.csv", "x.parquet", "x.npz", "x.npy"])
+def test_an_empty_file_is_named(name, tmp_path):
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(ValueError, match=name.replace(".", r"\.")):
+        list(read_logs(tmp_path / name))
+
+
 def test_a_small_file_that_claims_a_gigabyte_is_refused_unread(tmp_path):
     path = tmp_path / "bomb.parquet"
     zeros = pa.array(np.zeros(2_000_000))
@@ -325,6 +332,31 @@ def test_a_bag_that_is_cut_off_or_has_no_joints_is_named(tmp_path):
         list(read_logs(tmp_path / "cut.mcap"))
     with pytest.raises(ValueError, match=r"no sensor_msgs/JointState; its topics: /joint_states.*/wrist"):
         list(read_logs(bag(tmp_path / "none", "MCAP", joints=False)))
+
+
+def test_an_empty_bag_is_named(tmp_path):
+    pytest.importorskip("rosbags")
+    for name in ("x.mcap", "x.db3", "x.bag"):
+        (tmp_path / name).write_bytes(b"")
+        with pytest.raises(ValueError, match=name.replace(".", r"\.")):
+            list(read_logs(tmp_path / name))
+
+
+def test_a_small_mcap_file_that_claims_a_gigabyte_is_refused_unread(tmp_path):
+    mcap = pytest.importorskip("mcap.writer")
+    with (tmp_path / "bomb.mcap").open("wb") as file:
+        writer = mcap.Writer(file, chunk_size=2**26)
+        writer.start()
+        channel = writer.register_channel("/x", "json", 0)
+        writer.add_message(channel, 0, bytes(30_000_000), 0)
+        writer.finish()
+    assert (tmp_path / "bomb.mcap").stat().st_size < 100_000
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"bomb\.mcap declares 30\d+ bytes, and has \d+"):
+        list(read_logs(tmp_path / "bomb.mcap"))
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 5_000_000
 
 
 # ------------------------------------------------------------------ commands

@@ -119,23 +119,19 @@ def test_attribution_shows_the_channels_with_the_greatest_share_first(traces: li
     assert labels == [trace.detail.channels[i] for i in np.argsort(-peaks)[:3]]
 
 
-def test_a_strip_shows_each_alarm_at_its_worst_row_and_the_channel_that_surprised():
+def test_a_strip_shows_how_each_alarm_began_and_the_channel_that_raised_it():
     surprise, attribution = np.ones(100), np.ones((100, 2))
     surprise[[20, 21, 60]] = 30.0, 50.0, np.inf
-    attribution[21] = 10.0, 40.0
+    attribution[20], attribution[21] = (10.0, 20.0), (40.0, 10.0)  # the other one follows, and surprises more
     stream = np.arange(200.0).reshape(100, 2)
     detail = TraceDetail(attribution, ("q", "torque"), np.zeros(100, np.bool_), stream)
     trace = Trace("log.csv", 0, 0.01, 20.0, surprise, detail=detail)
     moments = figures.moments_of(trace)
-    assert [(m.start, m.stop, m.row, m.channel, m.excess) for m in moments] == [
-        (20, 22, 21, 1, 2.5),
-        (60, 61, 60, 0, np.inf),
-    ]
+    assert [(m.start, m.stop, m.channel, m.excess) for m in moments] == [(20, 22, 1, 2.5), (60, 61, 0, np.inf)]
     first, second, third = figures.moments_figure(moments).axes
-    assert first.get_title(loc="left") == "torque, 0.22 s, 2.5×"
-    sensed = first.lines[0]
-    np.testing.assert_array_equal(sensed.get_ydata(), stream[:72, 1])
-    assert first.lines[1].get_xdata()[0] == pytest.approx(0.22)
+    assert first.get_title(loc="left") == "torque, 0.21 s, 2.5×"
+    np.testing.assert_array_equal(first.lines[0].get_ydata(), stream[:71, 1])
+    assert first.lines[1].get_xdata()[0] == pytest.approx(0.21)
     assert second.get_title(loc="left") == "q, 0.61 s, inf×"
     assert not third.get_visible()
     with pytest.raises(ValueError, match="without the detail"):

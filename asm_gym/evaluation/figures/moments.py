@@ -1,4 +1,4 @@
-"""The worst moments of watched episodes, a panel each, as a strip of film would show them."""
+"""How alarms of watched episodes began, a panel each, as a strip of film would show them."""
 
 from __future__ import annotations
 
@@ -20,38 +20,35 @@ ACROSS = 3
 
 
 class Moment(NamedTuple):
-    """The worst row of an alarm.
+    """An alarm, and how it began.
 
     Attributes:
         trace: in which.
-        start, stop: the rows of the alarm.
-        row: the most surprising one.
-        channel: which number surprised most there.
-        excess: how surprising, in thresholds; infinite where the row was not finite.
+        start, stop: its rows.
+        channel: which number surprised most in the first of them; later others follow, and may surprise more.
+        excess: how surprising the worst of them was, in thresholds; infinite where it was not finite.
     """
 
     trace: Trace
     start: int
     stop: int
-    row: int
     channel: int
     excess: float
 
 
 def moments_of(trace: Trace) -> list[Moment]:
-    """The worst row of each alarm, in order. Raises ValueError where the trace has no detail."""
+    """The alarms of an episode, in order. Raises ValueError where the trace has no detail."""
     if trace.detail is None:
         raise ValueError("this trace was kept without the detail that says which channel surprised")
     found = []
     for start, stop in spans(trace.alarm):
-        row = start + int(np.argmax(trace.surprise[start:stop]))
-        channel = int(np.argmax(trace.detail.attribution[row]))
-        found.append(Moment(trace, start, stop, row, channel, float(trace.surprise[row] / trace.threshold)))
+        channel = int(np.argmax(trace.detail.attribution[start]))
+        found.append(Moment(trace, start, stop, channel, float(trace.surprise[start:stop].max() / trace.threshold)))
     return found
 
 
 def moments_figure(moments: Sequence[Moment]) -> Figure:
-    """What the channel that surprised most sensed about each moment, and where the alarm was."""
+    """What the channel that raised each alarm sensed about its beginning."""
     require_some(moments)
     down = math.ceil(len(moments) / ACROSS)
     with figure(height=0.5 + 1.7 * down) as fig:
@@ -63,12 +60,12 @@ def moments_figure(moments: Sequence[Moment]) -> Figure:
             assert detail is not None
             assert detail.stream is not None
             around = max(AROUND_ROWS, round(AROUND_S / trace.dt))
-            shown = slice(max(0, moment.row - around), min(len(trace), moment.row + around + 1))
+            shown = slice(max(0, moment.start - around), min(len(trace), moment.start + around + 1))
             ax.plot(trace.dt * (np.arange(len(trace))[shown] + 1), detail.stream[shown, moment.channel], color=BLUE)
             for start, stop in spans(trace.alarm[shown]):
                 ends = trace.dt * (shown.start + start), trace.dt * (shown.start + stop)
                 ax.axvspan(*ends, color=VERMILLION, alpha=0.2, linewidth=0)
-            at = trace.dt * (moment.row + 1)
+            at = trace.dt * (moment.start + 1)
             ax.axvline(at, color=BLACK, linewidth=1, linestyle=(0, (4, 2)))
             ax.set_title(f"{detail.channels[moment.channel]}, {at:.2f} s, {moment.excess:.1f}×", fontsize=9)
             ax.set_xlabel(f"{trace.title} [s]", fontsize=8)
