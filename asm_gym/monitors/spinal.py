@@ -4,11 +4,11 @@
                                         command, before anything of the step is sensed
     w_i = 5 σ_i + q_i Q^(1/κ_i) exp(min(max(S_i [c, a, 1], l_i), h_i))
 
-M and S are ridge regressions: of the middle of what substeps felt, and of the logarithm of how far the farthest lay
-from x̂, in episodes that M has not seen; l and h are how far S went there. A grasp is expected, and so inside, where the
-same force in free motion is not. q and κ say how far each number goes at its worst (``detection.tails``). Q is
-conformal: a fresh nominal episode leaves the band, in any number of any substep, with a probability of at most the
-rate.
+M and S are ridge regressions: of the middle of what substeps felt, and of the logarithm of how far the farthest within
+a fifth of a second lay from x̂, in episodes that M has not seen; l and h are how far S went there. A grasp is expected,
+and so inside, where the same force in free motion is not. σ is the sensor's noise, q and κ say how far each number goes
+at its worst (``detection.tails``). Q is conformal: a fresh nominal episode leaves the band, in any number of any
+substep, with a probability of at most the rate.
 
 The first rows of an episode are not judged: the memory knows nothing yet to expect from.
 """
@@ -43,6 +43,9 @@ PENALTY = 0.1
 
 EXTREME = 0.005
 """Share of steps beyond l, and beyond h."""
+
+AROUND_S = 0.2
+"""What may be felt so long before or after is expected at a time too: a hand seldom meets things to the step [s]."""
 
 ONE = np.ones(1)
 
@@ -126,7 +129,8 @@ class SpinalBand:
         read = [self._read(n, e) for n, e in enumerate(episodes)]
         middle = _ridge(read[::2], [(felt.max(axis=1) + felt.min(axis=1)) / 2 for _, felt in read[::2]])
         off = [_deviation(x @ middle.T, felt) for x, felt in read[1::2]]
-        spread = _ridge(read[1::2], [np.log(np.maximum(d, FAINTEST)) for d in off])
+        around = round(AROUND_S / self.spec.dt)
+        spread = _ridge(read[1::2], [np.log(np.maximum(_largest_around(d, around), FAINTEST)) for d in off])
         levels = [x @ spread.T for x, _ in read[1::2]]
         span = np.quantile(np.concatenate(levels), (EXTREME, 1.0 - EXTREME), axis=0).T  # (N, 2)
         maxima = [(d / np.exp(np.clip(v, *span.T))).max(axis=0) for d, v in zip(off, levels, strict=True)]
@@ -151,8 +155,7 @@ class SpinalBand:
             middle, half = self._at(x, 1.0)
             beyond = np.maximum(_deviation(middle, felt) - self._noise, 0.0) / (half - self._noise)
             maxima.append(float(np.max(beyond ** self.learned_["tail"])))
-        self.maxima_ = np.array(maxima)
-        self.scale_ = conformal_threshold(self.maxima_, false_alarm_rate)
+        self.scale_, self.maxima_ = conformal_threshold(np.array(maxima), false_alarm_rate), np.array(maxima)
         return self
 
     @property
@@ -270,6 +273,15 @@ def _deviation(middle: NDArray[np.float64], felt: NDArray[np.float64]) -> NDArra
     """(T, N) how far the farthest substep of ``felt`` (T, K, N) lies from the middle (T, N)."""
     farthest: NDArray[np.float64] = np.abs(felt - middle[:, None]).max(axis=1)
     return farthest
+
+
+def _largest_around(deviation: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
+    """(T, N) the largest of so many steps before and after each."""
+    largest = deviation.copy()
+    for k in range(1, min(steps, len(deviation) - 1) + 1):
+        np.maximum(largest[k:], deviation[:-k], out=largest[k:])
+        np.maximum(largest[:-k], deviation[k:], out=largest[:-k])
+    return largest
 
 
 def _ridge(

@@ -52,9 +52,9 @@ class Args(Common):
     """A shipped memory, or the file of one, of the body that acts."""
     tasks: tuple[str, ...] = ("Lift", "Door")
     """Names of tasks; each has a band of its own."""
-    fit_episodes: int = 60
+    fit_episodes: int = 100
     """Nominal episodes of each task that its band is fitted on."""
-    calibration_episodes: int = 100
+    calibration_episodes: int = 200
     """Others that it is calibrated on."""
     rate: float = 0.01
     """Nominal episodes that may leave the band."""
