@@ -4,10 +4,13 @@ import re
 from dataclasses import replace
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 from asm_gym.checkpoint import read_header
 from asm_gym.monitors import NeuralASM, make_monitor, pretrained, pretrained_for
+from asm_gym.policies import make_policy
+from asm_gym.policies.reflexes import Hold
 from asm_gym.scripts.demo import Args, without_fitting
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from tests.fakes import FakeEnv
@@ -84,6 +87,25 @@ def test_an_environment_of_the_panda_is_watched_by_the_memory_of_its_body():
     assert env.threshold == envs.threshold == NeuralASM.pretrained("panda").threshold
     env.close()
     envs.close()
+
+
+def test_the_panda_knows_rest_on_the_handle_of_a_door():
+    base = gym.make("asm_gym/Door-v0")
+    env = NeuralASMSafety(base, on_alarm="monitor", on_overrun="ignore")
+    expert, hold = make_policy("scripted", env, seed=0), Hold(base)
+    observation, _ = env.reset(seed=0)
+    state, infos = None, []
+    for t in range(120):
+        if t < 90:
+            action, state = expert.predict(observation, state, np.array([t == 0]))
+            held = hold.begin(action)
+        else:
+            action, held = hold.predict(observation, held)
+        observation, *_, info = env.step(action)
+        infos.append(info)
+    assert infos[89]["contact_force"] > 10  # it presses
+    assert max(i["asm"]["surprise"] for i in infos[90:]) < env.threshold
+    env.close()
 
 
 def test_nothing_fitted_a_push_is_noticed_and_a_healthy_episode_is_quiet():
