@@ -13,6 +13,9 @@ from asm_gym.memory.association import (
     synapses,
     trust,
 )
+from asm_gym.memory.energy import energy
+from asm_gym.memory.inference import direct_synapses
+from asm_gym.memory.learning import hebbian_change
 from asm_gym.memory.network import Network, initial_weights
 from asm_gym.memory.precision import LARGEST, SMALLEST, learn_precision, log_variance
 from asm_gym.scaling import ScaledRows
@@ -121,3 +124,39 @@ def test_association_learns_what_ties_the_senses_together_and_how_sure_that_is()
     rough = cause[:, 0] > 0.5
     calm = cause[:, 0] < -0.5
     assert deviation[rough].mean() > 1.8 * deviation[calm].mean()
+
+
+def test_both_parts_of_the_memory_descend_one_energy():
+    rng = np.random.default_rng(3)
+    B, H, S, A, units, inputs = 4, 6, 5, 2, 7, 13
+    w = initial_weights(H, S, A, rng)
+    W = {"W_C": w.W_C, "W_F": 3 * w.W_F, "W_D": 0.1 * rng.normal(size=w.W_D.shape) * direct_synapses(S, A)}
+    W |= {"V": rng.normal(size=(units, inputs)), "U": rng.normal(size=(S, units)), "D": rng.normal(size=(S, inputs))}
+    W = {name: np.asarray(array, np.float64) for name, array in W.items()}
+    c, u, x, z = (rng.normal(size=(B, n)) for n in (w.W_C.shape[1], A + 1, S, H))
+    a, delta, spread = rng.normal(size=(B, inputs)), rng.normal(size=(B, S)), rng.uniform(1.0, 4.0, S)
+
+    def left(W):
+        return np.hstack([x, u[:, :-1]]) - np.hstack([c, u]) @ W["W_D"].T
+
+    def total(W):
+        r = (delta - a @ W["D"].T - np.tanh(a @ W["V"].T) @ W["U"].T) / spread
+        rho = np.where(np.abs(r) <= 1, 0.5 * r**2, np.abs(r) - 0.5)
+        assert 0.1 < np.mean(np.abs(r) > 1) < 0.9  # both branches are there
+        temporal = energy(z, c @ W["W_C"].T, left(W), W["W_F"], 30.0, np.ones((B, S + A)))
+        return float(np.mean(temporal) + np.mean(np.sum(spread * rho, axis=1)))
+
+    settled = left(W) - np.tanh(z) @ W["W_F"].T
+    rules = hebbian_change(c, u, c @ W["W_C"].T, z, settled, 30.0)._asdict()
+    rules |= association_change(a, delta, spread, W["V"], W["U"], W["D"])[0]._asdict()
+    exists = {"W_D": direct_synapses(S, A)}
+    for name, array in W.items():
+        for index in zip(*(rng.integers(n, size=6) for n in array.shape), strict=True):
+            if not exists.get(name, np.ones(array.shape))[index]:
+                continue
+            ends = []
+            for step in (1e-5, -1e-5):
+                moved = array.copy()
+                moved[index] += step
+                ends.append(total({**W, name: moved}))
+            assert rules[name][index] == pytest.approx(-(ends[0] - ends[1]) / 2e-5, rel=1e-3, abs=1e-4), name

@@ -1,7 +1,15 @@
-"""The network as a whole: two ways to expect, one memory.
+"""The network as a whole: two ways to expect, one memory, one energy.
 
 time          c_t → μ_t → z_t      what is going on: traces of what was sensed and done, and the state they lead to
 association   a_t → Δ̂_t, σ_t       what each sense should do: from what came before and what the others do now
+
+    F = ½ Π_z ‖z - μ‖² + ½ Π_x ‖[x, a] - [x̂, â](z)‖² + Σ_i σ_i ρ(e_i/σ_i),     e = Δ - D a - U f(V a)
+    ρ(r) = ½ r² for |r| ≤ 1, |r| - ½ beyond;    ΔW ∝ -∂F/∂W, σ held;    D in closed form, for ρ(r) = ½ r²
+
+z descends F, and so does every synapse. But the two sums share rows and not a state: ∂F/∂z knows nothing of
+association, whose units h = V a follow the row without settling, as if their own precision were infinite. Only names
+are read from both. The precision of association is learned after it, by a likelihood of its own, and so is the motor
+association. ``docs/decisions/memory.md`` says why association stands apart.
 """
 
 from __future__ import annotations
