@@ -37,6 +37,8 @@ from asm_gym.tasks import task as task_spec
 
 SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
+_PANDAS = {"Door", "NutAssemblySquare", "NutAssemblyRound"}
+"""Tasks whose experts are at home with the Panda: with other arms some of them never succeed."""
 _GRIPPED = tuple(name for name, task in TASKS.items() if task.arms == 1 and name in EXPERTS and name != "Wipe")
 """Tasks of one arm with a gripper, whose streams are alike."""
 
@@ -47,8 +49,8 @@ class Args:
 
     robot: str = "Panda"
     """The arm."""
-    tasks: tuple[str, ...] = SHOWN
-    """Tasks to babble in."""
+    tasks: tuple[str, ...] | None = None
+    """Tasks to babble in; by default seven with the Panda, and with other arms those of them that their experts do."""
     guides: tuple[str, ...] = ()
     """Shipped agents that lead in turn with the experts; none by default, so that the examination meets them first."""
     episodes: int = 36
@@ -57,8 +59,8 @@ class Args:
     """Rows of the stream a second [Hz]; one each control step by default."""
     false_alarm_rate: float = 0.05
     """Share of healthy lessons that may raise an alarm."""
-    exam_tasks: tuple[str, ...] = LEFT_OUT
-    """Further tasks to examine in, which the memory never met."""
+    exam_tasks: tuple[str, ...] | None = None
+    """Further tasks to examine in; by default two that Panda experts do, with other arms those of them they do."""
     exam_policies: tuple[str, ...] | None = None
     """Agents to examine under; by default all that are shipped and fit this arm."""
     exam_episodes: int = 12
@@ -78,11 +80,11 @@ class Args:
 
     def __post_init__(self) -> None:
         check_choice("robot", self.robot, ROBOTS)
-        for name in (*self.tasks, *self.exam_tasks):
+        for name in (*self.shown, *self.left_out):
             check_choice("task of one arm with a gripper", name, _GRIPPED)
         for name in (*self.guides, *(self.exam_policies or ())):
             check_choice("agent", name, agents())
-        if not self.tasks:
+        if not self.shown:
             raise ValueError("there must be at least one task to babble in")
         kinds_of(self.exam_faults)
         if self.exam_episodes < 0:
@@ -90,20 +92,20 @@ class Args:
         if not self.window > 0:
             raise ValueError(f"window must be > 0 s, got {self.window}")
         needed = conformal_episodes(self.false_alarm_rate)
-        there = int(len(self.tasks) * (self.episodes // CALIBRATED_ON) * LEADING.count(LED) / len(LEADING))
+        there = int(len(self.shown) * (self.episodes // CALIBRATED_ON) * LEADING.count(LED) / len(LEADING))
         if there < needed:
             raise ValueError(
                 f"a false-alarm rate of {self.false_alarm_rate:g} needs {needed} undisturbed lessons to calibrate "
-                f"on, and {self.episodes} lessons in each of {len(self.tasks)} tasks hold about {there}"
+                f"on, and {self.episodes} lessons in each of {len(self.shown)} tasks hold about {there}"
             )
 
     def scaled(self) -> Args:
-        """With ``quick``, little of everything."""
+        """With the tasks of this arm, and with ``quick`` little of everything."""
         if not self.quick:
-            return self
+            return replace(self, tasks=self.shown, exam_tasks=self.left_out)
         return replace(
             self,
-            tasks=self.tasks[:2],
+            tasks=self.shown[:2],
             episodes=18,
             exam_tasks=(),
             exam_policies=(),
@@ -111,6 +113,19 @@ class Args:
             exam_faults=(),
             false_alarm_rate=0.34,
         )
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Tasks to babble in."""
+        return self._able(SHOWN) if self.tasks is None else self.tasks
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Further tasks to examine in."""
+        return self._able(LEFT_OUT) if self.exam_tasks is None else self.exam_tasks
+
+    def _able(self, tasks: Sequence[str]) -> tuple[str, ...]:
+        return tuple(t for t in tasks if self.robot == "Panda" or t not in _PANDAS)
 
     @property
     def config(self) -> RolloutConfig:
@@ -129,22 +144,22 @@ class Args:
         if self.robot != "Panda":  # which all of them were trained with
             trained_in = {}
         return [
-            *(Exam(t, "scripted", known=True) for t in self.tasks),
-            *(Exam(t, "scripted", known=False) for t in self.exam_tasks if t not in self.tasks),
+            *(Exam(t, "scripted", known=True) for t in self.shown),
+            *(Exam(t, "scripted", known=False) for t in self.left_out if t not in self.shown),
             *(Exam(t, p, known=p in self.guides) for p, t in trained_in.items()),
         ]
 
 
 def learn(args: Args, console: Console) -> NeuralASM:
     """Records what is missing, and fits, calibrates and saves the memory."""
-    wanted = curriculum(args.tasks, args.episodes, args.seed, args.guides)
+    wanted = curriculum(args.shown, args.episodes, args.seed, args.guides)
     with stage("babbling", console, {}) as progress:
         make = partial(record_lesson, config=args.config, folder=args.out.resolve())
         files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, args.parallel, progress)
     lessons = healthy([load_episode(file) for file in files])
     with stage("learning", console, {}) as progress:
         memory = learn_body(lessons, args.false_alarm_rate, args.seed, progress)
-    inner: Any = environment(task_spec(args.tasks[0]).id, args.config.settings).unwrapped
+    inner: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
     curriculum_of = {n: getattr(args, n) for n in ("tasks", "guides", "episodes", "seed", "false_alarm_rate")}
     counts = {
         "lessons": len(lessons.fit),

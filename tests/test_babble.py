@@ -181,6 +181,14 @@ def test_agents_are_examined_where_they_were_trained_and_nowhere_else():
     assert {e.policy for e in Args(robot="Sawyer").exams} == {"scripted"}
 
 
+def test_other_arms_babble_where_their_experts_succeed():
+    assert {"Door", "NutAssemblySquare"} < set(Args().shown)
+    iiwa = Args(robot="IIWA")
+    assert iiwa.scaled().tasks == ("Lift", "Stack", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
+    assert iiwa.scaled().exam_tasks == ("PickPlaceMilk",)
+    assert Args(robot="IIWA", tasks=("Lift",) * 4).shown == ("Lift",) * 4
+
+
 @pytest.mark.slow  # 36 episodes of two tasks, and a fit
 def test_the_command_makes_a_memory_of_a_body_and_goes_on_where_it_was(tmp_path):
     folder = tmp_path / "run"
