@@ -139,7 +139,8 @@ class Comply(Hold):
         if not acting:
             # What is carried weighs on the joints as well; only what has come since is yielded to.
             self._usual += USUAL_GAIN * (self._torque - self._usual)
-        self._torque = np.nan_to_num(np.asarray(row, np.float64)[self._columns])
+        torque = np.asarray(row[self._columns], np.float64)
+        self._torque = torque if np.isfinite(torque).all() else np.nan_to_num(torque)
 
     @property
     def load(self) -> NDArray[np.float64]:
