@@ -17,6 +17,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -164,7 +165,7 @@ def read_on(memory: Memory, stream: Rows, usual: float) -> tuple[NDArray[np.floa
     return np.stack(states), np.array(begins)
 
 
-def unnamed(values: NDArray[np.floating], found: NDArray[np.intp], most: int) -> tuple[NDArray[np.intp], int]:
+def unnamed(values: NDArray[np.floating[Any]], found: NDArray[np.intp], most: int) -> tuple[NDArray[np.intp], int]:
     """(T,) the cluster of each step, and how many there are.
 
     Args:
