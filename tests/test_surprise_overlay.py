@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import ImageColor
 
 from asm_gym.evaluation import overlay
-from asm_gym.evaluation.overlay import StripChart, compose
+from asm_gym.evaluation.overlay import StripChart, arrow, compose, project
 from asm_gym.wrappers.overlay import SurpriseOverlay
 
 RED, ORANGE, CURVE = (np.array(ImageColor.getrgb(c)) for c in (overlay._ALARM, overlay._FAULT, overlay._CURVE))
@@ -90,6 +90,22 @@ def test_a_caption_that_is_too_long_is_cut_inside_the_picture():
     picture = compose(GREY, chart, alarm=False, caption="a very long caption " * 20)
     changed = np.flatnonzero((picture[:120] != GREY).any(axis=(0, 2)))
     assert 100 < changed.max() < 199
+
+
+def test_points_are_seen_where_a_pinhole_camera_sees_them():
+    axes = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], float)  # at x = 2, looking back along x; z is up
+    points = np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    seen = project(points, np.array([2.0, 0, 0]), axes, 90.0, (100, 200))
+    np.testing.assert_allclose(seen, [[100, 50], [125, 50], [100, 25]])
+
+
+def test_an_arrow_is_drawn_from_its_label_to_its_tip():
+    plain = np.zeros((120, 240, 3), np.uint8)
+    drawn = arrow(plain, np.array([[60.0, 80.0], [180.0, 80.0]]), "20 N")
+    inked = np.flatnonzero(drawn[80].any(axis=1))
+    assert 55 <= inked.min() <= 62
+    assert 175 <= inked.max() <= 181
+    assert not plain.any()
 
 
 def test_drawing_changes_none_of_its_arguments():

@@ -10,7 +10,14 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from asm_gym.checks import check_number, shown
-from asm_gym.evaluation.overlay import StripChart, compose
+from asm_gym.envs.robosuite_env import RobosuiteEnv
+from asm_gym.evaluation.overlay import StripChart, arrow, compose, project
+
+ARROW_M = 0.01
+"""Length of a force's arrow [m/N]."""
+
+ARROW_S = 0.5
+"""How long it is shown after the alarm that named the force [s]."""
 
 
 class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -25,6 +32,8 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         caption: what to call the episode, such as the condition.
         seconds: time the chart shows [s].
         chart_height: [px]; a quarter of the picture where None.
+        camera: of the pictures; where it is given, an arrow shows the force that the monitor takes a contact for, in
+            environments of this package.
     """
 
     def __init__(
@@ -33,8 +42,9 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         caption: str = "",
         seconds: float = 5.0,
         chart_height: int | None = None,
+        camera: str | None = None,
     ) -> None:
-        RecordConstructorArgs.__init__(self, caption=caption, seconds=seconds, chart_height=chart_height)
+        RecordConstructorArgs.__init__(self, caption=caption, seconds=seconds, chart_height=chart_height, camera=camera)
         gym.Wrapper.__init__(self, env)
         if env.render_mode != "rgb_array":
             raise ValueError(
@@ -47,7 +57,7 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._seconds = check_number("seconds", seconds, above=0, high=3600)
         if chart_height is not None:
             check_number("chart_height", chart_height, low=1, high=4096, whole=True)
-        self._chart_height = chart_height
+        self._chart_height, self._camera = chart_height, camera
         self._dt = _control_period(env)
         self._chart: StripChart | None = None  # made at the first picture, whose width it needs
         self._clear()
@@ -58,6 +68,8 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._fault: list[bool] = []
         self._intervened = False
         self._cause = self._completed = ""  # named at the last alarm
+        self._force: dict[str, Any] | None = None
+        self._since_force = 0  # steps
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
@@ -82,6 +94,9 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         cause = asm.get("cause") or {}
         if cause.get("family"):
             self._cause = " ".join(filter(None, (cause["family"], cause["part"])))
+        self._since_force += 1
+        if cause.get("force"):
+            self._force, self._since_force = cause["force"], 0
         completed = asm.get("completed") or ()
         self._completed = f"{', '.join(completed)} completed" if completed else ""
         return observation, reward, terminated, truncated, info
@@ -90,12 +105,27 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """(H + chart height, W, 3) uint8."""
         frame = np.asarray(self.env.render())
         height, width = frame.shape[:2]
+        frame = self._with_arrow(frame)
         if self._chart is None or self._chart.width != width:
             # In units of the threshold, the chart is the same whatever the monitor.
             steps = max(2, round(self._seconds / self._dt))
             self._chart = StripChart(width, self._chart_height or max(72, height // 4), steps)
         strip = self._chart.draw(self._ratio, self._alarm, self._fault)
         return compose(frame, strip, bool(self._alarm and self._alarm[-1]), self._line())
+
+    def _with_arrow(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """An arrow that ends at the link which is pressed."""
+        inner = self.env.unwrapped
+        if self._camera is None or self._force is None or not isinstance(inner, RobosuiteEnv):
+            return frame
+        if self._since_force * self._dt >= ARROW_S:
+            return frame
+        model, data = inner.simulation.model, inner.simulation.data
+        eye, link = model.camera(self._camera).id, data.body(self._force["link"]).xpos
+        ends = np.stack([link - ARROW_M * np.asarray(self._force["vector"]), link])
+        axes, size = data.cam_xmat[eye].reshape(3, 3), (frame.shape[0], frame.shape[1])
+        seen = project(ends, data.cam_xpos[eye], axes, float(model.cam_fovy[eye]), size)
+        return arrow(frame, seen, f"{self._force['newtons']:.0f} N")
 
     def _line(self) -> str:
         time = f"{len(self._ratio) * self._dt:.2f} s"

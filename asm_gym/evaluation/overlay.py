@@ -118,6 +118,40 @@ class StripChart:
         return left, top * _SCALE, right, (top + self._bar) * _SCALE - 1
 
 
+def project(
+    points: NDArray[np.floating[Any]],
+    position: NDArray[np.floating[Any]],
+    axes: NDArray[np.floating[Any]],
+    fovy: float,
+    size: tuple[int, int],
+) -> NDArray[np.float64]:
+    """(N, 2) where points (N, 3) of the world are in a picture [px]: columns from the left, rows from the top.
+
+    Args:
+        position: (3,) of the camera.
+        axes: (3, 3) its axes in columns: right, up, and backwards.
+        fovy: vertical angle of view [degrees].
+        size: (height, width) of the picture [px].
+    """
+    right, up, back = ((points - position) @ axes).T
+    focal = 0.5 * size[0] / np.tan(0.5 * np.deg2rad(fovy))
+    return np.stack([0.5 * size[1] - focal * right / back, 0.5 * size[0] + focal * up / back], axis=1)
+
+
+def arrow(frame: NDArray[np.uint8], ends: NDArray[np.floating[Any]], label: str) -> NDArray[np.uint8]:
+    """The picture (H, W, 3) with an arrow from ``ends[0]`` to ``ends[1]`` [px], and a label where it begins."""
+    image = Image.fromarray(frame)
+    pen, width = ImageDraw.Draw(image), max(3, frame.shape[1] // 120)
+    start, tip = np.asarray(ends, np.float64)
+    along = (tip - start) / max(float(np.linalg.norm(tip - start)), 1e-9)
+    neck, side = tip - 4 * width * along, 2 * width * np.array([-along[1], along[0]])
+    pen.line((*start, *neck), fill=_FAULT, width=width)
+    pen.polygon([tuple(p) for p in (tip, neck + side, neck - side)], fill=_FAULT)
+    text = _text(label, 4 * width, _INK)
+    _paste(image, text, start[0] - text.width / 2, start[1] - text.height)
+    return np.asarray(image)
+
+
 def compose(frame: NDArray[np.uint8], chart: NDArray[np.uint8], alarm: bool, caption: str = "") -> NDArray[np.uint8]:
     """The picture with a caption at its top and the chart under it; in alarm, a red border and the word ALARM.
 

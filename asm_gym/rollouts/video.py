@@ -20,7 +20,7 @@ from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.trial import RolloutConfig, Trial, guarded, play, staged
 from asm_gym.wrappers import SurpriseOverlay
 
-PICTURE: dict[str, Any] = {"render_mode": "rgb_array", "camera": "agentview", "render_size": (512, 640)}
+PICTURE: dict[str, Any] = {"render_mode": "rgb_array", "camera": "frontview", "render_size": (512, 640)}
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,9 @@ def _frames(clip: Clip, config: RolloutConfig, monitor: Monitor) -> list[NDArray
     frames: list[NDArray[np.uint8]] = []
     try:
         with staged(clip.trial, config, env) as faulty:
-            watched = SurpriseOverlay(guarded(faulty, monitor, clip.trial), caption=clip.caption)
+            watched = SurpriseOverlay(
+                guarded(faulty, monitor, clip.trial), caption=clip.caption, camera=PICTURE["camera"]
+            )
             play(clip.trial, config, watched, lambda _: frames.append(watched.render()))
     finally:
         env.close()
