@@ -5,6 +5,7 @@
     shares/<channel>                                 what each channel adds to surprise
     log                                              when an alarm began, and what the cause seems to be
     camera                                           where there is one
+    robot                                            its links as lines [m], where the simulator is at hand
 
 Open it by ``rerun FILE.rrd``. Expectations are those of the memory's completion, each sense from all others.
 """
@@ -64,11 +65,26 @@ class LiveView:
         self._alarm = False
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._stream = self._rr.RecordingStream("asm-gym")
-        self._stream.save(self.path)
+        self._stream.save(self.path, default_blueprint=self._arranged())
         for channel in self._drawn:
             for what in ("sensed", "expected", "low", "high") if self._completion else ("sensed",):
                 names = [f"{label} {what}" for label in channel.labels]
                 self._stream.log(f"senses/{channel.name}/{what}", self._rr.SeriesLines(names=names), static=True)
+
+    def _arranged(self) -> Any:
+        """How the viewer shows it at first: surprise and threshold in one plot, and one for each channel."""
+        views = require("rerun.blueprint", what="a live view")
+        plots = [views.TimeSeriesView(name=c.name, origin=f"/senses/{c.name}") for c in self._drawn]
+        return views.Blueprint(
+            views.Grid(
+                views.TimeSeriesView(name="surprise", origin="/", contents=["/surprise", "/threshold"]),
+                views.TimeSeriesView(name="shares", origin="/shares"),
+                *plots,
+                views.Spatial3DView(name="robot", origin="/robot"),
+                views.Spatial2DView(name="camera", origin="/camera"),
+                views.TextLogView(name="log", origin="/log"),
+            )
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -89,6 +105,7 @@ class LiveView:
         shares: NDArray[np.floating[Any]],
         cause: Mapping[str, Any] | None = None,
         picture: NDArray[np.uint8] | None = None,
+        links: NDArray[np.float64] | None = None,
     ) -> None:
         """One row (D,) and what was made of it.
 
@@ -97,6 +114,7 @@ class LiveView:
             shares: (D,) what each number adds to surprise.
             cause: of an alarm, as ``info["asm"]["cause"]`` says it.
             picture: (H, W, 3).
+            links: (n, 2, 3) both ends of each link of the robot [m].
         """
         rr, log = self._rr, self._stream.log
         self._stream.set_time(TIMELINE, duration=seconds)
@@ -116,6 +134,8 @@ class LiveView:
         self._alarm = alarm
         if picture is not None:
             log("camera", rr.Image(picture))
+        if links is not None:
+            log("robot", rr.LineStrips3D(links))
 
     def _expected(self, row: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Expectation and band of every number (D,); of actions, which nobody expects, what they are."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
+import asm_gym  # noqa: F401
 from asm_gym.episodes import Episode, save_episode
 from asm_gym.live_view import LiveView
 from asm_gym.monitors import make_monitor
@@ -40,6 +42,25 @@ def test_what_a_watched_environment_did_is_in_the_recording(tmp_path):
     assert table[said].to_pylist() == [["alarm: position[0], 10.00 thresholds"]]
     pictures = rerun.dataframe.load_recording(str(path)).view(index="time", contents="/camera").select().read_all()
     assert pictures.num_rows == 5
+
+
+def test_the_links_of_a_robot_are_drawn_where_they_are(tmp_path):
+    pytest.importorskip("robosuite")
+    env = gym.make("asm_gym/Lift-v0", horizon=3)
+    watched = NeuralASMSafety(env, CueMonitor([9], env.unwrapped.stream_spec), on_alarm="monitor")
+    view = RerunView(watched, tmp_path / "run.rrd", channels=["joint_position"])
+    view.reset(seed=0)
+    view.step(np.zeros(env.action_space.shape, np.float32))
+    model, data = env.unwrapped.simulation.model, env.unwrapped.simulation.data
+    hand = data.body("robot0_right_hand").xpos.copy()
+    view.close()
+    recording = rerun.dataframe.load_recording(str(tmp_path / "run.rrd"))
+    table = recording.view(index="time", contents="/robot").select().read_all()
+    strips = next(name for name in table.column_names if name.endswith(":LineStrip3D"))
+    links = np.array(table[strips].to_pylist()[0])
+    assert links.shape[1:] == (2, 3)
+    np.testing.assert_allclose(np.abs(links[:, 1] - hand).sum(axis=1).min(), 0.0, atol=1e-5)
+    assert model.nbody > len(links) > 7
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, SupportsFloat
+from typing import Any, Protocol, SupportsFloat, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
 
 from asm_gym.live_view import LiveView
 from asm_gym.stream import control_period
@@ -16,8 +17,27 @@ from asm_gym.wrappers.recording import StreamSource
 from asm_gym.wrappers.safety import NeuralASMSafety
 
 
+@runtime_checkable
+class Simulated(Protocol):
+    """An environment of this package, whose robots' links can be looked up."""
+
+    simulation: Any
+    robosuite_env: Any
+
+
+def links_of(env: Simulated) -> NDArray[np.float64]:
+    """(n, 2, 3) where each body of the robots is, and its parent [m]."""
+    from asm_gym.envs.arms import bodies
+
+    model, data = env.simulation.model, env.simulation.data
+    ids = np.concatenate([bodies(model, robot) for robot in env.robosuite_env.robots])
+    ids = ids[model.body_parentid[ids] > 0]  # what stands on the ground has no link to it
+    both: NDArray[np.float64] = np.stack([data.xpos[model.body_parentid[ids]], data.xpos[ids]], axis=1)
+    return both
+
+
 class RerunView(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Writes every step to a ``.rrd`` file: senses, expectations, surprise, threshold, cause, and what is rendered.
+    """Writes every step to a ``.rrd`` file: senses, expectations, surprise, threshold, cause, robot, and pictures.
 
     Args:
         env: ``NeuralASMSafety`` around an environment; with ``render_mode="rgb_array"`` its pictures are kept too.
@@ -50,7 +70,9 @@ class RerunView(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         picture: Any = self.env.render() if self.env.render_mode == "rgb_array" else None
         shares = np.array(list(asm["attribution"].values()))
         row = self._source.row(observation, asm["executed_action"], info)
-        self.view.row(self._seconds, row, asm["surprise"], asm["threshold"], shares, asm.get("cause"), picture)
+        inner: Any = self.unwrapped
+        links = links_of(inner) if isinstance(inner, Simulated) else None
+        self.view.row(self._seconds, row, asm["surprise"], asm["threshold"], shares, asm.get("cause"), picture, links)
         return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
