@@ -33,8 +33,9 @@ test: $(stamp) ## the tests that take seconds
 test-all: $(stamp) ## every test, those that take minutes too
 	$(pytest) $(ARGS)
 
-soak: $(stamp) ## calls in any order, a hundred times as long as in the tests
-	SOAK=100 $(pytest) tests/test_fuzz_machines.py $(ARGS)
+soak: $(stamp) ## hours of hostile calls, lines and files, kills, full disks and guarded steps; ARGS=--help for less
+	$(one_thread) $(bin)/python -m tests.soak $(ARGS)
+	SOAK=100 $(pytest) tests/test_fuzz_machines.py
 
 check: $(stamp) ## formatting, lint and types
 	$(bin)/ruff format --check .

@@ -118,10 +118,17 @@ def check_flag(name: str, value: object) -> bool:
     return bool(value)
 
 
-def as_float32(values: ArrayLike) -> NDArray[np.float32]:
-    """``values`` as a stream and an action hold them: what is too large for that is infinite, and nothing is said."""
-    with np.errstate(over="ignore"):
-        return np.asarray(values, np.float32)
+def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
+    """``values`` as a stream and an action hold them: what is too large for that is infinite, and nothing is said.
+
+    Raises:
+        ValueError: naming the argument and what it was, where that is no array of numbers.
+    """
+    try:
+        with np.errstate(over="ignore"):
+            return np.asarray(values, np.float32)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers, got {shown(values)}") from error
 
 
 def shown(value: object) -> str:

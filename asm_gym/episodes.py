@@ -108,6 +108,7 @@ class Episode:
         return self.label
 
     @classmethod
+    @typed
     def from_stream(cls, x: NDArray[np.floating[Any]], spec: StreamSpec, **fields: Any) -> Episode:
         """An episode from a stream recorded elsewhere, a real robot's included: ``x`` has the shape (T, D)."""
         return cls(np.ascontiguousarray(x, dtype=np.float32), spec, **fields)

@@ -194,9 +194,13 @@ class StreamSpec:
     @classmethod
     @typed
     def from_json(cls, text: str) -> StreamSpec:
-        raw = json.loads(text)
-        channels = tuple(Channel(**{**c, "elements": tuple(c["elements"])}) for c in raw["channels"])
-        return cls(channels, raw["dt"], raw["source"])
+        """What ``to_json`` wrote. Raises ValueError where it is something else."""
+        try:
+            raw = json.loads(text)
+            channels = tuple(Channel(**{**c, "elements": tuple(c["elements"])}) for c in raw["channels"])
+            return cls(channels, raw["dt"], raw["source"])
+        except (ValueError, TypeError, KeyError) as error:
+            raise ValueError(f"the text of a stream's spec is damaged ({error}): {shown(text)}") from error
 
     @classmethod
     @typed

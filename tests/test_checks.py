@@ -77,3 +77,12 @@ def test_names_and_flags_are_what_they_say():
 def test_what_is_too_large_for_a_stream_is_infinite_without_a_warning(recwarn):
     np.testing.assert_array_equal(as_float32([1e39, -1e300, 0.5]), np.float32([np.inf, -np.inf, 0.5]))
     assert not recwarn.list
+
+
+@pytest.mark.parametrize("values", ["hold", ("a", "b"), None, {}, [[1], [2, 3]], object()])
+def test_what_is_no_array_of_numbers_is_refused_by_name(values):
+    if values is None:  # as numbers that are missing
+        assert np.isnan(as_float32(values, "an action"))
+        return
+    with pytest.raises(ValueError, match="an action must be numbers, got"):
+        as_float32(values, "an action")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from asm_gym.checks import check_text
 from asm_gym.stream import control_period
+from asm_gym.typed import typed
 
 FLAT = ("cost", "asm_surprise", "asm_alarm", "asm_intervened")
 """What the safety wrapper says in numbers, beside its dictionary."""
@@ -88,6 +89,7 @@ class SafetyLog(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         prefix: of the names.
     """
 
+    @typed
     def __init__(self, env: gym.Env[Any, Any], writer: Writer, prefix: str = "safety") -> None:
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, writer=writer, prefix=prefix)
         gym.Wrapper.__init__(self, env)
@@ -119,6 +121,7 @@ class FlatInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         keys: what to keep.
     """
 
+    @typed
     def __init__(self, env: gym.Env[Any, Any], keys: Sequence[str] = FLAT) -> None:
         RecordConstructorArgs.__init__(self, keys=keys)
         gym.Wrapper.__init__(self, env)
@@ -147,6 +150,7 @@ class SixValues(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         env: one whose ``info`` has ``"cost"``.
     """
 
+    @typed
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)

@@ -209,7 +209,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._ended:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
         if self._box is not None:
-            action = as_float32(action)
+            action = as_float32(action, "an action")
             if action.shape != self._box.shape:
                 raise ValueError(f"an action has the shape {self._box.shape}, got {action.shape}")
         self._ended = True  # where anything raises, nobody knows what was done

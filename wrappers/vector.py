@@ -177,7 +177,7 @@ class VectorNeuralASMSafety(VectorWrapper):
 
     def _command(self, actions: Any, begun: Mask) -> tuple[NDArray[np.float32], list[Command]]:
         """(n, A) what is done, and how it came to that in each."""
-        chosen = as_float32(actions).copy()
+        chosen = as_float32(actions, "actions").copy()
         if chosen.shape != self.env.action_space.shape:
             raise ValueError(f"actions have the shape {self.env.action_space.shape}, got {chosen.shape}")
         rest = Command(nearest_to_rest(self._space))  # where an episode begins, nothing is done

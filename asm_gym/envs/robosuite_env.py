@@ -390,7 +390,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         return action
 
     def _checked(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        action = as_float32(action)
+        action = as_float32(action, "the action")
         if action.shape != self.action_space.shape:
             raise ValueError(f"{self.task.name} takes an action of shape {self.action_space.shape}, got {action.shape}")
         if not np.isfinite(action).all():

@@ -111,12 +111,9 @@ def auroc(scores_pos: ArrayLike, scores_neg: ArrayLike) -> float:
 
     Takes infinite scores, refuses NaN.
     """
-    pos, neg = np.asarray(scores_pos, np.float64), np.asarray(scores_neg, np.float64)
+    pos, neg = _scores("scores_pos", scores_pos), _scores("scores_neg", scores_neg)
     if not pos.size or not neg.size:
         raise ValueError(f"auroc needs scores of both kinds, got {pos.size} positive and {neg.size} negative")
-    for name, scores in (("scores_pos", pos), ("scores_neg", neg)):
-        if np.isnan(scores).any():
-            raise ValueError(f"{name}: scores must not be NaN, got {shown(scores)}")
     neg = np.sort(neg)
     lower, not_higher = np.searchsorted(neg, pos, "left"), np.searchsorted(neg, pos, "right")  # (P,)
     return float((lower + not_higher).sum() / (2 * pos.size * neg.size))
@@ -148,6 +145,16 @@ def reduction(pairs: Floats) -> Floats:
     with np.errstate(divide="ignore", invalid="ignore"):
         share: Floats = np.where(alone > 0, 1.0 - pairs[..., 1].mean(axis=-1) / alone, math.nan)
     return share
+
+
+def _scores(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """(n,) numbers, infinite ones too."""
+    scores = np.asarray(values)
+    if scores.ndim != 1 or scores.dtype.kind not in "biuf":
+        raise ValueError(f"{name} must be numbers in the shape (n,), got {shown(values)}")
+    if np.isnan(scores).any():
+        raise ValueError(f"{name} must not be NaN, got {shown(values)}")
+    return scores.astype(np.float64)
 
 
 def _check_confidence(confidence: Any) -> float:

@@ -189,12 +189,13 @@ class NeuralASM(CalibratedMonitor):
         return cls.load(pretrained_file(name))
 
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
-        before, row = state.skill, self._compiled()
-        state, surprise = super().observe(state, stream) if row is None else row(state, self._rows(state, stream))
+        rows, row = self._rows(state, stream), self._compiled()
+        before = state.skill
+        state, surprise = super().observe(state, rows) if row is None else row(state, rows)
         if self.skills_:
             surprise = surprise._replace(skill=np.array(self.skills_)[state.model.skill.argmax(axis=1)])
         if self.skill_ is not None:
-            after, skill = self.skill_.monitor.observe(before, stream)
+            after, skill = self.skill_.monitor.observe(before, rows)
             state, surprise = state._replace(skill=after), self.skill_.joined(surprise, skill, self.alarm_on)
         return state, surprise
 
@@ -370,7 +371,7 @@ class NeuralASM(CalibratedMonitor):
         rate = check_number("rate", rate, above=0.0, high=1.0)
         below = check_number("below", below, above=0.0, high=1.0)
         quiet = surprise.value < below * self.threshold
-        return self.model.adapt(before.model, np.asarray(stream, np.float64), quiet, rate)
+        return self.model.adapt(before.model, self._rows(before, stream), quiet, rate)
 
     def learn_to_act(self, episodes: Sequence[Episode], units: int = 512) -> Self:
         """Learns what to command in which situation, so that ``NeuralASMPolicy`` can act by it.

@@ -1,0 +1,117 @@
+"""Prints what the package survives: hostile calls by verdict, kills, full disks, two at once, and long guarded runs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from asm_gym.checks import check_number
+from asm_gym.choices import check_choice
+from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.scripts.command import BAD_NEWS, DONE, run
+from tests.soak import guard, kills, verdicts
+from tests.soak.kills import WORKS
+
+AREAS = ("calls", "command lines", "files")
+MOST_RAW = 0.01
+"""Share of refusals in words that name neither argument nor value."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """An hour of what a minute of tests cannot show."""
+
+    cases: int = 30_000
+    """Hostile calls, command lines and files in all; 0 leaves them out, and so on."""
+    kills: int = 100
+    """Kills in all, shared out among the works."""
+    works: tuple[str, ...] = WORKS
+    """What is killed; ``react`` goes on with what ``evaluate`` left."""
+    steps: int = 1_000_000
+    """Guarded steps."""
+    seed: int = 0
+    """Of all that is drawn."""
+    out: Path = Path("runs/soak")
+    """Folder to work in; it must be empty, or one of a soak."""
+
+    def __post_init__(self) -> None:
+        for name in ("cases", "kills", "steps", "seed"):
+            check_number(name, getattr(self, name), low=0, whole=True)
+        for work in self.works:
+            check_choice("work", work, WORKS)
+        if "react" in self.works and "evaluate" not in self.works:
+            raise ValueError(f"react goes on with what evaluate left, got works {', '.join(self.works)}")
+
+
+def soak(args: Args, console: Console) -> int:
+    """Prints the tables; 1 where something was lost, let in, or said badly."""
+    mark = args.out / "soak"
+    if args.out.exists() and any(args.out.iterdir()) and not mark.exists():
+        raise ValueError(f"{args.out} is not empty, and no folder of a soak: name another --out")
+    shutil.rmtree(args.out, ignore_errors=True)
+    args.out.mkdir(parents=True)
+    mark.touch()
+    good = [part(args, console) for part in (hostile, killed, guarded)]
+    return DONE if all(good) else BAD_NEWS
+
+
+def hostile(args: Args, console: Console) -> bool:
+    """Hostile cases by verdict; ``cases.jsonl`` holds all of them."""
+    if not args.cases:
+        return True
+    judged: list[verdicts.Judged] = []
+    with (args.out / "cases.jsonl").open("w", buffering=1) as kept:
+        for area in AREAS:
+            with tempfile.TemporaryDirectory(dir=args.out) as place:
+                for one in verdicts.shard(area, args.seed, -(-args.cases // len(AREAS)), Path(place)):
+                    judged.append(one)
+                    kept.write(json.dumps(one) + "\n")
+    rows = verdicts.counted(judged)
+    console.print(console_table(Table("hostile cases by verdict", ("area", "cases", *verdicts.VERDICTS), rows)))
+    bad = [j for j in judged if j.verdict not in ("fine", "clear")]
+    for j in bad[:20]:
+        console.print(ascii(f"{j.verdict}: {j.case}: {j.said}"[:200]), markup=False, highlight=False)
+    refused = sum(j.verdict in ("clear", "raw") for j in judged)
+    raw = sum(j.verdict == "raw" for j in judged)
+    console.print(f"refused in words that name neither argument nor value: {100 * raw / max(1, refused):.2f} %")
+    return len(bad) == raw <= MOST_RAW * refused
+
+
+def killed(args: Args, console: Console) -> bool:
+    """Kills, full disks, and two at once."""
+    if not args.kills:
+        return True
+    rng, found, out = np.random.default_rng(args.seed), [], args.out.resolve()
+    works = [work for work in kills.commands(out) if work.name in args.works]
+    for k, work in enumerate(works):
+        share = args.kills // len(works) + (k < args.kills % len(works))
+        found.append(kills.killed_and_begun_again(work, out / work.name, share, rng))
+        if work.name != "save":
+            found += [kills.out_of_disk(work, out / work.name), kills.two_at_once(work, out / work.name)]
+    title = "killed, out of disk, two at once: exit codes (-9 killed, 2 refused in a line), and whether the end is one"
+    console.print(console_table(Table(title, ("what", "times", "exit codes", "same end"), [f.row for f in found])))
+    return all(f.same for f in found)
+
+
+def guarded(args: Args, console: Console) -> bool:
+    """Guarded steps under failing sensors and policies."""
+    if not args.steps:
+        return True
+    found = guard.guarded(args.steps, args.seed)
+    counts = found.steps, found.episodes, found.alarms, found.failures, found.missed, found.let_through
+    names = "steps", "episodes", "in alarm", "sensor or policy failed", "without alarm", "bad actions done"
+    growth = 100 * (found.sizes[-1] / found.sizes[min(1, len(found.sizes) - 1)] - 1) if found.sizes else 0.0
+    row = (*map(str, counts), f"{growth:+.1f} %")
+    console.print(console_table(Table("guarded steps of Lift", (*names, "memory grew"), [row])))
+    return not (found.missed or found.let_through) and growth < 5.0
+
+
+if __name__ == "__main__":
+    sys.exit(run("soak", Args, soak, about=__doc__))
