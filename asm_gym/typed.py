@@ -5,8 +5,8 @@
 
     load_monitor(3)                    ArgumentTypeError: path must be str | Path, got 3
 
-Looked at is what can be told cheaply: classes, unions of them, and the items of sequences. Numbers are not: ``checks``
-knows their bounds. Nor are names that a module imports for type checkers only.
+Looked at is what can be told cheaply: classes, methods of protocols, unions of them, items of sequences. Numbers are
+not: ``checks`` knows their bounds. Nor are names that a module imports for type checkers only.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Sequence
 from functools import cache, wraps
-from types import NoneType, SimpleNamespace, UnionType
+from types import SimpleNamespace, UnionType
 from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -68,12 +68,18 @@ def _fits(value: Any, kind: Any) -> bool:
         return True
     if origin is Sequence:
         return _is_sequence(value) and all(_fits(item, each) for each in get_args(kind) for item in value)
-    if not isinstance(origin, type) or origin is object:
+    if not isinstance(origin, type) or origin in (object, Any):
         return True
-    try:
-        return isinstance(value, NoneType if origin is None else origin)
-    except TypeError:  # a protocol that cannot be asked
-        return True
+    if getattr(origin, "_is_protocol", False):
+        return all(callable(getattr(value, name, None)) for name in _methods(origin))
+    return isinstance(value, origin)
+
+
+@cache
+def _methods(protocol: type) -> list[str]:
+    """Its public ones; properties are not asked for, since asking runs them."""
+    bases = [base for base in protocol.__mro__ if getattr(base, "_is_protocol", False)]
+    return [name for base in bases for name, m in vars(base).items() if inspect.isfunction(m) and name[0] != "_"]
 
 
 def _is_sequence(value: Any) -> bool:

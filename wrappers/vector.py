@@ -16,7 +16,6 @@ from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, Reflex, nearest_to_rest
-from asm_gym.typed import typed
 from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Command, Decision
 from asm_gym.wrappers.arguments import (
     body_memory,
@@ -59,7 +58,6 @@ class VectorNeuralASMSafety(VectorWrapper):
         RuntimeError: the monitor is not calibrated.
     """
 
-    @typed
     def __init__(
         self,
         env: VectorEnv[Any, Any, Any],

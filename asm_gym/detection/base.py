@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,6 @@ class Nominal(NamedTuple):
     outputs: Callable[[Sequence[Episode]], list[ModelOutput]]
 
 
-@runtime_checkable
 class Detection(Protocol):
     """Turns a model's errors into surprise, shared out among the numbers of the stream.
 
