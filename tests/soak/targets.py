@@ -1,4 +1,4 @@
-"""What is called: every public constructor and function, with arguments that it takes."""
+"""What is called: all that is public in monitors, wrappers, faults and policies, and most elsewhere."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ Target = tuple[Callable[..., Any], Callable[[], dict[str, Any]]]
 
 
 def public(good: Good) -> dict[str, Target]:
-    """Every public constructor and function, with arguments that it takes."""
+    """Public constructors and functions, with arguments that they take."""
     row = np.zeros((1, good.spec.size))
     found: dict[str, Target] = {
         "NeuralASM": (NeuralASM, lambda: {"spec": good.spec, "hidden_size": 4, "association_size": 4}),
