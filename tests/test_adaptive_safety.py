@@ -128,6 +128,7 @@ def play(env, policy, seed):
     return max(surprises), info
 
 
+@pytest.mark.filterwarnings("ignore:.*rows under this policy alarm")
 def test_a_policy_that_changes_alarms_no_more_than_was_promised_and_a_fault_still_does():
     rate, pendulum = 0.2, gym.make("Pendulum-v1", max_episode_steps=50)
     recorder, usual, rougher = StreamRecorder(pendulum), Swing(0.6), Swing(2.0)

@@ -94,7 +94,7 @@ def test_discrete_actions_are_recorded_watched_and_never_taken_over():
     ended = NeuralASMSafety(Both(), CueMonitor([0], recorder.stream_spec), on_alarm="terminate")
     ended.reset(seed=0)
     assert ended.step(0)[2]
-    with pytest.raises(TypeError, match=r"'hold' needs a Box action space.*on_alarm=\"monitor\""):
+    with pytest.raises(TypeError, match=r"needs a Box action space.*on_alarm=\"monitor\""):
         NeuralASMSafety(Both(), CueMonitor([2], recorder.stream_spec))
 
 

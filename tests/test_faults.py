@@ -324,7 +324,7 @@ def test_faults_need_one_of_our_environments(lift):
         FaultInjection(FakeEnv(), [Push()])
     with pytest.raises(TypeError, match="push"):
         FaultInjection(lift, ["push"])
-    with pytest.raises(TypeError, match="sequence"):
+    with pytest.raises(TypeError, match="Sequence"):
         FaultInjection(lift, Push())
 
 

@@ -26,7 +26,7 @@ def test_a_share_is_taken_of_what_was_named_so_many_steps_after_the_beginning():
     [
         ({"seeds": 0}, "seeds must be at least 1, got 0"),
         ({"workers": 0}, "workers must be at least 1, got 0"),
-        ({"false_alarm_rate": 1.5}, "must be in"),
+        ({"false_alarm_rate": 1.5}, r"must be a number in \(0, 1\)"),
         ({"window": 0.0}, "window must be > 0"),
         ({"alone_seeds": 4}, r"alone_seeds must be in \[0, 3\], got 4"),
         ({"switches": -1}, "switches must be at least 0, got -1"),

@@ -69,7 +69,7 @@ def test_what_a_kill_leaves_half_done_is_told_from_what_it_does_not(careful, tmp
                 continue
             with (folder / "log").open("a") as log:
                 log.write("x" * (not careful))
-            time.sleep(0.02)
+            time.sleep(0.1)
             (folder / str(k)).touch()
         return 0
 

@@ -10,7 +10,6 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from asm_gym.checks import check_number, shown
-from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.evaluation.overlay import StripChart, arrow, compose, project
 
 ARROW_M = 0.01
@@ -115,8 +114,12 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _with_arrow(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """An arrow that ends at the link which is pressed."""
+        if self._camera is None or self._force is None:
+            return frame
+        from asm_gym.envs.robosuite_env import RobosuiteEnv  # charts need no robosuite
+
         inner = self.env.unwrapped
-        if self._camera is None or self._force is None or not isinstance(inner, RobosuiteEnv):
+        if not isinstance(inner, RobosuiteEnv):
             return frame
         if self._since_force * self._dt >= ARROW_S:
             return frame

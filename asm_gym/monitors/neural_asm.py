@@ -189,6 +189,7 @@ class NeuralASM(CalibratedMonitor):
         return cls.load(pretrained_file(name))
 
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
+        self._fitted()
         rows, row = self._rows(state, stream), self._compiled()
         before = state.skill
         state, surprise = super().observe(state, rows) if row is None else row(state, rows)

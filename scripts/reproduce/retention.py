@@ -3,10 +3,12 @@
 The same letters are learned by the same memory in four ways, in as many updates:
 
 at once               all letters together
-one after another     block by block, and nothing of the blocks before
-replay from a cue     beside each block, what the memory itself recalls of the letters before, each from the first
-                      rows of one writing, which is all that is kept of it
-replay from nothing   the same, begun by chance: by rows drawn from a Gaussian of how writings have begun
+one after another     block by block, and nothing of those before
+replay from a cue     beside each block, what the memory itself recalls
+replay from nothing   the same, begun by chance
+
+A cue is the first rows of one writing of a letter, which is all that is kept of it. What is begun by chance begins with
+rows drawn from a Gaussian of how writings have begun.
 
 Sources: McCloskey and Cohen 1989 for forgetting in blocks; Robins 1995 (Connection Science 7(2)) for rehearsal of what
 a network itself makes.
@@ -58,7 +60,7 @@ class Args(Common):
     skills: int = 8
     """Letters."""
     blocks: int = 4
-    """In which they are learned."""
+    """Lessons that the letters are shared out to, one block each."""
     hidden: int = 64
     """Hidden units."""
     writings: int = 8

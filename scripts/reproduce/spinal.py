@@ -55,7 +55,7 @@ class Args(Common):
     fit_episodes: int = 100
     """Nominal episodes of each task that its band is fitted on."""
     calibration_episodes: int = 200
-    """Others that it is calibrated on."""
+    """Nominal episodes of each task that its band is calibrated on."""
     rate: float = 0.01
     """Nominal episodes that may leave the band."""
     episodes: int = 30

@@ -66,7 +66,7 @@ class Args(Common):
     scratch_episodes: int = 0
     """Episodes of such a policy for a memory that learns of it alone, from scratch, to compare with; 0 for none."""
     agents: tuple[tuple[str, str], ...] = ()
-    """Further agents to watch: a task and the file of an agent for each, such as ``Lift runs/train/clone.npz``."""
+    """Further agents to watch: a task and the file of an agent for each, such as Lift runs/train/clone.npz."""
     broken: tuple[str, ...] = ("lift_sac", "stack_sac", "door_sac")
     """Policies under which there are faults."""
     faults: tuple[str, ...] = ("test",)
