@@ -83,9 +83,8 @@ def test_weights_and_biases_keeps_what_is_logged_without_a_network(tmp_path, mon
         env.reset()
         for _ in range(8):
             env.step(ACT)
-        summary = dict(run.summary)
-    assert summary["safety/alarms"] == 2
-    assert list(tmp_path.rglob("*.wandb"))
+    (kept,) = tmp_path.rglob("*.wandb")
+    assert b"safety/alarms" in kept.read_bytes()
 
 
 def test_the_callback_logs_what_learning_met(tmp_path):
