@@ -85,6 +85,7 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return observation, {"stream": np.concatenate([observation, np.zeros(JOINTS, np.float32)])}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Moves one step as it is told; the senses and the stream after it."""
         told = np.clip(np.asarray(action, np.float64), -3.0, 3.0)
         self._position, self._velocity, torque = _advance(
             self._position, self._velocity, told, self._load, self._inverse
