@@ -161,7 +161,7 @@ def test_nobody_tells_the_robot_of_a_payload():
         env.step(rest)
     assert height - hands(env.robosuite_env)[0, 2] > 0.01  # not compensated: the arm sags
     model.body_mass[hand] -= 1.0
-    assert env.simulation._nominal() is env.simulation._pristine
+    assert env.simulation.nominal.now() is env.simulation.nominal.unedited
     env.close()
 
 

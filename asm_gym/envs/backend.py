@@ -71,6 +71,22 @@ def robots_for(task: TaskSpec, robot: str | Sequence[str] | None) -> tuple[str, 
     return names
 
 
+def row_substeps(rate: int, control_freq: int) -> int:
+    """Physics substeps between two rows of a stream of ``rate`` rows a second.
+
+    Raises:
+        ValueError: a rate that does not fit physics or control; the message lists those that do.
+    """
+    physics = PHYSICS_FREQ
+    possible = [f for f in range(control_freq, physics + 1) if not (physics % f or f % control_freq)]
+    if rate not in possible:
+        raise ValueError(
+            f"stream_freq must divide the physics rate of {physics} Hz and be a multiple of the control rate of "
+            f"{control_freq} Hz, one of {', '.join(map(str, possible))}, got {rate}"
+        )
+    return physics // rate
+
+
 def make(
     task: TaskSpec,
     robots: tuple[str, ...],

@@ -9,17 +9,17 @@ from typing import Any, Literal, NoReturn
 import gymnasium as gym
 import mujoco
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from asm_gym.checks import as_float32, check_flag, check_number, check_numbers, check_text, shown
 from asm_gym.choices import check_choice
 from asm_gym.envs import backend
+from asm_gym.envs.actions import Actions
 from asm_gym.envs.cameras import RENDER_MODES, Pictures
 from asm_gym.envs.edits import SimulatorEdits
 from asm_gym.envs.layout import Layout
 from asm_gym.envs.rewards import Rewards, RewardTerms
-from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS
+from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Corruption, SensorErrors
 from asm_gym.envs.simulation import Simulation
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.tasks import task as task_spec
@@ -109,7 +109,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             )
         if stream_freq is not None:
             check_number("stream_freq", stream_freq, low=1, whole=True)
-        self._row_substeps = _row_substeps(control_freq if stream_freq is None else stream_freq, control_freq)
+        self._row_substeps = backend.row_substeps(control_freq if stream_freq is None else stream_freq, control_freq)
         self.horizon = self.task.horizon if horizon is None else check_number("horizon", horizon, low=1, whole=True)
         for name, size in (("camera_size", camera_size), ("render_size", render_size)):
             if (check_numbers(name, size, 2, low=1, high=LARGEST_PICTURE) % 1).any():
@@ -118,7 +118,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.metadata = {**self.metadata, "render_fps": control_freq}
         self.terminate_on_success = check_flag("terminate_on_success", terminate_on_success)
         self.sensor_noise = check_number("sensor_noise", sensor_noise, low=0, high=1e3)
-        self.corruptions: list[Callable[[NDArray[np.float64]], None]] = []
+        self.corruptions: list[Corruption] = []
         """Sensor faults: each edits the measured row (channels of ``measured_spec``) in place, after the noise."""
         self.deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]] = []
         """Action faults: each makes of the action that was sent the one that arrives."""
@@ -154,9 +154,11 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         # Episodes are given their motion by the joints alone, so the initial noise is one number for every robot.
         self._qpos_noise = self.robosuite_env.robots[0].initialization_noise["magnitude"]
         self._bind()
-        self._build_spaces()
-        self.gripper_actions = _gripper_actions(self.robosuite_env.robots)
+        self._actions = Actions(self.robosuite_env, self.task.name, self.controller)
+        self.action_space = self._actions.space
+        self.gripper_actions = self._actions.grippers
         """Which numbers of the action command grippers."""
+        self._build_spaces()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
         """Refused: robosuite's own goes on reading the simulator that it was made from."""
@@ -178,9 +180,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.simulation.keeps_history = self._rewards.reads_history
 
     def _build_spaces(self) -> None:
-        self._action_low, self._action_high = self.robosuite_env.action_spec
-        self.action_space = spaces.Box(-1.0, 1.0, self._action_low.shape, np.float32)
-        action = Channel("action", self._action_low.size, "1", 0.0, MOTOR)
+        action = Channel("action", self._actions.size, "1", 0.0, MOTOR)
         everything = (*self.simulation.proprioception.channels, *self._objects.channels, action)
         dt, source = self._row_substeps / backend.PHYSICS_FREQ, "+".join(self.robots)
         self.measured_spec = StreamSpec(everything, dt, source)
@@ -188,10 +188,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         ends = "external_torque", "wrist_force"
         self.felt_channels = tuple(c for c in everything if c.name.endswith(ends))
         """Of what the arms feel: external torque of the joints and force at the wrist, of one arm after another."""
-        self._noise = self.measured_spec.noise * self.sensor_noise
-        steps = self.measured_spec.resolution
-        self._counted = np.flatnonzero(steps if self.sensor_noise else np.zeros_like(steps))
-        self._resolution = steps[self._counted]
+        self._errors = SensorErrors(self.measured_spec, self.sensor_noise)
         self._layout = Layout(self.measured_spec, self._groups, self._flat)
         self.observation_layout = self._layout.sizes
         """The observation's parts in order, and how many numbers each has."""
@@ -208,7 +205,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
     @stream_freq.setter
     def stream_freq(self, rate: int) -> None:
-        self._row_substeps = _row_substeps(rate, backend.PHYSICS_FREQ // self.substeps)
+        self._row_substeps = backend.row_substeps(rate, backend.PHYSICS_FREQ // self.substeps)
         self._build_spaces()
 
     def stream_spec_at(self, rate: int) -> StreamSpec:
@@ -217,7 +214,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         Raises:
             ValueError: a rate that does not fit physics or control.
         """
-        substeps = _row_substeps(rate, backend.PHYSICS_FREQ // self.substeps)
+        substeps = backend.row_substeps(rate, backend.PHYSICS_FREQ // self.substeps)
         return replace(self.stream_spec, dt=substeps / backend.PHYSICS_FREQ)
 
     # ------------------------------------------------------------------ episodes
@@ -259,7 +256,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             self.simulation.begin_episode()
         self._warnings = self._bad_count()
         self._steps, self.holding = 0, False
-        self._action = np.zeros(self.action_space.shape, np.float32)  # type: ignore[arg-type]
+        self._action = np.zeros(self._actions.size, np.float32)
         self._row = self.measure()
         self._ended = False
         if self.render_mode == "human":
@@ -276,7 +273,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             ValueError: a wrong shape, or an action that is not finite.
             gymnasium.error.ResetNeeded: the episode has ended, or none was begun.
         """
-        action = self._checked(action)
+        action = self._actions.checked(action)
         if self._ended:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
         env = self.robosuite_env
@@ -287,7 +284,9 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._rows: list[NDArray[np.float32]] = []
         self._advance()
         if self._stays and self.simulation.left_band is not None:
-            self._action = self._resting()  # what was done last is what the stream says was commanded
+            self._action = self._actions.resting(
+                self.simulation, self._action
+            )  # what was done last is what the stream says was commanded
         env.cur_time += env.control_timestep
         self._steps += 1
         reward = self._rewards(self._action)
@@ -329,9 +328,9 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         Raises:
             ValueError: a wrong shape, or an action that is not finite.
         """
-        action = self._checked(action)
+        action = self._actions.checked(action)
         held, self.holding = self.holding, False
-        self._action = self._resting() if held else action
+        self._action = self._actions.resting(self.simulation, self._action) if held else action
         self.simulation.command(self._delivered(self._action), held)
 
     def expect(self, low: NDArray[np.float64], high: NDArray[np.float64], stays: bool = True) -> None:
@@ -361,15 +360,6 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         left = self.simulation.left_band
         return None if left is None else (left + 1) / backend.PHYSICS_FREQ
 
-    def _resting(self) -> NDArray[np.float32]:
-        """(A,) the action that changes nothing, where there is one, with the grippers as they were told last."""
-        grip, action = list(self.gripper_actions), np.zeros_like(self._action)
-        if self.simulation.compiled:
-            for part, motion in self.simulation.motions(np.zeros(len(self.motors))):
-                action[part] = np.clip(motion, -1.0, 1.0)
-        action[grip] = self._action[grip]
-        return action
-
     def action_for(self, turns: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """The action that moves the arms' joints by ``turns`` from where they are, as nearly as one step can.
 
@@ -382,28 +372,13 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         Raises:
             ValueError: the controller is neither OSC_POSE nor JOINT_POSITION.
         """
-        if self.controller not in ("OSC_POSE", "JOINT_POSITION"):
-            raise ValueError(f"actions of OSC_POSE and JOINT_POSITION are changes, those of {self.controller} are not")
-        action = np.zeros(self.action_space.shape, np.float32)  # type: ignore[arg-type]
-        for part, motion in self.simulation.motions(np.asarray(turns, np.float64)):
-            action[part] = np.clip(motion, -1.0, 1.0)
-        return action
-
-    def _checked(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        action = as_float32(action, "the action")
-        if action.shape != self.action_space.shape:
-            raise ValueError(f"{self.task.name} takes an action of shape {self.action_space.shape}, got {action.shape}")
-        if not np.isfinite(action).all():
-            raise ValueError(f"the action must be finite, got {action}")
-        return np.clip(action, -1.0, 1.0)
+        return self._actions.turning(self.simulation, np.asarray(turns, np.float64))
 
     def _delivered(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
-        """What arrives of the action, in the units robosuite's controllers take, which for most are the same."""
+        """What arrives of the action, in robosuite's units."""
         for deliver in self.deliveries:
             action = np.clip(deliver(action), -1.0, 1.0)
-        half = 0.5 * (self._action_high - self._action_low)
-        scaled: NDArray[np.float64] = self._action_low + half * (action.astype(np.float64) + 1.0)
-        return scaled
+        return self._actions.scaled(action)
 
     # ------------------------------------------------------------------ senses
 
@@ -414,12 +389,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             (M,) as ``measured_spec`` names it.
         """
         row = np.concatenate([self.simulation.sense(), *self._objects.read(), self._action])
-        row += self._noise * self.np_random.standard_normal(row.size)
-        for corrupt in self.corruptions:
-            corrupt(row)
-        with np.errstate(over="ignore"):  # of a simulation that diverges
-            row[self._counted] = np.rint(row[self._counted] / self._resolution) * self._resolution
-        return row
+        return self._errors.added(row, self.corruptions, self.np_random)
 
     def to_stream(self, row: NDArray[np.float64]) -> NDArray[np.float32]:
         """(D,) what of a measured row the stream carries."""
@@ -485,26 +455,3 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             self.robosuite_env.close()
             self.robosuite_env = None
         self._ended = True
-
-
-def _row_substeps(rate: int, control_freq: int) -> int:
-    """Physics substeps between two rows of the stream."""
-    physics = backend.PHYSICS_FREQ
-    possible = [f for f in range(control_freq, physics + 1) if not (physics % f or f % control_freq)]
-    if rate not in possible:
-        raise ValueError(
-            f"stream_freq must divide the physics rate of {physics} Hz and be a multiple of the control rate of "
-            f"{control_freq} Hz, one of {', '.join(map(str, possible))}, got {rate}"
-        )
-    return physics // rate
-
-
-def _gripper_actions(robots: list[Any]) -> tuple[int, ...]:
-    found: list[int] = []
-    start = 0
-    for robot in robots:
-        for part, (low, high) in robot._action_split_indexes.items():
-            if "gripper" in part:
-                found += range(start + low, start + high)
-        start += robot.action_dim
-    return tuple(found)

@@ -1,4 +1,4 @@
-"""Proprioception: which channels an arm has, and where in the simulation each is read.
+"""Which channels an arm has, where in the simulation each is read, and what its sensor makes of it.
 
 A contact can come and go inside one control step, so torques, wrenches and contacts are sampled after every physics
 substep and summarised (mean, and signed peak: the value of largest magnitude), while positions and velocities are read
@@ -7,6 +7,7 @@ at the end of the step.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -16,7 +17,10 @@ from numpy.typing import NDArray
 
 from asm_gym.envs import kernels
 from asm_gym.envs.views import Views
-from asm_gym.stream import MOTOR, Channel
+from asm_gym.stream import MOTOR, Channel, StreamSpec
+
+Corruption = Callable[[NDArray[np.float64]], None]
+"""A sensor fault: edits a measured row in place."""
 
 GROUPS = ("joint", "torque", "hand", "wrench", "gripper", MOTOR)
 """The channel groups of a stream by default, in the order they stand in a row."""
@@ -111,6 +115,31 @@ class Proprioception:
         """One number for every element of ``channels``; noiseless."""
         values: NDArray[np.float64] = np.concatenate(list(self._sources.values()))[self._index]
         return values
+
+
+class SensorErrors:
+    """What sensors make of the truth: noise, then whatever a fault does, then steps of their resolution.
+
+    Args:
+        spec: of the row that is read.
+        scale: of the noise; at 0 readings are exact, and in no steps.
+    """
+
+    def __init__(self, spec: StreamSpec, scale: float) -> None:
+        self._noise = spec.noise * scale
+        self._stepped = np.flatnonzero(spec.resolution) if scale else np.zeros(0, np.intp)
+        self._steps = spec.resolution[self._stepped]
+
+    def added(
+        self, row: NDArray[np.float64], faults: Sequence[Corruption], rng: np.random.Generator
+    ) -> NDArray[np.float64]:
+        """(M,) the row as it is read; it is changed in place."""
+        row += self._noise * rng.standard_normal(row.size)
+        for corrupt in faults:
+            corrupt(row)
+        with np.errstate(over="ignore"):  # of a simulation that diverges
+            row[self._stepped] = np.rint(row[self._stepped] / self._steps) * self._steps
+        return row
 
 
 def _fill(table: _Table, robot: Any, arm: str, sample: int) -> None:

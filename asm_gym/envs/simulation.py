@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import importlib
 import sys
 from typing import Any
@@ -14,15 +13,12 @@ from numpy.typing import NDArray
 from asm_gym.compilation import must_compile
 from asm_gym.envs import kernels
 from asm_gym.envs.arms import bodies, compilable, describe
+from asm_gym.envs.nominal import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
-from asm_gym.envs.views import ACTS, ARMED, FELT, JOINTS, LEFT, Band, Goals, Nominal, Views
+from asm_gym.envs.views import ACTS, ARMED, FELT, JOINTS, LEFT, Band, Goals, Views
 
-# What the controllers and the torque estimate know of the robot. Whoever edits these in the model edits the world, not
-# the robot's knowledge of it.
 STIFFNESS, DAMPING = 150.0, 2 * 150.0**0.5
 """Of arms that are held beneath their controllers [1/s², 1/s]: those of robosuite's own controllers of the hand."""
-
-_INERTIA = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
 
 
 class Simulation:
@@ -43,13 +39,10 @@ class Simulation:
         self.data: mujoco.MjData = env.sim.data._data
         self._rotations = importlib.import_module("robosuite.utils.transform_utils")
         self._parts = [(robot, arm) for robot in env.robots for arm in robot.arms]
-        self._views = _views(self.model, self.data)
-        self._robots = np.unique(np.concatenate([bodies(self.model, robot) for robot, _ in self._parts]))
-        self._live = {name: getattr(self.model, name).reshape(self.model.nbody, -1) for name in _INERTIA}
-        self._frozen = {name: live.copy() for name, live in self._live.items()}
-        v = self._views
-        self._pristine = Nominal(0, 0, v.qpos, v.qvel, v.mass, v.bias, v.damping.copy())
-        self._believed: tuple[mujoco.MjModel, mujoco.MjData, Nominal] | None = None
+        self._views = Views.of(self.model, self.data)
+        robots = np.unique(np.concatenate([bodies(self.model, robot) for robot, _ in self._parts]))
+        self.nominal = NominalDynamics(self.model, self._views, robots)
+        """What the robot believes of itself."""
         self._samples = np.zeros((len(self._parts), substeps, kernels.SAMPLE))
         n = len(self._parts)
         self._band = Band(np.zeros((n, FELT)), np.zeros((n, FELT)), np.zeros(5, np.int64))
@@ -88,7 +81,7 @@ class Simulation:
         if must_compile(kernels.run):
             print("asm-gym: compiling the simulation loop, once on this machine (about 20 s)", file=sys.stderr)
             self._run(0)
-        kernels.sample(self._views, self._nominal(), self._arms, 0, self._samples)
+        kernels.sample(self._views, self.nominal.now(), self._arms, 0, self._samples)
         self._summarise(1)
 
     # ------------------------------------------------------------------ control steps
@@ -144,7 +137,7 @@ class Simulation:
                 if self._anchor is not None:
                     self._brake(self._anchor)
                 self.env.sim.step2()
-                kernels.sample(self._views, self._nominal(), self._arms, k - self._row_began, self._samples)
+                kernels.sample(self._views, self.nominal.now(), self._arms, k - self._row_began, self._samples)
                 kernels.feel(self._arms, self._band, k - self._row_began, self._samples)
                 if kernels.must_stay(self._band):
                     self._anchor = self.data.qpos[self._joints]
@@ -169,7 +162,7 @@ class Simulation:
     def _run(self, count: int) -> None:
         steps = (self._fresh, self._done - self._row_began, count, self._samples)
         goals = self._goals, self._band, self._deltas, self._turns
-        kernels.run(self._views, self._nominal(), self._arms, *goals, *steps)
+        kernels.run(self._views, self.nominal.now(), self._arms, *goals, *steps)
 
     @property
     def left_band(self) -> int | None:
@@ -262,22 +255,6 @@ class Simulation:
                 best = left, self.model.body(link).name, force
         return best[1], best[2]
 
-    def _nominal(self) -> Nominal:
-        """The dynamics the robot believes in: the live ones, until somebody edits its masses."""
-        if not any(kernels.edited(self._live[n], self._frozen[n], self._robots) for n in _INERTIA):
-            return self._pristine
-        if self._believed is None:
-            model = copy.copy(self.model)
-            for name in _INERTIA:
-                getattr(model, name)[:] = self._frozen[name].reshape(getattr(model, name).shape)
-            data = mujoco.MjData(model)
-            bias = np.zeros(model.nv)
-            nominal = Nominal(
-                model._address, data._address, data.qpos, data.qvel, data.qM, bias, self._pristine.damping
-            )
-            self._believed = (model, data, nominal)
-        return self._believed[2]
-
     @property
     def motors(self) -> NDArray[np.intp]:
         """The actuators of the arms' joints, from the base on."""
@@ -287,30 +264,3 @@ class Simulation:
 def _larger(now: float, before: float) -> float:
     """Of two forces; what is not finite stays so."""
     return float(np.maximum(now, before))
-
-
-def _views(model: mujoco.MjModel, data: mujoco.MjData) -> Views:
-    return Views(
-        model=model._address,
-        data=data._address,
-        qpos=data.qpos,
-        qvel=data.qvel,
-        qacc=data.qacc,
-        ctrl=data.ctrl,
-        mass=data.qM,
-        bias=data.qfrc_bias,
-        passive=data.qfrc_passive,
-        actuator=data.qfrc_actuator,
-        cdof=data.cdof,
-        cvel=data.cvel,
-        subtree_com=data.subtree_com,
-        site_xpos=data.site_xpos,
-        site_xmat=data.site_xmat,
-        sensordata=data.sensordata,
-        contact=data.cfrc_ext,
-        applied=data.xfrc_applied,
-        ctrlrange=model.actuator_ctrlrange,
-        damping=model.dof_damping,
-        mass_address=model.dof_Madr,
-        parent=model.dof_parentid,
-    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,6 +45,34 @@ class Views(NamedTuple):
     damping: Floats  # (nv,)
     mass_address: NDArray[np.int32]  # (nv,) where a row of `mass` begins
     parent: NDArray[np.int32]  # (nv,) the next joint towards the base, -1 at its end
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, data: mujoco.MjData) -> Views:
+        """The arrays of a loaded model."""
+        return cls(
+            model=model._address,
+            data=data._address,
+            qpos=data.qpos,
+            qvel=data.qvel,
+            qacc=data.qacc,
+            ctrl=data.ctrl,
+            mass=data.qM,
+            bias=data.qfrc_bias,
+            passive=data.qfrc_passive,
+            actuator=data.qfrc_actuator,
+            cdof=data.cdof,
+            cvel=data.cvel,
+            subtree_com=data.subtree_com,
+            site_xpos=data.site_xpos,
+            site_xmat=data.site_xmat,
+            sensordata=data.sensordata,
+            contact=data.cfrc_ext,
+            applied=data.xfrc_applied,
+            ctrlrange=model.actuator_ctrlrange,
+            damping=model.dof_damping,
+            mass_address=model.dof_Madr,
+            parent=model.dof_parentid,
+        )
 
 
 class Nominal(NamedTuple):
