@@ -47,6 +47,28 @@ class StreamModel:
         return self
 
 
+class ErrorPlaces:
+    """Where in the stream each error belongs.
+
+    Args:
+        columns: (X,) of the stream; -1 for none, of which all senses have a share.
+        spec: of the stream.
+    """
+
+    def __init__(self, columns: NDArray[np.intp], spec: StreamSpec) -> None:
+        self._nowhere, self._senses = columns < 0, spec.sensory
+        self._places = np.zeros((len(columns), spec.size))  # (X, D)
+        self._places[np.flatnonzero(~self._nowhere), columns[~self._nowhere]] = 1.0
+
+    def __call__(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Each number's share (B, D), from each error's (B, X)."""
+        found: NDArray[np.float64] = parts @ self._places
+        if self._nowhere.any():
+            common = np.where(self._nowhere, parts, 0.0).sum(axis=1, keepdims=True)
+            found[:, self._senses] += common / len(self._senses)
+        return found
+
+
 def parameter_names(kind: Callable[..., Any]) -> tuple[str, ...]:
     """The hyperparameters of a model, a detection or a monitor: what its constructor takes beside the spec."""
     taken = inspect.signature(kind).parameters.values()

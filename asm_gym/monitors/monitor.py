@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,21 +16,12 @@ from asm_gym.checkpoint import Checkpoint, write_checkpoint
 from asm_gym.checks import check_flag, check_number, shown
 from asm_gym.choices import check_choice
 from asm_gym.detection import Detection, ModelOutput, Nominal, Promise, conformal_episodes, conformal_threshold
-from asm_gym.detection.detector import ANYTHING
 from asm_gym.episodes import Episode
 from asm_gym.monitors.base import Model, Progress, Specialises, State, Surprise
-from asm_gym.monitors.model import batch_of, model_outputs, parameter_names, side_by_side
+from asm_gym.monitors.model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.nominal import check_nominal
-from asm_gym.stream import StreamSpec
+from asm_gym.monitors.saved import MAXIMA, SavedMonitor
 from asm_gym.typed import typed
-
-M = TypeVar("M", bound="CalibratedMonitor")
-
-MAXIMA = "nominal_maxima"
-"""Under which name a checkpoint keeps what ``calibrate`` has found."""
-
-RENAMED = {"habit": "context_quantile", "carry_prior": "free_running_probability"}
-"""What older checkpoints keep under another name."""
 
 
 class MonitorState(NamedTuple):
@@ -243,7 +234,7 @@ class CalibratedMonitor:
         self._fitted()
         rows = self._rows(state, stream)
         model, output = self.model.predict(state.model, rows)
-        detection, attribution = self.detection.attribute_step(state.detection, output, rows, self._place)
+        detection, attribution = self.detection.attribute_step(state.detection, output, rows, self._places)
         finite = np.isfinite(rows)
         broken = ~finite.all(axis=1)
         if broken.any():
@@ -306,38 +297,20 @@ class CalibratedMonitor:
         Raises:
             ValueError: something is missing, or does not fit together.
         """
-        header, new = saved.header, "detection" in saved.header
-        undeclared = sorted(set(saved.arrays) - set(header["shapes"]))
-        if undeclared:
-            raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
-        names = {n: n if new else RENAMED.get(n, n) for n in header["shapes"]}
-        arrays = {now: saved.array(n, *header["shapes"][n]) for n, now in names.items()}
-        maxima = arrays.pop(MAXIMA, None)
-        if "context_quantile" in arrays:
-            arrays.setdefault("context_range", ANYTHING)
+        found = SavedMonitor.of(saved)
         theirs = {n for d in self.detections.values() for n in d.arrays}
-        missing = [n for n in self.detection.arrays if n not in arrays]
+        missing = [n for n in self.detection.arrays if n not in found.arrays]
         if missing:
             raise ValueError(f"the checkpoint has no {', '.join(missing)}: an older asm-gym wrote it, so fit it anew")
-        self.model.restore({n: a for n, a in arrays.items() if n not in theirs}, tuple(header["skills"]))
+        self.model.restore({n: a for n, a in found.arrays.items() if n not in theirs}, found.skills)
         self._prepare()
         for detection in self.detections.values():
-            if arrays.keys() >= set(detection.arrays):
-                detection.restore({n: arrays[n] for n in detection.arrays})
-        self.about = dict(header.get("about", {}))  # an older asm-gym kept nothing
-        if not new or header["detection"] == self.detection.name:
-            self.threshold_, self.maxima_ = self._reachable(header["threshold"]), maxima
+            if found.arrays.keys() >= set(detection.arrays):
+                detection.restore({n: found.arrays[n] for n in detection.arrays})
+        self.about = found.about
+        if found.detection in (None, self.detection.name):
+            self.threshold_, self.maxima_ = found.threshold_below(self.detection.reach), found.maxima
         return self
-
-    def _reachable(self, threshold: object) -> float | None:
-        """A threshold that was read, once it is a number that surprise can exceed."""
-        if threshold is None:
-            return None
-        number = check_number("threshold", threshold, low=0.0)
-        if number >= self.detection.reach:
-            most = f"{self.detection.reach:g}, all that errors can add up to"
-            raise ValueError(f"threshold must be below {most}, got {number:g}")
-        return number
 
     @property
     def _name(self) -> str:
@@ -371,28 +344,4 @@ class CalibratedMonitor:
 
     def _prepare(self) -> None:
         """Where each error belongs in the stream, once the model knows."""
-        columns = self.model.error_columns
-        self._nowhere = columns < 0
-        self._places = np.zeros((len(columns), self.spec.size))  # (X, D)
-        self._places[np.flatnonzero(~self._nowhere), columns[~self._nowhere]] = 1.0
-
-    def _place(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Each number's share (B, D), from each error's (B, X)."""
-        found: NDArray[np.float64] = parts @ self._places
-        if self._nowhere.any():
-            senses = self.spec.sensory
-            found[:, senses] += np.where(self._nowhere, parts, 0.0).sum(axis=1, keepdims=True) / len(senses)
-        return found
-
-
-def restored(path: str | Path, saved: Checkpoint, make: Callable[..., M]) -> M:
-    """The monitor that a checkpoint is of, as ``make(spec, **hyperparameters)`` makes it before it is fitted.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
-    try:
-        hyperparameters = {RENAMED.get(n, n): value for n, value in saved.header["hyperparameters"].items()}
-        return make(StreamSpec.from_json(saved.header["spec"]), **hyperparameters).restore(saved)
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+        self._places = ErrorPlaces(self.model.error_columns, self.spec)

@@ -27,20 +27,18 @@ from asm_gym.monitors.base import Progress, Surprise
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.model import parameter_names
-from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState, restored
+from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState
 from asm_gym.monitors.nominal import check_nominal
 from asm_gym.monitors.row import CompiledRow
+from asm_gym.monitors.saved import restored
 from asm_gym.monitors.shipped import pretrained_file
-from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise
+from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise, apart
 from asm_gym.scaling import StreamScaler
 from asm_gym.stream import StreamSpec
 from asm_gym.typed import typed
 
 MOST_ITERATIONS = 1000
 """Of inference in a row: twenty are enough, and a file that asks for a thousand million would never answer."""
-
-SKILL = "skill."
-"""What the names of arrays begin with in a checkpoint that are of ``skill_``."""
 
 
 class NeuralASM(CalibratedMonitor):
@@ -220,13 +218,11 @@ class NeuralASM(CalibratedMonitor):
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
         found = super().learned_
-        return found if self.skill_ is None else found | {SKILL + n: a for n, a in self.skill_.arrays.items()}
+        return found if self.skill_ is None else found | self.skill_.arrays
 
     def restore(self, saved: Checkpoint) -> Self:
-        skill = {n.removeprefix(SKILL): a for n, a in saved.arrays.items() if n.startswith(SKILL)}
-        declared = {n: s for n, s in saved.header["shapes"].items() if not n.startswith(SKILL)}
-        arrays = {n: a for n, a in saved.arrays.items() if not n.startswith(SKILL)}
-        super().restore(Checkpoint({**saved.header, "shapes": declared}, arrays))
+        own, skill = apart(saved)
+        super().restore(own)
         self.skill_ = SkillSurprise.found(self.spec, skill, self.seed) if skill else None
         if self.alarm_on != "body" and self.skill_ is None:
             raise ValueError(f"the checkpoint alarms on {shown(self.alarm_on)} surprise, and holds no skills")
@@ -284,12 +280,7 @@ class NeuralASM(CalibratedMonitor):
         if self.skill_ is None:
             raise RuntimeError(f"alarm_on={which!r} takes a skill surprise: call learn_skills(episodes) first")
         other.about = {**self.about, "alarm_on": which}
-        known, threshold, maxima = self.skill_.maxima, self.threshold_, self.maxima_
-        other.threshold_ = other.maxima_ = None
-        if known is not None and threshold is not None and maxima is not None:
-            other.maxima_ = known[ALARMS_ON.index(which)]
-            below = int((maxima <= threshold).sum())
-            other.threshold_ = float(np.sort(other.maxima_)[below - 1]) if below else 0.0
+        other.threshold_, other.maxima_ = self.skill_.calibrated(which, self.threshold_, self.maxima_)
         return other
 
     def for_stream(self, spec: StreamSpec) -> Self:

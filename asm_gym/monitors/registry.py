@@ -12,7 +12,8 @@ from asm_gym.choices import check_choice
 from asm_gym.detection import Detection, EvidenceDetection
 from asm_gym.extras import needed_for
 from asm_gym.monitors.model import parameter_names
-from asm_gym.monitors.monitor import RENAMED, CalibratedMonitor, restored
+from asm_gym.monitors.monitor import CalibratedMonitor
+from asm_gym.monitors.saved import RENAMED, restored
 from asm_gym.stream import StreamSpec
 from asm_gym.typed import typed
 

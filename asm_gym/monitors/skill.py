@@ -41,6 +41,9 @@ GAINS = (0.8, 0.2, 0.05)
 ALARMS_ON = ("body", "skill", "either", "both")
 """Which surprise an alarm may be about."""
 
+PREFIX = "skill."
+"""What the names of its arrays begin with in a checkpoint."""
+
 SMALLEST = 1e-9
 """Lower bound of a surprise that another is divided by."""
 
@@ -173,20 +176,44 @@ class SkillSurprise:
         """With the maxima of what was made of nominal episodes."""
         return replace(self, maxima=np.array([self.ways(*s.parts).max(axis=1) for s in scores]).T)
 
+    def calibrated(
+        self, which: str, threshold: float | None, maxima: NDArray[np.float64] | None
+    ) -> tuple[float | None, NDArray[np.float64] | None]:
+        """The threshold of one of ``ALARMS_ON``, and the maxima that it is one of; None where nobody can say.
+
+        Args:
+            which: of ``ALARMS_ON``.
+            threshold: of another of them, whose rate this is to have.
+            maxima: (n,) the largest surprise in the episodes that it was set by.
+        """
+        if self.maxima is None or threshold is None or maxima is None:
+            return None, None
+        own, below = self.maxima[ALARMS_ON.index(which)], int((maxima <= threshold).sum())
+        return float(np.sort(own)[below - 1]) if below else 0.0, own
+
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All that a checkpoint needs of it, by name."""
         maxima = {} if self.maxima is None else {"maxima": self.maxima}
-        return {**self.monitor.learned_, **maxima, "weight": np.array(self.weight)}
+        kept = {**self.monitor.learned_, **maxima, "weight": np.array(self.weight)}
+        return {PREFIX + name: array for name, array in kept.items()}
 
     @classmethod
     def found(cls, spec: StreamSpec, arrays: Arrays, seed: int) -> Self:
-        """As ``arrays`` say. Raises ValueError or KeyError where they do not fit together."""
+        """As arrays by their names without the prefix say. Raises ValueError or KeyError where they do not fit."""
         weight = check_number("the weight of skill surprise", float(arrays["weight"]), above=0.0)
         learned = {n: a for n, a in arrays.items() if n not in ("maxima", "weight")}
         shapes = {name: array.shape for name, array in learned.items()}
         header = {"shapes": shapes, "skills": (), "threshold": None, "detection": EvidenceDetection.name}
         return cls(_monitor(spec, seed).restore(Checkpoint(header, learned)), weight, arrays.get("maxima"))
+
+
+def apart(saved: Checkpoint) -> tuple[Checkpoint, Arrays]:
+    """A memory's checkpoint without what listens for skills beside it, and the arrays of that."""
+    skill = {n.removeprefix(PREFIX): a for n, a in saved.arrays.items() if n.startswith(PREFIX)}
+    shapes = {n: s for n, s in saved.header["shapes"].items() if not n.startswith(PREFIX)}
+    arrays = {n: a for n, a in saved.arrays.items() if not n.startswith(PREFIX)}
+    return Checkpoint({**saved.header, "shapes": shapes}, arrays), skill
 
 
 def _monitor(spec: StreamSpec, seed: int) -> CalibratedMonitor:

@@ -1,0 +1,88 @@
+"""What a monitor's file holds, in whichever words an older asm-gym wrote it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.checkpoint import Checkpoint
+from asm_gym.checks import check_number
+from asm_gym.detection.base import Arrays
+from asm_gym.detection.detector import ANYTHING
+from asm_gym.stream import StreamSpec
+
+MAXIMA = "nominal_maxima"
+"""Under which name a checkpoint keeps what ``calibrate`` has found."""
+
+RENAMED = {"habit": "context_quantile", "carry_prior": "free_running_probability"}
+"""What older checkpoints keep under another name."""
+
+
+class SavedMonitor(NamedTuple):
+    """A checkpoint of a monitor.
+
+    Attributes:
+        arrays: what its model and its detections have learned, by name.
+        maxima: (n,) largest surprise in each episode of the calibration; None where it was not kept.
+        threshold: as it was written.
+        detection: which the threshold is of; None where there was but one.
+        skills: names of those that the model knows.
+        about: whatever else was worth knowing.
+    """
+
+    arrays: Arrays
+    maxima: NDArray[np.float64] | None
+    threshold: object
+    detection: str | None
+    skills: tuple[str, ...]
+    about: dict[str, Any]
+
+    @classmethod
+    def of(cls, saved: Checkpoint) -> Self:
+        """What a checkpoint says. Raises KeyError or ValueError where something is missing or not declared."""
+        header = saved.header
+        undeclared = sorted(set(saved.arrays) - set(header["shapes"]))
+        if undeclared:
+            raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
+        names = {n: n if "detection" in header else RENAMED.get(n, n) for n in header["shapes"]}
+        arrays = {now: saved.array(n, *header["shapes"][n]) for n, now in names.items()}
+        maxima = arrays.pop(MAXIMA, None)
+        if "context_quantile" in arrays:
+            arrays.setdefault("context_range", ANYTHING)
+        about = dict(header.get("about", {}))  # an older asm-gym kept nothing
+        return cls(arrays, maxima, header["threshold"], header.get("detection"), tuple(header["skills"]), about)
+
+    def threshold_below(self, reach: float) -> float | None:
+        """The threshold, once it is a number that surprise can exceed, which never comes to ``reach``."""
+        if self.threshold is None:
+            return None
+        number = check_number("threshold", self.threshold, low=0.0)
+        if number >= reach:
+            raise ValueError(f"threshold must be below {reach:g}, all that errors can add up to, got {number:g}")
+        return number
+
+
+class Restorable(Protocol):
+    """What takes up a checkpoint of its own kind."""
+
+    def restore(self, saved: Checkpoint) -> Self: ...
+
+
+R = TypeVar("R", bound=Restorable)
+
+
+def restored(path: str | Path, saved: Checkpoint, make: Callable[..., R]) -> R:
+    """The monitor that a checkpoint is of, as ``make(spec, **hyperparameters)`` makes it before it is fitted.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    try:
+        hyperparameters = {RENAMED.get(n, n): value for n, value in saved.header["hyperparameters"].items()}
+        return make(StreamSpec.from_json(saved.header["spec"]), **hyperparameters).restore(saved)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
