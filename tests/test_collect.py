@@ -8,6 +8,7 @@ import pytest
 from stable_baselines3 import SAC
 
 from asm_gym.rollouts import collect
+from asm_gym.rollouts.trial import Latest
 from asm_gym.scripts import collect as script
 from tests.fakes import FakeEnv
 
@@ -68,12 +69,28 @@ def test_an_environment_that_only_this_process_registered_is_known_to_the_worker
 
 
 def test_arguments_of_the_environment_may_be_lists_and_dictionaries():
-    gym.register("tests/Any-v0", entry_point=lambda sizes, **kwargs: FakeEnv(length=sizes["length"][0]))
+    made, sizes, lengths = [], {"length": [3]}, []
+
+    def make(sizes, **kwargs):
+        made.append(FakeEnv(length=sizes["length"][0]))
+        return made[-1]
+
+    gym.register("tests/Any-v0", entry_point=make)
     try:
-        episodes = collect("tests/Any-v0", policy="hold", episodes=1, workers=1, sizes={"length": [3]})
+        for sizes["length"][0] in (3, 3, 5):  # the caller's own list changes
+            episodes = collect("tests/Any-v0", policy="hold", episodes=2, workers=1, sizes=sizes)
+            lengths.append([len(e) for e in episodes])
     finally:
         del gym.registry["tests/Any-v0"]
-    assert len(episodes[0]) == 3
+    assert lengths == [[3, 3], [3, 3], [5, 5]]
+    assert len(made) == 2  # one environment for what equals what it was made of
+
+
+def test_what_was_made_of_an_array_is_made_again():
+    latest, made = Latest(), []
+    for scale in (np.ones(2), np.ones(2)):  # whose equality is not one answer
+        latest(("id", (("scale", scale),)), lambda: made.append(1) or len(made))
+    assert len(made) == 2
 
 
 class Lean:

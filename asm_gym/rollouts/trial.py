@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 import math
-import pickle
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-import cloudpickle
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 import asm_gym  # noqa: F401  (registers the environments in every worker)
 from asm_gym.envs.robosuite_env import RobosuiteEnv
@@ -39,6 +39,8 @@ Settings = tuple[tuple[str, Any], ...]
 """Arguments by name, in an order of their own."""
 PolicySource = str | Path | Policy | Callable[[gym.Env[Any, Any]], Policy]
 """What ``make_policy`` takes, whatever has ``predict``, or what makes one for an environment."""
+
+Made = TypeVar("Made")
 
 PASSING = "passing_push"
 """20 N for 0.3 s: a kind beside those of the suite."""
@@ -129,7 +131,7 @@ class Trial:
         inner: Any = env.unwrapped
         onset = self.begins(env)
         if not isinstance(inner, RobosuiteEnv):
-            sigma = np.array(_sigmas(self.env_id, cloudpickle.dumps(config)))
+            sigma = _LATEST_SIGMAS((self.env_id, config), lambda: _sigmas(self.env_id, config))
             return faults_anywhere(self.kind, FaultyInterface(env), sigma, self.severity, onset, self.seed)
         if self.kind == PASSING:
             drawn, steps = draw(inner, onset, self.seed), max(1, round(0.3 / control_period(env)))
@@ -155,16 +157,39 @@ def interface_of(env: gym.Env[Any, Any]) -> Any:
     return inner if isinstance(inner, RobosuiteEnv) else FaultyInterface(env)
 
 
-@lru_cache(maxsize=1)
-def _sigmas(env_id: str, config: bytes) -> tuple[float, ...]:
+class Latest(Generic[Made]):
+    """What was made last, for as long as it is asked for by what equals what it was made of."""
+
+    def __init__(self) -> None:
+        self._made: tuple[Any, Made] | None = None
+
+    def __call__(self, of: Any, make: Callable[[], Made]) -> Made:
+        """The one of ``of``, which need not be hashable."""
+        if self._made is None or not _equal(self._made[0], of):
+            self._made = None  # two environments at a time would take twice the memory
+            self._made = of, make()
+        return self._made[1]
+
+
+def _equal(a: Any, b: Any) -> bool:
+    try:
+        return bool(a == b)
+    except ValueError:  # of arrays, whose equality is not one answer
+        return False
+
+
+_LATEST_ENVIRONMENT: Latest[gym.Env[Any, Any]] = Latest()
+_LATEST_SIGMAS: Latest[NDArray[np.float64]] = Latest()
+
+
+def _sigmas(env_id: str, config: RolloutConfig) -> NDArray[np.float64]:
     """Of each sense, from nominal episodes of seeds that no role has."""
-    how: RolloutConfig = pickle.loads(config)
-    env = StreamRecorder(environment(env_id, how.settings))
+    env = StreamRecorder(environment(env_id, config.settings))
     streams = []
     for seed in episode_seeds(0, 3, stage=99):
-        play(Trial(env_id, seed), how, env)
+        play(Trial(env_id, seed), config, env)
         streams.append(env.finish().stream[:, env.stream_spec.sensory])
-    return tuple(sigmas(FaultyInterface(env.env), streams))
+    return sigmas(FaultyInterface(env.env), streams)
 
 
 def environment(env_id: str, settings: Settings = ()) -> gym.Env[Any, Any]:
@@ -173,12 +198,8 @@ def environment(env_id: str, settings: Settings = ()) -> gym.Env[Any, Any]:
     Args:
         settings: what ``gym.make`` is given besides.
     """
-    return _environment(env_id, cloudpickle.dumps(settings))  # lists and dicts are no keys, their bytes are
-
-
-@lru_cache(maxsize=1)
-def _environment(env_id: str, settings: bytes) -> gym.Env[Any, Any]:
-    return gym.make(env_id, **dict(pickle.loads(settings)))
+    given = copy.deepcopy(settings)  # the caller's own lists and dicts may change
+    return _LATEST_ENVIRONMENT((env_id, given), lambda: gym.make(env_id, **dict(given)))
 
 
 @lru_cache(maxsize=1)
