@@ -15,19 +15,8 @@ MOVED = {
     "asm_gym.faults.catalogue": "asm_gym.faults.base",
     "asm_gym.memory.checkpoint": "asm_gym.checkpoint",
     "asm_gym.memory.senses": "asm_gym.scaling",
-    "asm_gym.scripts.adopt": "asm_gym.scripts.reproduce.adoption",
-    "asm_gym.scripts.demonstrations": "asm_gym.scripts.import_demonstrations",
-    "asm_gym.scripts.dispatch": "asm_gym.rollouts.parallel",
-    "asm_gym.scripts.lagrangian": "asm_gym.scripts.examples.lagrangian",
-    "asm_gym.scripts.react": "asm_gym.scripts.reproduce.reflexes",
-    "asm_gym.scripts.repertoire": "asm_gym.scripts.reproduce.repertoire",
-    "asm_gym.scripts.train_safely": "asm_gym.scripts.reproduce.safe_training",
-    "asm_gym.wrappers.fault_injection": "asm_gym.wrappers.faults",
-    "asm_gym.wrappers.stream_recorder": "asm_gym.wrappers.recording",
-    "asm_gym.wrappers.surprise_overlay": "asm_gym.wrappers.overlay",
-    "asm_gym.wrappers.vector_safety": "asm_gym.wrappers.vector",
 }
-"""Old name to new name."""
+"""Old name to new name. A package above the core adds its own as it is imported, before any of its modules can be."""
 
 
 class MovedModules(MetaPathFinder, InspectLoader):

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+import asm_gym.wrappers  # noqa: F401  (adds its own to what has moved)
 from asm_gym.moved import MOVED
 from asm_gym.scripts import cli, command, reproduce
 
@@ -198,6 +199,10 @@ def running(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:
         return False
+
+
+def test_every_package_of_which_modules_have_moved_says_so_when_it_is_imported():
+    assert {name.split(".")[1] for name in MOVED} == {"faults", "memory", "scripts", "wrappers"}
 
 
 @pytest.mark.parametrize("old", MOVED)
