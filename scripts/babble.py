@@ -31,7 +31,7 @@ from asm_gym.rollouts.folder import claimed, make_missing, versions
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.trial import RolloutConfig, environment, record
-from asm_gym.scripts.command import run
+from asm_gym.scripts.command import at_least, run
 from asm_gym.tasks import ROBOTS, TASKS
 from asm_gym.tasks import task as task_spec
 
@@ -87,8 +87,7 @@ class Args:
         if not self.shown:
             raise ValueError("there must be at least one task to babble in")
         kinds_of(self.exam_faults)
-        if self.exam_episodes < 0:
-            raise ValueError(f"exam_episodes must be at least 0, got {self.exam_episodes}")
+        at_least(0, self, "exam_episodes")
         if not self.window > 0:
             raise ValueError(f"window must be > 0 s, got {self.window}")
         needed = conformal_episodes(self.false_alarm_rate)

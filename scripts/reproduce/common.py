@@ -27,7 +27,7 @@ from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, record
-from asm_gym.scripts.command import run
+from asm_gym.scripts.command import at_least, run
 
 Record = dict[str, Any]
 """One measurement: what was varied, the seed, and what came out."""
@@ -55,10 +55,8 @@ class Common:
     """Little of everything: to see that it runs, not to judge the figures."""
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "workers"):
-            at_least_one(name, getattr(self, name))
-        if self.seed < 0:
-            raise ValueError(f"seed must be at least 0, got {self.seed}")
+        at_least(1, self, "seeds", "workers")
+        at_least(0, self, "seed")
 
     @property
     def repetitions(self) -> range:
@@ -154,17 +152,6 @@ def demonstrations(
 ) -> list[Episode]:
     """Nominal episodes of the scripted experts that succeeded."""
     return [e for e in recorded(args, nominal_labels(tasks, role, episodes), console, seconds) if e.success]
-
-
-def at_least(least: int, name: str, number: int) -> None:
-    """Raises ValueError unless it is."""
-    if number < least:
-        raise ValueError(f"{name} must be at least {least}, got {number}")
-
-
-def at_least_one(name: str, number: int) -> None:
-    """Raises ValueError unless it is."""
-    at_least(1, name, number)
 
 
 def wide_enough(hidden: int, channels: int) -> None:

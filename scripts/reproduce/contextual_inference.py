@@ -25,13 +25,12 @@ from asm_gym.episodes import Episode
 from asm_gym.memory.readout import certainty, learn_readout
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.common import (
     SKILLS,
     Common,
     Findings,
     Record,
-    at_least,
-    at_least_one,
     demonstrations,
     reproduce,
     wide_enough,
@@ -43,6 +42,7 @@ from asm_gym.scripts.reproduce.handwriting import (
     STEPS,
     Letter,
     branching,
+    check_letters,
     chosen,
     copybook,
     detoured,
@@ -75,18 +75,16 @@ class Args(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(0, "robot_episodes", self.robot_episodes)
-        if not 2 <= self.repertoire <= len(NAMES):
-            raise ValueError(f"a repertoire has 2 to {len(NAMES)} skills here, got {self.repertoire}")
+        at_least(0, self, "robot_episodes")
+        check_letters(self.repertoire, least=2)
         for name in self.skills:
             check_choice("skill", name, NAMES[: self.repertoire])
         if len(set(self.skills)) < 2:
             raise ValueError(
                 f"two skills at least are needed to tell them apart, got {', '.join(self.skills) or 'none'}"
             )
-        at_least_one("steps", self.steps)
-        if self.writings < 2:
-            raise ValueError(f"writings must be at least 2, got {self.writings}")
+        at_least(1, self, "steps")
+        at_least(2, self, "writings")
         wide_enough(self.hidden, 4)
 
     def scaled(self) -> Args:

@@ -30,12 +30,12 @@ from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import environment
+from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.apprentices import CONSISTENT, SETTINGS, Clone, demonstrate, stream_of
 from asm_gym.scripts.reproduce.common import (
     Common,
     Findings,
     Record,
-    at_least_one,
     over_seeds,
     reproduce,
     shown,
@@ -68,15 +68,14 @@ class Args(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least_one("the number of tasks", len(self.tasks))
+        at_least(1, self, "tasks")
         if len(set(self.tasks)) < len(self.tasks):
             raise ValueError(f"a task was named twice: {', '.join(self.tasks)}")
         for task in self.tasks:
             if task not in EXPERTS or task.startswith("TwoArm"):
                 known = ", ".join(t for t in EXPERTS if not t.startswith("TwoArm"))
                 raise ValueError(f"unknown skill {task!r}; there is an expert of one arm for: {known}")
-        for name in ("demonstrations", "updates", "trials"):
-            at_least_one(name, getattr(self, name))
+        at_least(1, self, "demonstrations", "updates", "trials")
         for width in (self.units, self.hidden):
             wide_enough(width, INPUTS)
 

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 
+from asm_gym.checks import check_number
 from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.episodes import Episode
@@ -31,20 +32,19 @@ from asm_gym.faults.suite import KINDS, SEVERITIES
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.common import (
     SENSED,
     SKILLS,
     Common,
     Findings,
     Record,
-    at_least,
-    at_least_one,
     over_seeds,
     reproduce,
     shown,
     wide_enough,
 )
-from asm_gym.scripts.reproduce.handwriting import NAMES
+from asm_gym.scripts.reproduce.handwriting import check_letters
 from asm_gym.scripts.reproduce.trials import Trial, robot_trial, written_trial
 from asm_gym.tasks import task as task_spec
 
@@ -86,8 +86,7 @@ class Args(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 2 <= self.letters <= len(NAMES):
-            raise ValueError(f"to tell a wrong skill takes a repertoire of 2 to {len(NAMES)}, got {self.letters}")
+        check_letters(self.letters, least=2)
         for name in self.tasks:
             task_spec(name)
         for name in self.faults:
@@ -95,17 +94,17 @@ class Args(Common):
         check_choice("severity", self.severity, SEVERITIES)
         if len(set(self.tasks)) < 2 or not self.faults:
             raise ValueError("there must be at least two tasks and a kind of fault")
-        at_least_one("faulty_episodes", self.faulty_episodes)
+        at_least(1, self, "faulty_episodes")
         needed = conformal_episodes(RATE)
         for what, count in (("letters", self.letters * self.writings), ("tasks", self.robot_episodes)):
             if 0 < (count if what == "letters" else len(self.tasks) * (count // 2)) < needed or count < 0:
                 raise ValueError(f"a false-alarm rate of {RATE} needs {needed} calibration episodes of {what}")
-        at_least_one("writings", self.writings)
+        at_least(1, self, "writings")
         if len(set(self.tasks)) < len(self.tasks):
             raise ValueError(f"a task was named twice: {', '.join(self.tasks)}")
         wide_enough(self.hidden, 4)
         if self.robot_episodes:
-            at_least(-(-SENSED // 2), f"hidden (robosuite's {SENSED} channels take twice as many)", self.hidden)
+            check_number(f"hidden (robosuite's {SENSED} channels take twice as many)", self.hidden, low=-(-SENSED // 2))
 
     def scaled(self) -> Args:
         """With ``quick``, letters only, and few of them."""

@@ -76,9 +76,15 @@ def repertoire(count: int, dims: int, rng: np.random.Generator) -> list[Letter]:
     Raises:
         ValueError: there are none, or more than there are names.
     """
-    if not 1 <= count <= len(NAMES):
-        raise ValueError(f"a repertoire has 1 to {len(NAMES)} skills, got {count}")
+    check_letters(count)
     return [Letter(name, tuple(_stroke(n, dims, rng) for n in range(4))) for name in NAMES[:count]]
+
+
+def check_letters(*counts: int, least: int = 1) -> None:
+    """Raises ValueError where no repertoire has so many letters, or fewer than it takes."""
+    for count in counts:
+        if not least <= count <= len(NAMES):
+            raise ValueError(f"a repertoire has {least} to {len(NAMES)} skills, got {count}")
 
 
 def branching(letter: Letter, name: str, shared: int, rng: np.random.Generator) -> Letter:

@@ -23,6 +23,7 @@ import torch
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from asm_gym.checks import check_number
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
 from asm_gym.memory.inference import Weights
@@ -33,11 +34,11 @@ from asm_gym.memory.traces import fit_gains
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.scaling import StreamScaler
+from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.common import (
     Common,
     Findings,
     Record,
-    at_least_one,
     over_seeds,
     reproduce,
     shown,
@@ -46,7 +47,7 @@ from asm_gym.scripts.reproduce.common import (
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import trajectories
 from asm_gym.scripts.reproduce.gradients import COMPARED, CUE, Changes, cosine, exact, local
-from asm_gym.scripts.reproduce.handwriting import NAMES, copybook, repertoire
+from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire
 
 TARGETS = {
     "energy": "gradient of the energy",
@@ -77,12 +78,11 @@ class Args(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 1 <= self.skills <= len(NAMES):
-            raise ValueError(f"a repertoire has 1 to {len(NAMES)} skills, got {self.skills}")
-        for name in ("writings", "epochs"):
-            at_least_one(name, getattr(self, name))
-        for count in (*self.iterations, len(self.iterations)):
-            at_least_one("iterations", count)
+        check_letters(self.skills)
+        at_least(1, self, "writings", "epochs")
+        at_least(1, self, "iterations")
+        for count in self.iterations:
+            check_number("iterations", count, low=1, whole=True)
         wide_enough(self.hidden, 4)
 
     def scaled(self) -> Args:

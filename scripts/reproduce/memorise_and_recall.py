@@ -23,6 +23,7 @@ from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.tables import Table
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce import robot_recall
 from asm_gym.scripts.reproduce.common import (
     SENSED,
@@ -30,8 +31,6 @@ from asm_gym.scripts.reproduce.common import (
     Common,
     Findings,
     Record,
-    at_least,
-    at_least_one,
     demonstrations,
     over_seeds,
     reproduce,
@@ -48,7 +47,7 @@ from asm_gym.scripts.reproduce.expression import (
     mean_demonstrations,
     recalled,
 )
-from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, copybook, repertoire
+from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, check_letters, copybook, repertoire
 from asm_gym.scripts.reproduce.robot_recall import RECALLED, ROBOT_CUE
 
 MODELS = ("memory", "gru", "rnn", "gru_one_step", "hopfield", "library")
@@ -89,20 +88,16 @@ class Args(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for count in self.repertoires:
-            if not 1 <= count <= len(NAMES):
-                raise ValueError(f"a repertoire has 1 to {len(NAMES)} skills, got {count}")
-        for name in ("repertoires", "widths", "cues"):
-            at_least_one(f"the number of {name}", len(getattr(self, name)))
+        check_letters(*self.repertoires)
+        at_least(1, self, "repertoires", "widths", "cues")
         for hidden in (*self.widths, self.hidden):
             wide_enough(hidden, 2 * 3)
         wide_enough(self.robot_hidden, SENSED)
         for cue in self.cues:
             if not 1 <= cue < STEPS:
                 raise ValueError(f"a cue must be shorter than the letter, 1 to {STEPS - 1} steps, got {cue}")
-        for name in ("writings", "steps", "updates"):
-            at_least_one(name, getattr(self, name))
-        at_least(0, "robot_episodes", self.robot_episodes)
+        at_least(1, self, "writings", "steps", "updates")
+        at_least(0, self, "robot_episodes")
         if 2 not in self.dims or not set(self.dims) <= {2, 3}:
             raise ValueError(f"letters are written in 2 dimensions, or in 2 and 3, got {self.dims}")
 

@@ -36,7 +36,7 @@ from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress, p
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, record, watch_each
-from asm_gym.scripts.command import run
+from asm_gym.scripts.command import at_least, run
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers.arguments import ON_ALARM
 
@@ -94,9 +94,7 @@ class Args:
         check_choice("region of the body", self.region, QUASI_STATIC)
         for name in self.faults:
             check_choice("fault", name, (NOMINAL, PASSING, *KINDS))
-        for name in ("episodes", "fit_episodes", "calibration_episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        at_least(1, self, "episodes", "fit_episodes", "calibration_episodes")
         if self.memory is not None and self.monitor_freq is not None:
             raise ValueError("with a memory of its own no episodes are recorded: leave out monitor_freq")
         if not self.max_override_s > 0:

@@ -29,7 +29,7 @@ from asm_gym.rollouts.benchmark import detectability_of, result_of
 from asm_gym.rollouts.folder import files_in, recorded, tasks_in
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import run
+from asm_gym.scripts.command import at_least, run
 from asm_gym.scripts.reproduce.skill_recognition import (
     alarms_table,
     experienced,
@@ -72,17 +72,13 @@ class Args:
             check_choice("monitor", name, MONITORS)
         if not self.monitors:
             raise ValueError("there must be at least one monitor")
-        for name in ("seeds", "workers"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        at_least(1, self, "seeds", "workers")
         conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
         if not self.window > 0:
             raise ValueError(f"window must be > 0, got {self.window}")
         if not 0 <= self.alone_seeds <= self.seeds:
             raise ValueError(f"alone_seeds must be in [0, {self.seeds}], got {self.alone_seeds}")
-        for name in ("switches", "experience"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
+        at_least(0, self, "switches", "experience")
 
     @property
     def tasks(self) -> list[str]:

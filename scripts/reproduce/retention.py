@@ -30,12 +30,11 @@ from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.common import (
     Common,
     Findings,
     Record,
-    at_least,
-    at_least_one,
     over_seeds,
     reproduce,
     shown,
@@ -43,7 +42,7 @@ from asm_gym.scripts.reproduce.common import (
 )
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import Memory, mean_demonstrations, recalled
-from asm_gym.scripts.reproduce.handwriting import NAMES, NOISE, copybook, pen_spec, repertoire
+from asm_gym.scripts.reproduce.handwriting import NAMES, NOISE, check_letters, copybook, pen_spec, repertoire
 
 WAYS = ("at once", "one after another", "replay from a cue", "replay from nothing")
 BEGUN = 8
@@ -70,13 +69,11 @@ class Args(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 2 <= self.skills <= len(NAMES):
-            raise ValueError(f"a repertoire has 2 to {len(NAMES)} skills here, got {self.skills}")
-        at_least(2, "blocks", self.blocks)
+        check_letters(self.skills, least=2)
+        at_least(2, self, "blocks")
         if self.skills % self.blocks:
             raise ValueError(f"{self.skills} skills cannot be shared out evenly among {self.blocks} blocks")
-        for name in ("writings", "steps"):
-            at_least_one(name, getattr(self, name))
+        at_least(1, self, "writings", "steps")
         wide_enough(self.hidden, 4)
 
     def scaled(self) -> Args:

@@ -38,6 +38,7 @@ from asm_gym.rollouts.training.outcome import COUNTED, TrainingOutcome
 from asm_gym.rollouts.training.safe_run import ALONE, CONDITIONS, Setting, outcome_file, read_outcome, run
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts import command
+from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.training_report import counts_table, learning_figure, worth_table
 from asm_gym.tasks import task as task_spec
 
@@ -100,9 +101,7 @@ class Args:
             check_choice("condition", name, CONDITIONS)
         if ALONE not in self.conditions:
             raise ValueError(f"conditions must hold {ALONE}, which the others are compared with")
-        for name in ("seeds", "steps", "evaluate_every", *(n for n in vars(self) if n.endswith("episodes"))):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        at_least(1, self, "seeds", "steps", "evaluate_every", *(n for n in vars(self) if n.endswith("episodes")))
         for name in ("harmless_force", "harmless_torque", "force_limit"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")

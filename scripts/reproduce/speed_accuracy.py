@@ -32,11 +32,11 @@ from asm_gym.evaluation.tables import Table
 from asm_gym.memory.inference import direct, expect, infer, sense
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.common import (
     Common,
     Findings,
     Record,
-    at_least_one,
     over_seeds,
     reproduce,
     shown,
@@ -44,7 +44,7 @@ from asm_gym.scripts.reproduce.common import (
 )
 from asm_gym.scripts.reproduce.curves import points
 from asm_gym.scripts.reproduce.expression import Memory, Rows, read
-from asm_gym.scripts.reproduce.handwriting import NAMES, NOISE, STEPS, Letter, copybook, repertoire, written
+from asm_gym.scripts.reproduce.handwriting import NOISE, STEPS, Letter, check_letters, copybook, repertoire, written
 from asm_gym.scripts.reproduce.laws import LAWS, Fit, fit
 
 CUE = 20
@@ -82,10 +82,8 @@ class Args(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 1 <= self.skills <= len(NAMES):
-            raise ValueError(f"a repertoire has 1 to {len(NAMES)} skills, got {self.skills}")
-        for name in ("writings", "steps"):
-            at_least_one(name, getattr(self, name))
+        check_letters(self.skills)
+        at_least(1, self, "writings", "steps")
         if len(set(self.iterations)) < 4 or min(self.iterations) < 1:
             raise ValueError(f"a curve needs 4 different numbers of iterations, at least 1 each, got {self.iterations}")
         if len(set(self.speeds)) < 3 or not all(0.2 <= s <= 4 for s in self.speeds):

@@ -30,7 +30,8 @@ from asm_gym.rollouts.felt import felt_episodes
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import AFTER_S, PASSING, RolloutConfig, Trial, environment, policy_for, staged
-from asm_gym.scripts.reproduce.common import Common, Findings, Record, at_least, reproduce
+from asm_gym.scripts.command import at_least
+from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce
 from asm_gym.tasks import env_id
 from asm_gym.wrappers import NeuralASMSafety
 
@@ -63,8 +64,8 @@ class Args(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(8, "fit_episodes", self.fit_episodes)
-        at_least(1, "episodes", self.episodes)
+        at_least(8, self, "fit_episodes")
+        at_least(1, self, "episodes")
 
 
 class Felt(NamedTuple):

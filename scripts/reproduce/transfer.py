@@ -28,8 +28,9 @@ from asm_gym.rollouts.body import CALIBRATED_ON, harmless, healthy, learn_body
 from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.trial import RolloutConfig
+from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce import adoption
-from asm_gym.scripts.reproduce.common import Common, Findings, Record, at_least, at_least_one, demonstrations, reproduce
+from asm_gym.scripts.reproduce.common import Common, Findings, Record, demonstrations, reproduce
 from asm_gym.scripts.reproduce.transfer_judge import Judge, Own, fewer_senses, role
 from asm_gym.scripts.reproduce.transfer_report import drawn, tables
 from asm_gym.scripts.reproduce.transfer_watched import KNOWN, POLICIES, WATCHED, Watched, record_watched
@@ -90,12 +91,12 @@ class Args(Common):
             check_choice("task to leave out", name, self.tasks)
         for name, _ in self.agents:
             task_spec(name)
-        at_least(0, "scratch_episodes", self.scratch_episodes)
+        at_least(0, self, "scratch_episodes")
         for name in self.rivals:
             check_choice("monitor", name, MONITORS)
         kinds_of(self.faults)
-        at_least_one("nominal_episodes", self.nominal_episodes)
-        at_least(0, "faulty_episodes", self.faulty_episodes)
+        at_least(1, self, "nominal_episodes")
+        at_least(0, self, "faulty_episodes")
         needed = conformal_episodes(self.false_alarm_rate)
         calm = sum(leads(n) for n in range(self.lessons))  # lessons to calibrate on
         given = (len(self.tasks) - bool(self.without)) * calm, 3 * self.calibration_episodes

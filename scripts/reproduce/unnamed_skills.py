@@ -33,12 +33,11 @@ from asm_gym.memory.energy import Array
 from asm_gym.memory.recall import Recalled, follow
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.common import (
     Common,
     Findings,
     Record,
-    at_least,
-    at_least_one,
     over_seeds,
     reproduce,
     shown,
@@ -46,7 +45,7 @@ from asm_gym.scripts.reproduce.common import (
 )
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import Memory, Rows, read
-from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, copybook, repertoire
+from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters, copybook, repertoire
 
 USUAL = 0.999
 """Quantile of the errors within letters, over which another has begun."""
@@ -86,13 +85,10 @@ class Args(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least_one("the number of repertoires", len(self.repertoires))
-        for count in self.repertoires:
-            if not 2 <= count <= len(NAMES):
-                raise ValueError(f"a repertoire has 2 to {len(NAMES)} skills here, got {count}")
-        for name in ("writings", "steps"):
-            at_least_one(name, getattr(self, name))
-        at_least(2, "length", self.length)
+        at_least(1, self, "repertoires")
+        check_letters(*self.repertoires, least=2)
+        at_least(1, self, "writings", "steps")
+        at_least(2, self, "length")
         wide_enough(self.hidden, 4)
 
     def scaled(self) -> Args:
