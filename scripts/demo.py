@@ -37,7 +37,7 @@ from asm_gym.evaluation.tables import (
     tabulate,
 )
 from asm_gym.evaluation.trace import NOMINAL
-from asm_gym.faults import Fault, FrozenEncoder, Push, WeakJoint
+from asm_gym.faults import Collision, Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.parallel import parallel_map
@@ -59,8 +59,8 @@ class Args:
 
     task: str = "asm_gym/Lift-v0"
     """Environment id."""
-    on_alarm: str = "hold"
-    """What the wrapper does on an alarm: hold, graded (what the cause asks for) or terminate."""
+    on_alarm: str = "graded"
+    """What the wrapper does on an alarm: graded (what the cause asks for), hold or terminate."""
     false_alarm_rate: float = 0.05
     """Share of nominal episodes that may raise an alarm."""
     fit_episodes: int = 60
@@ -115,17 +115,17 @@ def faults(seed: int, episodes: int) -> list[tuple[str, Fault]]:
     Onsets fall between 0.5 s and 2.3 s, when the arm is on its way.
     """
     rng = np.random.default_rng([seed, 7])
-    made: list[tuple[str, Fault]] = []
+    made: dict[str, list[Fault]] = {"frozen encoder": [], "push": [], "weak joint": [], "collision": []}
     for _ in range(episodes):
         onset = int(rng.integers(10, 46))
         direction = rng.standard_normal(3)
         x, y, z = (float(v) for v in direction / np.linalg.norm(direction))
-        made += [
-            ("push", Push(body="robot0_link5", newtons=20.0, direction=(x, y, z), onset=onset, duration=10)),
-            ("weak joint", WeakJoint(joint=int(rng.integers(7)), strength=0.5, onset=onset)),
-            ("frozen encoder", FrozenEncoder(joint=int(rng.integers(7)), onset=onset)),
-        ]
-    return sorted(made, key=lambda pair: pair[0])
+        push = Push(body="robot0_link5", newtons=20.0, direction=(x, y, z), onset=onset, duration=10)
+        made["push"].append(push)
+        made["weak joint"].append(WeakJoint(joint=int(rng.integers(7)), strength=0.5, onset=onset))
+        made["frozen encoder"].append(FrozenEncoder(joint=int(rng.integers(7)), onset=onset))
+        made["collision"].append(Collision(onset=onset, duration=20))
+    return [(name, fault) for name, kind in made.items() for fault in kind]
 
 
 def trials(args: Args) -> list[Trial]:

@@ -21,6 +21,8 @@ TINY = [
     *("--faulty-episodes", "1", "--epochs", "3", "--workers", "2"),
 ]
 
+CONDITIONS = "nominal", "frozen encoder", "push", "weak joint", "collision"
+
 
 def test_collected_episodes_do_not_depend_on_the_number_of_workers():
     one, two = (collect("asm_gym/Lift-v0", episodes=2, seed=5, workers=n, horizon=15) for n in (1, 2))
@@ -72,7 +74,7 @@ def test_the_demo_writes_everything_it_promises(folder):
     pictures = {f"{name}.png" for name in ("surprise", "maxima", "delay", "roc", "attribution")}
     assert written == {"report.html", "demo.json", "lift.asm", *pictures}
     figures = json.loads((folder / "demo.json").read_text())
-    assert [row["condition"] for row in figures["results"]] == ["nominal", "frozen encoder", "push", "weak joint"]
+    assert [row["condition"] for row in figures["results"]] == list(CONDITIONS)
     assert figures["observe_us"]["median"] > 0
     assert figures["arguments"]["seed"] == 0
     assert figures["versions"]["robosuite"] == "1.5.2"
