@@ -19,14 +19,13 @@ from rich.console import Console
 from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import EpisodeLabel, load_episode
-from asm_gym.evaluation.metrics import false_alarms, false_alarms_per_hour
-from asm_gym.evaluation.statistics import Share
-from asm_gym.evaluation.tables import Column, Table, console_table, count, markdown, milliseconds, percent, tabulate
+from asm_gym.evaluation.tables import console_table, markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies.registry import EXPERTS, agents
 from asm_gym.rollouts.babbling import LEADING, LED, curriculum, record_lesson
-from asm_gym.rollouts.body import CALIBRATED_ON, Exam, Marks, examine, healthy, learn_body
+from asm_gym.rollouts.body import CALIBRATED_ON, healthy, learn_body
+from asm_gym.rollouts.examination import Exam, Marks, card, examine, summary
 from asm_gym.rollouts.folder import claimed, make_missing, versions
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
 from asm_gym.rollouts.progress import stage
@@ -188,47 +187,6 @@ def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
 
 def _place(label: EpisodeLabel, folder: Path) -> Path:
     return folder / label.path
-
-
-COLUMNS: Sequence[Column[Marks]] = (
-    Column("", lambda m: m.name),
-    Column("healthy, alarm", lambda m: count(false_alarms(m.solved))),
-    Column("per hour", lambda m: f"{false_alarms_per_hour(m.solved):.1f}"),
-    Column("failed, alarm", lambda m: count(false_alarms(m.failed)) if m.failed else ""),
-    Column("AUROC", lambda m: f"{m.metrics.auroc:.3f}" if m.metrics.faulty else ""),
-    Column("found", lambda m: f"{percent(m.metrics.detected)} of {m.metrics.detected.n}" if m.metrics.faulty else ""),
-    Column("median [ms]", lambda m: milliseconds(m.metrics.delays, "median_ms") if m.metrics.faulty else ""),
-)
-
-
-def card(marks: Sequence[Marks], memory: NeuralASM, window: float) -> Table:
-    """A row for each exam."""
-    about = memory.about
-    learned = f"learned from {about['lessons']} lessons of {', '.join(about['tasks'])} ({about['rows']} rows)"
-    limit = f"threshold {memory.threshold:.3g} from {about['calibrated_on']} others at {about['false_alarm_rate']:g}"
-    return tabulate(
-        f"{about['name']}: {learned}, {limit}. Episodes with an alarm, apart those that solved the task and those that "
-        "failed; faults of medium and strong severity that an ideal observer could see, found within "
-        f"{window:g} s.",
-        COLUMNS,
-        marks,
-    )
-
-
-def summary(marks: Sequence[Marks]) -> str:
-    """Alarms and faults found in all exams together."""
-    solved = Share.of([bool(t.false_alarms) for m in marks for t in m.solved])
-    found = Share(sum(m.metrics.detected.k for m in marks), sum(m.metrics.detected.n for m in marks))
-    pushes = [t.delay for m in marks for t in m.metrics.faulty if (t.kind, t.severity) == ("push", "medium")]
-    prompt = Share.of([delay is not None and delay <= PROMPT_S + 1e-9 for delay in pushes])
-    return (
-        f"In all: {count(solved)} healthy episodes alarm, {count(found)} faults found, {count(prompt)} pushes of 20 N "
-        f"noticed within {1e3 * PROMPT_S:.0f} ms."
-    )
-
-
-PROMPT_S = 0.1
-"""How soon a push should be noticed [s]."""
 
 
 def babble(args: Args, console: Console) -> None:

@@ -39,7 +39,7 @@ GROUPS: dict[str, dict[str, Command]] = {
         "train-safely": Command(
             "asm_gym.scripts.reproduce.safe_training", "an agent trained alone, and under the wrapper"
         ),
-        "public": Command("asm_gym.scripts.public", "AUROC by kind on voraus-AD or AURSAD, once downloaded"),
+        "public": Command("asm_gym.scripts.reproduce.public", "AUROC by kind on voraus-AD or AURSAD, once downloaded"),
         "benchmark": Command("asm_gym.scripts.benchmark", "speeds as ratios against rivals, and experts"),
     },
     "Examples": {

@@ -7,7 +7,6 @@ by seed. Prints one table and writes a report, its plots, a video, the fitted me
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import sys
@@ -26,7 +25,7 @@ from rich.console import Console
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, false_alarms_per_hour, typical
-from asm_gym.evaluation.report import write_report
+from asm_gym.evaluation.report import write_json, write_report
 from asm_gym.evaluation.statistics import Share, binomial_interval
 from asm_gym.evaluation.tables import (
     BRIEF_CONDITION_COLUMNS,
@@ -45,7 +44,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged, watch_pair
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
-from asm_gym.scripts.command import run
+from asm_gym.scripts.command import at_least, run
 from asm_gym.tasks import task
 from asm_gym.wrappers import NeuralASMSafety
 
@@ -87,9 +86,7 @@ class Args:
     def __post_init__(self) -> None:
         if self.on_alarm not in ("hold", "graded", "terminate"):
             raise ValueError(f"on_alarm must be hold, graded or terminate, got {self.on_alarm!r}")
-        for name in ("fit_episodes", "calibration_episodes", "nominal_episodes", "faulty_episodes", "epochs"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        at_least(1, self, *(n for n in vars(self) if n.endswith("_episodes")), "epochs")
         task(self.task)
         if self.calibration_episodes < conformal_episodes(self.false_alarm_rate):
             raise ValueError(
@@ -233,17 +230,12 @@ def as_json(m: DetectionMetrics) -> dict[str, Any]:
     }
 
 
-def write_json(
-    path: Path,
-    args: Args,
-    rows: Sequence[DetectionMetrics],
-    expert: Share,
-    latency: dict[str, float],
-    seconds: dict[str, float],
-) -> None:
+def figures_of(
+    args: Args, rows: Sequence[DetectionMetrics], expert: Share, latency: dict[str, float], seconds: dict[str, float]
+) -> dict[str, Any]:
     """Every figure, with what it takes to make it again."""
     packages = ("asm-gym", "mujoco", "robosuite", "gymnasium", "numpy", "numba")
-    content = {
+    return {
         "arguments": {**asdict(args), "out": str(args.out)},
         "versions": {"python": platform.python_version(), **{p: metadata.version(p) for p in packages}},
         "window_s": WINDOW_S,
@@ -252,20 +244,6 @@ def write_json(
         "observe_us": latency,
         "seconds": seconds,
     }
-    unfinished = path.with_suffix(".unfinished")
-    unfinished.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    unfinished.replace(path)
-
-
-def _finite(value: Any) -> Any:
-    """``value`` as JSON can hold it: a delay that never ended, or a rate of nothing, is null."""
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if hasattr(value, "_asdict"):
-        return _finite(value._asdict())
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def demonstrate(args: Args, console: Console) -> None:
@@ -308,7 +286,7 @@ def demonstrate(args: Args, console: Console) -> None:
         with timed("recording a video") as progress:
             clips = [Clip(trial, f"{trial.kind}, {trial.acting}") for trial in shown]
             video = record_video(clips, RolloutConfig(), memory, folder / "demo.mp4", progress)
-    write_json(folder / "demo.json", args, rows, expert, latency, seconds)
+    write_json(folder / "demo.json", figures_of(args, rows, expert, latency, seconds))
     write_report(
         folder / "report.html",
         f"asm-gym demo: {args.task}",

@@ -11,7 +11,7 @@ import math
 import platform
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -38,7 +38,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, horizon_of, record
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
-from asm_gym.scripts.command import one_line, run
+from asm_gym.scripts.command import at_least, one_line, run
 from asm_gym.tasks import env_id, is_task
 from asm_gym.wrappers.faults import FaultyInterface
 from asm_gym.wrappers.recording import StreamSource
@@ -117,9 +117,7 @@ class Args:
             kinds_of(self.faults)
         for name in self.faults if self.elsewhere else ():
             check_choice("kind of fault", name, anywhere.KINDS)
-        for field in fields(self):
-            if field.name.endswith("_episodes") and getattr(self, field.name) < 1:
-                raise ValueError(f"{field.name} must be at least 1, got {getattr(self, field.name)}")
+        at_least(1, self, *(n for n in vars(self) if n.endswith("_episodes")))
         if self.faulty_episodes > self.nominal_episodes:
             raise ValueError(
                 f"every faulty episode is the twin of a nominal one: faulty_episodes must be at most "

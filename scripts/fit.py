@@ -5,15 +5,12 @@ Part of the episodes are learned from, the others set the threshold. Episodes th
 
 from __future__ import annotations
 
-import math
 import sys
 import time
-from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -23,15 +20,12 @@ from asm_gym.checks import check_number
 from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode
-from asm_gym.evaluation.trace import spans
-from asm_gym.logs import Layout, Log, read_logs
+from asm_gym.logs import Layout, read_logs
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
+from asm_gym.normal import divided, normal_episodes, pieces, unbroken
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
-
-SHORTEST_S = 0.5
-"""Least length of a part between lost rows that is worth learning from [s]."""
 
 _QUICK = {"episodes": 20, "epochs": 5}
 
@@ -75,73 +69,6 @@ class Args:
             raise ValueError(f"out must be a file, and {self.out} is a folder")
 
 
-class Kept(NamedTuple):
-    """The episodes that are learned from, and how many others were left out, by why."""
-
-    episodes: list[Episode]
-    left_out: Counter[str]
-
-
-def chosen(logs: Iterable[Log], keep_failures: bool = False, progress: Progress | None = None) -> Kept:
-    """The normal episodes among ``logs``."""
-    kept = Kept([], Counter())
-    for n, (_, episode) in enumerate(logs, 1):
-        if progress is not None:
-            progress(n, n)  # how many there are is known at the end
-        why = _abnormal(episode)
-        if why == "failed" and keep_failures:
-            why = ""
-        if why:
-            kept.left_out[why] += 1
-        else:
-            kept.episodes.append(episode)
-    return kept
-
-
-def _abnormal(episode: Episode) -> str:
-    """What is not normal about an episode, in a word or two; empty where nothing is."""
-    if episode.faults.any() or (episode.label is not None and episode.label.role == "faulty"):
-        return "with a fault"
-    if episode.label is not None and episode.label.role == "harmless":
-        return "under a harmless variation"
-    return "" if episode.success else "failed"
-
-
-def pieces(episode: Episode, seconds: float) -> list[Episode]:
-    """An episode cut into pieces of one length; a rest that is shorter is left out."""
-    rows = max(1, round(seconds / episode.spec.dt))
-    ends = range(rows, len(episode) + 1, rows)
-    return [Episode.from_stream(episode.stream[n - rows : n], episode.spec, success=True) for n in ends]
-
-
-def unbroken(episode: Episode) -> list[Episode]:
-    """The parts of an episode between rows that were lost, in whole or in part; those under half a second left out."""
-    known = np.isfinite(episode.stream).all(axis=1)
-    if known.all():
-        return [episode]
-    least = max(2, round(SHORTEST_S / episode.spec.dt))
-    parts = [slice(start, stop) for start, stop in spans(known) if stop - start >= least]
-    return [Episode.from_stream(episode.stream[part], episode.spec, success=True) for part in parts]
-
-
-def divided(episodes: list[Episode], args: Args) -> tuple[list[Episode], list[Episode]]:
-    """Those to learn from, and those to calibrate on.
-
-    Raises:
-        ValueError: too few of them; the message says how many are needed.
-    """
-    n, needed = len(episodes), conformal_episodes(args.false_alarm_rate)
-    order = np.random.default_rng(args.seed).permutation(n)
-    calibration = math.floor(n * args.calibration_share + 1e-9)
-    if calibration < needed or calibration == n:
-        least = max(2, math.ceil(needed / args.calibration_share - 1e-9))
-        raise ValueError(
-            f"a false-alarm rate of {args.false_alarm_rate:g} needs {least} normal episodes, {needed} of them to "
-            f"calibrate on, got {n}: record more, take a higher --false-alarm-rate, or --split long logs"
-        )
-    return [episodes[i] for i in order[calibration:]], [episodes[i] for i in order[:calibration]]
-
-
 def learned(args: Args, fitting: list[Episode], calibration: list[Episode], progress: Progress) -> Any:
     """The monitor, fitted and calibrated."""
     settings: dict[str, Any] = {"seed": args.seed}
@@ -155,14 +82,16 @@ def fit(args: Args, console: Console) -> None:
     """Reads, learns, calibrates, saves, and says what came of it."""
     start = time.perf_counter()
     with stage("reading", console, {}) as progress:
-        kept = chosen(read_logs(args.data, Layout(rate=args.rate, action=args.action)), args.keep_failures, progress)
+        kept = normal_episodes(
+            read_logs(args.data, Layout(rate=args.rate, action=args.action)), args.keep_failures, progress
+        )
     left_out = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
     if not kept.episodes:
         hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
     whole = [part for episode in kept.episodes for part in unbroken(episode)]
     episodes = whole if args.split is None else [p for e in whole for p in pieces(e, args.split)]
-    fitting, calibration = divided(episodes, args)
+    fitting, calibration = divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
     fitting = fitting[: _QUICK["episodes"]] if args.quick else fitting
     with stage("learning", console, {}) as progress:
         monitor = learned(args, fitting, calibration, progress)

@@ -31,7 +31,7 @@ from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.learners import ALGORITHMS
 from asm_gym.rollouts.training.run import BEST, CLONE, Plan, TrainingRun, success_rate
 from asm_gym.rollouts.trial import RolloutConfig
-from asm_gym.scripts.command import run
+from asm_gym.scripts.command import at_least, run
 from asm_gym.tasks import task as task_spec
 
 KEPT = ("env_id", "algorithm", "robot", "demonstrations", "dataset", "cloning_updates", "seed")
@@ -79,11 +79,9 @@ class Args:
         check_choice("algorithm", self.algorithm, ALGORITHMS)
         if self.task not in gym.registry:
             task_spec(self.task)
-        for name in ("cloning_updates", "evaluate_every", "evaluation_episodes", "final_episodes", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.steps < 0 or self.demonstrations < 0:
-            raise ValueError(f"steps and demonstrations must be >= 0, got {self.steps} and {self.demonstrations}")
+        at_least(1, self, "cloning_updates", "evaluate_every", "evaluation_episodes", "final_episodes")
+        at_least(1, self, "checkpoint_every")
+        at_least(0, self, "steps", "demonstrations")
         if not self.steps and not self.demonstrations and self.dataset is None:
             raise ValueError("there is nothing to learn from: neither steps nor demonstrations")
 

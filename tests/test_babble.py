@@ -10,7 +10,8 @@ from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts import harmless
 from asm_gym.rollouts.babbling import ALONE, DRIVEN, LEADING, LED, Babbler, Lesson, curriculum, record_lesson
-from asm_gym.rollouts.body import Exam, healthy
+from asm_gym.rollouts.body import healthy
+from asm_gym.rollouts.examination import Exam
 from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.babble import Args, main

@@ -15,7 +15,8 @@ from rich.console import Console
 from asm_gym.episodes import Episode, EpisodeLabel, save_episode
 from asm_gym.logs import Layout, Log, read_logs
 from asm_gym.monitors import load_monitor, make_monitor
-from asm_gym.scripts import fit, watch
+from asm_gym.normal import divided, normal_episodes, pieces
+from asm_gym.scripts import watch
 from asm_gym.scripts.cli import main
 from asm_gym.stream import MOTOR
 from asm_gym.tables import read_table, stream_of
@@ -216,26 +217,25 @@ def test_only_normal_episodes_are_learned_from():
         "harmless": Episode.from_table(log(4), success=True, label=EpisodeLabel("Lift", "harmless", "slower")),
     }
     found = [Log(name, episode) for name, episode in episodes.items()]
-    kept = fit.chosen(found)
+    kept = normal_episodes(found)
     assert kept.episodes == [normal]
     assert kept.left_out == {"failed": 1, "with a fault": 2, "under a harmless variation": 1}
-    assert len(fit.chosen(found, keep_failures=True).episodes) == 2
+    assert len(normal_episodes(found, keep_failures=True).episodes) == 2
 
 
 def test_long_logs_are_cut_into_pieces_of_one_length():
-    cut = fit.pieces(Episode.from_table(log(0)), 0.5)
+    cut = pieces(Episode.from_table(log(0)), 0.5)
     assert [len(piece) for piece in cut] == [25, 25, 25]
     np.testing.assert_array_equal(np.vstack([p.stream for p in cut]), Episode.from_table(log(0)).stream[:75])
 
 
 def test_episodes_that_calibrate_are_not_learned_from_and_both_are_drawn_by_the_seed():
     episodes = [Episode.from_table(log(n)) for n in range(40)]
-    args = fit.Args(Path("x"), seed=1)
-    fitting, calibration = fit.divided(episodes, args)
+    fitting, calibration = divided(episodes, 0.05, 0.5, seed=1)
     assert len(calibration) == 20
     assert sorted(map(id, fitting + calibration)) == sorted(map(id, episodes))
-    assert fit.divided(episodes, args)[1] == calibration
-    assert fit.divided(episodes, fit.Args(Path("x"), seed=2))[1] != calibration
+    assert divided(episodes, 0.05, 0.5, seed=1)[1] == calibration
+    assert divided(episodes, 0.05, 0.5, seed=2)[1] != calibration
 
 
 def test_too_few_episodes_are_refused_with_how_many_are_needed(logs, tmp_path, capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -18,7 +19,8 @@ from matplotlib.figure import Figure
 
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.metrics import by_condition, false_alarms, time_matched_auroc
-from asm_gym.evaluation.report import write_report
+from asm_gym.evaluation.report import write_json, write_report
+from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Column, Table, detection_table, headline, outcome_table, tabulate
 from asm_gym.evaluation.trace import InterventionOutcome, Trace, TraceDetail
 from asm_gym.evaluation.video import write_video
@@ -278,3 +280,9 @@ def test_a_video_that_fails_leaves_nothing_behind(tmp_path: Path):
     with pytest.raises(ValueError, match=r"a frame must be \(H, W, 3\) uint8"):
         write_video(tmp_path / "v.mp4", [np.zeros((32, 32), np.uint8)], fps=10)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_delay_that_never_ended_is_null_in_json(tmp_path):
+    write_json(tmp_path / "new" / "x.json", {"delay": [np.inf, 2.0], "share": Share(1, 4), "none": np.nan})
+    found = json.loads((tmp_path / "new" / "x.json").read_text())
+    assert found == {"delay": [None, 2.0], "share": {"k": 1, "n": 4}, "none": None}

@@ -19,6 +19,7 @@ from asm_gym.evaluation.comparison import BenchmarkResult, Detectability
 from asm_gym.evaluation.tables import Table, harmless_table, kinds_table, lead_table, markdown, monitors_table
 from asm_gym.evaluation.trace import Trace, window_steps
 from asm_gym.extras import needed_for
+from asm_gym.files import written_whole
 
 _PAGE = Template("""<!doctype html>
 <html lang="en">
@@ -158,6 +159,22 @@ def _shown(caption: str, figure: Path | Figure) -> str:
 
 def _uri(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Writes what JSON can hold; a number that is not finite, such as a delay that never ended, is null."""
+    with written_whole(path) as file:
+        file.write((json.dumps(_finite(content), indent=2, allow_nan=False) + "\n").encode())
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return _finite(value._asdict())
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any], video: Path | None = None) -> None:

@@ -1,24 +1,16 @@
-"""A memory of a body: learned from babbling, and examined on policies and tasks that it never met."""
+"""A memory of a body, learned from what is healthy of babbling."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from asm_gym.episodes import Episode, EpisodeLabel
-from asm_gym.evaluation.comparison import visible_kinds
-from asm_gym.evaluation.metrics import DetectionMetrics
-from asm_gym.evaluation.trace import NOMINAL, Trace
-from asm_gym.monitors import CalibratedMonitor, NeuralASM
+from asm_gym.episodes import Episode
+from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import Progress
-from asm_gym.rollouts.benchmark import detectability_of, traces_of
-from asm_gym.rollouts.folder import labelled
-from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.rollouts.training.exploration import SHORTEST, Gentle, peak_torques
-from asm_gym.tasks import task as task_spec
 
 CALIBRATED_ON = 3
 """One in so many lessons of a task is not learned from: the threshold is set on those."""
@@ -28,8 +20,6 @@ AROUND_S = 0.2
 """What is left out before and after a hit [s]."""
 PASSES = 4
 """Of the temporal network over the lessons."""
-SEVERITIES = "medium", "strong"
-"""Of the faults in an examination; mild ones are hardly to be seen."""
 
 
 class Lessons(NamedTuple):
@@ -126,60 +116,3 @@ def learn_body(lessons: Lessons, rate: float, seed: int, progress: Progress) -> 
     """
     memory = NeuralASM(lessons.fit[0].spec, epochs=PASSES, habituates=False, seed=seed)
     return memory.fit(lessons.fit, progress).calibrate(lessons.calibration, rate)
-
-
-class Exam(NamedTuple):
-    """A policy in a task, and whether babbling has shown either."""
-
-    task: str
-    policy: str
-    known: bool
-
-    @property
-    def name(self) -> str:
-        """For people."""
-        who = "expert" if self.policy == "scripted" else self.policy
-        return f"{self.task}, {who}" + ("" if self.known else " (left out)")
-
-    def labels(self, episodes: int, kinds: Sequence[str], seed: int) -> list[EpisodeLabel]:
-        """Nominal episodes; and a twin of the first for each of ``kinds`` and severity, the second for the next."""
-        seeds = role_seeds(seed, self.task, "nominal", episodes)
-        horizon = task_spec(self.task).horizon
-        nominal = [EpisodeLabel(self.task, "nominal", seed=s) for s in seeds]
-        faults = [(kind, severity) for kind in kinds for severity in SEVERITIES]
-        twins = [seeds[n % episodes] for n in range(len(faults))]
-        return nominal + [
-            EpisodeLabel(self.task, "faulty", *fault, s, draw_onset(s, horizon))
-            for fault, s in zip(faults, twins, strict=True)
-        ]
-
-
-class Marks(NamedTuple):
-    """What a memory made of one exam.
-
-    Attributes:
-        name: of the exam.
-        solved: traces of healthy episodes in which the task was solved.
-        failed: traces of healthy episodes in which it was not.
-        metrics: on the faults that an ideal observer could see.
-    """
-
-    name: str
-    solved: list[Trace]
-    failed: list[Trace]
-    metrics: DetectionMetrics
-
-
-def examine(
-    memory: CalibratedMonitor, exam: Exam, folder: Path, labels: Sequence[EpisodeLabel], window: float
-) -> Marks:
-    """What ``memory`` makes of the recordings of these labels; faults are to be found within ``window`` [s]."""
-    recordings = labelled(folder, labels)
-    traces = traces_of(exam.name, memory, recordings, memory.threshold)
-    nominal = [t for t in traces if t.kind == NOMINAL]
-    twins = [r for r in recordings if r.labelled.role == "nominal"]
-    faulty = [r for r in recordings if r.labelled.role == "faulty"]
-    seen = visible_kinds(detectability_of(twins, faulty, window))
-    faults = [t for t in traces if t.onset is not None and seen[t.kind, t.severity]]
-    solved, failed = ([t for t in nominal if t.outcome.success is want] for want in (True, False))
-    return Marks(exam.name, solved, failed, DetectionMetrics(exam.name, faults, nominal, window))

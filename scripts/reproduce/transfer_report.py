@@ -13,8 +13,6 @@ from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table, count
 from asm_gym.scripts.reproduce.common import Record
 
-BODY = "of the body"
-
 
 def chosen(records: Sequence[Record], **where: Any) -> list[Record]:
     """Those that are as ``where`` says; of a tuple, any of it."""

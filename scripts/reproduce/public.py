@@ -25,11 +25,10 @@ from asm_gym.episodes import Episode
 from asm_gym.evaluation.statistics import auroc
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
+from asm_gym.normal import divided
 from asm_gym.public import Recorded, read_public
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
-from asm_gym.scripts.fit import Args as FitArgs
-from asm_gym.scripts.fit import divided
 
 AT_ONCE = 64
 """Episodes scored side by side."""
@@ -79,13 +78,7 @@ def is_finite(one: Recorded) -> bool:
 
 def fitted(args: Args, normal: list[Episode], console: Console) -> dict[str, Any]:
     """The monitors, each fitted and calibrated on the same episodes."""
-    how = FitArgs(
-        args.data,
-        false_alarm_rate=args.false_alarm_rate,
-        calibration_share=args.calibration_share,
-        seed=args.seed,
-    )
-    fitting, calibration = divided(normal, how)
+    fitting, calibration = divided(normal, args.false_alarm_rate, args.calibration_share, args.seed)
     fitting = fitting[:QUICK_EPISODES] if args.quick else fitting
     made = {}
     for name in args.monitors:

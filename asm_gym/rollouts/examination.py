@@ -1,0 +1,119 @@
+"""A memory of a body, examined on policies and tasks that it never met."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from asm_gym.episodes import EpisodeLabel
+from asm_gym.evaluation.comparison import visible_kinds
+from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, false_alarms_per_hour
+from asm_gym.evaluation.statistics import Share
+from asm_gym.evaluation.tables import Column, Table, count, milliseconds, percent, tabulate
+from asm_gym.evaluation.trace import NOMINAL, Trace
+from asm_gym.monitors import CalibratedMonitor
+from asm_gym.rollouts.benchmark import detectability_of, traces_of
+from asm_gym.rollouts.folder import labelled
+from asm_gym.rollouts.seeds import draw_onset, role_seeds
+from asm_gym.tasks import task as task_spec
+
+SEVERITIES = "medium", "strong"
+"""Of the faults in an examination; mild ones are hardly to be seen."""
+
+PROMPT_S = 0.1
+"""How soon a push should be noticed [s]."""
+
+
+class Exam(NamedTuple):
+    """A policy in a task, and whether babbling has shown either."""
+
+    task: str
+    policy: str
+    known: bool
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        who = "expert" if self.policy == "scripted" else self.policy
+        return f"{self.task}, {who}" + ("" if self.known else " (left out)")
+
+    def labels(self, episodes: int, kinds: Sequence[str], seed: int) -> list[EpisodeLabel]:
+        """Nominal episodes; and a twin of the first for each of ``kinds`` and severity, the second for the next."""
+        seeds = role_seeds(seed, self.task, "nominal", episodes)
+        horizon = task_spec(self.task).horizon
+        nominal = [EpisodeLabel(self.task, "nominal", seed=s) for s in seeds]
+        faults = [(kind, severity) for kind in kinds for severity in SEVERITIES]
+        twins = [seeds[n % episodes] for n in range(len(faults))]
+        return nominal + [
+            EpisodeLabel(self.task, "faulty", *fault, s, draw_onset(s, horizon))
+            for fault, s in zip(faults, twins, strict=True)
+        ]
+
+
+class Marks(NamedTuple):
+    """What a memory made of one exam.
+
+    Attributes:
+        name: of the exam.
+        solved: traces of healthy episodes in which the task was solved.
+        failed: traces of healthy episodes in which it was not.
+        metrics: on the faults that an ideal observer could see.
+    """
+
+    name: str
+    solved: list[Trace]
+    failed: list[Trace]
+    metrics: DetectionMetrics
+
+
+def examine(
+    memory: CalibratedMonitor, exam: Exam, folder: Path, labels: Sequence[EpisodeLabel], window: float
+) -> Marks:
+    """What ``memory`` makes of the recordings of these labels; faults are to be found within ``window`` [s]."""
+    recordings = labelled(folder, labels)
+    traces = traces_of(exam.name, memory, recordings, memory.threshold)
+    nominal = [t for t in traces if t.kind == NOMINAL]
+    twins = [r for r in recordings if r.labelled.role == "nominal"]
+    faulty = [r for r in recordings if r.labelled.role == "faulty"]
+    seen = visible_kinds(detectability_of(twins, faulty, window))
+    faults = [t for t in traces if t.onset is not None and seen[t.kind, t.severity]]
+    solved, failed = ([t for t in nominal if t.outcome.success is want] for want in (True, False))
+    return Marks(exam.name, solved, failed, DetectionMetrics(exam.name, faults, nominal, window))
+
+
+COLUMNS: Sequence[Column[Marks]] = (
+    Column("", lambda m: m.name),
+    Column("healthy, alarm", lambda m: count(false_alarms(m.solved))),
+    Column("per hour", lambda m: f"{false_alarms_per_hour(m.solved):.1f}"),
+    Column("failed, alarm", lambda m: count(false_alarms(m.failed)) if m.failed else ""),
+    Column("AUROC", lambda m: f"{m.metrics.auroc:.3f}" if m.metrics.faulty else ""),
+    Column("found", lambda m: f"{percent(m.metrics.detected)} of {m.metrics.detected.n}" if m.metrics.faulty else ""),
+    Column("median [ms]", lambda m: milliseconds(m.metrics.delays, "median_ms") if m.metrics.faulty else ""),
+)
+
+
+def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Table:
+    """A row for each exam."""
+    about = memory.about
+    learned = f"learned from {about['lessons']} lessons of {', '.join(about['tasks'])} ({about['rows']} rows)"
+    limit = f"threshold {memory.threshold:.3g} from {about['calibrated_on']} others at {about['false_alarm_rate']:g}"
+    return tabulate(
+        f"{about['name']}: {learned}, {limit}. Episodes with an alarm, apart those that solved the task and those that "
+        "failed; faults of medium and strong severity that an ideal observer could see, found within "
+        f"{window:g} s.",
+        COLUMNS,
+        marks,
+    )
+
+
+def summary(marks: Sequence[Marks]) -> str:
+    """Alarms and faults found in all exams together."""
+    solved = Share.of([bool(t.false_alarms) for m in marks for t in m.solved])
+    found = Share(sum(m.metrics.detected.k for m in marks), sum(m.metrics.detected.n for m in marks))
+    pushes = [t.delay for m in marks for t in m.metrics.faulty if (t.kind, t.severity) == ("push", "medium")]
+    prompt = Share.of([delay is not None and delay <= PROMPT_S + 1e-9 for delay in pushes])
+    return (
+        f"In all: {count(solved)} healthy episodes alarm, {count(found)} faults found, {count(prompt)} pushes of 20 N "
+        f"noticed within {1e3 * PROMPT_S:.0f} ms."
+    )
