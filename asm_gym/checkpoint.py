@@ -120,13 +120,7 @@ def read_header(path: str | Path) -> dict[str, Any]:
 @typed
 def kind_of(path: str | Path) -> str:
     """What a file is a checkpoint of. Raises FileNotFoundError, or ValueError where it is none."""
-    try:
-        with zipfile.ZipFile(path) as file:
-            return str(json.loads(file.read(HEADER))["kind"])
-    except FileNotFoundError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, ValueError, KeyError, TypeError, EOFError, OSError) as error:
-        raise ValueError(f"{path} is damaged or not a checkpoint of asm-gym: {error}") from error
+    return str(read_header(path).get("kind"))
 
 
 @typed

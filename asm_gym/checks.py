@@ -127,7 +127,7 @@ def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
     try:
         with np.errstate(over="ignore"):
             return np.asarray(values, np.float32)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be numbers, got {shown(values)}") from error
 
 

@@ -187,7 +187,7 @@ def read_dataset(path: str | Path, env_id: str | None = None, dt: float | None =
         raise ValueError(f"{folder} is damaged or not a Minari dataset: {error}") from error
     found = dataset.env_spec.id if dataset.env_spec is not None else None
     if env_id is not None and found != env_id:
-        raise ValueError(f"{folder} was recorded in {found}, not in {env_id}")
+        raise ValueError(f"{folder} was recorded in {found}, not in {env_id!r}")
     spec = _spec(folder, known, found, dt)
     if not recorded:
         raise ValueError(f"{folder} holds no episode")

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import read_arrays, read_checkpoint, write_checkpoint
+from asm_gym.checks import as_float32
 from asm_gym.files import regular_file
 from asm_gym.stream import StreamSpec
 from asm_gym.tables import stream_of
@@ -111,7 +112,7 @@ class Episode:
     @typed
     def from_stream(cls, x: NDArray[np.floating[Any]], spec: StreamSpec, **fields: Any) -> Episode:
         """An episode from a stream recorded elsewhere, a real robot's included: ``x`` has the shape (T, D)."""
-        return cls(np.ascontiguousarray(x, dtype=np.float32), spec, **fields)
+        return cls(np.ascontiguousarray(as_float32(x, "a stream")), spec, **fields)
 
     @classmethod
     @typed

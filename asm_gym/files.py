@@ -14,6 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
+from asm_gym.checks import shown
+
 UNFINISHED = ".unfinished"
 
 SPARE = 16 * 2**20
@@ -27,9 +29,9 @@ def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
     A process that is killed leaves a hidden file, which the next one to write there removes. Missing folders are made.
 
     Raises:
-        ValueError: something stands there that is no file, such as a device.
+        ValueError: something stands there that is no file, such as a device; the path names no file.
     """
-    path = Path(path)
+    path = _checked(path)
     if path.exists() and not path.is_file():
         raise ValueError(f"{path} is no regular file, and is not replaced by one")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -51,10 +53,10 @@ def regular_file(path: str | Path) -> int:
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: it is a folder, or a device or pipe, whose reading might never end.
+        ValueError: it is a folder, or a device or pipe, whose reading might never end; the path names no file.
     """
     try:
-        found = os.stat(path)
+        found = os.stat(_checked(path))
     except FileNotFoundError:
         raise FileNotFoundError(errno.ENOENT, "no such file", str(path)) from None
     if not stat.S_ISREG(found.st_mode):
@@ -70,6 +72,12 @@ def require_space(folder: Path, needed: int) -> None:
         raise OSError(
             errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed there, and {free / 1e6:.0f} MB are free", str(folder)
         )
+
+
+def _checked(path: str | Path) -> Path:
+    if not Path(path).name or "\x00" in str(path):
+        raise ValueError(f"a path must name a file, got {shown(str(path))}")
+    return Path(path)
 
 
 def _remove_left_behind(folder: Path, mark: str) -> None:

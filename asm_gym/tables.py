@@ -30,6 +30,9 @@ Column = NDArray[Any]
 TIME = ("time", "timestamp", "time_s", "t")
 """Columns that say when a row was sensed [s]: they are no channel, and tell the rate."""
 
+SLOWEST = 1e-6
+"""The least rate of a log [Hz]: a row in eleven days."""
+
 RATE_TOLERANCE = 0.01
 """How far a log's rate may be off that of the memory which reads it, as a share."""
 
@@ -83,7 +86,7 @@ def stream_of(
     columns, units = _without_units(_columns(frame))
     times = _times(columns)
     dt = None if times is None else period(times)
-    dt = dt if rate is None else 1.0 / check_number("rate", rate, above=0)
+    dt = dt if rate is None else 1.0 / check_number("rate", rate, low=SLOWEST)
     rows_of = {name: column for name, column in columns.items() if name not in TIME}
     if times is not None and dt is not None and len(times) > 1:
         theirs = channels.dt if isinstance(channels, StreamSpec) and _alike(channels.dt, dt) else dt
@@ -92,7 +95,7 @@ def stream_of(
     if isinstance(channels, StreamSpec):
         return _read_by(channels, signals, dt), channels
     if dt is None:
-        raise ValueError("how many rows come a second? Say the rate [Hz], or add a column time [s]")
+        raise ValueError("how many rows come a second? Say the rate [Hz] of this layout, or add a column time [s]")
     if isinstance(channels, Mapping):
         signals = [s for name, patterns in channels.items() for s in _renamed(name, _chosen(signals, patterns))]
     elif channels is not None:
@@ -128,7 +131,7 @@ def _columns(frame: Any) -> dict[str, Column]:
     columns = {n: c for n, c in columns.items() if c.dtype.kind in "biuf" and c.ndim in (1, 2)}
     lengths = {n: len(c) for n, c in columns.items()}
     if not lengths or not max(lengths.values()):
-        raise ValueError("the table holds no numbers")
+        raise ValueError(f"a frame must hold columns of numbers, got {shown(frame)}")
     if len(set(lengths.values())) > 1:
         raise ValueError(f"columns must have one length, got {', '.join(f'{n}: {k}' for n, k in lengths.items())}")
     return columns

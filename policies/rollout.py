@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from asm_gym.checks import check_number
 from asm_gym.policies.base import Policy
 from asm_gym.typed import typed
 
@@ -29,6 +30,8 @@ def rollout(
         on_step: is shown every step's ``info``.
         steps: where to leave it, if it has not ended before.
     """
+    if steps is not None:
+        check_number("steps", steps, low=1, whole=True)
     observation, _ = env.reset(seed=seed)
     state, success, done, taken = None, False, False, 0
     start = np.ones(1, dtype=bool)

@@ -7,12 +7,13 @@ import json
 import math
 import os
 import zipfile
+from functools import partial
 
 import numpy as np
 import pytest
 
 from asm_gym import checkpoint
-from asm_gym.checkpoint import read_arrays, read_checkpoint, write_checkpoint
+from asm_gym.checkpoint import kind_of, read_arrays, read_checkpoint, write_checkpoint
 
 
 def test_checkpoint_keeps_every_bit(tmp_path):
@@ -153,7 +154,8 @@ def test_no_flipped_bit_changes_what_is_read(tmp_path, seed):
             np.testing.assert_array_equal(found.arrays[name], good.arrays[name])
 
 
-def test_a_pipe_is_no_checkpoint(tmp_path):
+@pytest.mark.parametrize("read", [partial(read_checkpoint, kind="test"), kind_of, read_arrays])
+def test_a_pipe_is_no_checkpoint_and_nobody_waits_for_it(read, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ValueError, match="is no regular file"):
-        read_checkpoint(tmp_path / "pipe", "test")
+        read(tmp_path / "pipe")

@@ -22,6 +22,7 @@ from minari.dataset.minari_storage import MinariStorage
 from asm_gym.datasets import read_dataset, write_dataset
 from asm_gym.envs.demonstrations import recorded_in, replay
 from asm_gym.episodes import load_episode, save_episode
+from asm_gym.files import UNFINISHED
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy, rollout
 from asm_gym.scripts.cli import main
@@ -110,6 +111,7 @@ def test_a_killed_run_loses_only_what_was_running(tmp_path):
     assert main(["collect", "Lift", *ONE, str(more), "--out", str(tmp_path)]) == 0
     assert len(read_dataset(tmp_path)) == more
     assert all((tmp_path / "episodes" / name).stat().st_mtime_ns == stamp for name, stamp in stamps.items())
+    assert not [p.name for p in tmp_path.rglob("*") if p.name.endswith(UNFINISHED)]
 
 
 @pytest.mark.parametrize(

@@ -69,6 +69,13 @@ def test_a_pipe_a_device_or_a_folder_is_neither_read_nor_replaced(tmp_path):
         regular_file(tmp_path / "none")
 
 
+@pytest.mark.parametrize(("path", "said"), [("", "''"), (Path(), "'.'"), ("x\x00y", r"'x\\x00y'")])
+def test_a_path_that_can_name_no_file_is_refused(path, said):
+    for use in (regular_file, lambda path: written_whole(path).__enter__()):
+        with pytest.raises(ValueError, match=f"a path must name a file, got {said}"):
+            use(path)
+
+
 def test_a_full_disk_is_noticed_before_anything_is_written(tmp_path, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(files.shutil, "disk_usage", lambda _: usage(100, 50, files.SPARE + 1000))

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from loky import get_reusable_executor
 
-from asm_gym.rollouts import ParallelConfig, collect, parallel_map
+from asm_gym.rollouts import ParallelConfig, collect, parallel, parallel_map
 
 PARENT = """
 import os, signal, sys, threading, time
@@ -99,6 +100,18 @@ def test_what_a_task_raises_is_raised_here(workers):
         parallel_map(abs, ["a"], workers)
 
 
+def test_no_more_processes_are_started_than_there_is_work(monkeypatch):
+    started = []
+
+    def executor(workers, **more):
+        started.append(workers)
+        return get_reusable_executor(workers, **more)
+
+    monkeypatch.setattr(parallel, "get_reusable_executor", executor)
+    assert parallel_map(abs, [-3, 1], 500) == [3, 1]
+    assert started == [2]
+
+
 def test_a_killed_worker_is_an_error_that_says_so_and_the_next_call_works():
     with pytest.raises(ChildProcessError, match="killed"):
         parallel_map(_kill_myself, [signal.SIGKILL], 2)
@@ -123,6 +136,7 @@ def test_nothing_to_do_needs_nobody():
     ("arguments", "message"),
     [
         ({"workers": 0}, "workers.*0"),
+        ({"workers": 10**9}, "workers.*1000000000"),
         ({"backend": "slurm"}, "slurm.*dask"),
         ({"backend": "dask"}, "address"),
         ({"address": "tcp://host:1"}, "loky"),

@@ -10,6 +10,7 @@ import gymnasium as gym
 
 from asm_gym.abilities import SensesWithinSteps
 from asm_gym.checks import check_number, shown
+from asm_gym.detection.adaptive import AdaptiveThreshold, RunningThreshold
 from asm_gym.monitors import ExpectsActions, ExplainsItself, Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract, nearest_to_rest
@@ -65,6 +66,13 @@ def fitted_to(monitor: Monitor, watched: StreamSpec) -> Monitor:
         "for_stream(spec).calibrate(episodes) sets it anew"
     )
     return fewer
+
+
+def running(adapt: AdaptiveThreshold | None, threshold: float) -> RunningThreshold | None:
+    """The threshold that follows a policy, where it is to. Raises TypeError."""
+    if adapt is not None and not isinstance(adapt, AdaptiveThreshold):
+        raise TypeError(f"adapt must be an AdaptiveThreshold, got {shown(adapt)}")
+    return None if adapt is None else adapt.start(threshold)
 
 
 def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:

@@ -16,6 +16,7 @@ from asm_gym.checks import check_number, shown
 from asm_gym.memory.completion import Completion, Filling
 from asm_gym.monitors import ExplainsItself, Monitor
 from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 from asm_gym.wrappers.arguments import check_monitor
 from asm_gym.wrappers.observer import Observer
 from asm_gym.wrappers.recording import StreamSource
@@ -228,6 +229,7 @@ class CompletedObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArg
             in the observation; an unknown sensor (the message lists those that exist).
     """
 
+    @typed
     def __init__(
         self, env: gym.Env[Any, Any], monitor: Monitor, sensors: Sequence[str] = (), trust_s: float = TRUST_S
     ) -> None:

@@ -28,6 +28,7 @@ from asm_gym.wrappers.arguments import (
     make_patience,
     make_reflex,
     names_causes,
+    running,
 )
 from asm_gym.wrappers.observer import Observer, joined
 from asm_gym.wrappers.recording import StreamSource
@@ -156,7 +157,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if learning_rate > 0 and not isinstance(monitor, LearnsOnTheJob):
             raise ValueError(f"{type(monitor).__name__} cannot learn on the job: learning_rate must be 0")
         threshold = check_monitor(monitor, watched)
-        self._running = None if adapt is None else adapt.start(threshold)
+        self._running = running(adapt, threshold)
         self.monitor = monitor
         if on_alarm is None:
             on_alarm = "graded" if names_causes(monitor) else "hold"

@@ -25,6 +25,7 @@ from asm_gym.wrappers.arguments import (
     make_fallback,
     make_patience,
     make_reflex,
+    running,
 )
 from asm_gym.wrappers.batches import Mask, Member, final, members, refuse_changes, replace, set_attribute
 from asm_gym.wrappers.observer import Observer, joined
@@ -95,7 +96,7 @@ class VectorNeuralASMSafety(VectorWrapper):
             monitor = fitted_to(monitor, source.spec)
             threshold = check_monitor(monitor, source.spec)
         self.monitor = monitor
-        self._running = None if adapt is None else adapt.start(threshold)
+        self._running = running(adapt, threshold)
         self._ends_truncated = check_flag("truncate", truncate)
         self._terminates = on_alarm == "terminate"
         limits = release_after, release_below, max_override, try_after

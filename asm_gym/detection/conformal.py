@@ -36,9 +36,13 @@ def conformal_threshold(maxima: Array, rate: float) -> float:
         maxima: (n,) the largest value in each nominal episode.
         rate: P(any alarm in a nominal episode).
     """
-    maxima = np.asarray(maxima)
-    if maxima.ndim != 1 or maxima.dtype.kind not in "iuf" or np.isnan(maxima).any():
+    try:
+        found = np.asarray(maxima)
+    except ValueError:  # rows of several lengths
+        found = np.array(None)
+    if found.ndim != 1 or found.dtype.kind not in "iuf" or np.isnan(found).any():
         raise ValueError(f"maxima must be numbers in the shape (n,), got {shown(maxima)}")
+    maxima = found
     n, needed = len(maxima), conformal_episodes(rate)
     if n < needed:
         raise ValueError(

@@ -244,9 +244,12 @@ class EvidenceDetection:
         shrinkage: float = 1e-3,
         habituates: bool = True,
     ) -> None:
-        self.spec, self.gains = spec, tuple(map(float, gains))
-        if not self.gains or not all(0.0 < a <= 1.0 for a in self.gains):
-            raise ValueError(f"gains must be numbers in (0, 1], got {gains}")
+        try:
+            self.spec, self.gains = spec, tuple(check_number("gains", a, above=0.0, high=1.0) for a in gains)
+        except ValueError as error:
+            raise ValueError(f"gains must be numbers in (0, 1], got {shown(gains)}") from error
+        if not self.gains:
+            raise ValueError("gains must be numbers in (0, 1], got ()")
         self.bound = check_number("bound", bound, above=0.0)
         self.shrinkage = check_number("shrinkage", shrinkage, low=0.0, high=1.0)
         self.habituates = check_flag("habituates", habituates)

@@ -93,7 +93,7 @@ def binomial_interval(n: int, p: float, confidence: float = 0.95) -> tuple[int, 
     For checking a calibration: alarms in n nominal episodes at the false-alarm rate p.
     """
     check_number("p", p, low=0, high=1)
-    check_number("n", n, low=0, whole=True)
+    check_number("n", n, low=0, high=1e7, whole=True)
     tail = (1 - _check_confidence(confidence)) / 2
     if p in (0.0, 1.0):
         return round(n * p), round(n * p)
@@ -113,7 +113,7 @@ def auroc(scores_pos: ArrayLike, scores_neg: ArrayLike) -> float:
     """
     pos, neg = _scores("scores_pos", scores_pos), _scores("scores_neg", scores_neg)
     if not pos.size or not neg.size:
-        raise ValueError(f"auroc needs scores of both kinds, got {pos.size} positive and {neg.size} negative")
+        raise ValueError(f"scores_pos and scores_neg must hold some each, got {pos.size} and {neg.size}")
     neg = np.sort(neg)
     lower, not_higher = np.searchsorted(neg, pos, "left"), np.searchsorted(neg, pos, "right")  # (P,)
     return float((lower + not_higher).sum() / (2 * pos.size * neg.size))

@@ -332,7 +332,10 @@ class CalibratedMonitor:
         """(B, D) the rows, of a layout that compiled code knows."""
         if not isinstance(state, MonitorState):
             raise TypeError(f"state must be what initial_state or observe gave, got {shown(state)}")
-        rows = np.ascontiguousarray(stream, np.float64)
+        try:
+            rows = np.ascontiguousarray(stream, np.float64)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"stream must be rows of numbers, got {shown(stream)}") from error
         batch = batch_of(state)
         if rows.shape != (batch, self.spec.size):
             self.spec.check_row(rows)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from asm_gym.checkpoint import kind_of, read_checkpoint
+from asm_gym.checks import check_text
 from asm_gym.choices import check_choice
 from asm_gym.detection import Detection, EvidenceDetection
 from asm_gym.extras import needed_for
@@ -141,7 +142,7 @@ def register_monitor(model: type[Any], detection: str = "evidence") -> None:
         ValueError: the name is taken, or there is no such detection.
     """
     check_choice("detection", detection, DETECTIONS)
-    name: str = model.kind
+    name = check_text(f"the kind of model {model.__name__}", getattr(model, "kind", None))
     if name in MONITORS:
         raise ValueError(f"there is a monitor {name!r} already")
     row = MonitorKind(model, detection, detection)

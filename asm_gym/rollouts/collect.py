@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
+from asm_gym.checks import check_number
 from asm_gym.episodes import Episode, save_episode
 from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
@@ -53,8 +54,7 @@ def collect(
         ValueError: fewer than one episode or worker; whatever the environment and the policy refuse.
         TypeError: spaces that are no numbers, or a policy that cannot be sent to another process.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    check_number("episodes", episodes, low=1, whole=True)
     config = RolloutConfig(policy, env_kwargs=tuple(sorted(env_kwargs.items())))
     task = partial(record_episode, spec=env_spec(env_id), config=config)
     return parallel_map(task, episode_seeds(seed, episodes, stage), workers, progress)

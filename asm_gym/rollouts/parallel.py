@@ -34,6 +34,8 @@ Ended = Generator[tuple[int, Any], None, None]
 """Which item has ended, and its result."""
 
 BACKENDS = ("loky", "dask", "ray")
+MOST_WORKERS = 1000
+"""Processes of one machine: each takes 60 MB before it does anything."""
 IDLE_S = 300.0
 """How long a process waits for more work before it ends [s]."""
 ONE_THREAD = dict.fromkeys(
@@ -62,7 +64,7 @@ class ParallelConfig:
     address: str | None = None
 
     def __post_init__(self) -> None:
-        check_number("workers", self.workers, low=1, whole=True)
+        check_number("workers", self.workers, low=1, high=MOST_WORKERS, whole=True)
         check_choice("backend", self.backend, BACKENDS)
         if self.backend == "dask" and self.address is None:
             raise ValueError("backend='dask' needs the address of its scheduler, such as tcp://host:8786")
@@ -86,7 +88,7 @@ def parallel_map(
     worker was lost.
 
     Raises:
-        ValueError: fewer than one worker. What a task raises is raised here.
+        ValueError: fewer than one worker, or more than ``MOST_WORKERS``. What a task raises is raised here.
         TypeError: the task cannot be sent to another process.
         ConnectionError: there is no cluster at the address.
         ChildProcessError: a process was killed.
@@ -137,8 +139,9 @@ def _call_on_cluster(task: bytes, item: Any) -> Any:
 def _loky(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
     # A process that another thread starts would end with that thread.
     here = threading.current_thread() is threading.main_thread()
+    workers = min(parallel.workers, len(items))  # an executor starts all of them at once
     executor = get_reusable_executor(
-        parallel.workers, timeout=IDLE_S, initializer=_end_with_parent, initargs=(os.getpid(), here), env=ONE_THREAD
+        workers, timeout=IDLE_S, initializer=_end_with_parent, initargs=(os.getpid(), here), env=ONE_THREAD
     )
     try:
         yield from _as_they_end([executor.submit(_call, task, item) for item in items])

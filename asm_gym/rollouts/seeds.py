@@ -8,6 +8,9 @@ import numpy as np
 
 from asm_gym.checks import check_number
 
+MOST_EPISODES = 10**6
+"""At ten seconds each, four months."""
+
 
 def episode_seeds(seed: int, episodes: int, stage: int = 0) -> list[int]:
     """One seed an episode; lists of different ``stage`` have nothing in common."""
@@ -30,5 +33,5 @@ def _natural(name: str, value: int) -> int:
 
 
 def _drawn(entropy: list[int], episodes: int) -> list[int]:
-    check_number("episodes", episodes, low=0, high=10**9, whole=True)
+    check_number("episodes", episodes, low=0, high=MOST_EPISODES, whole=True)
     return [int(s) for s in np.random.SeedSequence(entropy).generate_state(episodes, np.uint32) // 2]

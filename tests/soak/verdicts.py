@@ -65,7 +65,7 @@ def names(said: str, hostile: dict[str, Any]) -> bool:
             w for n in (name, name.removesuffix("s"), CALLED.get(name, name)) for w in (n, n.replace("_", " "), f"{n}s")
         }
         with suppress(Exception):  # a value may have no text
-            words |= {repr(value)[:20], str(value)[:20]}
+            words |= {repr(value)[:20], str(value)[:20], getattr(value, "__name__", "")}
         if any(re.search(rf"(?<!\w){re.escape(w.lower())}", said) for w in words if w.strip()):
             return True
     return False
