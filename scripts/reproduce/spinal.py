@@ -11,6 +11,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -59,6 +60,8 @@ class Args(Common):
     """Nominal episodes of each task that its band is calibrated on."""
     rate: float = 0.01
     """Nominal episodes that may leave the band."""
+    seeds: int = 1
+    """How often it is done anew; each time a task has another band, and other episodes are pushed."""
     episodes: int = 30
     """Episodes of each kind and task."""
 
@@ -134,17 +137,18 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
         fit, calibration, episodes, rate = 8, 9, 2, 0.1
     records: list[Record] = []
     facts: dict[str, Any] = {}
-    for task in args.tasks:
+    for task, again in product(args.tasks, args.repetitions):
         env = environment(env_id(task))
         with stage(f"recording {task}", console, seconds):
             seen, fresh = (
-                felt_episodes(env, role_seeds(args.seed, task, role, count))
+                felt_episodes(env, role_seeds(again, task, role, count))
                 for role, count in (("spinal fit", fit), ("spinal calibration", calibration))
             )
         band = SpinalBand(memory).fit(seen).calibrate(fresh, rate)
-        facts[task] = band.export(args.out / f"spinal_{task}.json")
+        if task not in facts:
+            facts[task] = band.export(args.out / f"spinal_{task}.json")
         with stage(f"pushing {task}", console, seconds) as progress:
-            for n, seed in enumerate(role_seeds(args.seed, task, "spinal trials", episodes)):
+            for n, seed in enumerate(role_seeds(again, task, "spinal trials", episodes)):
                 records += [measured(seed, task, kind, memory, band) for kind in KINDS]
                 progress(n + 1, episodes)
     return Findings(records, [table(records, facts)], figure(records), facts)
