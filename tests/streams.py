@@ -52,6 +52,14 @@ def sine_episodes(
     return episodes
 
 
+def swing(spec: StreamSpec, seed: int) -> Episode:
+    """80 rows of two joints that follow a command back and forth, of the torque that is their sum, and of it."""
+    rng = np.random.default_rng(seed)
+    command = np.sin(0.1 * np.arange(80) + rng.uniform(0, 6))
+    q = np.stack([command, -command], axis=1) + 0.01 * rng.normal(size=(80, 2))
+    return Episode.from_stream(np.column_stack([q, q.sum(axis=1), command]), spec, success=True)
+
+
 def frozen(episode: Episode, column: int, onset: int) -> Episode:
     """The episode with one sense stuck at its value from ``onset`` on."""
     stream = episode.stream.copy()

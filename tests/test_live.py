@@ -9,17 +9,18 @@ import socket
 import threading
 import time
 import tracemalloc
+from functools import partial
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from asm_gym.episodes import Episode
 from asm_gym.live import RowReader, SourceDied, is_live, lines_from
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.watch import follow
 from asm_gym.stream import MOTOR, Channel, StreamSpec
+from tests.streams import swing
 
 SPEC = StreamSpec((Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02)
 ROWS = np.arange(40.0).reshape(10, 4)
@@ -146,12 +147,7 @@ def test_a_source_that_makes_no_sense_is_refused(source, message):
 
 @pytest.fixture(scope="module")
 def monitor():
-    def episode(seed):
-        rng = np.random.default_rng(seed)
-        command = np.sin(0.1 * np.arange(80) + rng.uniform(0, 6))
-        q = np.stack([command, -command], axis=1) + 0.01 * rng.normal(size=(80, 2))
-        return Episode.from_stream(np.column_stack([q, q.sum(axis=1), command]), SPEC)
-
+    episode = partial(swing, SPEC)
     made = make_monitor("kalman", SPEC, seed=0).fit([episode(n) for n in range(12)])
     return made.calibrate([episode(100 + n) for n in range(19)], 0.05), episode
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import asm_gym  # noqa: F401
-from asm_gym.episodes import Episode, save_episode
+from asm_gym.episodes import save_episode
 from asm_gym.live_view import LiveView
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, RerunView
 from tests.fakes import SPEC, CueMonitor, FakeEnv
+from tests.streams import swing
 
 rerun = pytest.importorskip("rerun")
 
@@ -65,12 +68,7 @@ def test_the_links_of_a_robot_are_drawn_where_they_are(tmp_path):
 
 @pytest.fixture(scope="module")
 def arm():
-    def episode(seed):
-        rng = np.random.default_rng(seed)
-        command = np.sin(0.1 * np.arange(80) + rng.uniform(0, 6))
-        q = np.stack([command, -command], axis=1) + 0.01 * rng.normal(size=(80, 2))
-        return Episode.from_stream(np.column_stack([q, q.sum(axis=1), command]), ARM, success=True)
-
+    episode = partial(swing, ARM)
     small = {"hidden_size": 8, "association_size": 12, "epochs": 1}
     made = make_monitor("neural_asm", ARM, seed=0, **small).fit([episode(n) for n in range(12)])
     return made.calibrate([episode(100 + n) for n in range(19)], 0.05), episode

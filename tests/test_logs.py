@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from asm_gym.episodes import Episode, EpisodeLabel, save_episode
-from asm_gym.logs import Layout, Log, read_logs
+from asm_gym.logs import READERS, Layout, Log, read_logs
 from asm_gym.monitors import load_monitor, make_monitor
 from asm_gym.normal import divided, normal_episodes, pieces
 from asm_gym.scripts import watch
@@ -204,6 +204,13 @@ def test_a_damaged_file_among_logs_is_named(tmp_path):
     write_csv(tmp_path / "a.csv", log(0))
     (tmp_path / "b.npz").write_bytes(b"no zip")
     with pytest.raises(ValueError, match=r"b\.npz: it is damaged"):
+        list(read_logs(tmp_path))
+
+
+@pytest.mark.parametrize("suffix", READERS)
+def test_a_file_of_any_kind_that_is_none_is_named(suffix, tmp_path):
+    (tmp_path / f"no{suffix}").write_bytes(b"\x00\xff no file of this kind \x00")
+    with pytest.raises(ValueError, match=rf"no\{suffix}: ."):
         list(read_logs(tmp_path))
 
 

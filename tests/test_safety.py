@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from asm_gym.policies.reflexes import Graded
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.arguments import make_patience
+from asm_gym.wrappers.arguments import REFLEXES, make_patience
 from tests.fakes import SPEC, CueMonitor, FakeEnv
 
 ACT = np.array([0.3, -0.2, 1.0], np.float32)
@@ -368,3 +368,23 @@ def test_rates_that_do_not_fit_are_refused():
     env.close()
     with pytest.raises(ValueError, match="needs an environment of asm_gym"):
         NeuralASMSafety(FakeEnv(), CueMonitor(), monitor_freq=100)
+
+
+class Foreseeing(CueMonitor):
+    """Expects no action, which ``recall`` then commands."""
+
+    def expected_action(self, state):
+        return np.zeros((1, 7), np.float32)
+
+
+@pytest.mark.parametrize("name", REFLEXES)
+def test_every_reflex_acts_in_the_step_after_an_alarm_by_an_action_of_its_own(name, lift):
+    env = NeuralASMSafety(lift, Foreseeing([3], lift.unwrapped.stream_spec), on_alarm=name)
+    env.reset(seed=0)
+    wanted = np.full(7, 0.75, np.float32)
+    said = [env.step(wanted)[4]["asm"] for _ in range(5)]
+    assert [s["alarm"] for s in said] == [False, False, False, True, False]
+    assert [s["intervened"] for s in said] == [False, False, False, False, True]
+    assert all((s["executed_action"] == wanted).all() for s in said[:4])
+    assert not (said[4]["executed_action"] == wanted).all()
+    assert env.action_space.contains(np.asarray(said[4]["executed_action"], np.float32))

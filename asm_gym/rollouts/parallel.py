@@ -33,7 +33,6 @@ Progress = Callable[[int, int], None]
 Ended = Generator[tuple[int, Any], None, None]
 """Which item has ended, and its result."""
 
-BACKENDS = ("loky", "dask", "ray")
 MOST_WORKERS = 1000
 """Processes of one machine: each takes 60 MB before it does anything."""
 IDLE_S = 300.0
@@ -72,9 +71,6 @@ class ParallelConfig:
             raise ValueError(f"an address is for a cluster: backend must be dask or ray, got loky with {self.address}")
 
 
-TWO_PROCESSES, THIS_PROCESS = ParallelConfig(), ParallelConfig(1)
-
-
 @typed
 def parallel_map(
     task: Callable[[Item], Result],
@@ -104,7 +100,7 @@ def parallel_map(
     if not items:
         return []
     found: dict[int, Result] = {}
-    with closing(_RUN[parallel.backend](parallel, _pickled(task), items)) as ended:
+    with closing(BACKENDS[parallel.backend](parallel, _pickled(task), items)) as ended:
         for index, result in ended:
             found[index] = result
             tell(len(found), len(items))
@@ -198,5 +194,7 @@ def _ray(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
             ray.shutdown()
 
 
-_RUN = {"loky": _loky, "dask": _dask, "ray": _ray}
-"""Runs a pickled task on every item, and says of each, as it ends, which it was and what came out."""
+BACKENDS = {"loky": _loky, "dask": _dask, "ray": _ray}
+"""Each runs a pickled task on every item, and says of each, as it ends, which it was and what came out."""
+
+TWO_PROCESSES, THIS_PROCESS = ParallelConfig(), ParallelConfig(1)
