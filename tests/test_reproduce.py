@@ -12,9 +12,6 @@ import numpy as np
 import pytest
 
 from asm_gym.episodes import Episode
-from asm_gym.memory.inference import Weights, direct_synapses
-from asm_gym.memory.learning import Batch
-from asm_gym.memory.network import initial_weights
 from asm_gym.scripts.cli import main as cli
 from asm_gym.scripts.reproduce import (
     INDEPENDENT,
@@ -38,72 +35,16 @@ from asm_gym.scripts.reproduce.expression import (
     mean_demonstrations,
     recalled,
 )
-from asm_gym.scripts.reproduce.gradients import COMPARED, cosine, exact, local
 from asm_gym.scripts.reproduce.handwriting import (
-    DT,
     NOISE,
     STEPS,
-    Letter,
-    Stroke,
-    branching,
     chosen,
     copybook,
-    detoured,
     repertoire,
-    velocity,
-    written,
 )
 from asm_gym.scripts.reproduce.laws import LAWS, fit
 from asm_gym.scripts.reproduce.trials import written_trial
 from asm_gym.stream import MOTOR, Channel, StreamSpec
-
-STROKE = Stroke(length=4.0, direction=0.3, turn=1.5, rise=0.0, onset=-0.05, sigma=0.3)
-
-
-def test_a_stroke_ends_at_its_chord():
-    time = (np.arange(200_000) + 0.5) * 2e-5
-    end = (velocity(Letter("a", (STROKE,)), time) * 2e-5).sum(axis=0)
-    # ∫_0^1 exp(i (θ + Δθ u)) du = (exp(i (θ + Δθ)) - exp(i θ)) / (i Δθ)
-    chord = 4.0 * (np.exp(1j * 1.8) - np.exp(1j * 0.3)) / (1j * 1.5)
-    np.testing.assert_allclose(end, [chord.real, chord.imag, 0.0], atol=1e-3)
-
-
-def test_a_stroke_is_fastest_at_the_mode_of_its_lognormal():
-    time = np.linspace(0.01, 1.0, 100_000)
-    speed = np.linalg.norm(velocity(Letter("a", (STROKE,)), time), axis=1)
-    assert time[speed.argmax()] == pytest.approx(-0.05 + math.exp(-1.75 - 0.3**2), abs=1e-4)
-
-
-def test_the_pen_goes_where_its_commands_take_it():
-    episode = written(repertoire(1, 3, np.random.default_rng(0))[0], 3, np.random.default_rng(1))
-    gone = episode.stream[:, :3] - np.cumsum(episode.stream[:, 3:], axis=0) * DT
-    assert episode.stream.shape == (STEPS, 6)
-    assert gone.std() == pytest.approx(NOISE, rel=0.2)
-
-
-def test_writing_twice_as_fast_goes_the_same_way_in_half_the_steps():
-    letter = repertoire(1, 2, np.random.default_rng(0))[0]
-    slow, fast = (written(letter, 2, np.random.default_rng(1), speed, wobble=0.0) for speed in (1.0, 2.0))
-    assert len(fast) == len(slow) / 2
-    np.testing.assert_allclose(fast.stream[:, :2], slow.stream[1::2, :2], atol=6 * NOISE)
-    np.testing.assert_allclose(fast.stream[:, 2:], slow.stream[::2, 2:] + slow.stream[1::2, 2:], atol=0.05)  # [cm/s]
-
-
-def test_pairs_begin_alike_or_have_one_middle():
-    rng = np.random.default_rng(0)
-    letter = repertoire(1, 2, rng)[0]
-    letter = replace(letter, strokes=(STROKE, *letter.strokes[1:]))
-    time = np.arange(4000) / 4000
-    paths = [
-        np.cumsum(velocity(x, time), axis=0) / 4000
-        for x in (letter, branching(letter, "b", 2, rng), detoured(letter, "c", rng))
-    ]
-    begun, detour = (np.linalg.norm(p - paths[0], axis=1) for p in paths[1:])
-    assert begun[: int(0.3 * 4000)].max() < 0.05
-    assert begun[-1] > 1.0
-    assert detour[: int(0.3 * 4000)].max() > 0.3
-    assert detour[int(0.45 * 4000) : int(0.5 * 4000)].max() < 0.1
-    assert detour[-1] > 1.0
 
 
 def letters_of(count: int, each: int = 6, seed: int = 0) -> tuple[list, list]:
@@ -155,59 +96,6 @@ def test_the_memory_recalls_each_letter_from_its_cue():
     still = np.linalg.norm(streams[20:, :, :2] - streams[19, :, :2], axis=2).mean()
     assert right >= 5 / 6
     assert error < 0.5 * still
-
-
-def small_batch(steps: int, seed: int = 0) -> tuple[Weights, Batch]:
-    rng = np.random.default_rng(seed)
-    senses, commands = (rng.normal(size=(steps, 4, n)).astype(np.float32) for n in (5, 3))
-    weights = initial_weights(7, 5, 2, rng)
-    weights.W_F[:] = rng.normal(size=weights.W_F.shape)
-    weights.W_D[:] = 0.1 * rng.normal(size=weights.W_D.shape) * direct_synapses(5, 2)
-    return weights, Batch(senses, commands, np.full(steps, 4))
-
-
-def test_the_differentiated_network_has_the_energy_and_the_errors_of_the_memory():
-    weights, batch = small_batch(14)
-    theirs = exact(weights, batch, 15, 3.0)
-    assert theirs["energy"].energy == pytest.approx(local(weights, batch, 15, 3.0).energy, rel=1e-4)
-    assert theirs["error"].error == pytest.approx(local(weights, batch, 15, 3.0).error, rel=1e-4)
-    assert theirs["alone"].error == pytest.approx(local(weights, batch, 15, 3.0, alone=True).error, rel=1e-4)
-
-
-def test_at_converged_inference_the_local_change_is_the_exact_gradient_of_the_energy():
-    weights, batch = small_batch(6)  # along six steps: nothing has to come back through time
-    ours, theirs = local(weights, batch, 400, 1.0), exact(weights, batch, 400, 1.0)["energy"]
-    for name in COMPARED:
-        np.testing.assert_allclose(ours.arrays[name], theirs.arrays[name], atol=1e-3)
-
-
-def test_the_exact_gradient_is_that_of_finite_differences():
-    weights, batch = small_batch(14)
-    gradient = exact(weights, batch, 8, 1.0)
-    for name, index in (("W_C", (2, 3)), ("W_F", (1, 4)), ("W_D", (0, 2)), ("W_D", (6, 5))):
-        for target in ("error", "alone"):
-            ends = []
-            for step in (0.01, -0.01):
-                moved = getattr(weights, name).copy()
-                moved[index] += step
-                ends.append(local(weights._replace(**{name: moved}), batch, 8, 1.0, target == "alone").error)
-            slope = (ends[0] - ends[1]) / 0.02
-            assert -gradient[target].arrays[name][index] == pytest.approx(slope, rel=0.05, abs=0.02)
-
-
-def test_the_local_change_comes_closer_to_the_gradient_the_firmer_the_prior():
-    weights, batch = small_batch(20)
-    angles = []
-    for pi_z in (1.0, 100.0):
-        theirs = exact(weights, batch, 50, pi_z)
-        angles.append(cosine(local(weights, batch, 50, pi_z), theirs["error"]))
-        # What running on alone would need to send back through time is left out.
-        assert 0.2 < cosine(local(weights, batch, 50, pi_z, alone=True), theirs["alone"]) < 0.999
-    assert 0.5 < angles[0] < angles[1]
-    assert angles[1] > 0.999
-    ours = local(weights, batch, 5, 1.0)
-    assert cosine(ours, ours) == pytest.approx(1.0)
-    assert exact(weights, batch, 5, 1.0, ("error",))["error"].saved > 20 * ours.saved
 
 
 @pytest.mark.parametrize(

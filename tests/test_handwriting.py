@@ -1,0 +1,70 @@
+"""Letters of lognormal strokes, against their closed forms."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from asm_gym.scripts.reproduce.handwriting import (
+    DT,
+    NOISE,
+    STEPS,
+    Letter,
+    Stroke,
+    branching,
+    detoured,
+    repertoire,
+    velocity,
+    written,
+)
+
+STROKE = Stroke(length=4.0, direction=0.3, turn=1.5, rise=0.0, onset=-0.05, sigma=0.3)
+
+
+def test_a_stroke_ends_at_its_chord():
+    time = (np.arange(200_000) + 0.5) * 2e-5
+    end = (velocity(Letter("a", (STROKE,)), time) * 2e-5).sum(axis=0)
+    # ∫_0^1 exp(i (θ + Δθ u)) du = (exp(i (θ + Δθ)) - exp(i θ)) / (i Δθ)
+    chord = 4.0 * (np.exp(1j * 1.8) - np.exp(1j * 0.3)) / (1j * 1.5)
+    np.testing.assert_allclose(end, [chord.real, chord.imag, 0.0], atol=1e-3)
+
+
+def test_a_stroke_is_fastest_at_the_mode_of_its_lognormal():
+    time = np.linspace(0.01, 1.0, 100_000)
+    speed = np.linalg.norm(velocity(Letter("a", (STROKE,)), time), axis=1)
+    assert time[speed.argmax()] == pytest.approx(-0.05 + math.exp(-1.75 - 0.3**2), abs=1e-4)
+
+
+def test_the_pen_goes_where_its_commands_take_it():
+    episode = written(repertoire(1, 3, np.random.default_rng(0))[0], 3, np.random.default_rng(1))
+    gone = episode.stream[:, :3] - np.cumsum(episode.stream[:, 3:], axis=0) * DT
+    assert episode.stream.shape == (STEPS, 6)
+    assert gone.std() == pytest.approx(NOISE, rel=0.2)
+
+
+def test_writing_twice_as_fast_goes_the_same_way_in_half_the_steps():
+    letter = repertoire(1, 2, np.random.default_rng(0))[0]
+    slow, fast = (written(letter, 2, np.random.default_rng(1), speed, wobble=0.0) for speed in (1.0, 2.0))
+    assert len(fast) == len(slow) / 2
+    np.testing.assert_allclose(fast.stream[:, :2], slow.stream[1::2, :2], atol=6 * NOISE)
+    np.testing.assert_allclose(fast.stream[:, 2:], slow.stream[::2, 2:] + slow.stream[1::2, 2:], atol=0.05)  # [cm/s]
+
+
+def test_pairs_begin_alike_or_have_one_middle():
+    rng = np.random.default_rng(0)
+    letter = repertoire(1, 2, rng)[0]
+    letter = replace(letter, strokes=(STROKE, *letter.strokes[1:]))
+    time = np.arange(4000) / 4000
+    paths = [
+        np.cumsum(velocity(x, time), axis=0) / 4000
+        for x in (letter, branching(letter, "b", 2, rng), detoured(letter, "c", rng))
+    ]
+    begun, detour = (np.linalg.norm(p - paths[0], axis=1) for p in paths[1:])
+    assert begun[: int(0.3 * 4000)].max() < 0.05
+    assert begun[-1] > 1.0
+    assert detour[: int(0.3 * 4000)].max() > 0.3
+    assert detour[int(0.45 * 4000) : int(0.5 * 4000)].max() < 0.1
+    assert detour[-1] > 1.0
