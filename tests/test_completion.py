@@ -132,6 +132,26 @@ def test_what_nothing_else_tells_of_is_trusted_for_a_second_only():
     assert trusted == [True] * 30 + [False] * 30
 
 
+def test_surprise_without_a_sense_is_what_the_others_add_to_it():
+    attribution = np.array([[1.0, 2.0, 5.0], [0.0, 0.0, 4.0], [0.0, 0.0, 0.0]])
+    surprise = Surprise(np.array([8.0, 4.0, np.inf]), attribution, of_body=np.array([6.0, 4.0, np.inf]))
+    left = surprise.without(np.array([False, False, True]))
+    np.testing.assert_allclose(left.value, [3.0, 0.0, np.inf])  # what failed goes on to be an alarm
+    np.testing.assert_allclose(left.attribution[:2].sum(axis=1), left.value[:2])
+    np.testing.assert_allclose(left.of_body, [6.0 * 3 / 8, 0.0, np.inf])
+    assert surprise.without(np.zeros(3, bool)) is surprise
+
+
+def test_a_sense_that_is_completed_is_the_cause_no_more():
+    rows, diagnosis = arm(30, 8), Judge(()).diagnosis_
+    rows[-3:, 0] += 0.3
+    attribution = np.array([9.0, 0.1, 0.1, 0.1, 0, 0, 0])
+    assert diagnosis(rows, attribution).part == "observation[0]"
+    without = diagnosis(rows, attribution, missing(0))
+    assert without.part.startswith("observation")
+    assert 0 not in without.columns
+
+
 class Arm(gym.Env):
     """Plays an episode of the arm back; what is sensed is the observation, and there is no stream."""
 
@@ -184,7 +204,7 @@ class Judge:
         return 0
 
     def observe(self, state, stream):
-        attribution = np.zeros((1, 7))
+        attribution = np.zeros((1, self.spec.size))
         attribution[0, 0] = 10.0 if state in self.cue else 0.1
         return state + 1, Surprise(attribution.sum(axis=1), attribution)
 

@@ -4,14 +4,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from asm_gym.memory.completion import Completion
+from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.policies.reflexes import Graded
+from asm_gym.scaling import StreamScaler
+from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.arbitration import Arbiter
 from asm_gym.wrappers.arguments import make_fallback
 from asm_gym.wrappers.patience import Patience
 from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, responses_from
 from tests.fakes import CueMonitor, FakeEnv
-from tests.test_completion import Arm, Judge, offset
+from tests.test_completion import MEMORY, SPEC, Arm, Judge, Named, offset
 
 ACT = np.array([0.5, -0.5], np.float32)
 
@@ -114,12 +118,92 @@ def test_a_sensor_at_fault_is_completed_and_the_policy_goes_on():
     assert not any(s["intervened"] for s in said)
 
 
-def test_a_sensor_that_is_completed_already_and_surprises_still_is_held(monkeypatch):
-    env = NeuralASMSafety(Acting(offset), Judge({21, 30}, "sensor"), on_alarm="graded", release_after=2)
-    diagnosis = env.monitor.diagnosis_
-    same = diagnosis.hypotheses[0]
-    monkeypatch.setattr(type(diagnosis), "named", lambda *_: same)
-    assert [s["response"] for s in infos(env, 40) if s["response"]] == ["complete", "hold"]
+@pytest.mark.parametrize(("column", "answered"), [(0, []), (3, [30])])
+def test_what_is_completed_surprises_nobody_and_what_is_not_still_does(column, answered):
+    class Elsewhere(Judge):
+        def observe(self, state, stream):
+            state, surprise = super().observe(state, stream)
+            return state, surprise if state < 30 else surprise._replace(
+                attribution=np.roll(surprise.attribution, column, axis=1)
+            )
+
+    said = infos(NeuralASMSafety(Acting(offset), Elsewhere({21, 30}), on_alarm="graded"), 40)
+    assert [t for t, s in enumerate(said) if s["alarm"]] == [21, *answered]
+
+
+class Partial(Acting):
+    """Its stream says more than its observation: nothing of ``lone``, of which nothing else tells either."""
+
+    stream_spec = SPEC
+
+    def __init__(self, broken):
+        super().__init__(broken)
+        self.observation_layout = {"joint_position": 2, "hand_position": 2}
+        self.observation_space = gym.spaces.Box(-50, 50, (4,), np.float32)
+
+    def reset(self, **kwargs):
+        self.last = np.zeros(2, np.float32)
+        return super().reset(**kwargs)[0], {"stream": np.append(self.row, self.last)}
+
+    def step(self, action):
+        observation, *rest, _ = super().step(action)
+        return observation, *rest, {"stream": np.append(self.row, np.float32(action))}
+
+    def _observe(self):
+        self.row = super()._observe()
+        return self.row[:4]
+
+
+def lone_offset(t, row):
+    row[4] += 50.0 * (t >= 20)
+
+
+def lone_lost(t, row):
+    row[4] = np.nan if t >= 20 else row[4]
+
+
+def of_stream(monitor):
+    monitor.spec = SPEC
+    monitor.diagnosis_ = Diagnosis(MEMORY, monitor.diagnosis_.readout)
+    return monitor
+
+
+def test_a_sensor_that_the_policy_cannot_read_stops_nobody_and_is_said(caplog):
+    env = NeuralASMSafety(Partial(lone_offset), of_stream(Judge({21})), on_alarm="graded")
+    with caplog.at_level("INFO", "asm_gym.safety"):
+        said = infos(env, 80)
+    assert "complete: surprise" in caplog.text
+    assert "(unread sensor lone, 0.9" in caplog.text
+    assert (said[21]["cause"]["part"], said[21]["case"], said[21]["response"]) == ("lone", "unread sensor", "complete")
+    assert [s["unread"] for s in said] == [()] * 21 + [("lone",)] * 59  # it is never well again: nothing tells of it
+    assert not any(s["intervened"] or s["failure"] for s in said)
+    np.testing.assert_array_equal(env.unwrapped.actions, [ACT] * 80)
+
+
+def test_readings_that_are_lost_and_were_never_read_stop_nobody(caplog):
+    env = NeuralASMSafety(Partial(lone_lost), of_stream(Judge(())), on_alarm="graded")
+    with caplog.at_level("INFO", "asm_gym.safety"):
+        said = infos(env, 80)
+    assert "complete: lone says nothing any more" in caplog.text
+    assert not any(s["intervened"] or s["failure"] for s in said)
+
+
+def test_what_is_done_about_a_sensor_that_is_not_read_can_be_edited():
+    table = {"unread sensor": "hold"}
+    env = NeuralASMSafety(Partial(lone_offset), of_stream(Judge({21})), "graded", responses=table, release_after=2)
+    assert [s["intervened"] for s in infos(env, 30)[21:25]] == [False, True, True, False]
+
+
+def test_a_sensor_that_is_read_is_none_of_those_that_are_not():
+    said = infos(NeuralASMSafety(Partial(offset), of_stream(Judge({21})), on_alarm="graded"), 30)
+    assert (said[21]["case"], said[21]["completed"], said[21]["unread"]) == ("sensor", ("encoder[0]",), ())
+
+
+def test_where_it_is_not_known_what_a_policy_reads_the_robot_holds():
+    changed = gym.wrappers.TransformObservation(Partial(lone_offset), lambda o: o[:3], gym.spaces.Box(-50, 50, (3,)))
+    with pytest.warns(UserWarning, match="on a sensor at fault the robot holds"):
+        env = NeuralASMSafety(changed, of_stream(Judge({21})), on_alarm="graded", release_after=2)
+    assert [s["intervened"] for s in infos(env, 30)[21:25]] == [False, True, True, False]
 
 
 def test_where_nothing_is_left_to_check_by_the_robot_holds_and_says_so():
@@ -160,6 +244,90 @@ def test_a_stream_that_stops_for_a_second_is_held_for_as_long_without_a_trial_an
     assert [t for t, s in enumerate(said) if s["intervened"]] == list(range(21, 45))
     assert [t for t, s in enumerate(said) if s["failure"].startswith("stream: ")] == list(range(20, 40))
     assert [(t, s["transition"]) for t, s in enumerate(said) if s["transition"]] == [(20, "override"), (44, "release")]
+
+
+def test_an_episode_that_is_to_stop_does_though_it_is_quiet_while_nothing_is_done():
+    env = NeuralASMSafety(Acting(), Judge({10}, "joint"), "graded", responses={"actuator": "stop"}, release_after=2)
+    env.reset(seed=0)
+    ended = [bool(env.step(ACT)[2]) for _ in range(21)]
+    assert ended.index(True) == 20
+
+
+SOLID = StreamSpec(
+    (
+        Channel("joint_position", 2, "rad", 0.001, "joint"),
+        Channel("external_torque", 2, "N m", 0.1, "torque"),
+        Channel("action", 2, group=MOTOR),
+    ),
+    dt=0.05,
+)
+
+
+class Solid(gym.Env):
+    """Two joints that swing, until from step 60 on something presses the second, or not, and blocks it, or both."""
+
+    metadata = {"render_fps": 20}  # noqa: RUF012
+    stream_spec = SOLID
+    observation_layout = {"joint_position": 2}  # noqa: RUF012
+    observation_space = gym.spaces.Box(-50, 50, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self, torque=20.0, turns=0.0, others=0.0):
+        self.torque, self.turns, self.others = torque, turns, others
+
+    def row(self, action):
+        swing = np.sin(0.2 * self.t + np.arange(2))
+        blocked = self.t >= 60
+        swing *= [self.others if blocked else 1.0, self.turns if blocked else 1.0]
+        external = 0.1 * self.np_random.standard_normal(2) + np.array([0.0, self.torque * blocked])
+        return np.concatenate([swing + 0.001 * self.np_random.standard_normal(2), external, action]).astype(np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(2, np.float32), {"stream": self.row(np.zeros(2))}
+
+    def step(self, action):
+        self.t += 1
+        row = self.row(action)
+        return row[:2], 0.0, False, False, {"stream": row}
+
+
+def healthy(seed):
+    env = Solid(0.0, 1.0, 1.0)
+    rows = [env.reset(seed=seed)[1]["stream"]]
+    return np.stack(rows + [env.step(np.zeros(2))[4]["stream"] for _ in range(150)])
+
+
+@pytest.mark.parametrize(
+    ("family", "fault", "case"),
+    [
+        ("object", (20.0, 0.0, 0.0), "lasting contact"),
+        ("object", (20.0, 0.0, 1.0), "object"),
+        ("object", (20.0, 1.0, 0.0), "object"),
+        ("object", (0.0, 0.0, 0.0), "object"),
+        ("joint", (20.0, 0.0, 1.0), "lasting actuator"),
+        ("joint", (20.0, 1.0, 0.0), "actuator"),
+    ],
+)
+def test_nobody_goes_on_against_what_blocks_the_arm(family, fault, case, monkeypatch):
+    monitor = Judge(range(60, 130, 5), family)
+    streams = [healthy(seed) for seed in range(8)]
+    monitor.spec = SOLID
+    monitor.diagnosis_ = Diagnosis(Completion.fit(StreamScaler.fit(SOLID, streams), streams), Named(family))
+    joint = next(h for h in monitor.diagnosis_.hypotheses if h.part == "joint[1]")
+    monkeypatch.setattr(Diagnosis, "named", lambda *_: joint)
+    env = NeuralASMSafety(Solid(*fault), monitor, "graded", responses={"actuator": "slow"}, release_after=2)
+    env.reset(seed=99)
+    said = []
+    while len(said) < 125 and not (said and said[-1]["gave_up"]):
+        said.append(env.step(ACT)[4]["asm"])
+    first = next((t for t, s in enumerate(said) if s["case"] == case), None)
+    assert {s["case"] for s in said[60:80]} == {"", "actuator" if family == "joint" else family}  # not at once
+    assert first is not None
+    assert (first >= 60 + 25) == case.startswith("lasting")
+    assert any(s["intervened"] and s["transition"] != "slow" for s in said) or not case.startswith("lasting")
+    assert said[-1]["gave_up"] == (case == "lasting actuator")
 
 
 def test_a_diagnosis_that_raises_is_answered_as_the_unknown_is():

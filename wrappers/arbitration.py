@@ -256,12 +256,13 @@ class Arbiter:
             return response
         if alarm and response not in ("", *GOING_ON):
             self._choose(response)
-        gone = self._free >= self._patience.free_after << self._returned and self._response != "stop"
-        if gone or (self._quiet >= self._patience.release_after and not pressed):
+        stops = self._response == "stop"  # a fault that is quiet while nothing is asked of the robot has not gone
+        gone = self._free >= self._patience.free_after << self._returned
+        if not stops and (gone or (self._quiet >= self._patience.release_after and not pressed)):
             self.overriding, self._handed_back, self._tried = False, 0, False
             self._slowed, self._quiet = gone, 0
             return "release"
-        stopped = self._response == "stop" and self._held >= (self._patience.try_after or self._patience.release_after)
+        stopped = stops and self._held >= (self._patience.try_after or self._patience.release_after)
         if stopped or self._acted >= (self._patience.max_override or math.inf):
             return "give_up"
         if self._held >= self._wait and pressed is None:

@@ -40,10 +40,12 @@ class Repair:
     Args:
         completion: of the memory that watches the stream.
         trust_s: how long a sense that nothing else tells of is completed [s].
+        read: (D,) which columns the policy reads, of whose completion something depends; all where that is not known.
     """
 
-    def __init__(self, completion: Completion, trust_s: float = TRUST_S) -> None:
+    def __init__(self, completion: Completion, trust_s: float = TRUST_S, read: NDArray[np.bool_] | None = None) -> None:
         self._completion, spec = completion, completion.spec
+        self._read = np.ones(spec.size, bool) if read is None else read
         self._spec, self._patience = spec, round(check_number("trust_s", trust_s, low=0) / spec.dt)
         self._well_after = max(1, round(WELL_AFTER_S / spec.dt))
         self._settle = 2 * completion.senses.lag + 1  # rows in which changes are taken from what was not yet repaired
@@ -67,8 +69,17 @@ class Repair:
         return tuple(self._calm)
 
     @property
+    def unread(self) -> tuple[str, ...]:
+        """Those of them that the policy does not read: it goes on without them, however long nothing tells of them."""
+        return tuple(name for name, own in self._completion.sensors if name in self._calm and not self.reads(own))
+
+    def reads(self, columns: NDArray[np.intp]) -> bool:
+        """Whether the policy reads one of ``columns``."""
+        return bool(self._read[columns].any())
+
+    @property
     def trusted(self) -> bool:
-        """Whether what it says can be relied on: False once a sense that nothing else tells of is missing for long."""
+        """Whether the policy can rely on it: False once a sense that nothing else tells of is missing for long."""
         return self._unchecked <= self._patience
 
     def read(self, row: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
@@ -113,6 +124,7 @@ class Repair:
         self._filling: Filling = self._completion.filling(self.missing)
         spread = self._completion.senses.spread[self._filling.columns]
         self._untold = self._filling.error > UNTOLD * spread  # (M,)
+        self._guessed = self._untold & self._read[self._filling.columns]  # (M,)
         self._unchecked = 0
 
     def _repaired(self) -> NDArray[np.float64]:
@@ -121,16 +133,16 @@ class Repair:
         repaired, columns = self._raw.copy(), self._filling.columns
         before = self._raw if self._before is None else self._before
         value = self._completion.complete(self._filling, self._completion.lift(np.stack([before, self._raw])))[-1]
-        if self._untold.any():
+        if self._guessed.any():
             last = self._completion.senses.mean if self._good is None else self._good
-            value = np.where(self._untold, last[columns], value)
+            value = np.where(self._guessed, last[columns], value)
         repaired[columns] = value
         return repaired
 
     def _judge(self, repaired: NDArray[np.float64]) -> None:
         """Counts for how long each missing sensor has been well, and believes those that have been for long enough."""
         columns, limit = self._filling.columns, WELL_WITHIN * self._filling.error
-        self._unchecked = self._unchecked + 1 if self._untold.any() else 0
+        self._unchecked = self._unchecked + 1 if self._guessed.any() else 0
         close = np.abs(self._raw[columns] - repaired[columns]) <= limit  # False for what is not finite
         repeats = (self._raw[columns] == self._earlier[columns]) & (self._spec.noise[columns] > 0)
         fine = dict(zip(columns.tolist(), (close & ~repeats & ~self._untold).tolist(), strict=True))
@@ -173,6 +185,10 @@ class ObservationMap:
             self._places = [Place("", spec.sensory, np.arange(len(spec.sensory)))]
         else:
             raise ValueError(f"{inner} does not say where its stream stands in its observation")
+        self.shown = np.zeros(spec.size, bool)
+        """(D,) which columns stand in the observation; a policy that sees nothing else cannot read the others."""
+        for place in self._places:
+            self.shown[place.columns] = True
 
     def repaired(self, observation: Any, row: NDArray[np.float32], missing: NDArray[np.bool_]) -> Any:
         """The observation with the numbers of ``row`` (D,) where they are ``missing`` (D,); the rest is not touched."""

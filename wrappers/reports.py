@@ -51,9 +51,11 @@ def report(
         ``monitor: …``, ``completion: …`` or ``reflex: …``; or empty. ``cause``: at an alarm, ``family`` (one of
         ``asm_gym.monitors.diagnosis.FAMILIES``), ``part``, ``probability`` of the family, ``probabilities`` of all,
         and for a contact ``force``: the link, the force's size [N] and its vector. ``response``: what is done about it
-        under ``"graded"``. ``executed_action``: the last one. ``attribution``: what each number of the stream adds to
-        surprise. ``surprises`` (n,) of all rows in this step. ``latency_us``: the longest time that the monitor took
-        for one. The wrapper adds ``completed``, the sensors that are not believed now.
+        under ``"graded"``, and ``case``: the row of the table that says so. ``executed_action``: the last one.
+        ``attribution``: what each number of the stream adds to surprise. ``surprises`` (n,) of all rows in this step.
+        ``latency_us``: the longest time that the monitor took for one. The wrapper adds ``completed``, the sensors that
+        are not believed now, and ``unread``, those of them that stand in no observation, so that the policy goes on
+        without them.
     """
     surprises = [float(row.surprise.value[0]) for row in rows]
     largest = max(surprises)
@@ -71,6 +73,7 @@ def report(
         "failure": joined(failed, *(row.failure for row in rows)),
         "cause": caused.cause,
         "response": caused.name,
+        "case": caused.case,
         "executed_action": executed,
         "attribution": dict(zip(spec.labels, worst.attribution[0].tolist(), strict=True)),
         "surprises": np.array(surprises),

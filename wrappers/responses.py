@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -9,19 +10,25 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.abilities import LocatesForces
 from asm_gym.checks import shown
 from asm_gym.choices import check_choice
 from asm_gym.monitors import ExplainsItself, Monitor
 from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, as_info, averaged
-from asm_gym.stream import StreamSpec
 from asm_gym.wrappers.arbitration import GOING_ON
 from asm_gym.wrappers.completion import ObservationMap, Repair
+from asm_gym.wrappers.touch import Touch
+
+_log = logging.getLogger("asm_gym.safety")
 
 LASTING = {"contact": 1.0, "actuator": 2.5}
-"""From when on a cause is a lasting one [s]."""
+"""From when on a cause is a lasting one [s]: a contact that is there for so long; an actuator's fault where its joint
+has been pressed for most of that time and has not turned. Where the policy goes on in spite of another cause, and the
+arm is pressed so and does not move, it is a lasting contact."""
 
-CAUSES = (*FAMILIES, *(f"lasting {family}" for family in LASTING))
+UNREAD = "unread sensor"
+"""One at fault of which nothing stands in the observation, so that the policy has never read it."""
+
+CAUSES = (*FAMILIES, UNREAD, *(f"lasting {family}" for family in LASTING))
 """What a table of responses says something about."""
 
 RESPONSES = (*GOING_ON, "hold", "yield", "retract", "stop")
@@ -30,9 +37,10 @@ to what presses; go back along the path; stay, and end the episode."""
 
 DEFAULT: dict[str, str] = {
     "sensor": "complete",
+    UNREAD: "complete",
     "contact": "hold",
     "lasting contact": "yield",
-    "actuator": "slow",
+    "actuator": "go on",
     "lasting actuator": "stop",
     "action": "hold",
     "object": "go on",
@@ -46,9 +54,6 @@ QUIET_S = 1.0
 SURE = 0.5
 """A family that is less probable is unknown."""
 
-PRESSING = 2.5
-"""Something presses where an external torque is so many of its completion's standard deviations off."""
-
 
 class Response(NamedTuple):
     """What is to be done after a row.
@@ -56,6 +61,7 @@ class Response(NamedTuple):
     Attributes:
         name: one of ``RESPONSES``; empty where there is nothing to respond to, or nothing is to be done by the table.
         cause: as ``info["asm"]["cause"]`` says it.
+        case: one of ``CAUSES``: the row of the table that was followed; empty where none was.
         pressed: whether the contact that was responded to is still there; None where that is not known, and where it
             has lasted for so long that it may never end.
     """
@@ -63,13 +69,14 @@ class Response(NamedTuple):
     name: str
     cause: dict[str, Any]
     pressed: bool | None = None
+    case: str = ""
 
     @property
     def why(self) -> str:
         """The cause in words."""
         if not self.cause["family"]:
             return ""
-        part = " ".join(filter(None, (self.cause["family"], self.cause["part"])))
+        part = " ".join(filter(None, (self.case or self.cause["family"], self.cause["part"])))
         return f"{part}, {self.cause['probability']:.2f}"
 
 
@@ -104,17 +111,14 @@ class Responder:
     def __init__(self, env: gym.Env[Any, Any], monitor: Monitor, table: Mapping[str, str], repairs: bool) -> None:
         self._table, self._spec, self._repairs = table, monitor.spec, repairs
         self._diagnosis = monitor.diagnosis_ if isinstance(monitor, ExplainsItself) else None
-        inner = env.unwrapped
-        self._body = inner if isinstance(inner, LocatesForces) else None
         self.repair: Repair | None = None
         self._map: ObservationMap | None = None
-        self._touch: Any = None
+        self._touch: Touch | None = None
+        self._kept = WINDOW + 1 + round(LASTING["actuator"] / self._spec.dt)
         if self._diagnosis is not None:
-            self.repair = Repair(self._diagnosis.completion)
-            missing = _touched(monitor.spec)
-            if missing.any():
-                self._touch = self._diagnosis.completion.filling(missing)
+            self._touch = Touch.where_measured(env, self._diagnosis.completion)
             self._map = self._mapped(env) if repairs else None
+            self.repair = Repair(self._diagnosis.completion, read=None if self._map is None else self._map.shown)
         self.reset()
 
     def _mapped(self, env: gym.Env[Any, Any]) -> ObservationMap | None:
@@ -146,6 +150,11 @@ class Responder:
         return self.repair is not None and self.repair.settling > 0
 
     @property
+    def missing(self) -> NDArray[np.bool_]:
+        """(D,) the numbers that are completed, at which nobody is surprised."""
+        return np.zeros(self._spec.size, bool) if self.repair is None else self.repair.missing
+
+    @property
     def doubt(self) -> str:
         """What can no longer be relied on; empty where everything can."""
         if self.repair is None or self.repair.trusted:
@@ -157,16 +166,24 @@ class Responder:
         """The sensors that are completed."""
         return () if self.repair is None else self.repair.names
 
+    @property
+    def unread(self) -> tuple[str, ...]:
+        """Those of them that the policy does not read."""
+        return () if self.repair is None else self.repair.unread
+
     def read(self, row: NDArray[np.float32]) -> NDArray[np.float32]:
         """(D,) the row as the monitor is to see it."""
         if self.repair is not None and self._map is not None:
+            known = self.completed
             try:
                 row = self.repair.read(row)
+                if lost := ", ".join(name for name in self.completed if name not in known):
+                    _log.info("complete: %s says nothing any more", lost)
             except Exception as error:
                 # Nobody knows what the row should say: what is not finite is an alarm, and nothing explains it.
                 gym.logger.warn(f"completion: {error!r}; the row counts as lost")
                 row = np.full_like(row, np.nan)
-        self._rows = [*self._rows[-WINDOW:], row]
+        self._rows = [*self._rows[1 - self._kept :], row]
         return row
 
     def observed(self, observation: Any) -> Any:
@@ -200,19 +217,33 @@ class Responder:
         self._named = cause
         family = cause.family if cause is not None and cause.probability >= SURE else "unknown"
         self._since.setdefault(family, 0)
-        name = self._table[f"lasting {family}" if self._lasts(family) else family]
+        case = self._case(family, cause)
+        name = self._table[case]
+        if name in ("go on", "slow") and self._blocked(family, cause):
+            # Whatever the policy goes on with, it does not move the arm, and presses.
+            case = "lasting actuator" if family == "actuator" else "lasting contact"
+            name = self._table[case]
         if name == "complete" and not self._complete(cause):
             name = self._table["unknown"]
         said = as_info(cause, self._force(family))
         if cause is None or family != cause.family:
             said |= {"family": family, "part": ""}
-        return Response(name if self._repairs else "", said, pressed)
+        return Response(name, said, pressed, case) if self._repairs else Response("", said, pressed)
+
+    def _case(self, family: str, cause: Cause | None) -> str:
+        """The row of the table for a cause of ``family``."""
+        if family == "contact" and self._lasts(family):
+            return f"lasting {family}"
+        if family != "sensor" or cause is None or self.repair is None or self._map is None:
+            return family
+        return family if self.repair.reads(cause.columns) else UNREAD
 
     def _cause(self, failed: bool, attribution: NDArray[np.float64]) -> Cause | None:
-        if failed or self._diagnosis is None or not all(np.isfinite(row).all() for row in self._rows):
+        rows = np.stack(self._rows[-1 - WINDOW :])
+        if failed or self._diagnosis is None or not np.isfinite(rows).all():
             return None
         try:
-            return self._diagnosis(np.stack(self._rows), attribution)
+            return self._diagnosis(rows, attribution, self.missing)
         except Exception as error:
             # Whatever goes wrong here, an alarm is answered: by what is done about the unknown.
             gym.logger.warn(f"diagnosis: {error!r}; the cause counts as unknown")
@@ -241,41 +272,27 @@ class Responder:
             self._forget()
         return row is not None
 
-    def _pressing(self) -> NDArray[np.float64] | None:
-        """(J,) external torque beyond what everything else tells of [N m]; None where it is not measured."""
-        if self._touch is None or self._diagnosis is None or len(self._rows) < 2:
-            return None
-        completion, columns = self._diagnosis.completion, self._touch.columns
-        expected = completion.complete(self._touch, completion.lift(np.stack(self._rows[-2:])))[-1]
-        beyond = self._rows[-1][columns] - expected
-        own = np.array([self._spec.labels[c].split("[")[0].endswith("external_torque") for c in columns])
-        found: NDArray[np.float64] = beyond[own]
-        self._usual = self._touch.error[own]
-        return found
-
     def _pressed(self) -> bool | None:
         """Whether what touched the body still does."""
-        if self._named is None or self._named.family != "contact":
+        if self._named is None or self._named.family != "contact" or self._touch is None or len(self._rows) < 2:
             return None
-        torque = self._pressing()
-        if torque is None or (np.abs(torque) < PRESSING * self._usual).all():
-            return None if torque is None else False
+        if not self._touch.presses(np.stack(self._rows[-2:])):
+            return False
         return None if self._lasts("contact") else True
+
+    def _blocked(self, family: str, cause: Cause | None) -> bool:
+        """Whether the joint at fault, or else the arm, is pressed and still, for as long as what lasts."""
+        rows = self._kept - WINDOW
+        joint = cause.part if family == "actuator" and cause is not None else ""
+        if self._touch is None or len(self._rows) < rows:
+            return False
+        return self._touch.blocked(np.stack(self._rows[-rows:]), joint)
 
     def _lasts(self, family: str) -> bool:
         return self._since.get(family, 0) >= LASTING.get(family, np.inf) / self._spec.dt
 
     def _force(self, family: str) -> dict[str, Any] | None:
-        """The link that is pressed, and the force (3,) on it [N], in the world's axes."""
-        torque = self._pressing() if family == "contact" and self._body is not None else None
-        if torque is None or self._body is None:
+        """What is behind a contact."""
+        if family != "contact" or self._touch is None or len(self._rows) < 2:
             return None
-        link, force = self._body.force_behind(torque)
-        return {"link": link, "newtons": float(np.linalg.norm(force)), "vector": force.round(3).tolist()}
-
-
-def _touched(spec: StreamSpec) -> NDArray[np.bool_]:
-    """(D,) what a contact shows in: external torques, and forces and torques at the wrist."""
-    groups = [c.group for c in spec.channels for _ in range(c.size)]
-    external = np.array(["external_torque" in label for label in spec.labels])
-    return external | np.array([g == "wrench" for g in groups]) if external.any() else external
+        return self._touch.force(np.stack(self._rows[-2:]))

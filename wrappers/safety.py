@@ -283,6 +283,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         surprise, expected, (failure,), latency = self._observer.observe(row[None], (failure,))
         if self._late(latency):
             surprise = surprise._replace(value=np.full(1, np.inf))
+        surprise = surprise.without(self._responder.missing)
         if self._responder.settling and not failure:
             surprise = surprise.silenced(np.ones(1, np.bool_))
         if self.learning_rate > 0 and not self._arbiter.overriding and not failure:
@@ -329,7 +330,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def _report(self, info: dict[str, Any], rows: list[RowReport], executed: Any) -> dict[str, Any]:
         failed = self._failed if executed is not None else ""
         asm = report(rows, self.monitor.spec, self.threshold, executed, failed)
-        asm["completed"] = self._responder.completed
+        asm |= {"completed": self._responder.completed, "unread": self._responder.unread}
         if self._spinal is not None:
             asm["spinal_s"] = None if executed is None or self._left is None else self._left.after_s
         if self._running is not None:

@@ -55,6 +55,22 @@ class Surprise(NamedTuple):
         value = np.where(where, 0.0, self.value)
         return self._replace(value=value, attribution=shares, of_body=kept(self.of_body), of_skill=kept(self.of_skill))
 
+    def without(self, columns: NDArray[np.bool_]) -> Surprise:
+        """What is left of it where the precision of ``columns`` (D,) is 0."""
+        if not columns.any():
+            return self
+        shares = np.where(columns, 0.0, self.attribution)
+        left = np.ones(len(self.value))
+        judged = np.isfinite(self.value) & (self.value > 0)
+        left[judged] -= self.attribution[judged][:, columns].sum(axis=1) / self.value[judged]
+        left = np.clip(left, 0.0, 1.0)
+
+        def kept(value: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+            return None if value is None else np.where(judged, left * value, value)
+
+        value = np.where(judged, left * self.value, self.value)
+        return self._replace(value=value, attribution=shares, of_body=kept(self.of_body), of_skill=kept(self.of_skill))
+
 
 class Monitor(Protocol):
     """Watches a stream and says how surprising it is."""

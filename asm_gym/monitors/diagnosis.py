@@ -58,6 +58,9 @@ EVIDENCE = (*KINDS, "energy", "alone", *GROUPS)
 """What is weighed, in order: how much the best hypothesis of each kind explains; the energy; the share of the surprise
 that is in one sensor alone, and in each group of channels."""
 
+SETTLED, SETTLED_AFTER = 0.9, 3
+"""A belief of so much, after so many diagnoses, is not changed any more."""
+
 REPEATS = 3
 """Readings that are the same to the last digit, of a sensor that has noise and surprises: it is stuck."""
 
@@ -138,7 +141,12 @@ class Readout:
 
 
 def averaged(belief: NDArray[np.float64], newest: NDArray[np.float64], diagnoses: int) -> NDArray[np.float64]:
-    """(F,) the mean of all ``diagnoses`` of families so far, of which the newest counts a tenth at least."""
+    """(F,) the mean of all ``diagnoses`` of families so far, of which the newest counts a tenth at least.
+
+    Once it is sure it stays: what comes later is seen from where the fault has brought the arm, where nobody has been.
+    """
+    if diagnoses > SETTLED_AFTER and belief.max() >= SETTLED:
+        return belief
     return belief + max(1 / diagnoses, 0.1) * (newest - belief)
 
 
@@ -193,13 +201,14 @@ class Diagnosis:
         return energy, np.stack(left, axis=1)
 
     def evidence(
-        self, lifted: NDArray[np.float64], attribution: NDArray[np.float64]
+        self, lifted: NDArray[np.float64], attribution: NDArray[np.float64], missing: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.float64], dict[str, int]]:
         """(F,) what is weighed, and the best hypothesis of each kind.
 
         Args:
             lifted: (T, Y) y of the last rows.
             attribution: (D,) where the surprise is, of the last row.
+            missing: (D,) senses that are completed, and so explain nothing any more.
         """
         energy, left = self.explained(lifted[-WINDOW:])
         usual = len(self.completion.covariance)
@@ -207,6 +216,8 @@ class Diagnosis:
         explains = np.log(total / rest)
         best: dict[str, int] = {}
         for i, h in enumerate(self.hypotheses):
+            if missing is not None and missing[h.columns].all():
+                continue
             if h.evidence not in best or explains[i] > explains[best[h.evidence]]:
                 best[h.evidence] = i
         found = [explains[best[name]] if name in best else 0.0 for name in KINDS]
@@ -221,13 +232,22 @@ class Diagnosis:
         names = np.array([c.group for c in spec.channels for _ in range(c.size)])
         return [np.flatnonzero(names == group) for group in GROUPS]
 
-    def __call__(self, rows: NDArray[np.floating[Any]], attribution: NDArray[np.float64]) -> Cause:
-        """The cause of the surprise in the last of the rows (T, D), of which it attributes (D,)."""
+    def __call__(
+        self,
+        rows: NDArray[np.floating[Any]],
+        attribution: NDArray[np.float64],
+        missing: NDArray[np.bool_] | None = None,
+    ) -> Cause:
+        """The cause of the surprise in the last of the rows (T, D), of which it attributes (D,).
+
+        Args:
+            missing: (D,) senses that are completed already, and so are the cause no more.
+        """
         stuck = self._stuck(rows, attribution)
         if stuck is not None:
             certain = {name: float(name == "sensor") for name in FAMILIES}
             return Cause("sensor", stuck[0], 1.0, certain, stuck[1])
-        evidence, best = self.evidence(self.completion.lift(rows), attribution)
+        evidence, best = self.evidence(self.completion.lift(rows), attribution, missing)
         p = self.readout(evidence[None])[0]
         probabilities = dict.fromkeys(FAMILIES, 0.0)
         for (family, _), q in zip(CLASSES.values(), p, strict=True):
