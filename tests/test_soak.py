@@ -108,6 +108,7 @@ def test_every_call_takes_its_arguments_as_they_should_be():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*the action must be finite:UserWarning")  # which is said of a policy gone mad
 def test_a_guard_lets_nothing_through_in_a_few_steps():
     found = guard.guarded(150)
     assert found.steps == 150

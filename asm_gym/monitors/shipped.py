@@ -36,7 +36,7 @@ def pretrained_file(name: str) -> Path:
 
 
 @typed
-def pretrained_for(spec: StreamSpec, controller: str = "") -> str:
+def pretrained_for(spec: StreamSpec, controller: str) -> str:
     """The name of the shipped memory of this body; a stream may lack channels that it knows.
 
     Args:

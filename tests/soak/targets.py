@@ -171,7 +171,7 @@ def public(good: Good) -> dict[str, Target]:
         "NeuralASM.pretrained": (NeuralASM.pretrained, lambda: {"name": "panda"}),
         "make_monitor": (make_monitor, lambda: {"name": "kalman", "spec": good.spec}),
         "monitor_class": (monitor_class, lambda: {"name": "kalman"}),
-        "pretrained_for": (pretrained_for, lambda: {"spec": good.shipped.spec}),
+        "pretrained_for": (pretrained_for, lambda: {"spec": good.shipped.spec, "controller": "OSC_POSE"}),
         "register_monitor": (
             register_monitor,
             lambda: {"model": good.own_monitor()},
