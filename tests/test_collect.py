@@ -1,6 +1,9 @@
 """Episodes of any policy in any environment with Box spaces: the same ones, whoever records them."""
 
+import resource
+import sys
 import threading
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -8,8 +11,11 @@ import pytest
 from stable_baselines3 import SAC
 
 from asm_gym.rollouts import collect
-from asm_gym.rollouts.trial import Latest
+from asm_gym.rollouts.collect import record_episode
+from asm_gym.rollouts.seeds import episode_seeds
+from asm_gym.rollouts.trial import Latest, RolloutConfig
 from asm_gym.scripts import collect as script
+from asm_gym.tasks import env_spec
 from tests.fakes import FakeEnv
 
 PENDULUM = "Pendulum-v1"
@@ -109,3 +115,14 @@ def test_discrete_actions_are_a_number_for_each():
 
 def test_the_old_name_is_the_same_function():
     assert script.collect is collect
+
+
+@pytest.mark.slow  # 80 resets of robosuite
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
+def test_a_process_that_records_for_long_does_not_grow():
+    """It once grew by 4 MB an episode."""
+    spec, config, sizes = env_spec("asm_gym/Lift-v0"), RolloutConfig(env_kwargs=(("horizon", 5),)), []
+    for seed in episode_seeds(0, 80):
+        record_episode(seed, spec, config)
+        sizes.append(int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6)
+    assert sizes[-1] - sizes[19] < 60.0

@@ -179,7 +179,8 @@ def _arrays(held: Mapping[str, NDArray[Any]]) -> list[tuple[str, bytes]]:
 
 def _acts(agent: Any, size: int) -> bytes:
     """What it does at a few observations of this size."""
-    return b"".join(agent.predict(np.full(size, x, np.float32))[0].tobytes() for x in (-1.0, 0.1, 2.0))
+    rows = [np.full(size, x, np.float32) for x in (-1.0, 0.1, 2.0)]
+    return b"".join(agent.predict(row, deterministic=True)[0].tobytes() for row in rows)
 
 
 def _dataset(file: Path) -> list[tuple[Any, ...]]:

@@ -26,7 +26,7 @@ class Guarded(NamedTuple):
     steps: int
     episodes: int
     alarms: int  # steps in alarm
-    failures: int  # steps in which sensor or policy failed
+    failures: int  # steps in which a sensor failed, or the policy while it was asked
     missed: int  # of those, steps without an alarm
     let_through: int  # actions that were not finite or out of the box, and reached the environment
     sizes: list[float]  # resident memory by tenths [MB]
@@ -48,7 +48,7 @@ def guarded(steps: int, seed: int = 0) -> Guarded:
     alarms = failures = missed = episodes = 0
     while done < steps:
         observation, _ = env.reset(seed=int(rng.integers(2**31)) if episodes % 20 == 0 else None)
-        policy, over = make_policy("scripted", env, seed=episodes), False
+        policy, over, relieved = make_policy("scripted", env, seed=episodes), False, False
         episodes += 1
         while not over and done < steps:
             action = np.clip(policy.predict(observation)[0], -1.0, 1.0)
@@ -60,8 +60,10 @@ def guarded(steps: int, seed: int = 0) -> Guarded:
                 robot.corruptions.append(lambda row, where=where, bad=bad: row.__setitem__(where, bad))
             observation, _, terminated, truncated, info = env.step(action)
             robot.corruptions.clear()
-            alarms, failures = alarms + info["asm"]["alarm"], failures + (fails is not None)
-            missed += fails is not None and not info["asm"]["alarm"]
+            failed = fails == 1 or (fails == 0 and not relieved)
+            alarms, failures = alarms + info["asm"]["alarm"], failures + failed
+            missed += failed and not info["asm"]["alarm"]
+            relieved = {"override": True, "release": False}.get(info["asm"]["transition"], relieved)
             over, done = terminated or truncated, done + 1
             if done % max(1, steps // 10) == 0:
                 sizes.append(_resident())
