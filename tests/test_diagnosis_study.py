@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asm_gym.faults.suite import KINDS
-from asm_gym.monitors.diagnosis import CLASSES, EVIDENCE, Readout
+from asm_gym.monitors.diagnosis import CLASSES, EVIDENCE, FAMILIES, Readout, averaged
 from asm_gym.scripts.reproduce.diagnosis import FAMILY, Examples, asked, class_of, main
 
 
@@ -52,3 +52,14 @@ def test_the_shipped_readout_fits_what_is_weighed():
 def test_a_run_without_recordings_is_refused(tmp_path, capsys):
     assert main(["--run", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "run asm-gym evaluate first" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_belief_that_is_sure_stays_and_one_that_is_not_is_the_mean():
+    sensor, contact = np.eye(len(FAMILIES))[:2]
+    belief = np.zeros(len(FAMILIES))
+    for n in (1, 2, 3):
+        belief = averaged(belief, 0.95 * sensor + 0.05 * contact, n)
+    np.testing.assert_array_equal(averaged(belief, contact, 4), belief)
+    doubtful = 0.8 * sensor + 0.2 * contact
+    np.testing.assert_allclose(averaged(doubtful, contact, 4), doubtful + (contact - doubtful) / 4)
+    np.testing.assert_allclose(averaged(sensor, contact, 2), (sensor + contact) / 2)  # one diagnosis makes nobody sure
