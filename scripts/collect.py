@@ -23,7 +23,7 @@ from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig
-from asm_gym.scripts.command import run
+from asm_gym.scripts.command import at_least, run
 from asm_gym.tasks import env_id
 
 __all__ = ["collect", "episode_seeds"]  # which were here before there was a room for them
@@ -53,8 +53,7 @@ class Args:
     """Four episodes: to see that everything runs."""
 
     def __post_init__(self) -> None:
-        if self.episodes < 1:
-            raise ValueError(f"episodes must be at least 1, got {self.episodes}")
+        at_least(1, self, "episodes")
         env_id(self.task)  # refuses what there is not
 
     @property

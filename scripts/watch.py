@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -25,9 +25,10 @@ from rich.console import Console
 
 from asm_gym.checks import check_number
 from asm_gym.evaluation import figures
+from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, traces_of
 from asm_gym.evaluation.report import write_report
 from asm_gym.evaluation.tables import Table
-from asm_gym.evaluation.trace import Trace, TraceDetail
+from asm_gym.evaluation.trace import Trace
 from asm_gym.live import RowReader, SourceDied, is_live, lines_from
 from asm_gym.live_view import LiveView
 from asm_gym.logs import Layout, Log, read_logs
@@ -73,52 +74,6 @@ class Args:
         check_number("silence", self.silence, above=0)
         if self.rate is not None:
             check_number("rate", self.rate, above=0)
-
-
-class Alarm(NamedTuple):
-    """One alarm of a recording.
-
-    Attributes:
-        log: in which.
-        start, end: from when to when [s]; a row is known at the end of its step.
-        channel: which number surprised most when it was raised.
-        excess: how surprising its worst row was, in thresholds; infinite where it was not finite.
-    """
-
-    log: str
-    start: float
-    end: float
-    channel: str
-    excess: float
-
-    def cells(self) -> tuple[str, ...]:
-        """For a table."""
-        return self.log, f"{self.start:.3f}", f"{self.end:.3f}", self.channel, f"{self.excess:.2f}"
-
-
-HEADINGS = ("log", "from [s]", "to [s]", "channel", "thresholds")
-"""The last: how surprising the worst row was, in multiples of the threshold."""
-
-
-def alarms_of(trace: Trace) -> list[Alarm]:
-    """Every alarm of an episode, in order."""
-    detail = trace.detail
-    assert detail is not None
-    return [
-        Alarm(trace.kind, (m.start + 1) * trace.dt, m.stop * trace.dt, detail.channels[m.channel], m.excess)
-        for m in figures.moments_of(trace)
-    ]
-
-
-def traces_of(logs: Sequence[Log], monitor: Any) -> list[Trace]:
-    """What the monitor says of each."""
-    spec: StreamSpec = monitor.spec
-    traces = []
-    for (name, episode), surprise in zip(logs, monitor.score_episodes([log.episode for log in logs]), strict=True):
-        fault = episode.faults if len(episode.faults) == len(episode) else np.zeros(len(episode), np.bool_)
-        detail = TraceDetail(surprise.attribution, spec.labels, fault, episode.stream)
-        traces.append(Trace(name, 0, spec.dt, monitor.threshold, surprise.value, detail=detail))
-    return traces
 
 
 def in_groups(logs: Iterable[Log], size: int) -> Iterator[list[Log]]:

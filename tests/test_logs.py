@@ -13,6 +13,7 @@ import pytest
 from rich.console import Console
 
 from asm_gym.episodes import Episode, EpisodeLabel, save_episode
+from asm_gym.evaluation.alarms import traces_of
 from asm_gym.logs import READERS, Layout, Log, read_logs
 from asm_gym.monitors import load_monitor, make_monitor
 from asm_gym.normal import divided, normal_episodes, pieces
@@ -127,7 +128,7 @@ def test_two_dimensional_arrays_are_channels_of_several_numbers():
         ({}, {"action": ["motor*"]}, r"no column is called 'motor\*'; there are: q_0"),
         ({}, {"channels": ["effort"]}, "no column is called 'effort'"),
         ({}, {"action": ["cmd_0"]}, "channel 'cmd' is commanded in part: cmd_0, cmd_1"),
-        ({}, {"rate": 0.0}, "rate must be a number above 0, got 0.0"),
+        ({}, {"rate": 0.0}, "rate must be a number of at least 1e-06, got 0.0"),
         ({}, {"action": ["*"]}, "at least one channel that is not an action"),
     ],
 )
@@ -296,7 +297,7 @@ def test_rows_as_they_come_raise_the_alarms_of_the_recording(memory, tmp_path):
     stuck = log(101)
     stuck["q_1"][40:] = stuck["q_1"][40]
     episode = Episode.from_table(stuck, channels=monitor.spec)
-    (trace,) = watch.traces_of([Log("stuck", episode)], monitor)
+    (trace,) = traces_of([Log("stuck", episode)], monitor)
     code, said = streamed(monitor, stuck)
     assert code == 1
     *alarms, summary = said.strip().splitlines()
