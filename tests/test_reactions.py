@@ -151,6 +151,8 @@ def test_it_runs_on_what_an_evaluation_has_recorded(tmp_path):
     assert len(made) == 2 * 2 * 5
     for one in made:
         assert one["acting"] != POLICY_ALONE or one["acted_s"] == 0
-        assert one["fault"] == "nominal" or one["peak_force"] > 0
+        assert one["peak_force"] >= 0
+        if one["acting"] == POLICY_ALONE:  # a reflex may end it before anything is touched
+            assert one["fault"] == "nominal" or one["peak_force"] > 0
         assert math.isfinite(one["impulse"])
     assert (tmp_path / "out" / "reactions.md").read_text().count("\n| ") == 2 + 2 * 4
