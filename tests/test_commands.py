@@ -22,7 +22,7 @@ from asm_gym.scripts import cli, command, reproduce
 
 ROOT = Path(__file__).resolve().parents[1]
 STUDIES = [f"reproduce {study}" for study in ("all", *reproduce.STUDIES)]
-MEASURES = [f"benchmark {what}" for what in ("env", "leaks", "experts", "coverage", "memory", "fit", "safety")]
+MEASURES = [f"benchmark {what}" for what in ("env", "leaks", "experts", "coverage", "memory", "fit", "safety", "watch")]
 EVERY_COMMAND = [*cli.COMMANDS, *STUDIES, *MEASURES]
 
 

@@ -25,7 +25,8 @@ from asm_gym.scripts.benchmark.coverage import Coverage
 from asm_gym.scripts.benchmark.experts import Experts
 from asm_gym.scripts.benchmark.fit import Fit
 from asm_gym.scripts.benchmark.memory import Memory, Safety
-from asm_gym.scripts.benchmark.turns import BusyError, take_turns
+from asm_gym.scripts.benchmark.turns import GROWTH, BusyError, resident, take_turns
+from asm_gym.scripts.benchmark.watch import Watch
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 from asm_gym.tasks import task as task_spec
 
@@ -168,21 +169,14 @@ class Leaks:
             for _ in range(length):
                 env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
             if (i + 1) % max(1, self.resets // 10) == 0:
-                sizes.append(_resident())
+                sizes.append(resident())
         console.print(
             f"{self.task}: {length * self.resets} steps, {self.resets} resets; resident memory [MB] by tenths"
         )
         console.print("  " + " ".join(f"{size:.0f}" for size in sizes))
         growth = sizes[-1] / sizes[min(1, len(sizes) - 1)] - 1
         console.print(f"  growth since the second: {100 * growth:+.1f} %")
-        return BAD_NEWS if growth > 0.05 else DONE
-
-
-def _resident() -> float:
-    """Resident memory of this process [MB]."""
-    with open("/proc/self/statm") as file:
-        pages = int(file.read().split()[1])
-    return pages * 4096 / 1e6
+        return BAD_NEWS if growth > GROWTH else DONE
 
 
 @dataclass
@@ -196,7 +190,8 @@ class Args:
         | Annotated[Coverage, tyro.conf.subcommand("coverage")]
         | Annotated[Memory, tyro.conf.subcommand("memory")]
         | Annotated[Fit, tyro.conf.subcommand("fit")]
-        | Annotated[Safety, tyro.conf.subcommand("safety")],
+        | Annotated[Safety, tyro.conf.subcommand("safety")]
+        | Annotated[Watch, tyro.conf.subcommand("watch")],
         tyro.conf.arg(name=""),
     ] = field(default_factory=Env)
 
