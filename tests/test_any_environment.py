@@ -11,8 +11,9 @@ import pytest
 from asm_gym.episodes import Episode
 from asm_gym.monitors import CalibratedMonitor, make_monitor
 from asm_gym.stream import StreamSpec, control_period
+from tests.needs import needs
 
-pytest.importorskip("mujoco")
+needs("mujoco")
 
 STEPS, ONSET = 60, 30
 

@@ -9,6 +9,7 @@ from asm_gym.episodes import Episode
 from asm_gym.monitors import MONITORS, load_monitor, make_monitor
 from asm_gym.monitors.baselines import association_mlp, fail_detect, gru, lstm_vae
 from asm_gym.stream import MOTOR, Channel, StreamSpec
+from tests.needs import needs
 from tests.streams import sine_episodes, sine_spec
 
 SPEC = StreamSpec(
@@ -176,7 +177,7 @@ def test_the_parts_of_the_memory_expect_what_it_does():
 
 
 def test_training_slows_down_at_plateaus_ends_where_nothing_is_gained_and_keeps_the_best():
-    torch = pytest.importorskip("torch")
+    torch = needs("torch")
     from asm_gym.monitors.baselines.torch_model import PATIENCE, converge
 
     module, rates = torch.nn.Linear(1, 1, bias=False), []
@@ -195,7 +196,7 @@ def test_training_slows_down_at_plateaus_ends_where_nothing_is_gained_and_keeps_
 
 def test_boosted_trees_say_what_scikit_learn_says_of_them():
     """Of the inputs that they saw, whatever the others are; more than one change, side by side."""
-    ensemble = pytest.importorskip("sklearn.ensemble")
+    ensemble = needs("sklearn.ensemble")
     from asm_gym.monitors.baselines.association_boosted import _Forest, _said
 
     rng = np.random.default_rng(0)

@@ -31,6 +31,7 @@ from asm_gym.stream import MOTOR, Channel, StreamSpec, flat, flat_rows
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
 from asm_gym.wrappers.faults import FaultyInterface
 from tests.fakes import CueMonitor, FakeEnv
+from tests.needs import needs
 
 ONSET, STEPS = 5, 12
 ARM = "asm_gym/SyntheticArm-v0"
@@ -338,8 +339,8 @@ def test_environments_side_by_side_must_sense_boxes():
     ],
 )
 def test_environments_of_others_give_streams_whose_senses_can_be_struck(package, env_id, policy):
-    pytest.importorskip(package)
-    pytest.importorskip("dm_control" if package == "shimmy" else package)
+    needs(package)
+    needs("dm_control" if package == "shimmy" else package)
     env = gym.make(env_id, max_episode_steps=20)
     (episode,) = collect(env_id, policy, 1, workers=1, max_episode_steps=20)
     assert episode.stream.shape == (20, episode.spec.size)

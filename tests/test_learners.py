@@ -7,13 +7,11 @@ import json
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3 import PPO
-from stable_baselines3.common.logger import configure
 
-from asm_gym.rollouts.training.callback import SafetyCallback
 from asm_gym.wrappers import FlatInfo, NeuralASMSafety, SafetyLog, SixValues
 from asm_gym.wrappers.learners import SafetyCounter, WandbWriter
 from tests.fakes import CueMonitor, FakeEnv
+from tests.needs import needs
 
 ACT = np.zeros(3, np.float32)
 
@@ -62,8 +60,8 @@ def test_each_episode_is_logged_when_it_ends():
 
 
 def test_tensorboard_keeps_what_is_logged(tmp_path):
-    tensorboard = pytest.importorskip("torch.utils.tensorboard")
-    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    tensorboard = needs("torch.utils.tensorboard")
+    events = needs("tensorboard.backend.event_processing.event_accumulator")
     with tensorboard.SummaryWriter(str(tmp_path)) as writer:
         env = SafetyLog(watched(), writer)
         env.reset()
@@ -76,7 +74,7 @@ def test_tensorboard_keeps_what_is_logged(tmp_path):
 
 @pytest.mark.slow
 def test_weights_and_biases_keeps_what_is_logged_without_a_network(tmp_path, monkeypatch):  # 20 s: it starts a service
-    wandb = pytest.importorskip("wandb")
+    wandb = needs("wandb")
     monkeypatch.setenv("WANDB_SILENT", "true")
     with wandb.init(mode="offline", dir=tmp_path, project="asm-gym") as run:
         env = SafetyLog(watched(), WandbWriter(run))
@@ -88,9 +86,12 @@ def test_weights_and_biases_keeps_what_is_logged_without_a_network(tmp_path, mon
 
 
 def test_the_callback_logs_what_learning_met(tmp_path):
+    sb3, logger = needs("stable_baselines3"), needs("stable_baselines3.common.logger")
+    from asm_gym.rollouts.training.callback import SafetyCallback
+
     callback = SafetyCallback(dt=0.05)
-    agent = PPO("MlpPolicy", watched(), n_steps=16, batch_size=16, seed=0)
-    agent.set_logger(configure(str(tmp_path), ["csv", "json"]))
+    agent = sb3.PPO("MlpPolicy", watched(), n_steps=16, batch_size=16, seed=0)
+    agent.set_logger(logger.configure(str(tmp_path), ["csv", "json"]))
     agent.learn(32, callback=callback)
     assert len(callback.ended) == 4
     assert {(e.alarms, e.cost) for e in callback.ended} == {(2, 3.0)}
@@ -100,7 +101,7 @@ def test_the_callback_logs_what_learning_met(tmp_path):
 
 
 def test_torchrl_reads_the_flat_numbers():
-    envs = pytest.importorskip("torchrl.envs")
+    envs = needs("torchrl.envs")
     from torchrl.envs.libs.gym import default_info_dict_reader
 
     envs.check_env_specs(envs.GymWrapper(watched()))
@@ -151,7 +152,7 @@ def test_a_loop_as_cleanrl_writes_it_sees_cost_and_episodes():
 
 @pytest.mark.slow
 def test_rllib_samples_a_watched_environment():  # half a minute: it starts Ray
-    pytest.importorskip("ray.rllib")
+    pytest.importorskip("ray.rllib", reason="pip install 'ray[rllib]'")
     from ray.rllib.algorithms.ppo import PPOConfig
     from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
     from ray.tune import register_env

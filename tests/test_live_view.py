@@ -17,8 +17,9 @@ from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, RerunView
 from tests.fakes import SPEC, CueMonitor, FakeEnv
 from tests.streams import swing
+from tests.needs import needs
 
-rerun = pytest.importorskip("rerun")
+rerun = needs("rerun")
 
 ARM = StreamSpec((Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.05)
 
@@ -48,7 +49,7 @@ def test_what_a_watched_environment_did_is_in_the_recording(tmp_path):
 
 
 def test_the_links_of_a_robot_are_drawn_where_they_are(tmp_path):
-    pytest.importorskip("robosuite")
+    needs("robosuite")
     env = gym.make("asm_gym/Lift-v0", horizon=3)
     watched = NeuralASMSafety(env, CueMonitor([9], env.unwrapped.stream_spec), on_alarm="monitor")
     view = RerunView(watched, tmp_path / "run.rrd", channels=["joint_position"])

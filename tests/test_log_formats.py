@@ -18,6 +18,7 @@ from asm_gym.logs import Layout, read_logs
 from asm_gym.scripts.cli import main
 from asm_gym.stream import MOTOR
 from asm_gym.timing import noise_of, regular
+from tests.needs import needs
 
 RATE, ROWS = 50.0, 80
 
@@ -128,7 +129,7 @@ def test_every_format_of_a_table_gives_the_same_rows(tmp_path):
 def test_pandas_and_polars_frames_are_tables():
     wanted = Episode.from_table(flat(arm(0)))
     for name in ("pandas", "polars"):
-        made = Episode.from_table(pytest.importorskip(name).DataFrame(flat(arm(0))))
+        made = Episode.from_table(needs(name).DataFrame(flat(arm(0))))
         assert made.spec == wanted.spec
         np.testing.assert_array_equal(made.stream, wanted.stream)
 
@@ -271,8 +272,8 @@ def test_a_folder_that_holds_something_is_not_written_to(tmp_path):
 
 def bag(folder: Path, plugin: str, lost: tuple[int, ...] = (), joints: bool = True) -> Path:
     """A wrist at twice the rate of two joints, and their commands."""
-    rosbag2 = pytest.importorskip("rosbags.rosbag2")
-    typesys = pytest.importorskip("rosbags.typesys")
+    rosbag2 = needs("rosbags.rosbag2")
+    typesys = needs("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     types = store.types
     stamp, header = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
@@ -335,7 +336,7 @@ def test_a_bag_that_is_cut_off_or_has_no_joints_is_named(tmp_path):
 
 
 def test_an_empty_bag_is_named(tmp_path):
-    pytest.importorskip("rosbags")
+    needs("rosbags")
     for name in ("x.mcap", "x.db3", "x.bag"):
         (tmp_path / name).write_bytes(b"")
         with pytest.raises(ValueError, match=name.replace(".", r"\.")):
@@ -343,7 +344,7 @@ def test_an_empty_bag_is_named(tmp_path):
 
 
 def test_a_small_mcap_file_that_claims_a_gigabyte_is_refused_unread(tmp_path):
-    mcap = pytest.importorskip("mcap.writer")
+    mcap = needs("mcap.writer")
     with (tmp_path / "bomb.mcap").open("wb") as file:
         writer = mcap.Writer(file, chunk_size=2**26)
         writer.start()

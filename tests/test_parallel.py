@@ -13,6 +13,7 @@ import pytest
 from loky import get_reusable_executor
 
 from asm_gym.rollouts import ParallelConfig, collect, parallel, parallel_map
+from tests.needs import needs
 
 PARENT = """
 import os, signal, sys, threading, time
@@ -151,12 +152,12 @@ def test_a_config_that_makes_no_sense_is_refused(arguments, message):
 def cluster(request):
     """A real cluster on this machine, with two workers."""
     if request.param == "dask":
-        distributed = pytest.importorskip("distributed", reason="pip install 'asm-gym[cluster]'")
+        distributed = needs("distributed")
         quiet = {"processes": True, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
         with distributed.LocalCluster(2, **quiet) as made:
             yield ParallelConfig(2, "dask", made.scheduler_address)
     else:
-        utils = pytest.importorskip("ray.cluster_utils", reason="pip install 'asm-gym[cluster]'")
+        utils = needs("ray.cluster_utils")
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
         made = utils.Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False})
         yield ParallelConfig(2, "ray", made.address)
@@ -196,6 +197,6 @@ def test_a_cluster_collects_the_same_episodes(cluster):
 
 @pytest.mark.slow
 def test_no_cluster_at_the_address_is_said():
-    pytest.importorskip("distributed")
+    needs("distributed")
     with pytest.raises(ConnectionError, match=r"tcp://127\.0\.0\.1:1"):
         parallel_map(abs, [1], ParallelConfig(2, "dask", "tcp://127.0.0.1:1"))

@@ -16,6 +16,7 @@ from asm_gym.wrappers.patience import Patience
 from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, responses_from
 from tests.fakes import CueMonitor, FakeEnv
 from tests.test_completion import MEMORY, SPEC, Arm, Judge, Named, offset
+from tests.needs import needs
 
 ACT = np.array([0.5, -0.5], np.float32)
 
@@ -399,7 +400,7 @@ def test_control_does_not_go_back_while_something_presses_though_surprise_is_qui
 
 
 def test_the_force_of_a_push_is_found_where_it_pushes():
-    mujoco = pytest.importorskip("mujoco")
+    mujoco = needs("mujoco")
     env = gym.make("asm_gym/Lift-v0", horizon=20)
     env.reset(seed=0)
     inner = env.unwrapped

@@ -1,0 +1,81 @@
+"""What an extra brings is enough for what needs it: each in a fresh environment, with nothing else installed.
+
+    python -m tests.extras              all of them, minutes each; make extras
+    python -m tests.extras learners     one
+
+A test may be skipped where it says another extra that it needs, and for no other reason.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import venv
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+from tests.wheel import ROOT, build_wheel
+
+
+class Check(NamedTuple):
+    """What is installed, and what must run then.
+
+    Attributes:
+        extras: of asm-gym.
+        tests: as pytest takes them.
+        also: packages that no extra brings, and that are read where they are there.
+    """
+
+    extras: str
+    tests: str
+    also: str = ""
+
+
+CHECKS = {
+    "logs": Check(
+        "report,ros", "tests/test_logs.py tests/test_live.py tests/test_log_formats.py", "mcap pandas polars"
+    ),
+    "rerun": Check("report,rerun", "tests/test_live_view.py"),
+    "data": Check("robosuite,data,report", "tests/test_datasets.py tests/test_public.py"),
+    "agents": Check("agents", "tests/test_learners.py"),
+    "learners": Check("learners", "tests/test_learners.py"),
+    "rllib": Check("cluster", "tests/test_learners.py", "ray[rllib]"),
+    "cluster": Check("report,cluster", "tests/test_parallel.py -k cluster"),
+    "environments": Check("environments,report", "tests/test_elsewhere.py"),
+    "robosuite": Check("robosuite,report,video", "tests/test_robosuite_env.py -m 'not slow'"),
+}
+
+
+def check(name: str, wheel: Path) -> str:
+    """What is wrong with an extra, or nothing."""
+    extras, tests, also = CHECKS[name]
+    with TemporaryDirectory() as folder:
+        venv.create(folder, with_pip=True)
+        install = f"{folder}/bin/python -m pip install -q -c constraints.txt '{wheel}[{extras}]' {also} pytest"
+        subprocess.run(install, shell=True, cwd=ROOT, check=True)
+        there = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+        command = f"{folder}/bin/python -m pytest -q -rs {tests}"
+        print(f"{name}: {command}", flush=True)
+        done = subprocess.run(command, shell=True, cwd=ROOT, env=there, stdout=subprocess.PIPE, text=True)
+    print(done.stdout, flush=True)
+    wrong = [] if done.returncode == 0 else [f"pytest ended with {done.returncode}"]
+    ours = re.compile(rf"asm-gym\[({extras.replace(',', '|')})\]")
+    skipped = [line for line in done.stdout.splitlines() if line.startswith("SKIPPED")]
+    return "; ".join(wrong + [line for line in skipped if "pip install" not in line or ours.search(line)])
+
+
+def main(names: list[str]) -> int:
+    """Checks some or all, and returns 1 where one is wrong."""
+    with TemporaryDirectory() as folder:
+        wheel = build_wheel(Path(folder))
+        said = {name: check(name, wheel) for name in names or CHECKS}
+    for name, wrong in said.items():
+        print(f"{name:<14} {wrong or 'ok'}")
+    return int(any(said.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
