@@ -12,7 +12,7 @@ pytest = $(one_thread) $(bin)/python -m pytest -n $(JOBS) --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo reproduce doctor test test-all soak check format docs page stale clean
+.PHONY: help demo reproduce doctor test test-all extras soak check format docs page stale clean
 
 help: ## list the commands
 	@sed -nE 's/^([a-z-]+):.* ## (.*)/  make \1\t\2/p' Makefile | expand -t 20
@@ -32,6 +32,9 @@ test: $(stamp) ## the tests that take seconds
 
 test-all: $(stamp) ## every test, those that take minutes too
 	$(pytest) $(ARGS)
+
+extras: $(stamp) ## every extra in a fresh environment, with the tests of what needs it; ARGS=learners for one
+	$(one_thread) $(bin)/python -m tests.extras $(ARGS)
 
 soak: $(stamp) ## hours of hostile calls, lines and files, kills, full disks and guarded steps; ARGS=--help for less
 	$(one_thread) $(bin)/python -m tests.soak $(ARGS)

@@ -29,6 +29,7 @@ from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, traces_of
 from asm_gym.evaluation.report import write_report
 from asm_gym.evaluation.tables import Table
 from asm_gym.evaluation.trace import Trace
+from asm_gym.extras import require
 from asm_gym.live import RowReader, SourceDied, is_live, lines_from
 from asm_gym.live_view import LiveView
 from asm_gym.logs import Layout, Log, read_logs
@@ -193,6 +194,10 @@ def follow(lines: Iterable[str], monitor: Any, console: Console) -> int:
 
 def watch(args: Args, console: Console) -> int:
     """Watches whichever it is."""
+    if args.rerun is not None:
+        if is_live(args.source):
+            raise ValueError(f"--rerun is for a recording, and {args.source} is live")
+        require("rerun", what="a live view")
     monitor: Any = load_monitor(args.monitor)
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")

@@ -9,13 +9,14 @@ import subprocess
 import sys
 import tomllib
 import venv
+import zipfile
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from asm_gym.extras import BROUGHT_BY, needed_for, require
-from tests.wheel import ROOT, build_wheel
+from tests.wheel import LINKS, ROOT, build_wheel
 
 CORE = ("gymnasium", "numpy", "numba", "scipy", "threadpoolctl")
 LARGEST = 500e6
@@ -106,6 +107,16 @@ def test_a_command_says_which_extra_it_lacks(tmp_path):
     assert done.stderr == "asm-gym doctor: this command needs rich: pip install 'asm-gym[report]'\n"
 
 
+def test_logs_are_watched_without_a_simulator(tmp_path):
+    absent = {name for name, extra in BROUGHT_BY.items() if extra != "report"}
+    code = NOTHING_ELSE.replace("ABSENT", repr(absent)) + (
+        "from asm_gym.scripts import fit, watch\ntry:\n    from asm_gym.rollouts import collect\n"
+        "except ImportError as error:\n    print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.stdout.strip(), done.stderr) == (SAID[0], "")
+
+
 def test_every_requirement_of_an_extra_is_known_by_the_name_it_is_imported_under():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     imported_as = {"pillow": "PIL", "scikit-learn": "sklearn", "rerun-sdk": "rerun"}
@@ -127,6 +138,14 @@ def test_only_a_package_that_is_missing_is_said_to_be_missing(tmp_path, monkeypa
     monkeypatch.delitem(sys.modules, "matplotlib", raising=False)
     with pytest.raises(ModuleNotFoundError, match="No module named 'nosuch'"), needed_for("a chart"):
         import_module("matplotlib")
+
+
+def test_a_wheel_holds_every_file_of_the_package(tmp_path):
+    """An editable install finds them all, whatever pyproject.toml says."""
+    folders = {"asm_gym": ROOT / "asm_gym", **{f"asm_gym/{name}": ROOT / name for name in LINKS}}
+    there = {f"{name}/{p.relative_to(top)}" for name, top in folders.items() for p in top.rglob("*") if p.is_file()}
+    with zipfile.ZipFile(build_wheel(tmp_path)) as wheel:
+        assert {name for name in there if "__pycache__" not in name} <= set(wheel.namelist())
 
 
 @pytest.mark.slow

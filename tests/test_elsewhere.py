@@ -276,6 +276,7 @@ def test_the_synthetic_arm_is_an_environment_and_follows_what_it_is_told():
 
 
 def test_what_a_dict_environment_did_is_a_dataset_and_comes_back(tmp_path):
+    needs("minari")
     gym.register("tests/Named-v0", entry_point="tests.test_elsewhere:named")
     try:
         options = ["--policy", "sway", "--episodes", "3", "--workers", "1", "--out", str(tmp_path)]

@@ -363,6 +363,7 @@ def test_standard_input_is_watched_as_a_command(memory, monkeypatch, capsys):
         (["watch", "nowhere"], "--monitor"),
         (["watch", "nowhere", "--monitor", "none.asm"], "none.asm"),
         (["watch", "nowhere", "--monitor", "x.asm", "--figures", "0"], "figures must be"),
+        (["watch", "-", "--monitor", "x.asm", "--rerun", "x.rrd"], "--rerun is for a recording, and - is live"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(arguments, message, capsys):

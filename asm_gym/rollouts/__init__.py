@@ -2,8 +2,10 @@
 
 from typing import Any
 
-from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
+from asm_gym.extras import needed_for
 
+with needed_for("running episodes"):
+    from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 try:
     from asm_gym.rollouts.body import harmless
     from asm_gym.rollouts.collect import collect

@@ -31,10 +31,11 @@ def surprise_figure(traces: Sequence[Trace]) -> Figure:
         panels[0].set_xlim(0, 1.01 * max(len(t) * t.dt for t in traces))
         panels[-1].set_xlabel("time [s]")
         fig.supylabel("surprise", fontsize=10)
+        known = any(t.onset is not None or (t.detail is not None and t.detail.fault.any()) for t in traces)
         fig.legend(
             handles=[
                 Line2D([], [], color=BLACK, linewidth=1, linestyle=(0, (4, 2)), label="threshold"),
-                Patch(color=ORANGE, alpha=0.3, label="fault active"),
+                *([Patch(color=ORANGE, alpha=0.3, label="fault active")] if known else []),
                 Line2D([], [], color=VERMILLION, linewidth=4, solid_capstyle="butt", label="in alarm"),
                 Line2D([], [], color=VERMILLION, marker="v", linestyle="", label="alarm raised"),
             ],
@@ -99,6 +100,8 @@ def attribution_figure(trace: Trace, top: int = 12) -> Figure:
 def stream_figure(trace: Trace, top: int = 4) -> Figure:
     """What was sensed by the ``top`` channels that surprised most since the onset, beside the healthy twin.
 
+    Where no fault is known, as in a log, the rows in alarm are shaded.
+
     Raises:
         ValueError: the trace has no stream.
     """
@@ -114,6 +117,10 @@ def stream_figure(trace: Trace, top: int = 4) -> Figure:
             for start, stop in spans(detail.fault):
                 label = "fault" if i == 0 else None
                 ax.axvspan(start * trace.dt, stop * trace.dt, color="#f3d9a4", linewidth=0, label=label)
+            for k, (start, stop) in enumerate(spans(trace.alarm) if trace.onset is None else []):
+                label = "in alarm" if i == k == 0 else None
+                ends = (start + 1) * trace.dt, min(stop + 1, len(trace)) * trace.dt
+                ax.axvspan(*ends, color=VERMILLION, alpha=0.2, linewidth=0, label=label)
             if detail.twin is not None:
                 healthy = detail.twin[: len(trace), row]
                 label = "without the fault" if i == 0 else None
