@@ -15,8 +15,10 @@ from rich.console import Console
 from rich.progress import track
 
 from asm_gym.checks import check_number
-from asm_gym.monitors.shipped import pretrained_file
+from asm_gym.episodes import Episode
+from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.collect import collect
+from asm_gym.scripts.benchmark.memory import synthetic
 from asm_gym.scripts.benchmark.turns import GROWTH, resident
 from asm_gym.scripts.command import BAD_NEWS, DONE
 
@@ -27,10 +29,12 @@ SAMPLES = 10
 
 @dataclass
 class Watch:
-    """Rows of a Panda come through a pipe as fast as they are taken: what one costs, and whether the process grows."""
+    """Rows come through a pipe as fast as they are taken: what one costs, and whether the process grows."""
 
     rows: int = 100_000
     """How many; in the first tenth the command starts, which does not count."""
+    channels: int | None = None
+    """Sensory channels of synthetic rows and a small memory; by default rows of a Panda and its shipped memory."""
     rate: float = 1000.0
     """Rows a second to keep up with, on one core [Hz]."""
 
@@ -39,32 +43,40 @@ class Watch:
 
     def run(self, console: Console) -> int:
         """Prints what a row costs, and memory by tenths of the rows; 1 where it does not keep up, or grows."""
-        episodes = collect("asm_gym/Lift-v0", episodes=10, workers=1)
+        asm, episodes = self._memory()
         lines = [f"{json.dumps(row.tolist())}\n".encode() for episode in episodes for row in episode.stream]
         every = self.rows // (TENTHS * SAMPLES)
         sizes, seconds = [], []
-        with TemporaryDirectory() as folder, (Path(folder) / "said").open("w+b") as said:
-            memory = str(pretrained_file("panda"))
-            command = [sys.executable, "-m", "asm_gym.scripts.watch", "-", "--monitor", memory]
-            with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=said) as watching:
+        with TemporaryDirectory() as folder:
+            memory = f"{folder}/x.asm"
+            asm.with_threshold(0.99 * asm.detection.reach).save(memory)  # that nothing is printed but the end
+            command = [sys.executable, "-m", "asm_gym.scripts.watch", "-", "--monitor", memory, "--silence", "1e6"]
+            with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as watching:
                 assert watching.stdin is not None
+                assert watching.stdout is not None
                 for number in track(range(1, self.rows + 1), "watching", console=console, transient=True):
                     watching.stdin.write(lines[number % len(lines)])
                     if number % every == 0:
                         sizes.append(resident(watching.pid))
                         seconds.append(processor_time(watching.pid))
-            said.seek(0)
-            console.print(said.read().decode().splitlines()[-1])  # those before it are alarms, where an episode ends
+                watching.stdin.close()
+                console.print(watching.stdout.read().decode().strip())
         peaks = [float(part.max()) for part in np.array_split(sizes, TENTHS)]
         growth = peaks[-1] / peaks[1] - 1
-        cost = (seconds[-1] - seconds[SAMPLES - 1]) / (
-            self.rows - SAMPLES * every
-        )  # [s]; the first tenth has its start
-        size = episodes[0].spec.size
+        cost = (seconds[-1] - seconds[SAMPLES - 1]) / (self.rows - SAMPLES * every)  # [s] of a core, for a row
+        size = asm.spec.size
         console.print(f"{size} numbers: {1e3 * cost:.3f} ms of a core a row, so {1 / cost:.0f} rows a second")
         console.print("resident memory [MB] by tenths: " + " ".join(f"{peak:.1f}" for peak in peaks))
         console.print(f"growth since the second: {100 * growth:+.1f} %")
         return DONE if 1 / cost > self.rate and growth < GROWTH else BAD_NEWS
+
+    def _memory(self) -> tuple[NeuralASM, list[Episode]]:
+        """A memory, and nominal episodes for it."""
+        if self.channels is None:
+            return NeuralASM.pretrained("panda"), collect("asm_gym/Lift-v0", episodes=10, workers=1)
+        episodes = synthetic(self.channels, 14)
+        small = NeuralASM(episodes[0].spec, hidden_size=16, association_size=16, epochs=1)
+        return small.fit(episodes[:7]).calibrate(episodes[7:], 0.5), episodes
 
 
 def processor_time(process: int) -> float:
