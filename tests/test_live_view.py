@@ -16,8 +16,8 @@ from asm_gym.scripts.cli import main
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, RerunView
 from tests.fakes import SPEC, CueMonitor, FakeEnv
-from tests.streams import swing
 from tests.needs import needs
+from tests.streams import swing
 
 rerun = needs("rerun")
 

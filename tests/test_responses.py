@@ -15,8 +15,8 @@ from asm_gym.wrappers.arguments import make_fallback
 from asm_gym.wrappers.patience import Patience
 from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, responses_from
 from tests.fakes import CueMonitor, FakeEnv
-from tests.test_completion import MEMORY, SPEC, Arm, Judge, Named, offset
 from tests.needs import needs
+from tests.test_completion import MEMORY, SPEC, Arm, Judge, Named, offset
 
 ACT = np.array([0.5, -0.5], np.float32)
 
