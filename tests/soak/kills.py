@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from asm_gym.checkpoint import read_arrays
+from asm_gym.checkpoint import kind_of, read_checkpoint
 from asm_gym.datasets import read_dataset
 from asm_gym.episodes import load_episode
 from asm_gym.files import UNFINISHED
@@ -92,7 +92,8 @@ def tables(folder: Path) -> Any:
 
 def agent(folder: Path) -> Any:
     """The weights of what was trained."""
-    return {p.name: {n: a.tobytes() for n, a in read_arrays(p).items()} for p in sorted(folder.glob("*.npz"))}
+    kept = {p.name: read_checkpoint(p, kind_of(p)) for p in sorted(folder.glob("*.npz"))}
+    return {name: {n: a.tobytes() for n, a in found.arrays.items()} for name, found in kept.items()}
 
 
 SIZES = (3, 24)
