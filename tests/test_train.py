@@ -218,7 +218,7 @@ def datasets(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("door", "asm_gym/Door-v0, not in asm_gym/Lift-v0"), ("damaged", "damaged"), ("bare", "holds no streams")],
+    [("door", "asm_gym/Door-v0, not in 'asm_gym/Lift-v0'"), ("damaged", "damaged"), ("bare", "holds no streams")],
 )
 def test_a_dataset_that_does_not_fit_is_refused_before_anything_is_learned(name, message, datasets, tmp_path, capsys):
     out = tmp_path / "out"
