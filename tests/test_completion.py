@@ -13,6 +13,7 @@ from asm_gym.scaling import StreamScaler
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import CompletedObservation, NeuralASMSafety
 from asm_gym.wrappers.completion import ObservationMap, Repair
+from tests.fakes import CueMonitor
 
 SPEC = StreamSpec(
     (
@@ -190,18 +191,13 @@ class Named:
 GENERIC = StreamSpec.from_spaces(Arm().observation_space, Arm().action_space, 0.05)
 
 
-class Judge:
+class Judge(CueMonitor):
     """Surprised in the steps of ``cue``; its diagnosis is that of the family it is given."""
 
-    threshold = 1.0
-
     def __init__(self, cue, family="sensor"):
+        super().__init__(cue, GENERIC)
         streams = STREAMS
-        self.spec, self.cue = GENERIC, cue
         self.diagnosis_ = Diagnosis(Completion.fit(StreamScaler.fit(GENERIC, streams), streams), Named(family))
-
-    def initial_state(self, batch=1):
-        return 0
 
     def observe(self, state, stream):
         attribution = np.zeros((1, self.spec.size))
@@ -235,6 +231,14 @@ def test_a_policy_under_the_wrapper_sees_what_a_faulty_sense_should_say():
         info = out[-1][1]
         said = info.get("completed") or info["asm"]["completed"]
         assert said == ("observation[0]",)
+
+
+def test_what_is_completed_already_completes_nothing_else(monkeypatch):
+    monitor = Judge({21, 30})
+    named = iter(monitor.diagnosis_.hypotheses)
+    monkeypatch.setattr(Diagnosis, "named", lambda *_: next(named))  # another one each time
+    out = played(CompletedObservation(Arm(offset), monitor), 60)
+    assert [info["completed"] for _, info in out[22:]] == [("observation[0]",)] * 39
 
 
 def test_a_named_sensor_is_never_believed_and_an_unknown_one_is_refused():

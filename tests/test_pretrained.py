@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from asm_gym.checkpoint import read_header
+from asm_gym.faults import Freeze, FrozenEncoder
 from asm_gym.monitors import NeuralASM, make_monitor, pretrained, pretrained_for
-from asm_gym.policies import make_policy
+from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.reflexes import Hold
 from asm_gym.scripts.demo import Args, without_fitting
-from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
+from asm_gym.wrappers import FaultInjection, NeuralASMSafety, VectorNeuralASMSafety
 from tests.fakes import FakeEnv
 from tests.streams import sine_episodes, sine_spec
 
@@ -115,3 +116,24 @@ def test_nothing_fitted_a_push_is_noticed_and_a_healthy_episode_is_quiet():
     assert int(reached) < 100
     assert int(late) <= 500  # the push lasts that long
     assert without_fitting(Args(task="asm_gym/TwoArmLift-v0")) == ""
+
+
+@pytest.mark.parametrize(
+    ("fault", "completed", "unread"),
+    [
+        (Freeze(channel="wrist_force", element=None, onset=18), ("wrist",), ("wrist",)),
+        (FrozenEncoder(joint=1, onset=18), ("encoder[1]",), ()),
+    ],
+)
+def test_a_sensor_that_the_expert_does_not_need_fails_and_nothing_else_is_done(fault, completed, unread):
+    done = {}
+    for on_alarm in ("monitor", "graded"):
+        infos = []
+        faulty = FaultInjection(gym.make("asm_gym/Lift-v0"), [fault])
+        env = NeuralASMSafety(faulty, on_alarm=on_alarm, on_overrun="ignore")
+        rollout(env, make_policy("scripted", env, seed=854111985), 854111985, infos.append, 60)
+        done[on_alarm] = np.array([info["asm"]["executed_action"] for info in infos])
+        env.close()
+    assert any(info["asm"]["alarm"] for info in infos)
+    assert (infos[-1]["asm"]["completed"], infos[-1]["asm"]["unread"]) == (completed, unread)
+    np.testing.assert_array_equal(done["graded"], done["monitor"])

@@ -279,9 +279,10 @@ class CompletedObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArg
         observation, reward, terminated, truncated, info = self.env.step(action)
         row = self._believed(self._source.row(observation, action, info))
         self._rows = [*self._rows[-3:], row]
-        surprise = self._observer.observe(row[None], ("",)).surprise
+        missing = self._repair.missing
+        surprise = self._observer.observe(row[None], ("",)).surprise.without(missing)
         if float(surprise.value[0]) > self._threshold and not self._repair.settling:
-            cause = self._explained(np.stack(self._rows), surprise.attribution[0])
+            cause = self._explained(np.stack(self._rows), surprise.attribution[0], missing)
             again = self._repair.suspect(cause.columns) if cause.family == "sensor" else None
             row = row if again is None else again
             self._rows[-1] = row
