@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checkpoint import read_arrays, read_checkpoint, write_checkpoint
+from asm_gym.checkpoint import DAMAGE, read_arrays, read_checkpoint, write_checkpoint
 from asm_gym.checks import as_float32
 from asm_gym.files import regular_file
 from asm_gym.stream import StreamSpec
@@ -190,7 +190,7 @@ def load_episode(path: str | Path, spec: StreamSpec | None = None) -> Episode:
         return episode
     except FileNotFoundError:
         raise
-    except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile) as error:
+    except (*DAMAGE, TypeError) as error:
         raise ValueError(f"{path} is damaged or no episode that can be read: {error}") from error
 
 

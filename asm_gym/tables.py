@@ -185,7 +185,8 @@ def _chosen(signals: Sequence[Signal], patterns: str | Sequence[str]) -> list[Si
     asked = [patterns] if isinstance(patterns, str) else list(patterns)
     for pattern in asked:
         if not any(s.goes_by(pattern) for s in signals):
-            raise ValueError(f"no column is called {pattern!r}; there are: {', '.join(s.column for s in signals)}")
+            columns = ", ".join(s.column for s in signals) or "none"
+            raise ValueError(f"no column of these channels is called {pattern!r}; there are: {columns}")
     return [s for s in signals if any(s.goes_by(pattern) for pattern in asked)]
 
 

@@ -135,8 +135,11 @@ def test_episode_files_give_back_what_was_saved_and_refuse_others(tmp_path):
     assert_same(load_episode(save_episode(tmp_path / "one.npz", episode)), episode)
     whole = (tmp_path / "one.npz").read_bytes()
     (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match=r"half\.npz is damaged"):
-        load_episode(tmp_path / "half.npz")
+    at = whole.index(b"PK\x01\x02") + 6  # which version of zip it takes to read the first member
+    (tmp_path / "new.npz").write_bytes(whole[:at] + bytes([234]) + whole[at + 1 :])
+    for name in ("half", "new"):
+        with pytest.raises(ValueError, match=rf"{name}\.npz is damaged"):
+            load_episode(tmp_path / f"{name}.npz")
 
 
 class _Sines(gym.Env):

@@ -75,8 +75,10 @@ def test_auroc_takes_infinity_and_refuses_nan_and_nothing():
     assert auroc([math.inf, math.inf], [1.0, math.inf]) == pytest.approx(0.75)
     with pytest.raises(ValueError, match="must not be NaN"):
         auroc([math.nan], [1.0])
-    with pytest.raises(ValueError, match="0 positive and 1 negative"):
+    with pytest.raises(ValueError, match="scores_pos and scores_neg must hold some each, got 0 and 1"):
         auroc([], [1.0])
+    with pytest.raises(ValueError, match=r"scores_neg must be numbers in the shape \(n,\), got \[\[1\], \[2, 3\]\]"):
+        auroc([1.0], [[1], [2, 3]])
 
 
 def test_gain_and_reduction_are_the_hand_computed_ones():

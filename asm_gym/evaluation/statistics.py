@@ -149,7 +149,10 @@ def reduction(pairs: Floats) -> Floats:
 
 def _scores(name: str, values: ArrayLike) -> NDArray[np.float64]:
     """(n,) numbers, infinite ones too."""
-    scores = np.asarray(values)
+    try:
+        scores: NDArray[Any] = np.asarray(values)
+    except ValueError:  # rows of several lengths
+        scores = np.array(None)
     if scores.ndim != 1 or scores.dtype.kind not in "biuf":
         raise ValueError(f"{name} must be numbers in the shape (n,), got {shown(values)}")
     if np.isnan(scores).any():

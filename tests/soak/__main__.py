@@ -78,7 +78,7 @@ def hostile(args: Args, console: Console) -> bool:
     rows = verdicts.counted(judged)
     console.print(console_table(Table("hostile cases by verdict", ("area", "cases", *verdicts.VERDICTS), rows)))
     bad = [j for j in judged if j.verdict not in ("fine", "clear")]
-    for j in bad[:20]:
+    for j in list({(j.verdict, j.said[:40]): j for j in bad}.values())[:20]:  # each that was said, once
         console.print(ascii(f"{j.verdict}: {j.case}: {j.said}"[:200]), markup=False, highlight=False)
     refused = sum(j.verdict in ("clear", "raw") for j in judged)
     raw = sum(j.verdict == "raw" for j in judged)
