@@ -12,6 +12,7 @@ Open it by ``rerun FILE.rrd``. Expectations are those of the memory's completion
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -64,6 +65,7 @@ class LiveView:
         self._before: NDArray[np.float64] | None = None
         self._alarm = False
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        os.environ.setdefault("RERUN_FLUSH_TICK_SECS", "1")  # read by the next line: by default 0.008, a chunk a row
         self._stream = self._rr.RecordingStream("asm-gym")
         self._stream.save(self.path, default_blueprint=self._arranged())
         for channel in self._drawn:
