@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import resource
 import signal
@@ -63,7 +64,7 @@ def commands(out: Path) -> list[Work]:
     evaluate = ["evaluate", "--tasks", "Lift", "--monitors", "kalman", "--faults", "push", "--severities", "strong"]
     less = ["--harmless", "touch", "--harmless-episodes", "2", "--false-alarm-rate", "0.05", "--no-video"]
     train = ["train", "Lift", "--demonstrations", "2", "--cloning-updates", "300", "--steps", "400", "--quick"]
-    react = ["react", "--run", str(out / "evaluate" / "whole"), "--tasks", "Lift", "--monitor", "kalman"]
+    react = ["react", "--run", str(out / "evaluate" / "whole"), "--tasks", "Lift"]
     hold = ["--reflexes", "hold", "--faults", "passing_push", "--episodes", "2", "--false-alarm-rate", "0.05"]
     return [
         Work("save", save_for_ever, lambda folder: NeuralASM.load(folder / "x.asm").hidden_size in SIZES),
@@ -91,9 +92,13 @@ def tables(folder: Path) -> Any:
 
 
 def agent(folder: Path) -> Any:
-    """The weights of what was trained."""
-    kept = {p.name: read_checkpoint(p, kind_of(p)) for p in sorted(folder.glob("*.npz"))}
-    return {name: {n: a.tobytes() for n, a in found.arrays.items()} for name, found in kept.items()}
+    """The weights of the clone, and at which steps the agent was judged.
+
+    What was learned since the last checkpoint is learned anew, by other random numbers.
+    """
+    clone, agents = folder / "clone.npz", sorted(p.name for p in folder.glob("*.npz"))
+    weights = {n: a.tobytes() for n, a in read_checkpoint(clone, kind_of(clone)).arrays.items()}
+    return agents, weights, [step for step, _ in json.loads((folder / "result.json").read_text())["curve"]]
 
 
 SIZES = (3, 24)
