@@ -284,7 +284,7 @@ def demonstrate(args: Args, console: Console) -> None:
         examples = {(t.kind, t.seed) for t in (typical(m.watched) for m in rows)}
         shown = [t for t in todo if (t.kind, t.seed) in examples]
         with timed("recording a video") as progress:
-            clips = [Clip(trial, f"{trial.kind}, {trial.acting}") for trial in shown]
+            clips = [Clip(trial, trial.kind) for trial in shown]
             video = record_video(clips, RolloutConfig(), memory, folder / "demo.mp4", progress)
     write_json(folder / "demo.json", figures_of(args, rows, expert, latency, seconds))
     write_report(
