@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.baselines.gru import GRU
+from asm_gym.monitors import NeuralASM, make_monitor
+from asm_gym.monitors.model import model_outputs
 from asm_gym.scripts.benchmark import main
 from asm_gym.scripts.benchmark.experts import Attempt, _row, attempt
 from asm_gym.scripts.benchmark.fit import errors
@@ -63,10 +63,13 @@ def test_a_ratio_is_of_medians_and_its_spread_over_repetitions():
 @pytest.mark.slow
 def test_errors_of_both_learners_are_those_their_surprise_is_made_of():
     episodes = synthetic(10, 12)
-    for monitor in (NeuralASM(episodes[0].spec, hidden_size=16, association_size=50, epochs=1), GRU(episodes[0].spec)):
+    for monitor in (
+        NeuralASM(episodes[0].spec, hidden_size=16, association_size=50, epochs=1),
+        make_monitor("gru", episodes[0].spec),
+    ):
         monitor.fit(episodes[:10])
-        (off,) = errors(monitor, episodes[-1:])
-        (run,) = monitor._runs([episodes[-1].stream])
+        (off,) = errors(monitor.model, episodes[-1:])
+        (run,) = model_outputs(monitor.model, episodes[-1:])
         ratio = run.errors[2:] / off  # 1/σ, whichever way the error went
         assert np.all(ratio > 0)
         assert off.shape == (len(episodes[-1]) - 2, 10)
