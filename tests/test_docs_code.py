@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -16,7 +18,9 @@ import tyro
 from asm_gym.faults import FAULTS
 from asm_gym.monitors import MONITORS
 from asm_gym.scripts.cli import main
+from asm_gym.scripts.command import run
 from tests import documents
+from tests.soak import __main__ as soak
 
 README = documents.ROOT / "README.md"
 
@@ -34,7 +38,8 @@ PYTHON = [
 SHELL = [p for p in documents.written() if any(b.language == "sh" for b in documents.blocks(p))]
 RESULTS = [p for p in documents.written() if p.parent.name == "results" and p.name != "index.md"]
 
-RECORDER = 'asm-gym() { printf "%s\\n" "asm-gym $*"; }; make() { printf "%s\\n" "make $*"; }; apt-get() { :; }\n'
+RECORDER = "".join(f'{name}() {{ printf "%s\\n" "{name} $*"; }}; ' for name in ("asm-gym", "make", "python"))
+RECORDER += "apt-get() { :; }\n"
 """Instead of commands: what they would have been given."""
 
 
@@ -84,6 +89,11 @@ def check(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
         targets = re.findall(r"^([a-z-]+):", (documents.ROOT / "Makefile").read_text(), re.M)
         assert argv[0] in targets
         return
+    if program == "python":
+        assert argv[:2] == ["-m", "tests.soak"], command
+        called: Callable[[], int] = partial(run, "soak", soak.Args, soak.soak, argv[2:])
+    else:
+        called = partial(main, argv)
     parse = tyro.cli
 
     def dry(*args: Any, **kwargs: Any) -> Any:
@@ -92,7 +102,7 @@ def check(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(tyro, "cli", dry)
     try:
-        code = main(argv)
+        code = called()
     except Parsed:
         return
     except SystemExit as stopped:

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from asm_gym.evaluation.report import write_json
 from asm_gym.evaluation.statistics import Share
 from asm_gym.faults import FrozenEncoder, Push
 from asm_gym.rollouts.parallel import parallel_map
@@ -116,9 +117,11 @@ def test_a_bad_argument_is_refused_before_anything_is_written(arguments, message
     assert not (tmp_path / "out").exists()
 
 
-def test_what_is_infinite_or_undefined_is_null_in_the_json():
+def test_what_is_infinite_or_undefined_is_null_in_the_json(tmp_path):
     content = {"delay": float("inf"), "rates": [float("nan"), 1.0], "share": Share(1, 2), "n": 3, "s": "inf"}
-    assert demo._finite(content) == {"delay": None, "rates": [None, 1.0], "share": {"k": 1, "n": 2}, "n": 3, "s": "inf"}
+    write_json(tmp_path / "figures.json", content)
+    found = json.loads((tmp_path / "figures.json").read_text())
+    assert found == {"delay": None, "rates": [None, 1.0], "share": {"k": 1, "n": 2}, "n": 3, "s": "inf"}
 
 
 def test_quick_keeps_the_calibration_that_the_rate_needs():

@@ -149,13 +149,15 @@ def killed_and_begun_again(work: Work, folder: Path, kills: int, rng: np.random.
     same, done, k = codes == [0], 0, 0
     while done < kills:
         place = folder / f"killed-{k}"
-        # Four kills in a row, and then it may finish: what is done already makes the later ones come late.
-        for _ in range(min(4, kills - done)):
+        for _ in range(min(4, kills - done)):  # in a row, and then it may finish
             process = started(work, place)
             time.sleep(lasted * rng.uniform(0.05, 1.0))
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process, signal.SIGKILL)
             codes.append(ended(process))
+            if codes[-1] == 0:  # it had ended before, and this was no kill
+                lasted *= 0.8
+                break
             done += 1
         codes.append(ended(started(work, place)))
         same &= codes[-1] == 0 and work.left(place) == expected
