@@ -10,7 +10,9 @@ try:
     from asm_gym.rollouts.body import harmless
     from asm_gym.rollouts.collect import collect
     from asm_gym.rollouts.trial import RolloutConfig, Trial
-except ImportError as error:  # who watches logs has no simulator; who asks for one of these is told what is missing
+except ImportError as error:
+    # Who watches logs has no simulator, and who asks for one of these is told what is missing. They are not looked up
+    # when they are asked for, as in ``asm_gym.wrappers``: ``collect`` is a module too, which would be found first.
     _missing = error
 
 __all__ = ["ParallelConfig", "RolloutConfig", "Trial", "collect", "harmless", "parallel_map"]

@@ -208,11 +208,12 @@ def table(found: Sequence[Measured], args: Args) -> Table:
         for c in (m.comparison,)
     ]
     return Table(
-        f"Reflexes against the policy alone, paired by seed, {args.episodes} episodes of each of "
-        f"{', '.join(args.tasks)}, {args.policy}; force on the arm from outside while the fault lasts; in brackets "
-        "95 % bootstrap intervals. The ideal reflex is told of the fault: it stays from the first physics substep of a "
-        "contact to its end, and its senses are never at fault. Shares of what it gains are of success / peak / "
-        "impulse, from the policy alone (0) to it (1). Within limits: contacts under the forces of ISO/TS 15066 for "
+        f"Reflexes against the policy alone, paired by seed. {args.episodes} episodes of each of "
+        f"{', '.join(args.tasks)}, {args.policy}. Force is that on the arm from outside while the fault lasts. "
+        "Brackets hold 95 % bootstrap intervals. The ideal reflex is told of the fault. It stays from the first "
+        "physics substep of a contact to its end, and its senses are never at fault. Shares of what it gains are of "
+        "success / peak / impulse, from the policy alone (0) to it (1). Within limits: contacts under the forces of "
+        "ISO/TS 15066 for "
         f"the {args.region}, which is no claim of conformity.",
         headings,
         rows,
