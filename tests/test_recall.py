@@ -190,7 +190,8 @@ def test_a_memory_that_was_loaded_recalls_the_same(asm, tmp_path):
         (np.zeros((5, 13)), 5, r"14 numbers a step.*\(5, 13\)"),
         (np.full((5, 14), np.nan), 5, r"cue row 0, joint_position\[0\] must be finite, got nan"),
         (np.full((5, 14), np.inf), 5, "must be finite, got inf"),
-        (np.zeros((5, 14)), 0, "steps must be at least 1, got 0"),
+        (np.zeros((5, 14)), 0, "steps must be a whole number in .*, got 0"),
+        (np.zeros((5, 14)), 10**10, "steps must be a whole number in .*, got 10000000000"),
     ],
 )
 def test_a_cue_that_cannot_be_recalled_from_is_refused(asm, rows, steps, message):

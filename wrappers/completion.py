@@ -219,12 +219,6 @@ def _laid_out(layout: dict[str, int], spec: StreamSpec, space: spaces.Space[Any]
     return found
 
 
-def repair_for(monitor: Monitor, trust_s: float = TRUST_S) -> Repair | None:
-    """What repairs the rows that ``monitor`` watches; None where it knows no completion."""
-    diagnosis = monitor.diagnosis_ if isinstance(monitor, ExplainsItself) else None
-    return None if diagnosis is None else Repair(diagnosis.completion, trust_s)
-
-
 class CompletedObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Hands on the observation and the stream with the numbers that a sense at fault should say.
 

@@ -20,9 +20,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_number
 from asm_gym.memory.energy import Array
 from asm_gym.memory.network import Network, Step
 from asm_gym.scaling import StreamScaler
+
+MOST_STEPS = 1_000_000
+"""Rows that are recalled at once."""
 
 
 class Recalled(NamedTuple):
@@ -85,6 +89,7 @@ def continued(
 
 def check_cue(reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
     """The cue (T, D) to recall ``steps`` rows from. Raises ValueError unless it can be recalled from."""
+    check_number("steps", steps, low=1, high=MOST_STEPS, whole=True)
     rows, least = np.asarray(cue, np.float64), 2 * reader.lag
     if rows.ndim != 2:
         raise ValueError(f"a cue has the shape (T, {reader.spec.size}), got {rows.shape}")
@@ -95,8 +100,6 @@ def check_cue(reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int) 
     if len(bad):
         row, column = bad[0]
         raise ValueError(f"cue row {row}, {reader.spec.labels[column]} must be finite, got {rows[row, column]}")
-    if steps < 1:
-        raise ValueError(f"steps must be at least 1, got {steps}")
     return rows
 
 

@@ -400,7 +400,8 @@ class NeuralASM(CalibratedMonitor):
             steps: how many rows to recall.
 
         Raises:
-            ValueError: the cue is too short, not finite, or of another width; fewer than one step.
+            ValueError: the cue is too short, not finite, or of another width; fewer than one step, or more than a
+                million.
         """
         self._fitted()
         return self.model.recall(cue, steps)
