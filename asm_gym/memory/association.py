@@ -14,7 +14,7 @@ learn what is left of it, and are believed as far as rows that they have not lea
 
 The rule equals the gradient of a Huber loss, and Uᵀ is the transpose of the weights that predict (weight transport):
 this is backpropagation through one layer, at one moment, and only ΔU is local. Nor is D, from the inverse of what all
-inputs have in common.
+inputs have in common. ``feedback`` has other ways for the errors to come back, and what they find is measured.
 
 Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning by prediction errors; Salvatori et al. 2021
 (NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest; Huber 1964 for ψ.
@@ -108,6 +108,24 @@ def existing(association: Association) -> Change:
     return Change(*((W != 0).astype(np.float32) for W in (association.V, association.U, association.D)))
 
 
+class Feedback:
+    """How the hidden units learn what they did wrong: here by the transposed weights."""
+
+    def begin(self, exists: Array, rng: np.random.Generator) -> None:
+        """Before the first batch; ``exists`` is 1 where U (X, M) has a synapse."""
+
+    def back(self, U: Array) -> Array:
+        """(X, M) by which errors come back."""
+        return U
+
+    def change(self, a: Array, left: Array, spread: Array, V: Array, U: Array, D: Array) -> tuple[Change, Array]:
+        """As ``association_change``."""
+        return association_change(a, left, spread, V, U, D, back=self.back(U))
+
+    def learn(self, U: Array, change: Array, rate: float) -> None:
+        """After a batch, in which U (X, M) was changed along ``change``."""
+
+
 @kernel
 def hidden_units(a: Array, V: Array) -> Array:
     """f(h) (B, M) for inputs ``a`` (B, I)."""
@@ -159,13 +177,24 @@ def normalised_errors(
 
 
 def association_change(
-    a: Array, delta: Array, spread: Array, V: Array, U: Array, D: Array, bound: float = 1.0
+    a: Array,
+    delta: Array,
+    spread: Array,
+    V: Array,
+    U: Array,
+    D: Array,
+    bound: float = 1.0,
+    back: Array | None = None,
 ) -> tuple[Change, Array]:
-    """What each synapse changes by for inputs (B, I) and changes (B, X), as if all existed; and the errors (B, X)."""
+    """What each synapse changes by for inputs (B, I) and changes (B, X), as if all existed; and the errors (B, X).
+
+    Args:
+        back: (X, M) by which errors come back to the hidden units; ``U`` where None.
+    """
     f = hidden_units(a, V)
     error = delta - complete(f, a, U, D)
     pulled = np.clip(error / spread, np.float32(-bound), np.float32(bound))
-    upstream = (np.float32(1) - f * f) * (pulled @ U)  # (B, M) ε_h
+    upstream = (np.float32(1) - f * f) * (pulled @ (U if back is None else back))  # (B, M) ε_h
     return Change(coincidence(upstream, a), coincidence(pulled, f), coincidence(pulled, a)), error
 
 
@@ -179,6 +208,7 @@ def learn_association(
     tick: Callable[[], None] = lambda: None,
     updates: int = UPDATES,
     passes: int = PASSES,
+    feedback: Feedback | None = None,
 ) -> Association:
     """What is linear in closed form; what remains by the hidden units, in random order; how sure it is last.
 
@@ -189,15 +219,15 @@ def learn_association(
         groups, changes, size: as in ``synapses``.
         tick: called ``TICKS`` times on the way, and once after each of ``PRECISION_EPOCHS``.
         updates, passes: over batches and over the N steps, at most.
+        feedback: how errors come back to the hidden units; by the transposed weights where None.
     """
     D = learn_linear(a, groups, changes)
     remainder = np.maximum(np.sqrt(np.mean((delta - a @ D.T) ** 2, axis=0)), SMALLEST_SPREAD)  # (X,)
     left = (delta - a @ D.T) / remainder
     fresh = len(tried_on(a))
     shown = max(len(a) - fresh, 1)
-    V, U = _learn_hidden(
-        a[:shown], left[:shown], synapses(groups, changes, a.shape[1], size), rng, tick, updates, passes
-    )
+    exists = synapses(groups, changes, a.shape[1], size)
+    V, U = _learn_hidden(a[:shown], left[:shown], exists, rng, tick, updates, passes, feedback or Feedback())
     # How far it goes wrong in rows that it has learned says too little of how far it will.
     f, left = hidden_units(a[-fresh:], V), left[-fresh:]
     U *= trust(left, f @ U.T)[:, None]
@@ -221,6 +251,7 @@ def _learn_hidden(
     tick: Callable[[], None],
     updates: int,
     passes: int,
+    feedback: Feedback,
 ) -> tuple[Array, Array]:
     """V and U from N rows (N, I) and what the linear part leaves of them (N, X), standardised."""
     updates = max(TICKS, min(updates, passes * len(a) // BATCH))
@@ -228,11 +259,13 @@ def _learn_hidden(
     U, nothing = np.zeros_like(exists.U), np.zeros_like(exists.D)
     into, out_of = Synapse(V), Synapse(U)
     spread = np.ones(left.shape[1], np.float32)
+    feedback.begin(exists.U, rng)
     for n, chosen in zip(range(updates), shuffled(len(a), BATCH, rng), strict=False):
-        change, error = association_change(a[chosen], left[chosen], spread, V, U, nothing)
-        rate = _rate(n / updates)
+        change, error = feedback.change(a[chosen], left[chosen], spread, V, U, nothing)
+        rate, outward_change = _rate(n / updates), change.U * exists.U
         into.learn(change.V * exists.V, rate)
-        out_of.learn(change.U * exists.U, rate)
+        out_of.learn(outward_change, rate)
+        feedback.learn(U, outward_change, rate)
         now = np.sqrt(np.mean(np.minimum(error**2, 9 * spread**2), axis=0))
         spread += TRACKING * (np.maximum(now, SMALLEST_SPREAD) - spread)
         if (n + 1) * TICKS // updates > n * TICKS // updates:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,13 @@ def result_of(
         by_role: fit, calibration and nominal episodes, and perhaps faulty and harmless ones.
         rate: share of nominal episodes that may raise an alarm.
     """
-    monitor = fitted(folder, name, by_role["fit"], seed)
+    return judged(name, fitted(folder, name, by_role["fit"], seed), by_role, rate)
+
+
+def judged(
+    name: str, monitor: CalibratedMonitor, by_role: Mapping[str, Sequence[Episode]], rate: float
+) -> MonitorResult:
+    """What a fitted monitor makes of the episodes, once it is calibrated."""
     monitor.calibrate(by_role["calibration"], rate)
     rates = sorted({rate, *(r for r in RATES if len(by_role["calibration"]) >= conformal_episodes(r))})
     thresholds = {r: monitor.threshold_at(r) for r in rates}
@@ -100,17 +107,36 @@ def result_of(
     )
 
 
+LEARNING = ("memory", "detection", "monitors", "scaling.py", "stream.py")
+"""What decides, in the package, over what a monitor learns."""
+
+
+@cache
+def code_digest(package: Path = Path(asm_gym.__file__).parent) -> str:
+    """Of the code in ``LEARNING``."""
+    made = hashlib.sha256()
+    for place in (package / name for name in LEARNING):
+        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            made.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
+    return made.hexdigest()[:8]
+
+
 def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) -> CalibratedMonitor:
-    """The monitor fitted on these episodes; kept in the folder for the next time, under the name of what it learned."""
+    """The monitor fitted on these episodes; kept in the folder for the next time, by what it learned and by which code.
+
+    Warns where one is there that other code has learned, and fits anew.
+    """
     spec = recordings[0].spec
     model = name.removesuffix(EVIDENCE)
     made = make_monitor(name, spec, seed=seed)
     learned = model, asm_gym.__version__, made.get_params(), sorted(str(r.labelled.path) for r in recordings)
-    digest = hashlib.sha256(json.dumps(learned, default=str).encode())
-    path = folder / "monitors" / f"{model}-{digest.hexdigest()[:12]}.asm"
+    digest = hashlib.sha256(json.dumps(learned, default=str).encode()).hexdigest()[:12]
+    path = folder / "monitors" / f"{model}-{digest}-{code_digest()}.asm"
     # One that cannot be read, for it is damaged or of an older asm-gym, is made anew.
     with suppress(FileNotFoundError, ValueError):
         return monitor_class(name).load(path)
+    if any(other != path for other in path.parent.glob(f"{model}-{digest}*.asm")):
+        warnings.warn(f"{model} was fitted by other code than today's: it is fitted anew", stacklevel=2)
     monitor = made.fit(recordings)
     path.parent.mkdir(parents=True, exist_ok=True)
     monitor.save(path)

@@ -1,0 +1,198 @@
+"""What local learning of association costs: its hidden units taught in four ways, and left out.
+
+Reads the recordings of ``asm-gym evaluate``. Association stands alone, without the context that the temporal network
+gives, so that nothing but the way that errors come back differs: see ``memory.feedback``.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, NamedTuple, Self
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.console import Console
+
+from asm_gym.choices import check_choice
+from asm_gym.detection import EvidenceDetection, ModelOutput, conformal_episodes
+from asm_gym.detection.base import Arrays
+from asm_gym.episodes import Episode
+from asm_gym.evaluation.comparison import BenchmarkResult, MonitorResult
+from asm_gym.evaluation.figures import figure
+from asm_gym.evaluation.resampling import interval
+from asm_gym.evaluation.tables import lead_table, monitors_table
+from asm_gym.faults.suite import KINDS, kinds_of
+from asm_gym.memory.association import Association, learn_association, normalised_errors, spans
+from asm_gym.memory.feedback import FEEDBACK
+from asm_gym.monitors import CalibratedMonitor, make_monitor
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
+from asm_gym.monitors.model import StreamModel
+from asm_gym.rollouts.benchmark import detectability_of, judged
+from asm_gym.rollouts.folder import recorded, tasks_in
+from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.progress import stage
+from asm_gym.scaling import StreamScaler, rows_apart
+from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce
+from asm_gym.scripts.reproduce.learning_curve import in_turn
+from asm_gym.stream import StreamSpec
+
+UNITS = 960
+"""Of association, shared out among the groups, as in the memory."""
+
+LINEAR = "linear"
+"""No hidden units at all."""
+WAYS = (*FEEDBACK, LINEAR)
+
+QUICK = 12
+"""Episodes that are learned from with ``--quick``."""
+
+
+@dataclass(frozen=True)
+class Args(Common):
+    """Association whose errors come back in different ways."""
+
+    seeds: int = 1
+    """How often it repeats itself."""
+    run: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
+    """Folder of an evaluation, whose recordings are learned from and judged."""
+    ways: tuple[str, ...] = WAYS
+    """How errors come back to the hidden units."""
+    kinds: tuple[str, ...] = ()
+    """Kinds of fault, development or test, of those that the run has recorded; all by default."""
+    episodes: int = 1000
+    """How many episodes are learned from at most, of all tasks together."""
+    false_alarm_rate: float = 0.01
+    """Share of nominal episodes that may raise an alarm."""
+    window: float = 1.0
+    """How soon after its onset a fault must be noticed [s]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in self.ways:
+            check_choice("way of feedback", name, WAYS)
+        kinds_of(self.kinds)
+        conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
+        if not self.ways or self.episodes < 1:
+            raise ValueError("there must be a way of feedback, and one episode to learn from")
+        if not self.tasks:
+            raise ValueError(f"{self.run} holds no recordings: run asm-gym evaluate first")
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """What the run has recorded."""
+        return tuple(tasks_in(self.run))
+
+
+class FedAssociation(StreamModel):
+    """Association alone, its hidden units taught in a way of their own."""
+
+    kind = "fed_association"
+
+    def __init__(self, spec: StreamSpec, way: str) -> None:
+        super().__init__(spec)
+        self.way, self.lag = way, rows_apart(spec.dt)
+        self.shortest = 1 + self.lag
+
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        streams = [e.stream for e in episodes]
+        senses = StreamScaler.fit(self.spec, streams, self.lag)
+        a = np.concatenate([senses.read_episode(s).inputs[self.lag :] for s in streams])
+        delta, each = np.ascontiguousarray(a[:, senses.changes]), UNITS // (int(senses.groups.max()) + 1)
+        layout = senses.groups, senses.changes, max(1, each)
+        found = learn_association(a, delta, *layout, rng, feedback=FEEDBACK[self.way]())
+        standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change}
+        return self.restore({**standard, **found._asdict()})
+
+    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        self.senses_ = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
+        self.association_ = Association(**{n: learned[n] for n in Association._fields})
+        self.spans_ = spans(self.association_.U)
+        return super().restore(learned, skills)
+
+    def start(self, batch: int, skills: Sequence[str] = ()) -> Lagged:
+        return nothing_before(batch, self.lag, self.spec.size)
+
+    def predict(self, state: Lagged, rows: NDArray[np.float64]) -> tuple[Lagged, ModelOutput]:
+        state, r, known = associated(self.senses_, state, rows)
+        error, _ = normalised_errors(r.inputs, r.changes, known, *self.association_, self.spans_)
+        return state, ModelOutput(error, no_context(rows))
+
+
+class Job(NamedTuple):
+    """One way of feedback, to be learned and asked."""
+
+    way: str
+    seed: int
+
+    @property
+    def monitor(self) -> str:
+        """Its name in tables."""
+        return f"{self.way}, seed {self.seed}"
+
+
+def monitor_of(job: Job, spec: StreamSpec) -> CalibratedMonitor:
+    """What is to be fitted."""
+    if job.way == LINEAR:
+        return make_monitor("association_linear+evidence", spec, seed=job.seed)
+    return CalibratedMonitor(FedAssociation(spec, job.way), EvidenceDetection(spec), seed=job.seed)
+
+
+def roles_of(args: Args) -> dict[str, Sequence[Episode]]:
+    """The recordings by role, those of the kinds that are asked for."""
+    roles = recorded(args.run, args.tasks).roles
+    asked = kinds_of(args.kinds or tuple(KINDS))
+    return {**roles, "faulty": [e for e in roles.get("faulty", []) if e.labelled.kind in asked], "harmless": []}
+
+
+def score(job: Job, args: Args) -> MonitorResult:
+    """What association that was taught in one way makes of the recordings."""
+    roles = roles_of(args)
+    learned = in_turn(roles["fit"], job.seed)[: QUICK if args.quick else args.episodes]
+    return judged(job.monitor, monitor_of(job, learned[0].spec).fit(learned), roles, args.false_alarm_rate)
+
+
+def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+    """Teaches association in every way, and asks it."""
+    jobs = [Job(way, seed) for seed in args.repetitions for way in args.ways]
+    with stage("fitting and judging", console, seconds) as progress:
+        found = parallel_map(partial(score, args=args), jobs, args.workers, progress)
+    _, failed, twins = recorded(args.run, args.tasks)
+    seen = detectability_of(twins, roles_of(args)["faulty"], args.window)
+    by_name = {job.monitor: result for job, result in zip(jobs, found, strict=True)}
+    result = BenchmarkResult(by_name, seen, args.false_alarm_rate, args.window, failed)
+    records: list[Record] = [
+        {**job._asdict(), "auroc": m.auroc, "found": m.found[args.false_alarm_rate].value}
+        for job, m in zip(jobs, result.on_visible, strict=True)
+    ]
+    facts = {"tasks": args.tasks, "kinds": sorted({kind for kind, _ in result.visible})}
+    return Findings(records, [monitors_table(result), lead_table(result)], bars(result), facts)
+
+
+def bars(result: BenchmarkResult) -> Figure:
+    """AUROC of each, with its interval."""
+    with figure(height=3.0) as fig:
+        ax = fig.subplots()
+        names = [m.name for m in result.on_visible]
+        each = [interval(m.auroc, m.draws.auroc) for m in result.on_visible]
+        centre, low, high = np.array(each).T
+        ax.errorbar(centre, names, xerr=[centre - low, high - centre], fmt="o", capsize=3)
+        ax.invert_yaxis()
+        ax.set(xlabel="AUROC, same steps")
+        ax.grid(axis="x", color="#dddddd", linewidth=0.6)
+    return fig
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Compares, and returns the exit code."""
+    return reproduce("feedback", study, Args, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
