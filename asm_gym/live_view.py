@@ -63,7 +63,7 @@ class LiveView:
         self._drawn = [c for c in spec.channels if channels is None or c.name in channels]
         self._completion = model.completion_ if isinstance(model, Completes) else None
         self._before: NDArray[np.float64] | None = None
-        self._alarm = False
+        self._alarm, self._scenes = False, {"robot": False, "camera": False}
         self.path.parent.mkdir(parents=True, exist_ok=True)
         os.environ.setdefault("RERUN_FLUSH_TICK_SECS", "1")  # read by the next line: by default 0.008, a chunk a row
         self._stream = self._rr.RecordingStream("asm-gym")
@@ -74,17 +74,21 @@ class LiveView:
                 self._stream.log(f"senses/{channel.name}/{what}", self._rr.SeriesLines(names=names), static=True)
 
     def _arranged(self) -> Any:
-        """How the viewer shows it at first: surprise and threshold in one plot, and one for each channel."""
+        """How the viewer shows it at first: surprise with its threshold, each channel, and scenes that were seen."""
         views = require("rerun.blueprint", what="a live view")
-        plots = [views.TimeSeriesView(name=c.name, origin=f"/senses/{c.name}") for c in self._drawn]
+        kinds = {"robot": views.Spatial3DView, "camera": views.Spatial2DView}
+        scenes = [kinds[name](name=name, origin=f"/{name}") for name, seen in self._scenes.items() if seen]
+        bare = views.PlotLegend(
+            visible=False
+        )  # dozens of names would cover the lines; pointing at one says which it is
+        senses = [views.TimeSeriesView(name=c.name, origin=f"/senses/{c.name}", plot_legend=bare) for c in self._drawn]
         return views.Blueprint(
             views.Grid(
                 views.TimeSeriesView(name="surprise", origin="/", contents=["/surprise", "/threshold"]),
-                views.TimeSeriesView(name="shares", origin="/shares"),
-                *plots,
-                views.Spatial3DView(name="robot", origin="/robot"),
-                views.Spatial2DView(name="camera", origin="/camera"),
+                views.TimeSeriesView(name="shares", origin="/shares", plot_legend=bare),
                 views.TextLogView(name="log", origin="/log"),
+                *scenes,
+                *senses,
             )
         )
 
@@ -134,10 +138,20 @@ class LiveView:
             said = f"alarm: {self.spec.labels[int(np.argmax(shares))]}, {surprise / threshold:.2f} thresholds"
             log("log", rr.TextLog(said + _named(cause), level="WARN"))
         self._alarm = alarm
-        if picture is not None:
-            log("camera", rr.Image(picture))
-        if links is not None:
-            log("robot", rr.LineStrips3D(links))
+        scenes = {
+            "robot": None if links is None else rr.LineStrips3D(links),
+            "camera": None if picture is None else rr.Image(picture),
+        }
+        for name, scene in scenes.items():
+            if scene is not None:
+                self._show(name)
+                log(name, scene)
+
+    def _show(self, name: str) -> None:
+        """Gives a scene its place when it is first seen: a log of rows has neither robot nor camera."""
+        if not self._scenes[name]:
+            self._scenes[name] = True
+            self._stream.send_blueprint(self._arranged())
 
     def _expected(self, row: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Expectation and band of every number (D,); of actions, which nobody expects, what they are."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from functools import partial
 
@@ -34,6 +36,13 @@ def column(path, entity):
     return np.array([row for row in table[name].to_pylist() if row is not None])
 
 
+def origins(path):
+    """What the views of a recording's blueprints show."""
+    command = [sys.executable, "-m", "rerun", "rrd", "print", "-vvv", str(path)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return {name for name in ("camera", "robot", "log") if f"[/{name}]" in said}
+
+
 def test_what_a_watched_environment_did_is_in_the_recording(tmp_path):
     path = tmp_path / "run.rrd"
     env = RerunView(NeuralASMSafety(FakeEnv(), CueMonitor([2]), on_alarm="monitor"), path)
@@ -47,6 +56,7 @@ def test_what_a_watched_environment_did_is_in_the_recording(tmp_path):
     assert table[said].to_pylist() == [["alarm: position[0], 10.00 thresholds"]]
     pictures = rerun.dataframe.load_recording(str(path)).view(index="time", contents="/camera").select().read_all()
     assert pictures.num_rows == 5
+    assert origins(path) == {"camera", "log"}
 
 
 def test_the_links_of_a_robot_are_drawn_where_they_are(tmp_path):
@@ -99,6 +109,7 @@ def test_a_log_is_written_for_the_viewer_by_a_command(arm, tmp_path):
     np.testing.assert_allclose(
         column(tmp_path / "log.rrd", "surprise").ravel(), asm.score(episode(500)).value, rtol=1e-9
     )
+    assert origins(tmp_path / "log.rrd") == {"log"}  # there is neither a robot nor a camera
 
 
 def test_rows_that_come_slowly_share_a_chunk(tmp_path):
