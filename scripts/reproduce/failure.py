@@ -12,13 +12,12 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from rich.console import Console
 
 from asm_gym.choices import check_choice
@@ -28,15 +27,15 @@ from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.statistics import RESAMPLES, Estimate, Share, auroc
 from asm_gym.evaluation.tables import Table, count
 from asm_gym.evaluation.trace import NOMINAL
-from asm_gym.monitors import MONITORS, make_monitor
-from asm_gym.policies import make_policy
-from asm_gym.policies.network import NetworkPolicy
+from asm_gym.monitors import MONITORS
 from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce
+from asm_gym.scripts.reproduce.failure_rivals import NAMES, scored
+from asm_gym.scripts.reproduce.weakened import weakened
 from asm_gym.tasks import env_id
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import StreamRecorder
@@ -47,9 +46,6 @@ KINDS = {
     **dict.fromkeys(("Lift", "Stack"), ("teleport", "snatch", "slip", "gripper_opens")),
 }
 """What disturbs the agent of a task, in turn."""
-
-WEAKEST = 0.3
-"""Largest standard deviation of the share that a weight is off by; that of an episode is drawn below it."""
 
 TESTED = ("as it is", "weakened", "disturbed")
 SHARES = (0.25, 0.5, 1.0)
@@ -70,7 +66,7 @@ class Args(Common):
     tasks: tuple[str, ...] = ("Lift", "Stack")
     """Tasks that have an agent: Lift, Stack, Door; one monitor learns all of them."""
     monitors: tuple[str, ...] = ("memory_skill", "neural_asm", "logpzo", "rnd", "gru+evidence", "elapsed_time")
-    """Names of monitors; memory_skill is the skill surprise, neural_asm that of the body."""
+    """Names of monitors, or reversals, inconsistency, two_signals; memory_skill is skill surprise."""
     episodes: int = 40
     """Episodes of each task to learn from, to calibrate on, and to test on for each way of acting."""
     false_alarm_rate: float = 0.05
@@ -79,7 +75,7 @@ class Args(Common):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in self.monitors:
-            check_choice("monitor", name, MONITORS)
+            check_choice("monitor", name, (*MONITORS, *NAMES))
         for name in self.tasks:
             check_choice("task", name, AGENTS)
         conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
@@ -92,38 +88,6 @@ class Args(Common):
             return self
         monitors = tuple(name for name in self.monitors if name in _QUICKLY) or self.monitors[:1]
         return replace(self, tasks=self.tasks[:1], monitors=monitors, episodes=QUICK, false_alarm_rate=0.5)
-
-
-class Weakened:
-    """An agent of which every weight is off, by another draw in each episode."""
-
-    def __init__(self, agent: NetworkPolicy) -> None:
-        self._agent, self._layers = agent, agent.layers
-
-    def set_random_seed(self, seed: int) -> None:
-        """Of how far off it is."""
-        rng = np.random.default_rng([seed, 3])
-        size = WEAKEST * rng.random()
-        self._agent.layers = [
-            ((W * (1.0 + size * rng.standard_normal(W.shape))).astype(np.float32), b) for W, b in self._layers
-        ]
-
-    def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], Any]:
-        return self._agent.predict(observation, state, episode_start, deterministic)
-
-
-def weakened(env: gym.Env[Any, Any], name: str) -> Weakened:
-    """The agent of that name, weakened. Raises TypeError where it is no network."""
-    agent = make_policy(name, env)
-    if not isinstance(agent, NetworkPolicy):
-        raise TypeError(f"{name} is no network whose weights could be off")
-    return Weakened(agent)
 
 
 def labels(args: Args, seed: int) -> list[EpisodeLabel]:
@@ -166,14 +130,13 @@ def watched(name: str, seed: int, recordings: Sequence[Episode], args: Args) -> 
     def of(role: str) -> list[Episode]:
         return [e for e in recordings if e.labelled.role == role and e.success]
 
-    monitor = make_monitor(name, recordings[0].spec, seed=seed)
-    monitor.fit(of("fit")).calibrate(of("calibration"), args.false_alarm_rate)
     roles = {how.replace(" ", "_"): how for how in TESTED}
     tested = [e for e in recordings if e.labelled.role in roles]
+    values, threshold = scored(name, seed, of("fit"), of("calibration"), tested, args.false_alarm_rate)
     found = []
-    for episode, surprise in zip(tested, monitor.score_episodes(tested), strict=True):
-        so_far = np.maximum.accumulate(surprise.value)
-        over = np.flatnonzero(so_far > monitor.threshold)
+    for episode, value in zip(tested, values, strict=True):
+        so_far = np.maximum.accumulate(value)
+        over = np.flatnonzero(so_far > threshold)
         greatest = tuple(float(so_far[max(1, round(share * len(so_far))) - 1]) for share in SHARES)
         alarmed = float(over[0] + 1) / len(so_far) if len(over) else np.inf
         found.append(Watched(not episode.success, roles[episode.labelled.role], greatest, alarmed))
@@ -268,11 +231,21 @@ def order(by_monitor: Mapping[str, Sequence[Watched]]) -> Table:
         "failure, as it is": lambda w: w.failed and w.how == TESTED[0],
         "failure, otherwise": lambda w: w.failed and w.how != TESTED[0],
     }
-    rows = [
-        (name, *(count(Share.of([w.alarmed_after <= 1.0 for w in own if of(w)])) for of in groups.values()))
-        for name, own in by_monitor.items()
-    ]
-    return Table("Episodes with an alarm; wanted is an order from few to many.", ("Monitor", *groups), rows)
+    rows = []
+    for name, own in by_monitor.items():
+        shares = [Share.of([w.alarmed_after <= 1.0 for w in own if of(w)]) for of in groups.values()]
+        rows.append((name, *map(count, shares), "yes" if in_order(shares) else "no"))
+    return Table(
+        "Episodes with an alarm; wanted is an order: success known ≤ success new < failure known ≤ failure new.",
+        ("Monitor", *groups, "in order"),
+        rows,
+    )
+
+
+def in_order(shares: Sequence[Share]) -> bool:
+    """Of alarms in successes known and new, and in failures known and new; a group without episodes is passed over."""
+    there = [(share.value, failed) for share, failed in zip(shares, (0, 0, 1, 1), strict=True) if share.n]
+    return all(a <= b if of_a == of_b else a < b for (a, of_a), (b, of_b) in pairwise(there))
 
 
 def curve(by_monitor: Mapping[str, Sequence[Watched]]) -> Figure:
