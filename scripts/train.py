@@ -65,7 +65,7 @@ class Args:
     final_episodes: int = 100
     """Episodes of the last evaluation, on other seeds."""
     checkpoint_every: int = 2_500
-    """Control steps between checkpoints: what a kill loses at most."""
+    """Control steps between checkpoints: what a kill loses at most. PPO's wait for the end of its rollout."""
     parallel: tyro.conf.OmitArgPrefixes[ParallelConfig] = THIS_PROCESS
     """Who records demonstrations; learning is done by one process."""
     seed: int = 0

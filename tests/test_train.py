@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.logger import configure
+from torch.utils._pytree import tree_leaves
 
 from asm_gym.datasets import write_dataset
 from asm_gym.episodes import Episode
@@ -182,6 +183,48 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path):
     assert result["curve"][-1][0] == steps
     agent = NetworkPolicy.load(tmp_path / "agent.npz")
     assert (agent.observation_size, agent.action_size) == (3, 1)
+
+
+class Killed(BaseException):
+    """Ends a run wherever it is."""
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_run_that_was_killed_ends_in_the_same_weights_as_one_that_was_not(algorithm, tmp_path, monkeypatch):
+    recipe = RECIPES[algorithm]
+    few = {"batch_size": 8} | ({"n_steps": 16} if algorithm == "ppo" else {})
+    few = replace(recipe, settings=recipe.settings | few, critic_updates=4, anchor=1)
+    monkeypatch.setitem(RECIPES, algorithm, few)
+    plan = Plan("Pendulum-v1", {}, algorithm, 70, 10, 30, 1, 21, 3)
+
+    def train(name, killed_at=()):
+        for end in (*killed_at, None):
+
+            def tick(done, total, end=end):
+                if done == end:
+                    raise Killed
+
+            run = TrainingRun(plan, tmp_path / name, linear_expert())
+            try:
+                run.begin(lambda done, total: None)
+                run.learn(tick)
+            except Killed:
+                continue
+            finally:
+                run.close()
+        return run
+
+    whole, killed = train("whole"), train("killed", (10, 21, 35))
+    assert whole.state == killed.state
+    assert [step for step, _ in whole.state.curve] == [0, 30, 60, 80 if algorithm == "ppo" else 70]
+    for name, value in whole.learner.get_parameters().items():
+        found = killed.learner.get_parameters()[name]
+        leaves, others = (tree_leaves(x) for x in (value, found))
+        assert all(np.array_equal(a, b) for a, b in zip(leaves, others, strict=True)), name
+    for name in ("clone.npz", "best.npz"):
+        agents = [NetworkPolicy.load(tmp_path / folder / name) for folder in ("whole", "killed")]
+        seen = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
+        np.testing.assert_array_equal(*(agent.predict(seen)[0] for agent in agents))
 
 
 def test_an_expert_is_cloned_and_improved_end_to_end(tmp_path):

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TextIO, TypeVar
 
 import asm_gym
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
+from asm_gym.files import written_whole
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 
 Item = TypeVar("Item")
@@ -59,7 +60,8 @@ def claimed(folder: Path, name: str, settings: dict[str, Any]) -> Iterator[None]
                 raise ValueError(
                     f"{folder} holds recordings of other settings ({'; '.join(other)}): name another --out"
                 )
-        path.write_text(json.dumps(ours, indent=2) + "\n", encoding="utf-8")
+        with written_whole(path) as file:
+            file.write((json.dumps(ours, indent=2) + "\n").encode())
         yield
 
 

@@ -92,13 +92,11 @@ def tables(folder: Path) -> Any:
 
 
 def agent(folder: Path) -> Any:
-    """The weights of the clone, and at which steps the agent was judged.
-
-    What was learned since the last checkpoint is learned anew, by other random numbers.
-    """
-    clone, agents = folder / "clone.npz", sorted(p.name for p in folder.glob("*.npz"))
-    weights = {n: a.tobytes() for n, a in read_checkpoint(clone, kind_of(clone)).arrays.items()}
-    return agents, weights, [step for step, _ in json.loads((folder / "result.json").read_text())["curve"]]
+    """The weights of the agents, and how well they did."""
+    found = {p.name: read_checkpoint(p, kind_of(p)).arrays for p in sorted(folder.glob("*.npz"))}
+    weights = {(file, n): a.tobytes() for file, arrays in found.items() for n, a in arrays.items()}
+    result = json.loads((folder / "result.json").read_text())
+    return weights, result["curve"], result["success"]
 
 
 SIZES = (3, 24)

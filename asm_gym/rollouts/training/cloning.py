@@ -35,6 +35,10 @@ class Cloner:
         actions: (N, A), as the environment takes them.
         learning_rate: of the updates while learning; cloning itself begins at 1e-3.
         seed: of the batches.
+
+    Attributes:
+        draw: what batches are drawn with.
+        optimiser: of the updates while learning.
     """
 
     def __init__(
@@ -49,8 +53,8 @@ class Cloner:
             raise ValueError(f"every action needs its observation, got {len(observations)} and {len(actions)}")
         self._learner: Any = learner
         self._observations, self._actions = torch.as_tensor(observations), torch.as_tensor(as_kept(learner, actions))
-        self._draw = torch.Generator().manual_seed(seed)
-        self._optimiser = torch.optim.Adam(list(self._parameters()), lr=learning_rate)
+        self.draw = torch.Generator().manual_seed(seed)
+        self.optimiser = torch.optim.Adam(list(self._parameters()), lr=learning_rate)
 
     def clone(self, updates: int, progress: Progress = lambda done, total: None) -> float:
         """From scratch; returns the mean squared error of the last hundred updates."""
@@ -74,10 +78,10 @@ class Cloner:
     def anchor(self, updates: int) -> None:
         """A few more updates, while the actor learns."""
         for _ in range(updates):
-            self._update(self._optimiser)
+            self._update(self.optimiser)
 
     def _update(self, optimiser: torch.optim.Optimizer) -> float:
-        drawn = torch.randint(len(self._actions), (BATCH,), generator=self._draw)
+        drawn = torch.randint(len(self._actions), (BATCH,), generator=self.draw)
         loss = ((self._mean(self._observations[drawn]) - self._actions[drawn]) ** 2).mean()
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]

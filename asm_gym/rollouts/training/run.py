@@ -1,4 +1,8 @@
-"""One training run: cloned, warmed up, learning, judged now and then; where it was killed it goes on."""
+"""One training run: cloned, warmed up, learning, judged now and then; where it was killed it goes on.
+
+It learns in stretches. Each begins with a new episode and generators seeded by how far the run is, and ends with a
+checkpoint: what is learned in it follows from the checkpoint before it, whether or not the run was killed in between.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium.wrappers import TransformObservation
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
@@ -73,7 +78,7 @@ class Standard:
 
 
 class Evaluation(BaseCallback):
-    """Judges the agent now and then, keeps the best one, and writes checkpoints."""
+    """Judges the agent now and then, and keeps the best one."""
 
     def __init__(self, run: TrainingRun, tick: Progress) -> None:
         super().__init__()
@@ -86,8 +91,6 @@ class Evaluation(BaseCallback):
             success = self._run.evaluate()
             self.logger.record("eval/success", success)
             self.logger.dump(steps)
-        if steps % plan.checkpoint_every == 0:
-            save(self._run.out, self.model, self._run.state)
         return True
 
 
@@ -125,7 +128,7 @@ class TrainingRun:
         """Goes on from the newest checkpoint, or clones the expert."""
         folder = newest(self.out)
         if folder is not None:
-            self.state = resume(folder, self.learner)
+            self.state = resume(folder, self.learner, self._anchor)
             return
         if self.cloner is None:
             self.evaluate()
@@ -137,13 +140,16 @@ class TrainingRun:
             fill_buffer(self.learner, self.demonstrations, self.standard.mean, self.standard.scale)
             self.learner.set_logger(configure(None, []))
             warm_critic(self.learner, min(recipe.critic_updates, self.plan.cloning_updates) if self.plan.steps else 0)
-        save(self.out, self.learner, self.state)
+        save(self.out, self.learner, self.state, self._anchor)
+
+    @property
+    def _anchor(self) -> torch.optim.Optimizer | None:
+        return self.cloner.optimiser if self.cloner is not None else None
 
     def learn(self, tick: Progress) -> None:
-        """The steps that are left."""
-        done = self.state.steps
-        left = self.plan.steps - done
-        if left <= 0:
+        """The steps that are left, a checkpoint after each stretch; PPO ends one with the steps it gathers at once."""
+        done, plan = self.learner.num_timesteps, self.plan
+        if done >= plan.steps:
             return
         formats = ["csv"] + ["tensorboard"] * (importlib.util.find_spec("tensorboard") is not None)
         self.learner.set_logger(configure(str(self.out / "log" / f"from_{done}"), formats))
@@ -151,11 +157,22 @@ class TrainingRun:
         recipe = RECIPES[self.plan.algorithm]
         if self.cloner is not None and recipe.anchor:
             callbacks.append(Anchor(self.cloner, recipe.anchor))
-        self.learner.set_random_seed(self.plan.seed + done)
-        self.learner.learn(left, callback=callbacks, reset_num_timesteps=False)
-        if self.state.curve[-1][0] != self.learner.num_timesteps:
-            self.evaluate()
-        save(self.out, self.learner, self.state)
+        while done < plan.steps:
+            self._learn_on(min(plan.steps, (done // plan.checkpoint_every + 1) * plan.checkpoint_every), callbacks)
+            done = self.learner.num_timesteps
+            if done >= plan.steps and self.state.curve[-1][0] != done:
+                self.evaluate()
+            save(self.out, self.learner, self.state, self._anchor)
+
+    def _learn_on(self, until: int, callbacks: list[BaseCallback]) -> None:
+        """Learns until so many control steps are done, from a new episode on."""
+        seed, around = self.plan.seed + self.learner.num_timesteps, self.learner.get_env()
+        assert around is not None
+        self.learner.set_env(around, force_reset=True)
+        self.learner.set_random_seed(seed)
+        if self.cloner is not None:
+            self.cloner.draw.manual_seed(seed)
+        self.learner.learn(until - self.learner.num_timesteps, callback=callbacks, reset_num_timesteps=False)
 
     def evaluate(self) -> float:
         """The share of successes of the agent as it is now, which is kept where it is the best.

@@ -6,13 +6,15 @@ import json
 import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
+ANCHOR = "anchor.pth"
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
@@ -31,9 +33,15 @@ class TrainingState:
     curve: tuple[tuple[int, float], ...]
 
 
-def save(out: Path, learner: BaseAlgorithm, reached: TrainingState) -> Path:
-    """Writes a checkpoint, which appears when it is complete, and removes older ones."""
-    steps = learner.num_timesteps
+def save(
+    out: Path, learner: BaseAlgorithm, reached: TrainingState, anchor: torch.optim.Optimizer | None = None
+) -> Path:
+    """Writes a checkpoint, which appears when it is complete, and removes older ones.
+
+    Args:
+        anchor: what keeps the learner near its expert, where something does.
+    """
+    steps, counted = learner.num_timesteps, cast(Any, learner)
     folder = out / f"checkpoint_{steps}"
     unfinished = out / ".checkpoint"
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -44,7 +52,9 @@ def save(out: Path, learner: BaseAlgorithm, reached: TrainingState) -> Path:
         size = buffer.size()
         arrays = {name: getattr(buffer, name)[:size] for name in _BUFFER}
         np.savez(unfinished / "buffer.npz", pos=buffer.pos, full=buffer.full, **arrays)
-    state = asdict(reached) | {"steps": steps}
+    if anchor is not None:
+        torch.save(anchor.state_dict(), unfinished / ANCHOR)
+    state = asdict(reached) | {"steps": steps, "updates": counted._n_updates}
     (unfinished / "state.json").write_text(json.dumps(state), encoding="utf-8")
     shutil.rmtree(folder, ignore_errors=True)
     unfinished.rename(folder)
@@ -60,12 +70,15 @@ def newest(out: Path) -> Path | None:
     return found[-1] if found else None
 
 
-def resume(folder: Path, learner: BaseAlgorithm) -> TrainingState:
+def resume(folder: Path, learner: BaseAlgorithm, anchor: torch.optim.Optimizer | None = None) -> TrainingState:
     """Puts a learner of the same settings where the checkpoint was made; only tensors and arrays are read.
+
+    A checkpoint of before leaves the anchor, and the count of updates, as they are.
 
     Raises:
         ValueError: the checkpoint is damaged, or of other settings.
     """
+    counted = cast(Any, learner)
     try:
         state = json.loads((folder / "state.json").read_text(encoding="utf-8"))
         _, parameters, variables = load_from_zip_file(folder / "learner.zip", load_data=False, device="cpu")
@@ -78,7 +91,9 @@ def resume(folder: Path, learner: BaseAlgorithm) -> TrainingState:
                 for name in _BUFFER:
                     getattr(buffer, name)[: len(arrays[name])] = arrays[name]
                 buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
-        learner.num_timesteps = state["steps"]
+        if anchor is not None and (folder / ANCHOR).is_file():
+            anchor.load_state_dict(torch.load(folder / ANCHOR, map_location="cpu", weights_only=True))
+        learner.num_timesteps, counted._n_updates = state["steps"], state.get("updates", counted._n_updates)
         curve = tuple((int(s), float(x)) for s, x in state["curve"])
         return TrainingState(state["steps"], state["best"], curve)
     except (OSError, KeyError, ValueError, RuntimeError) as error:
