@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 from asm_gym.evaluation.contact import ContactForce, contact_force, within_limits
 from asm_gym.evaluation.intervention import compare, share_of_ideal
 from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, InterventionOutcome, Trace
-from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, staged, watch_each
+from asm_gym.monitors import NeuralASM
+from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, band_of, staged, watch, watch_each
 from asm_gym.scripts.evaluate import main as evaluate
 from asm_gym.scripts.reproduce.reflexes import Args, main, trials
 
@@ -75,6 +77,81 @@ def test_only_episodes_that_may_differ_are_run(monkeypatch, kind, alarmed, runs)
     assert [t.acting for t in made] == [POLICY_ALONE, "ideal", "hold"]
 
 
+@pytest.mark.parametrize(
+    ("kind", "runs", "undisturbed"),
+    [
+        ("encoder_bias", ["policy alone", "graded+spinal"], 1),
+        (NOMINAL, ["graded+spinal"], 1),
+        ("collision", ["policy alone", "ideal", "graded+spinal"], 0),
+    ],
+)
+def test_what_is_known_of_the_seed_is_not_run_again_and_a_band_always_is(monkeypatch, kind, runs, undisturbed):
+    run, asked = [], []
+
+    def one(trial, config, memory):
+        run.append(trial.acting)
+        return trace(trial.seed, trial.acting, delay=99)
+
+    def quiet():
+        asked.append(kind)
+        return trace(0, POLICY_ALONE, delay=99, impulse=1.0)
+
+    monkeypatch.setattr("asm_gym.rollouts.trial.watch", one)
+    trial = Trial("asm_gym/Lift-v0", 0, kind, "" if kind == NOMINAL else "strong")
+    made = watch_each(trial, (POLICY_ALONE, "ideal", "graded+spinal"), RolloutConfig(), Path("none"), quiet)
+    assert (run, len(asked)) == (runs, undisturbed)
+    assert made[1].acting == "ideal"
+    assert (made[1].outcome.impulse == 1.0) == (undisturbed == 1)
+
+
+def test_the_ideal_episode_of_a_sensors_fault_is_the_one_in_which_nothing_is_wrong(tmp_path):
+    memory = tmp_path / "memory.asm"
+    NeuralASM.pretrained("panda").save(memory)
+    faulty = Trial("asm_gym/Lift-v0", 3, "encoder_bias", "strong", acting="ideal", after_s=0.5)
+    ran, known = (
+        watch(trial, RolloutConfig(robot="Panda"), memory)
+        for trial in (faulty, Trial("asm_gym/Lift-v0", 3, after_s=0.5))
+    )
+    assert ran.outcome == known.outcome
+    np.testing.assert_array_equal(ran.surprise, known.surprise)
+
+
+def test_a_trace_that_was_kept_is_the_same():
+    made = trace(3, "graded", contact=ContactForce(7.5, 0.1), cause="contact", impulse=math.inf)
+    again = Trace.from_json(made.to_json())
+    assert repr(again.outcome) == repr(made.outcome)
+    assert (again.acting, again.delay, again.to_json()) == (made.acting, made.delay, made.to_json())
+    np.testing.assert_array_equal(again.surprise, made.surprise)
+
+
+def test_a_command_that_was_stopped_goes_on(tmp_path, monkeypatch):
+    ran = []
+
+    def one(trial, config, memory):
+        ran.append((trial.kind, trial.acting))
+        onset = None if trial.kind == NOMINAL else 2
+        return replace(trace(trial.seed, trial.acting), kind=trial.kind, onset=onset)
+
+    monkeypatch.setattr("asm_gym.rollouts.trial.watch", one)
+    monkeypatch.setattr("asm_gym.scripts.reproduce.reflexes.watch", one)
+    how = ["--tasks", "Lift", "--memory", "panda", "--reflexes", "hold", "--out", str(tmp_path), "--workers", "1"]
+    for faults, new in (
+        (["nominal", "encoder_bias"], [("nominal", "policy alone"), ("nominal", "hold")]),
+        (["nominal", "encoder_bias", "passing_push"], [("passing_push", a) for a in ("policy alone", "ideal", "hold")]),
+    ):
+        ran.clear()
+        assert main([*how, "--episodes", "1", "--faults", *faults]) == 0
+        biased = [("encoder_bias", a) for a in ("policy alone", "hold")] if len(faults) == 2 else []
+        assert ran == new + biased
+    made = json.loads((tmp_path / "reactions.json").read_text())["episodes"]
+    assert [e["acting"] for e in made] == ["policy alone", "ideal", "hold"] * 3
+
+
+def test_a_reflex_above_a_band_needs_one():
+    with pytest.raises(ValueError, match="band"):
+        band_of(RolloutConfig(), NeuralASM.pretrained("panda"))
+
+
 def test_each_task_has_the_agent_that_was_trained_in_it():
     args = Args(policy="agents")
     assert [args.config(task).policy for task in ("Lift", "Stack", "Door")] == ["lift_sac", "stack_sac", "door_sac"]
@@ -122,6 +199,7 @@ def test_the_ideal_reflex_stays_while_something_touches_and_is_told_no_lies():
     ("arguments", "message"),
     [
         (["--reflexes", "dance"], "dance.*hold"),
+        (["--reflexes", "dance+spinal"], "dance.*hold"),
         (["--faults", "meteor"], "meteor.*passing_push"),
         (["--episodes", "0"], "episodes"),
         (["--max-override-s", "0"], "max_override_s"),
@@ -144,9 +222,10 @@ def test_it_runs_on_what_an_evaluation_has_recorded(tmp_path):
     counts = ["--fit-episodes", "10", "--calibration-episodes", "19", "--nominal-episodes", "2"]
     few = ["--faulty-episodes", "1", "--harmless-episodes", "1", "--false-alarm-rate", "0.05", "--no-video"]
     assert evaluate([*small, *counts, *few, "--monitors", "neural_asm", "--out", str(tmp_path / "run")]) == 0
-    how = ["--tasks", "Lift", "--reflexes", "hold", "retract", "terminate", "--faults", "nominal", "collision"]
+    how = ["--tasks", "Lift", "--reflexes", "hold", "hold+spinal", "terminate", "--faults", "nominal", "collision"]
     where = ["--run", str(tmp_path / "run"), "--out", str(tmp_path / "out")]
-    assert main([*how, *where, "--episodes", "2", "--false-alarm-rate", "0.05"]) == 0
+    felt = ["--fit-episodes", "4", "--calibration-episodes", "19", "--false-alarm-rate", "0.05"]
+    assert main([*how, *where, *felt, "--episodes", "2"]) == 0
     made = json.loads((tmp_path / "out" / "reactions.json").read_text())["episodes"]
     assert len(made) == 2 * 2 * 5
     for one in made:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,6 +124,22 @@ class Trace:
     top_channel: str = ""
     outcome: InterventionOutcome = InterventionOutcome()  # noqa: RUF009  (immutable)
     detail: TraceDetail | None = None
+
+    def to_json(self) -> str:
+        """All of it but ``detail``."""
+        kept = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "detail"}
+        return json.dumps(
+            kept, default=lambda value: value.tolist() if isinstance(value, np.ndarray) else sorted(value)
+        )
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """What ``to_json`` wrote, to the last bit."""
+        kept = json.loads(text)
+        outcome = InterventionOutcome(*kept.pop("outcome"))
+        outcome = outcome._replace(contact=ContactForce(*outcome.contact))
+        surprise, affected = np.array(kept.pop("surprise"), np.float64), frozenset(kept.pop("affected_channels"))
+        return cls(**kept, surprise=surprise, affected_channels=affected, outcome=outcome)
 
     def __post_init__(self) -> None:
         if self.surprise.ndim != 1 or not len(self.surprise):

@@ -26,6 +26,7 @@ from asm_gym.faults.body import touches_body
 from asm_gym.faults.sensor import corrupts_senses
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
 from asm_gym.monitors import Monitor, NeuralASM
+from asm_gym.monitors.spinal import SpinalBand
 from asm_gym.policies import Policy, Seeded, make_policy, rollout
 from asm_gym.policies.scripted.base import Style
 from asm_gym.rollouts.seeds import draw_onset, episode_seeds
@@ -42,6 +43,8 @@ PolicySource = str | Path | Policy | Callable[[gym.Env[Any, Any]], Policy]
 
 Made = TypeVar("Made")
 
+SPINAL = "+spinal"
+"""Ends the name of a reflex under which the arm also stays as soon as it leaves the band of ``RolloutConfig``."""
 PASSING = "passing_push"
 """20 N for 0.3 s: a kind beside those of the suite."""
 EXECUTIONS = {"slower": 0.85, "faster": 1.15}
@@ -60,6 +63,7 @@ class RolloutConfig:
         stream_freq: rows of the stream a second [Hz]; one each control step by default.
         max_override_s: how long a reflex may act at a stretch before the episode is ended [s].
         env_kwargs: what ``gym.make`` is given besides.
+        band: file of a calibrated ``SpinalBand`` of the memory that watches, for reflexes that are ``"+spinal"``.
     """
 
     policy: PolicySource = "scripted"
@@ -67,6 +71,7 @@ class RolloutConfig:
     stream_freq: int | None = None
     max_override_s: float | None = None
     env_kwargs: Settings = ()
+    band: Path | None = None
 
     @property
     def settings(self) -> Settings:
@@ -88,7 +93,7 @@ class Trial:
         onset: when it begins [steps]; by default drawn from the seed, in the first half of the episode.
         faults: what goes wrong, in place of what ``kind`` names.
         acting: ``"policy alone"``, ``"ideal"`` for a reflex that is told what is wrong and when, or what ``on_alarm``
-            takes.
+            takes, which may end in ``"+spinal"``.
         after_s: where to leave the episode, counted from the onset [s]; at its end by default.
     """
 
@@ -116,7 +121,7 @@ class Trial:
     @property
     def on_alarm(self) -> str:
         """What the safety wrapper is told."""
-        return "monitor" if self.acting in (POLICY_ALONE, IDEAL) else self.acting
+        return "monitor" if self.acting in (POLICY_ALONE, IDEAL) else self.acting.removesuffix(SPINAL)
 
     def begins(self, env: gym.Env[Any, Any]) -> int:
         """When in ``env`` something goes wrong, or would [steps]."""
@@ -255,12 +260,16 @@ def policy_for(source: PolicySource, env: gym.Env[Any, Any], seed: int, **kwargs
 
 
 def guarded(
-    env: gym.Env[Any, Any], monitor: Monitor, trial: Trial, max_override_s: float | None = None
+    env: gym.Env[Any, Any],
+    monitor: Monitor,
+    trial: Trial,
+    max_override_s: float | None = None,
+    band: SpinalBand | None = None,
 ) -> gym.Env[Any, Any]:
     """``env`` under the safety wrapper, which acts as the trial says."""
     limited = max_override_s is not None and trial.acting not in (POLICY_ALONE, IDEAL)
     steps = max(1, round((max_override_s or 0.0) / control_period(env))) if limited else None
-    return NeuralASMSafety(env, monitor, on_alarm=trial.on_alarm, max_override=steps, on_overrun="ignore")
+    return NeuralASMSafety(env, monitor, on_alarm=trial.on_alarm, max_override=steps, on_overrun="ignore", spinal=band)
 
 
 def record(label: EpisodeLabel, config: RolloutConfig, folder: Path) -> Path:
@@ -295,8 +304,9 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> Trace:
     """
     monitor = _memory(memory, memory.stat().st_mtime_ns)
     infos: list[dict[str, Any]] = []
+    band = band_of(config, monitor) if trial.acting.endswith(SPINAL) else None
     with staged(trial, config) as env:
-        success = play(trial, config, guarded(env, monitor, trial, config.max_override_s), infos.append)
+        success = play(trial, config, guarded(env, monitor, trial, config.max_override_s, band), infos.append)
         began, dt = trial.begins(env), control_period(env)
     asm = [info["asm"] for info in infos]
     rows = len(asm[0]["surprises"])  # of each control step
@@ -340,17 +350,41 @@ def watch_pair(trial: Trial, config: RolloutConfig, memory: Path) -> list[Trace]
     return watch_each(replace(trial, acting=POLICY_ALONE), (POLICY_ALONE, trial.acting), config, memory)
 
 
-def watch_each(trial: Trial, actings: Sequence[str], config: RolloutConfig, memory: Path) -> list[Trace]:
+def band_of(config: RolloutConfig, monitor: NeuralASM) -> SpinalBand:
+    """The band beneath a reflex. Raises ValueError where none was named."""
+    if config.band is None:
+        raise ValueError(f"a reflex that ends in {SPINAL} needs the file of a band: RolloutConfig(band=...)")
+    return SpinalBand.load(config.band, monitor)
+
+
+def watch_each(
+    trial: Trial,
+    actings: Sequence[str],
+    config: RolloutConfig,
+    memory: Path,
+    undisturbed: Callable[[], Trace] | None = None,
+) -> list[Trace]:
     """The traces of one trial with each of ``actings``, of which those that must be the same run once.
 
-    The wrapper acts only after an alarm, so without one any reflex's episode is that of the policy alone; the ideal
-    reflex's is, where nothing touches the body and no sense is at fault.
+    Without a band the wrapper acts only after an alarm, so without one any reflex's episode is that of the policy
+    alone. The ideal reflex's is, where nothing touches the body and no sense is at fault. Where nothing but senses is
+    at fault, it is the one in which nothing goes wrong.
+
+    Args:
+        undisturbed: makes the trace of the policy alone in this trial when nothing goes wrong, where that is known.
     """
-    alone = watch(replace(trial, acting=POLICY_ALONE), config, memory)
+    if undisturbed is not None and trial.kind == NOMINAL:
+        alone = undisturbed()
+    else:
+        alone = watch(replace(trial, acting=POLICY_ALONE), config, memory)
+    of_senses = undisturbed is not None and concerns_senses_alone(trial, config)
 
     def found(acting: str) -> Trace:
+        if acting == IDEAL and of_senses and undisturbed is not None:
+            return replace(undisturbed(), kind=trial.kind, severity=trial.severity, acting=IDEAL)
         told = acting == IDEAL and concerns_ideal(trial, config)
-        if acting == POLICY_ALONE or not (told or (acting != IDEAL and alone.alarm.any())):
+        warned = acting != IDEAL and (alone.alarm.any() or acting.endswith(SPINAL))
+        if acting == POLICY_ALONE or not (told or warned):
             return replace(alone, acting=acting)
         return watch(replace(trial, acting=acting), config, memory)
 
@@ -361,3 +395,9 @@ def concerns_ideal(trial: Trial, config: RolloutConfig) -> bool:
     """Whether an ideal reflex has anything to do about what goes wrong."""
     faults = trial.faults_in(environment(trial.env_id, config.settings), config)
     return any(touches_body(fault) or corrupts_senses(fault) for fault in faults)
+
+
+def concerns_senses_alone(trial: Trial, config: RolloutConfig) -> bool:
+    """Whether something goes wrong, and none of it but with the senses."""
+    faults = trial.faults_in(environment(trial.env_id, config.settings), config)
+    return bool(faults) and all(corrupts_senses(fault) for fault in faults)

@@ -11,6 +11,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from asm_gym.episodes import Episode, load_episode
+from asm_gym.evaluation.reliability import Reliability, reliability
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.diagnosis import CLASSES, FAMILIES, WINDOW, Diagnosis, Hypothesis, Readout, averaged
@@ -52,6 +54,9 @@ SHRINKAGE, STEPS, RATE = 1e-3, 1500, 2.0
 
 FOLDS = 3
 """So many times a part of the seeds is left out."""
+
+BINS = (SURE, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
+"""Of the probabilities that are stated."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +160,7 @@ def asked(readout: Readout, rows: Examples, left_out: str, seed: int) -> list[Re
         unknown = bool(belief[family] < SURE or family == FAMILIES.index("unknown"))
         right = bool(family == FAMILY[rows.classes[i]]) and not unknown
         which = int(np.where(family == FAMILY, each[i], -1.0).argmax())
-        said = {"right": right, "unknown": unknown, "part": right and bool(rows.located[i, which])}
+        said = {"right": right, "unknown": unknown, "part": right and bool(rows.located[i, which]), "episode": episode}
         kind = str(rows.kinds[i])
         records.append({"seed": seed, "left_out": left_out, "kind": kind, "p": float(belief[family]), **said})
     return records
@@ -193,7 +198,8 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     shipped = learned(known)
     saved = {name: np.round(getattr(shipped, name), 5).tolist() for name in ("mean", "spread", "weights", "bias")}
     (args.out / "causes.json").write_text(json.dumps(saved), encoding="utf-8")
-    return Findings(records, [table(records, kinds)], figure(records), {})
+    found = {out: reliable(records, out) for out in (SEEDS_OUT, KINDS_OUT)}
+    return Findings(records, [table(records, kinds), promised(found)], figure(found), {})
 
 
 def table(records: Sequence[Record], kinds: Sequence[str]) -> Table:
@@ -219,21 +225,44 @@ def table(records: Sequence[Record], kinds: Sequence[str]) -> Table:
     )
 
 
-def figure(records: Sequence[Record]) -> Figure:
-    """How often it is right about other seeds, by how sure it is."""
-    records = [r for r in records if r["left_out"] == SEEDS_OUT]
+def reliable(records: Sequence[Record], left_out: str) -> Reliability:
+    """What is stated where a family is named, and whether it is right."""
+    named = [r for r in records if r["left_out"] == left_out and not r["unknown"]]
+    p, right, episodes = ([r[name] for r in named] for name in ("p", "right", "episode"))
+    return reliability(np.minimum(p, 1.0), np.array(right), np.array(episodes), BINS)
+
+
+def promised(found: dict[str, Reliability]) -> Table:
+    """A row for each bin of what is stated."""
+    rows = []
+    for k, (low, high) in enumerate(pairwise(BINS)):
+        told = [
+            (f"{r.rows[k]}", f"{r.episodes[k]}", f"{r.stated[k]:.2f}", r.right[k].percent()) for r in found.values()
+        ]
+        rows.append((f"{low:g} to {high:g}", *told[0], *told[1]))
+    errors = [("", "", "", r.error.percent()) for r in found.values()]
+    rows.append(("calibration error", *errors[0], *errors[1]))
+    one = ("Rows", "Episodes", "Mean", "Right")
+    return Table(
+        "What a stated probability is worth. Rows in alarm in which a family is named, by the probability of it, in "
+        "episodes of seeds, and then of kinds, that the read-out did not learn from. Brackets hold 95 % bootstrap "
+        "intervals over episodes. The calibration error is the mean over rows of how far the share that is right and "
+        "the mean stated are apart in their bin.",
+        ("Stated", *one, *(f"Kind left out: {name.lower()}" for name in one)),
+        rows,
+    )
+
+
+def figure(found: dict[str, Reliability]) -> Figure:
+    """How often it is right about what it has not learned from, by how sure it is."""
     drawn = Figure(figsize=(4, 4), layout="constrained")
     axes: Any = drawn.add_subplot()
-    edges = np.linspace(SURE, 1.0, 6)
-    sure = np.array([r["p"] for r in records if not r["unknown"]])
-    right = np.array([r["right"] for r in records if not r["unknown"]])
-    places = np.clip(np.digitize(sure, edges) - 1, 0, len(edges) - 2)
-    means = [
-        (sure[places == k].mean(), right[places == k].mean()) for k in range(len(edges) - 1) if (places == k).any()
-    ]
     axes.plot([SURE, 1], [SURE, 1], color="grey", linewidth=1)
-    axes.plot(*np.array(means).reshape(-1, 2).T, marker="o")
+    for left_out, r in found.items():
+        value, low, high = np.array(r.right).T
+        axes.errorbar(r.stated, value, [value - low, high - value], marker="o", label=f"{left_out} left out")
     axes.set(xlabel="probability it gives", ylabel="share it has right")
+    axes.legend()
     return drawn
 
 

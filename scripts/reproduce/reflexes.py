@@ -1,42 +1,42 @@
 """Lets reflexes act on the alarms of a memory that an evaluation has fitted: what is gained, what it costs.
 
 Every faulty episode is run with the policy alone and with each reflex, paired by seed, on the real simulator. Reads the
-folder of ``asm-gym evaluate`` for nominal episodes to learn from and to calibrate on.
+folder of ``asm-gym evaluate`` for nominal episodes to learn from and to calibrate on. A command that was stopped
+goes on where it was: traces are kept under ``--out``.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import sys
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
+from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated
 
 import tyro
 from rich.console import Console
 
 from asm_gym.choices import check_choice
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
-from asm_gym.evaluation.contact import QUASI_STATIC, within_limits
-from asm_gym.evaluation.intervention import Comparison, IdealShare, compare, share_of_ideal
-from asm_gym.evaluation.statistics import Share
+from asm_gym.evaluation.contact import QUASI_STATIC
 from asm_gym.evaluation.tables import Table, console_table, markdown
 from asm_gym.evaluation.trace import IDEAL, NOMINAL, POLICY_ALONE, Trace
 from asm_gym.faults.suite import KINDS
+from asm_gym.files import written_whole
 from asm_gym.monitors import NeuralASM, pretrained
 from asm_gym.policies.registry import agents
 from asm_gym.rollouts.benchmark import fitted
 from asm_gym.rollouts.collect import check
-from asm_gym.rollouts.folder import claimed, files_in, locked, make_missing
-from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress, parallel_map
+from asm_gym.rollouts.felt import band_of_task
+from asm_gym.rollouts.folder import claimed, files_in, locked, make_missing, versions
+from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, record, watch_each
+from asm_gym.rollouts.trial import PASSING, SPINAL, RolloutConfig, Trial, record, watch, watch_each
 from asm_gym.scripts.command import at_least, run
+from asm_gym.scripts.reproduce.reflexes_report import comparisons, row, table
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers.arguments import ON_ALARM
 
@@ -44,6 +44,12 @@ AGENTS = "agents"
 """As a policy: of each task the agent that was trained in it."""
 
 FAULTS = (NOMINAL, PASSING, "collision", "held_by_person", "stuck_joint", "encoder_bias")
+
+DECIDING = (
+    *("tasks", "robot", "policy", "reflexes", "monitor_freq", "fit_episodes", "calibration_episodes"),
+    *("max_override_s", "false_alarm_rate", "seed"),
+)
+"""Arguments that decide over an episode."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,8 @@ class Args:
     policy: str = "scripted"
     """What acts: scripted, agents for the shipped agent of each task, or the path of an agent."""
     reflexes: tuple[str, ...] = ("hold", "retract", "comply", "recall", "graded", "terminate")
-    """Names of reflexes: what the safety wrapper does on an alarm."""
+    """Names of reflexes: what the safety wrapper does on an alarm; with +spinal behind it, such as graded+spinal, above
+    a band on what the arm feels, which is learned first from nominal episodes of each task."""
     faults: tuple[str, ...] = FAULTS
     """nominal, passing_push (20 N for 0.3 s), or kinds of the suite, which are strong."""
     episodes: int = 12
@@ -70,7 +77,7 @@ class Args:
     monitor_freq: int | None = None
     """Rows watched a second [Hz], for reflexes within control steps; nominal episodes are then recorded here."""
     fit_episodes: int = 60
-    """Nominal episodes of each task to learn from, with a monitor_freq."""
+    """Nominal episodes of each task to learn from, with a monitor_freq or for bands."""
     calibration_episodes: int = 60
     """Other nominal episodes of each task, to calibrate on."""
     region: str = "hand"
@@ -78,7 +85,7 @@ class Args:
     max_override_s: float = 3.0
     """How long a reflex may act at a stretch before the episode is ended [s]."""
     false_alarm_rate: float = 0.01
-    """Share of nominal episodes that may raise an alarm."""
+    """Share of nominal episodes that may raise an alarm, of a memory that learns here, and of a band."""
     parallel: tyro.conf.OmitArgPrefixes[ParallelConfig] = TWO_PROCESSES
     """Who does the work."""
     seed: int = 0
@@ -90,7 +97,7 @@ class Args:
         for task in self.tasks:
             task_spec(task)
         for name in self.reflexes:
-            check_choice("reflex", name, ON_ALARM)
+            check_choice("reflex", name.removesuffix(SPINAL), ON_ALARM)
         check_choice("region of the body", self.region, QUASI_STATIC)
         for name in self.faults:
             check_choice("fault", name, (NOMINAL, PASSING, *KINDS))
@@ -105,7 +112,22 @@ class Args:
         policy = self.policy
         if policy == AGENTS:
             policy = next((name for name in agents() if name.startswith(f"{task.lower()}_")), policy)
-        return RolloutConfig(policy, self.robot, self.monitor_freq, self.max_override_s)
+        band = self.folder / f"{task}.band" if self.spinal else None
+        return RolloutConfig(policy, self.robot, self.monitor_freq, self.max_override_s, band=band)
+
+    @property
+    def spinal(self) -> bool:
+        """Whether bands are needed."""
+        return any(name.endswith(SPINAL) for name in self.reflexes)
+
+    @property
+    def folder(self) -> Path:
+        """Where traces and bands of these settings are kept, so that a command that was stopped goes on."""
+        given = self.memory or str(self.run)
+        memory = sha256(Path(given).read_bytes()).hexdigest() if Path(given).is_file() else given
+        settings = memory, versions(), [getattr(self, name) for name in DECIDING]
+        digest = sha256(json.dumps(settings, default=str).encode()).hexdigest()
+        return self.out.resolve() / "traces" / digest[:12]
 
 
 def learned_from(args: Args) -> NeuralASM:
@@ -146,102 +168,49 @@ def _record(label: EpisodeLabel, args: Args) -> Path:
     return record(label, args.config(label.task), args.out.resolve())
 
 
+def make_band(task: str, args: Args, memory: Path) -> Path:
+    """Learns what the arm feels in a task, and writes it where its reflexes look for it."""
+    counts = args.fit_episodes, args.calibration_episodes
+    band = band_of_task(NeuralASM.load(memory), task, args.config(task), counts, args.false_alarm_rate, args.seed)
+    path = args.folder / f"{task}.band"
+    band.save(path)
+    return path
+
+
 def trials(args: Args) -> list[Trial]:
-    """Every episode with the policy alone, those that share a task and a fault side by side."""
+    """Every episode with the policy alone, those that share a task and a seed side by side."""
     return [
         Trial(task_spec(task).id, seed, fault, "" if fault in (NOMINAL, PASSING) else "strong")
         for task in args.tasks
-        for fault in args.faults
         for seed in role_seeds(args.seed, task, "react", args.episodes)
+        for fault in args.faults
     ]
 
 
-class Measured(NamedTuple):
-    """What became of one reflex under one fault, over all tasks."""
-
-    comparison: Comparison
-    ideal: IdealShare
-    harmless: Share  # contacts within the limits
-    settled: Share  # episodes that were solved, or ended by the wrapper
-    named: Counter[str]  # families of causes at the first alarm
+def place(trial: Trial, folder: Path) -> Path:
+    """Where the traces of a trial are kept."""
+    return folder / f"{trial.task}-{trial.seed}-{trial.kind}.json"
 
 
-def comparisons(traces: Sequence[Trace], args: Args) -> list[Measured]:
-    """Each reflex under each fault, over all tasks."""
-
-    def of(fault: str, acting: str) -> list[Trace]:
-        return [t for t in traces if (t.kind, t.acting) == (fault, acting)]
-
-    def measured(fault: str, reflex: str) -> Measured:
-        alone, acted = of(fault, POLICY_ALONE), of(fault, reflex)
-        ideal = share_of_ideal(alone, acted, of(fault, IDEAL))
-        named = Counter(t.outcome.cause for t in acted if t.outcome.cause)
-        contacts = within_limits([t.outcome.contact for t in acted], args.region)
-        settled = Share.of([t.outcome.success or t.outcome.ended_by_alarm for t in acted])
-        return Measured(compare(alone, acted, args.seed), ideal, contacts, settled, named)
-
-    return [measured(fault, reflex) for fault in args.faults for reflex in (*args.reflexes, IDEAL)]
+def kept(trial: Trial, folder: Path) -> list[Trace]:
+    """The traces of a trial that was run."""
+    return [Trace.from_json(line) for line in place(trial, folder).read_text(encoding="utf-8").splitlines()]
 
 
-def table(found: Sequence[Measured], args: Args) -> Table:
-    """A row for each fault and reflex."""
-    headings = (
-        *("Fault", "Reflex", "Success", "alone", "gained", "Peak force less by", "Impulse less by"),
-        *("Of the ideal reflex's", "Within limits", "Solved or ended", "Median delay [ms]", "Cause named"),
-    )
-    rows = [
-        (
-            c.kind.replace("_", " "),
-            c.acting,
-            f"{100 * c.success.value:.0f} %",
-            f"{100 * c.alone.value:.0f} %",
-            c.gained.percent(),
-            c.peak.percent() if c.kind != NOMINAL else "",
-            c.impulse.percent() if c.kind != NOMINAL else "",
-            " / ".join("" if math.isnan(share) else f"{share:.2f}" for share in asdict(m.ideal).values()),
-            f"{m.harmless.k} of {m.harmless.n}",
-            f"{m.settled.k} of {m.settled.n}",
-            "" if c.kind == NOMINAL else f"{c.median_delay_ms:.0f}" if math.isfinite(c.median_delay_ms) else "missed",
-            ", ".join(f"{family} {n}" for family, n in m.named.most_common(3)),
-        )
-        for m in found
-        for c in (m.comparison,)
-    ]
-    return Table(
-        f"Reflexes against the policy alone, paired by seed. {args.episodes} episodes of each of "
-        f"{', '.join(args.tasks)}, {args.policy}. Force is that on the arm from outside while the fault lasts. "
-        "Brackets hold 95 % bootstrap intervals. The ideal reflex is told of the fault. It stays from the first "
-        "physics substep of a contact to its end, and its senses are never at fault. Shares of what it gains are of "
-        "success / peak / impulse, from the policy alone (0) to it (1). Within limits: contacts under the forces of "
-        "ISO/TS 15066 for "
-        f"the {args.region}, which is no claim of conformity.",
-        headings,
-        rows,
-    )
+def run_trial(trial: Trial, args: Args, memory: Path) -> Path:
+    """Runs a trial with the policy alone and with every reflex, and keeps the traces."""
+    config, folder = args.config(trial.task), args.folder
+    nominal = replace(trial, kind=NOMINAL, severity="")
 
+    @cache
+    def undisturbed() -> Trace:
+        known = kept(nominal, folder)[:1] if place(nominal, folder).is_file() else []
+        return known[0] if known else watch(nominal, config, memory)
 
-def _row(trace: Trace) -> dict[str, Any]:
-    """An episode as it is written down."""
-    return {
-        "task": trace.task,
-        "fault": trace.kind,
-        "acting": trace.acting,
-        "seed": trace.seed,
-        "success": trace.outcome.success,
-        "peak_force": trace.outcome.external_force,
-        "impulse": trace.outcome.impulse,
-        "alarm_s": float(trace.alarm.sum() * trace.dt),
-        "acted_s": trace.outcome.acted_s,
-        "delay_ms": None if trace.delay is None else 1e3 * trace.delay,
-        "ended": trace.outcome.ended_by_alarm,
-        "contact": list(trace.outcome.contact),
-        "cause": trace.outcome.cause,
-        "part": trace.outcome.part,
-    }
-
-
-def _watch(trial: Trial, args: Args, memory: Path) -> list[Trace]:
-    return watch_each(trial, (POLICY_ALONE, IDEAL, *args.reflexes), args.config(trial.task), memory)
+    traces = watch_each(trial, (POLICY_ALONE, IDEAL, *args.reflexes), config, memory, undisturbed)
+    with written_whole(place(trial, folder)) as file:
+        file.write("\n".join(trace.to_json() for trace in traces).encode())
+    return place(trial, folder)
 
 
 def memory_of(named: str) -> NeuralASM:
@@ -266,16 +235,22 @@ def _react(args: Args, console: Console) -> Table:
     memory = args.out / "memory.asm"
     with stage("fitting and calibrating", console, seconds):
         (learned_from(args) if args.memory is None else memory_of(args.memory)).save(memory)
+    if args.spinal:
+        with stage("learning what is felt", console, seconds) as progress:
+            feel = partial(make_band, args=args, memory=memory.resolve())
+            make_missing(feel, args.tasks, lambda task: args.folder / f"{task}.band", args.parallel, progress)
     with stage("acting", console, seconds) as progress:
-        run = partial(_watch, args=args, memory=memory.resolve())
-        traces = [trace for each in parallel_map(run, trials(args), args.parallel, progress) for trace in each]
+        make = partial(run_trial, args=args, memory=memory.resolve())
+        tried = trials(args)
+        make_missing(make, tried, lambda trial: place(trial, args.folder), args.parallel, progress)
+    traces = [trace for trial in tried for trace in kept(trial, args.folder)]
     found = comparisons(traces, args)
     made = table(found, args)
     (args.out / "reactions.md").write_text(markdown(made) + "\n", encoding="utf-8")
     content = {
         "settings": json.loads(json.dumps(asdict(args), default=str)),
         "seconds": seconds,
-        "episodes": [_row(trace) for trace in traces],
+        "episodes": [row(trace) for trace in traces],
     }
     (args.out / "reactions.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     return made

@@ -27,7 +27,7 @@ from asm_gym.evaluation.trace import IDEAL, POLICY_ALONE
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.spinal import SpinalBand
 from asm_gym.policies import rollout
-from asm_gym.rollouts.felt import felt_episodes
+from asm_gym.rollouts.felt import band_of_task
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import AFTER_S, PASSING, RolloutConfig, Trial, environment, policy_for, staged
@@ -138,13 +138,8 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     records: list[Record] = []
     facts: dict[str, Any] = {}
     for task, again in product(args.tasks, args.repetitions):
-        env = environment(env_id(task))
         with stage(f"recording {task}", console, seconds):
-            seen, fresh = (
-                felt_episodes(env, role_seeds(again, task, role, count))
-                for role, count in (("spinal fit", fit), ("spinal calibration", calibration))
-            )
-        band = SpinalBand(memory).fit(seen).calibrate(fresh, rate)
+            band = band_of_task(memory, task, RolloutConfig(), (fit, calibration), rate, again)
         if task not in facts:
             facts[task] = band.export(args.out / f"spinal_{task}.json")
         with stage(f"pushing {task}", console, seconds) as progress:
