@@ -112,10 +112,10 @@ LEARNING = ("memory", "detection", "monitors", "scaling.py", "stream.py")
 
 
 @cache
-def code_digest(package: Path = Path(asm_gym.__file__).parent) -> str:
-    """Of the code in ``LEARNING``."""
+def code_digest(package: Path = Path(asm_gym.__file__).parent, names: Sequence[str] = LEARNING) -> str:
+    """Of the code in these rooms and files of the package."""
     made = hashlib.sha256()
-    for place in (package / name for name in LEARNING):
+    for place in (package / name for name in names):
         for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
             made.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
     return made.hexdigest()[:8]

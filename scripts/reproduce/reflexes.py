@@ -27,7 +27,7 @@ from asm_gym.faults.suite import KINDS
 from asm_gym.files import written_whole
 from asm_gym.monitors import NeuralASM, pretrained
 from asm_gym.policies.registry import agents
-from asm_gym.rollouts.benchmark import fitted
+from asm_gym.rollouts.benchmark import LEARNING, code_digest, fitted
 from asm_gym.rollouts.collect import check
 from asm_gym.rollouts.felt import band_of_task
 from asm_gym.rollouts.folder import claimed, files_in, locked, make_missing, versions
@@ -122,10 +122,11 @@ class Args:
 
     @property
     def folder(self) -> Path:
-        """Where traces and bands of these settings are kept, so that a command that was stopped goes on."""
+        """Where traces and bands of these settings and this code are kept, so that a stopped command goes on."""
         given = self.memory or str(self.run)
         memory = sha256(Path(given).read_bytes()).hexdigest() if Path(given).is_file() else given
-        settings = memory, versions(), [getattr(self, name) for name in DECIDING]
+        code = code_digest(names=(*LEARNING, "envs", "faults", "policies", "rollouts", "wrappers"))
+        settings = memory, code, versions(), [getattr(self, name) for name in DECIDING]
         digest = sha256(json.dumps(settings, default=str).encode()).hexdigest()
         return self.out.resolve() / "traces" / digest[:12]
 
