@@ -15,13 +15,13 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = ()) -> F:
-    """Compiles ``function``, once a machine.
+    """Compiles ``function``, once a machine; while it runs, other threads may.
 
     Args:
         fastmath: lets loops use vector registers; inputs must then be finite.
         calls: folders of the package, beside its own, that hold functions which it calls; ``"."`` for the package's.
     """
-    dispatcher: Any = numba.njit(cache=True, fastmath=fastmath, error_model="numpy")(function)
+    dispatcher: Any = numba.njit(cache=True, nogil=True, fastmath=fastmath, error_model="numpy")(function)
     cache = _cache_of(dispatcher)
     if cache is not None:
         # numba looks at the function's own file alone, and would keep code that another file's change made stale.

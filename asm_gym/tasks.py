@@ -23,7 +23,7 @@ class TaskSpec:
         horizon: control steps before an episode is truncated, at the default 20 Hz.
         success: what ``info["success"]`` means.
         arms: how many robots it takes.
-        draws_shapes: robosuite draws the shapes of its objects, and can do so only when it loads the model.
+        draws_shapes: robosuite draws the shapes of its objects when it loads the model; see ``asm_gym.envs.shapes``.
     """
 
     name: str

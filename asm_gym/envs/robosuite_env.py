@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from asm_gym.checks import as_float32, check_flag, check_number, check_numbers, check_text, shown
 from asm_gym.choices import check_choice
-from asm_gym.envs import backend
+from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.cameras import RENDER_MODES, Pictures
 from asm_gym.envs.edits import SimulatorEdits
@@ -224,8 +224,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
         Args:
             seed: makes the episode exact: same seed, same episode to the last bit, whatever ran before. Where a task
-                draws the shapes of its objects, they are drawn anew, which means loading the model again (~0.2 s). An
-                unseeded reset goes on with the same generator and keeps the model (a few ms).
+                draws the shapes of its objects, they are drawn anew, which an unseeded reset does not: it goes on with
+                the same generator and keeps the shapes.
             options: ``qpos_noise``: standard deviation of the initial joint positions [rad], 0.02 by default.
 
         Raises:
@@ -248,9 +248,10 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             backend.reseed(env, self.np_random)
             self._seeded = True
         backend.choose_object(env, self.task)
-        env.hard_reset = seed is not None and self.task.draws_shapes
+        draws = seed is not None and self.task.draws_shapes
+        env.hard_reset = draws and (self._is_edited() or not shapes.draw(env))
         env.reset()
-        if env.hard_reset:
+        if draws:
             self._bind()
         else:
             self.simulation.begin_episode()
@@ -262,6 +263,11 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         if self.render_mode == "human":
             self.render()
         return self._observation(), self._info(bool(env._check_success()))
+
+    def _is_edited(self) -> bool:
+        """Whether somebody has changed numbers of the model that would be mixed up with those that are drawn."""
+        nominal = self.simulation.nominal
+        return len(self.edits) > 0 or nominal.now() is not nominal.unedited
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Runs one control step.
