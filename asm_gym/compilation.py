@@ -14,14 +14,15 @@ import numba
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = ()) -> F:
-    """Compiles ``function``, once a machine; while it runs, other threads may.
+def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), nogil: bool = False) -> F:
+    """Compiles ``function``, once a machine.
 
     Args:
         fastmath: lets loops use vector registers; inputs must then be finite.
         calls: folders of the package, beside its own, that hold functions which it calls; ``"."`` for the package's.
+        nogil: other threads run Python meanwhile; worth it for what takes long.
     """
-    dispatcher: Any = numba.njit(cache=True, nogil=True, fastmath=fastmath, error_model="numpy")(function)
+    dispatcher: Any = numba.njit(cache=True, nogil=nogil, fastmath=fastmath, error_model="numpy")(function)
     cache = _cache_of(dispatcher)
     if cache is not None:
         # numba looks at the function's own file alone, and would keep code that another file's change made stale.

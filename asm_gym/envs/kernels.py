@@ -9,6 +9,7 @@ the quantity a momentum observer estimates (Haddadin, De Luca, Albu-Schäffer 20
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +138,7 @@ def must_stay(band: Band) -> bool:
     return bool(now)
 
 
-@compiled
+@partial(compiled, nogil=True)
 def run(
     views: Views,
     nominal: Nominal,
