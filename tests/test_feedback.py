@@ -7,7 +7,9 @@ import pytest
 
 from asm_gym.memory.association import association_change, complete, hidden_units, learn_association
 from asm_gym.memory.feedback import FEEDBACK, Learned, Random, Settled
+from asm_gym.monitors import NeuralASM
 from tests.problems import some_association
+from tests.streams import sine_episodes
 
 
 def tied(rng):
@@ -45,6 +47,19 @@ def test_hidden_units_learn_what_no_line_can_and_best_by_errors_that_know_the_we
 def test_what_is_given_nothing_else_is_taught_by_the_transposed_weights():
     for one, other in zip(left_by(None)[0], left_by(FEEDBACK["transported"]())[0], strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_a_memory_remembers_how_it_was_taught(tmp_path):
+    episodes = sine_episodes(6)
+    taught = NeuralASM(episodes[0].spec, hidden_size=8, association_size=16, epochs=1, feedback="learned").fit(episodes)
+    plain = NeuralASM(episodes[0].spec, hidden_size=8, association_size=16, epochs=1).fit(episodes)
+    assert not np.array_equal(taught.learned_["V"], plain.learned_["V"])
+    taught.save(tmp_path / "taught.asm")
+    again = NeuralASM.load(tmp_path / "taught.asm")
+    assert again.feedback == again.model.feedback == "learned"
+    np.testing.assert_array_equal(again.score(episodes[0]).value, taught.score(episodes[0]).value)
+    with pytest.raises(ValueError, match="transported, learned"):
+        NeuralASM(episodes[0].spec, feedback="none")
 
 
 def test_units_that_settle_under_a_firm_prior_learn_along_the_gradient_and_with_less_energy_than_they_began():

@@ -96,8 +96,9 @@ class Settled(Feedback):
         return Change(coincidence(pushed, a), coincidence(pulled, f), np.zeros_like(D)), error
 
 
+TRANSPORTED = "transported"
 FEEDBACK: dict[str, Callable[[], Feedback]] = {
-    "transported": Feedback,
+    TRANSPORTED: Feedback,
     "learned": Learned,
     "random": Random,
     "settled": lambda: Settled(Feedback()),

@@ -21,7 +21,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import TICKS, Association, learn_association, normalised_errors, spans
+from asm_gym.memory.association import TICKS, Association, Feedback, learn_association, normalised_errors, spans
 from asm_gym.memory.energy import Array, Scalar
 from asm_gym.memory.inference import Weights, carry, direct, expect, infer, sense, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory, passes
@@ -157,6 +157,7 @@ def train(
     schedule: Schedule,
     rng: np.random.Generator,
     progress: Callable[[int, int], object] | None = None,
+    feedback: Feedback | None = None,
 ) -> Trained:
     """Learns both kinds of synapses from whole episodes.
 
@@ -165,6 +166,7 @@ def train(
         changes: where the changes stand among the inputs of association.
         hidden: H.
         units: hidden units of association for each group.
+        feedback: how errors come back to them; by the transposed weights where None.
     """
     done = 0
 
@@ -180,6 +182,9 @@ def train(
     weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in trajectories])
     energy = learn(weights, trajectories, schedule, rng, tick)
     inputs = np.concatenate([t.inputs for t in trajectories])
-    association = learn_association(inputs, np.ascontiguousarray(inputs[:, changes]), groups, changes, units, rng, tick)
+    layout = groups, changes, units
+    association = learn_association(
+        inputs, np.ascontiguousarray(inputs[:, changes]), *layout, rng, tick, feedback=feedback
+    )
     how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision
     return Trained(Network(weights, association, *how), energy)

@@ -17,6 +17,7 @@ from asm_gym.episodes import Episode
 from asm_gym.memory.adaptation import followed
 from asm_gym.memory.association import Association, association_shapes, existing, hidden_units
 from asm_gym.memory.completion import Completion
+from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
 from asm_gym.memory.fewer import MOST_INPUTS, Kept, fewer_changes, fewer_traces, moments
 from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
@@ -42,6 +43,7 @@ class MemoryModel(StreamModel):
         hidden_size: H, hidden units of the temporal network.
         association_size: hidden units of association, shared out among the groups of senses.
         schedule: how to learn and to infer.
+        feedback: how errors come back to the hidden units of association, one of ``memory.feedback.FEEDBACK``.
 
     Attributes:
         senses_: how it reads a row.
@@ -52,8 +54,16 @@ class MemoryModel(StreamModel):
 
     kind = "neural_asm"
 
-    def __init__(self, spec: StreamSpec, hidden_size: int, association_size: int, schedule: Schedule) -> None:
+    def __init__(
+        self,
+        spec: StreamSpec,
+        hidden_size: int,
+        association_size: int,
+        schedule: Schedule,
+        feedback: str = TRANSPORTED,
+    ) -> None:
         super().__init__(spec)
+        self.feedback = feedback
         self.hidden_size, self.association_size, self.schedule = hidden_size, association_size, schedule
         self.lag = rows_apart(spec.dt)
         self.shortest = 1 + self.lag
@@ -68,8 +78,8 @@ class MemoryModel(StreamModel):
         readings = [senses.read_episode(s) for s in streams]
         # Nothing came before the first ``lag`` rows, so that no change in them is known.
         trajectories = [Trajectory(r.senses[::lag], r.commands[::lag], r.inputs[lag:]) for r in readings]
-        sizes = self.hidden_size, self._units_each(senses)
-        trained = train(trajectories, senses.groups, senses.changes, *sizes, self.schedule, rng, progress)
+        layout = senses.groups, senses.changes, self.hidden_size, self._units_each(senses)
+        trained = train(trajectories, *layout, self.schedule, rng, progress, FEEDBACK[self.feedback]())
         standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change, "energy": trained.energy}
         if senses.inputs <= MOST_INPUTS:
             standard["moments"] = moments(np.concatenate([t.inputs for t in trajectories]))
@@ -100,7 +110,7 @@ class MemoryModel(StreamModel):
         weights = fewer_traces(self.network.weights, C, old, new, columns)
         skills = {name: self.learned_[name] for name in ("W_K", "b_K") if self.skills_}
         learned = {**standard, **skills, "energy": self.learned_["energy"]}
-        model = MemoryModel(spec, self.hidden_size, self.association_size, self.schedule)
+        model = MemoryModel(spec, self.hidden_size, self.association_size, self.schedule, self.feedback)
         return model.restore({**learned, **weights._asdict(), **kept.association._asdict()}, self.skills_), kept
 
     def specialise(self, episodes: Sequence[Episode]) -> Self:

@@ -20,6 +20,7 @@ from asm_gym.choices import check_choice
 from asm_gym.detection import Detector, EvidenceDetection
 from asm_gym.detection.detector import BOUND, GAINS
 from asm_gym.episodes import Episode
+from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
 from asm_gym.memory.network import Network
@@ -66,6 +67,7 @@ class NeuralASM(CalibratedMonitor):
         habituates: surprise is measured against what is usual in a context. A context knows the policy, so a memory
             that is to watch any policy leaves it out.
         seed: of the initial weights and of the order of the episodes.
+        feedback: how errors come back to the hidden units of association, one of ``memory.feedback.FEEDBACK``.
 
     Attributes:
         threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
@@ -94,6 +96,7 @@ class NeuralASM(CalibratedMonitor):
         shrinkage: float = 1e-3,
         habituates: bool = True,
         seed: int = 0,
+        feedback: str = TRANSPORTED,
         **renamed: float,
     ) -> None:
         if "carry_prior" in renamed:
@@ -112,8 +115,10 @@ class NeuralASM(CalibratedMonitor):
         self.free_running_probability = check_number(
             "free_running_probability", free_running_probability, low=0.0, high=1.0
         )
+        check_choice("feedback", feedback, FEEDBACK)
+        self.feedback = feedback
         schedule = Schedule(**{name: getattr(self, name) for name in Schedule._fields})
-        model = MemoryModel(spec, self.hidden_size, self.association_size, schedule)
+        model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, feedback)
         super().__init__(model, EvidenceDetection(spec, gains, bound, shrinkage, habituates), seed=seed)
         self._diagnosis: Diagnosis | None = None
         self._row: CompiledRow | None = None
@@ -161,7 +166,7 @@ class NeuralASM(CalibratedMonitor):
         schedule = {name: getattr(self, name) for name in Schedule._fields}
         sizes = {"hidden_size": self.hidden_size, "association_size": self.association_size}
         detections = {n: getattr(d, n) for d in self.detections.values() for n in parameter_names(type(d))}
-        return schedule | sizes | detections | {"seed": self.seed}
+        return schedule | sizes | detections | {"seed": self.seed, "feedback": self.feedback}
 
     @classmethod
     @typed

@@ -8,8 +8,8 @@ two_signals     min(r/θ_r, c/θ_c) > 1, after FIPER: random network distillatio
                 the policy's embedding and c many sampled chunks; here r reads the row, and c is the Gaussian entropy
                 of the last second's commands, as exp(entropy/A). The shipped agents have no noise to sample from.
 
-Sources: Agia et al. 2025 (CoRL, PMLR 270), “Unpacking failure modes of generative policies”, for STAC; Römer et al. 2025
-(NeurIPS), “Failure prediction at runtime for generative robot policies”, for FIPER.
+Sources: Agia et al. 2025 (CoRL, PMLR 270), “Unpacking failure modes of generative policies”, for STAC; Römer et al.
+2025 (NeurIPS), “Failure prediction at runtime for generative robot policies”, for FIPER.
 """
 
 from __future__ import annotations
