@@ -29,7 +29,7 @@ from asm_gym.evaluation.report import publish
 from asm_gym.evaluation.tables import brief_monitors_table, console_table, harmless_table, kinds_table
 from asm_gym.faults import anywhere
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of, possible
-from asm_gym.monitors import MONITORS, PARTS, make_monitor
+from asm_gym.monitors import MONITORS, PARTS, make_monitor, monitor_class
 from asm_gym.policies import make_policy
 from asm_gym.rollouts.benchmark import benchmark, calibrated
 from asm_gym.rollouts.folder import claimed, make_missing
@@ -65,7 +65,7 @@ class Args:
     steps: int | None = None
     """Length of an episode, in an environment by its id; by default its own."""
     monitors: tuple[str, ...] = tuple(name for name in MONITORS if name not in PARTS)
-    """Names of monitors."""
+    """Names of monitors; any model goes under any detection, as in external_torque_limit+evidence."""
     faults: tuple[str, ...] = ()
     """Kinds of fault, by default all that there are; development or test for robosuite's to choose by, or to report."""
     severities: tuple[str, ...] = SEVERITIES
@@ -106,8 +106,10 @@ class Args:
             if not self.elsewhere:
                 raise ValueError("robosuite's tasks have lengths of their own: leave --steps out")
             check_number("steps", self.steps, low=2, whole=True)
+        for name in self.monitors:
+            if name not in MONITORS:
+                monitor_class(name)  # refuses what is no model under a detection
         for what, names, known in (
-            ("monitor", self.monitors, MONITORS),
             ("severity", self.severities, SEVERITIES),
             ("harmless variation", self.harmless, _HARMLESS),
         ):

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
+from asm_gym.monitors import registry
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 from asm_gym.rollouts.seeds import draw_onset
 from asm_gym.rollouts.trial import RolloutConfig, record
@@ -88,6 +89,7 @@ def test_a_folder_of_other_settings_is_refused(run, capsys):
         ("--faults flood", "'flood'.*push"),
         ("--tasks Juggle", "'Juggle'.*Lift"),
         ("--monitors oracle", "'oracle'.*neural_asm"),
+        ("--monitors force_limit+magic", "'magic'.*evidence"),
         ("--severities deadly", "'deadly'.*mild"),
         ("--harmless hurricane", "'hurricane'.*touch"),
         ("--false-alarm-rate 0.001", "needs 999 calibration"),
@@ -103,6 +105,12 @@ def test_arguments_that_make_no_sense_are_refused(arguments, message, tmp_path, 
     assert main([*SMALL, *arguments.split(), "--out", str(tmp_path)]) == 2
     assert re.search(message, capsys.readouterr().err)
     assert not list(tmp_path.iterdir())
+
+
+def test_any_model_may_be_asked_for_under_any_detection():
+    name = "external_torque_limit+evidence"
+    assert name not in registry.MONITORS
+    assert Args(monitors=(name, "neural_asm")).monitors[0] == name
 
 
 def test_quick_is_less_of_everything():
