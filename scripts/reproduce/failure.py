@@ -260,7 +260,7 @@ def curve(by_monitor: Mapping[str, Sequence[Watched]]) -> Figure:
             ax.plot(100 * passed, shares, color=colour, linestyle=line, linewidth=1.8, label=name)
         ax.set(xlabel="of the episode passed [%]", ylabel="failures with an alarm [%]", ylim=(0, 100))
         ax.grid(color="#dddddd", linewidth=0.6)
-        ax.legend(handlelength=3.5)
+        fig.legend(loc="outside upper center", ncols=4, handlelength=3.5)
     return fig
 
 
