@@ -153,7 +153,7 @@ def test_a_loop_as_cleanrl_writes_it_sees_cost_and_episodes():
 
 @pytest.mark.slow
 def test_rllib_samples_a_watched_environment():  # half a minute: it starts Ray
-    pytest.importorskip("ray.rllib", reason="pip install 'ray[rllib]'")
+    pytest.importorskip("ray.rllib", reason="pip install 'ray[rllib]' torch")
     from ray.rllib.algorithms.ppo import PPOConfig
     from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
     from ray.tune import register_env
