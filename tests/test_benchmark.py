@@ -2,10 +2,13 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.model import model_outputs
@@ -14,6 +17,7 @@ from asm_gym.scripts.benchmark.experts import Attempt, _row, attempt
 from asm_gym.scripts.benchmark.fit import errors
 from asm_gym.scripts.benchmark.memory import PlainTorch, synthetic
 from asm_gym.scripts.benchmark.turns import BusyError, Turns, check_quiet
+from asm_gym.scripts.benchmark.vector import vector_table
 
 
 @pytest.mark.parametrize("channels", [5, 23])
@@ -110,3 +114,16 @@ def test_what_a_row_costs_to_watch_is_printed_and_it_keeps_up(capfd):
     assert len(sizes) == 10
     assert min(map(float, sizes)) > 10.0  # it is the command's memory that is looked at, and not a shell's
     assert main(["watch", "--rows", "20"]) == 2
+
+
+def test_vector_environments_are_compared_on_a_quiet_machine_alone(monkeypatch):
+    make = partial(gym.make, "asm_gym/Lift-v0", horizon=10**6, disable_env_checker=True)
+    table = vector_table(make, (2,), 2, Console(), even_if_busy=True)
+    assert table.headings[2:4] == ("ThreadVectorEnv", "AsyncVectorEnv")
+    (row,) = table.rows
+    assert row[0] == "2"
+    assert int(row[1]) > 0
+    assert all(float(cell.split("(")[1].split(" ±")[0]) > 0 for cell in row[2:])
+    monkeypatch.setattr("asm_gym.scripts.benchmark.vector.os.getloadavg", lambda: (9.0, 9.0, 9.0))
+    with pytest.raises(BusyError):
+        vector_table(make, (1,), 1, Console(), even_if_busy=False)

@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.progress import track
 
 import asm_gym  # noqa: F401  (registers the environments)
+from asm_gym.checks import check_number
 from asm_gym.envs.backend import import_robosuite
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.scripts.benchmark.coverage import Coverage
@@ -26,6 +27,7 @@ from asm_gym.scripts.benchmark.experts import Experts
 from asm_gym.scripts.benchmark.fit import Fit
 from asm_gym.scripts.benchmark.memory import Memory, Safety
 from asm_gym.scripts.benchmark.turns import GROWTH, BusyError, resident, take_turns
+from asm_gym.scripts.benchmark.vector import vector_table
 from asm_gym.scripts.benchmark.watch import Watch
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 from asm_gym.tasks import task as task_spec
@@ -45,13 +47,19 @@ class Env:
     """Control steps of each rival."""
     resets: int = 10
     """Resets of each rival."""
+    members: tuple[int, ...] = (1, 2, 4, 8, 16)
+    """How many environments side by side, on threads and in processes; none for no such table."""
     seed: int = 0
     """Seed of the actions."""
     even_if_busy: bool = False
     """Print figures though the machine has too much else to do."""
 
+    def __post_init__(self) -> None:
+        for n in self.members:
+            check_number("members", n, low=1, high=256, whole=True)
+
     def run(self, console: Console) -> int:
-        """Prints the table."""
+        """Prints the tables."""
         steps = take_turns(self._rivals(), self.steps, console, self.even_if_busy)
         table = Table(
             f"{self.task}, {self.robot}, {self.controller}, 20 Hz: median of {self.steps} control steps",
@@ -74,12 +82,18 @@ class Env:
         )
         rows = [(name, f"{1e3 * resets.median(name):.1f}", resets.faster(name, default)) for name in resets.seconds]
         console.print(console_table(Table(f"median of {self.resets} resets", ("", "ms", "against robosuite"), rows)))
+        if self.members:
+            vector = vector_table(self._made, self.members, max(1, self.steps // 4), console, self.even_if_busy)
+            console.print(console_table(vector))
         console.print(steps.where())
         return DONE
 
-    def _make(self, **kwargs: Any) -> Any:
+    def _made(self, **kwargs: Any) -> gym.Env[Any, Any]:
         kwargs |= {"robot": self.robot, "controller": self.controller, "horizon": 10**9}
-        env = gym.make(f"asm_gym/{self.task}-v0", disable_env_checker=True, **kwargs).unwrapped
+        return gym.make(f"asm_gym/{self.task}-v0", disable_env_checker=True, **kwargs)
+
+    def _make(self, **kwargs: Any) -> Any:
+        env = self._made(**kwargs).unwrapped
         env.reset(seed=self.seed)
         return env
 
@@ -157,7 +171,7 @@ class Leaks:
     steps: int = 100_000
     """Control steps in all."""
     resets: int = 500
-    """Resets, spread evenly over the steps; every tenth is seeded, which loads the model anew for some tasks."""
+    """Resets, spread evenly over the steps; every tenth is seeded, which draws some tasks' shapes anew."""
 
     def run(self, console: Console) -> int:
         """Prints the resident memory after each tenth; 1 where the last is more than 5 % above the second."""
