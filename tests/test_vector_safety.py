@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
+from asm_gym.envs.threads import ThreadVectorEnv
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies.reflexes import Hold, Retract
 from asm_gym.scripts.collect import collect
@@ -129,8 +130,9 @@ def test_environments_without_a_stream_are_watched_through_their_spaces(mode):
 
 
 @pytest.mark.parametrize("mode", [NEXT, SAME], ids=["next", "same"])
-def test_worker_processes_are_watched_alike(mode):
-    ours, theirs = both({"on_alarm": "hold", "max_override": 2}, mode, many=AsyncVectorEnv)
+@pytest.mark.parametrize("many", [AsyncVectorEnv, ThreadVectorEnv])
+def test_members_in_processes_and_on_threads_are_watched_alike(mode, many):
+    ours, theirs = both({"on_alarm": "hold", "max_override": 2}, mode, many=many)
     assert_equal_step_by_step(ours, theirs, steps=25)
     ours.close()
 
