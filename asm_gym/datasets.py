@@ -26,7 +26,7 @@ from asm_gym import episodes as single
 from asm_gym.checks import check_text
 from asm_gym.episodes import Episode, check_recorded
 from asm_gym.extras import require
-from asm_gym.files import require_space
+from asm_gym.files import named, require_space, written_whole
 from asm_gym.hdf5 import opened_hdf5
 from asm_gym.stream import StreamSpec, control_period, flat_rows
 from asm_gym.tasks import TASKS
@@ -56,7 +56,6 @@ def write_dataset(
         OSError: the disk has no room for it.
     """
     storage_class = _minari("minari.dataset.minari_storage.MinariStorage")
-    buffer = _minari("minari.data_collector.EpisodeBuffer")
     if not episodes:
         raise ValueError("a dataset needs at least one episode, got none")
     spec = episodes[0].spec
@@ -73,22 +72,43 @@ def write_dataset(
     require_space(folder, sum(map(_bytes, episodes)))
     for before in (unfinished, replaced):
         shutil.rmtree(before, ignore_errors=True)
-    (unfinished / "data").mkdir(parents=True)
+    data = unfinished / "data"
+    data.mkdir(parents=True)
     # A dict is kept as the numbers in it: the stream's channels say which are which.
     spaces = {"observation_space": flatten_space(env.observation_space), "action_space": env.action_space}
-    storage = storage_class.new(unfinished / "data", **spaces, env_spec=env.spec)
-    storage.update_episodes(buffer(**_columns(e)) for e in episodes)
-    storage.update_episode_metadata([{"success": bool(e.success), "info": json.dumps(e.info)} for e in episodes])
-    about = {"dataset_id": dataset_id, "minari_version": _minari("minari.__version__"), "stream_spec": spec.to_json()}
-    storage.update_metadata({**details, **about})
-    (unfinished / "data" / CHECKSUMS).write_text(
-        "".join(f"{_digest(unfinished / 'data' / name)}  {name}\n" for name in (ARRAYS, METADATA)), encoding="ascii"
-    )
+    with named(data):
+        storage = storage_class.new(data, **spaces, env_spec=env.spec)
+        with written_whole(data / ARRAYS) as file:
+            file.write(_as_hdf5(episodes))
+        counted = {"total_episodes": len(episodes), "total_steps": sum(len(e.rewards) for e in episodes)}
+        about = {"dataset_id": dataset_id, "minari_version": _minari("minari.__version__")}
+        size = {"dataset_size": storage.get_size(), "stream_spec": spec.to_json()}
+        storage.update_metadata({**counted, **size, **details, **about})
+        (data / CHECKSUMS).write_text(
+            "".join(f"{_digest(data / name)}  {name}\n" for name in (ARRAYS, METADATA)), encoding="ascii"
+        )
     if folder.exists():
         folder.rename(replaced)
     unfinished.rename(folder)
     shutil.rmtree(replaced, ignore_errors=True)
     return folder
+
+
+def _as_hdf5(episodes: Sequence[Episode]) -> bytes:
+    """The file that Minari keeps them in, made in memory: HDF5 ends the process where a disk takes no more of it."""
+    h5py = require("h5py", what="a dataset")
+    with h5py.File("episodes", "w", driver="core", backing_store=False, track_order=True) as file:
+        for n, episode in enumerate(episodes):
+            group, columns = file.create_group(f"episode_{n}"), _columns(episode)
+            about = {"id": n, "seed": columns.pop("seed"), "total_steps": len(episode.rewards)}
+            about |= {"success": bool(episode.success), "info": json.dumps(episode.info)}
+            group.attrs.update({name: value for name, value in about.items() if value is not None})
+            infos = {f"infos/{name}": array for name, array in columns.pop("infos").items()}
+            for name, array in {**columns, **infos}.items():
+                group.create_dataset(name, data=array, chunks=True, maxshape=(None, *array.shape[1:]))
+        file.flush()
+        image: bytes = file.id.get_file_image()
+    return image
 
 
 def _place(root: Path, dataset_id: str) -> Path:
@@ -199,7 +219,8 @@ def find_dataset(path: Path) -> Path:
     """The folder with the metadata of the only dataset at or below ``path``. Raises FileNotFoundError or ValueError."""
     if (path / METADATA).is_file():
         return path
-    below = [f.parent for f in sorted(path.rglob(METADATA)) if f.parent.name == "data"]
+    found = [f for f in sorted(path.rglob(METADATA)) if f.parent.name == "data"]
+    below = [f.parent for f in found if not any(p.startswith(".") for p in f.relative_to(path).parts)]  # left by a kill
     if not below:
         raise FileNotFoundError(f"no Minari dataset at or below {path}")
     if len(below) > 1:

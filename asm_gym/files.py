@@ -18,6 +18,9 @@ from asm_gym.checks import shown
 
 UNFINISHED = ".unfinished"
 
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""What writing ends with where a disk, a share of it, or a file takes no more."""
+
 SPARE = 16 * 2**20
 """[bytes] that a disk must have beyond what is to be written."""
 
@@ -39,12 +42,23 @@ def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
     _remove_left_behind(path.parent, mark)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f"{mark}{os.getpid()}.", suffix=UNFINISHED)
     try:
-        with os.fdopen(handle, "wb") as file:
+        with named(path), os.fdopen(handle, "wb") as file:
             yield file
         os.chmod(temporary, 0o644)  # mkstemp makes it readable by its owner alone
         os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Says where a disk is full: Python does not, of a file that is open."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in FULL and error.filename is None:
+            error.filename = str(path)
         raise
 
 

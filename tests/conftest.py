@@ -1,5 +1,7 @@
 """Environments that several tests share: making one costs more than an episode."""
 
+import resource
+
 import gymnasium as gym
 import pytest
 
@@ -29,3 +31,12 @@ def scene(kept_scene):
     """At the beginning of an episode, always the same one."""
     kept_scene.reset()
     return kept_scene
+
+
+@pytest.fixture
+def small_disk():
+    """Lets no file grow beyond 100 KB: what is written to one fails as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -284,6 +284,14 @@ def test_a_full_disk_is_a_line_and_leaves_the_dataset_that_was_there(tmp_path, m
     assert [p.name for p in tmp_path.iterdir()] == ["ours"]
 
 
+@pytest.mark.usefixtures("small_disk")
+def test_a_disk_that_fills_while_a_dataset_is_written_is_a_line_that_names_the_file(tmp_path):
+    write_dataset(tmp_path, "ours", _observed(sine_episodes(1)), _Sines(), {})
+    with pytest.raises(OSError, match=r"File too large: '.*main_data\.hdf5'"):
+        write_dataset(tmp_path, "ours", _observed(sine_episodes(40)), _Sines(), {})
+    assert len(read_dataset(tmp_path)) == 1
+
+
 def test_no_flipped_bit_of_a_dataset_goes_unnoticed(tmp_path):
     data = write_dataset(tmp_path, "ours", _observed(sine_episodes(2)), _Sines(), {}) / "data"
     done = subprocess.run(["sha256sum", "--check", "SHA256SUMS"], cwd=data, capture_output=True, text=True, check=True)

@@ -108,9 +108,11 @@ def test_every_call_takes_its_arguments_as_they_should_be():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("made", [guard.arm, guard.lift])
 @pytest.mark.filterwarnings("ignore:.*the action must be finite:UserWarning")  # which is said of a policy gone mad
-def test_a_guard_lets_nothing_through_in_a_few_steps():
-    found = guard.guarded(150)
+def test_a_guard_lets_nothing_through_in_a_few_steps(made):
+    found = guard.guarded(made(), 150)
     assert found.steps == 150
     assert found.failures > 0
     assert (found.missed, found.let_through) == (0, 0)
+    assert len(found.sizes) == 10

@@ -162,6 +162,14 @@ def test_a_checkpoint_gives_back_the_learner(algorithm, env, tmp_path):
         resume(folder, other)
 
 
+@pytest.mark.usefixtures("small_disk")
+def test_a_checkpoint_that_no_disk_holds_is_a_line_that_names_the_file(env, tmp_path):
+    learner = small("td3", env)
+    with pytest.raises(OSError, match=r"File too large: '.*learner\.zip'"):
+        save(tmp_path, learner, TrainingState(0, 0.0, ()))
+    assert newest(tmp_path) is None
+
+
 def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path):
     how = ["--algorithm", "td3", "--checkpoint-every", "100", "--evaluate-every", "400", "--out", str(tmp_path)]
     command = [sys.executable, "-m", "asm_gym.scripts.cli", *PENDULUM, *how, "--steps", "100000"]

@@ -113,10 +113,9 @@ def write_report(
     if details:
         items = "\n".join(f"<dt>{escape(k)}</dt><dd>{escape(str(v))}</dd>" for k, v in details.items())
         parts.append(f"<section><h2>How this was made</h2>\n<dl>{items}</dl></section>")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    unfinished.write_text(_PAGE.substitute(title=escape(title), body="\n".join(parts)), encoding="utf-8")
-    return unfinished.replace(path)
+    with written_whole(path) as file:
+        file.write(_PAGE.substitute(title=escape(title), body="\n".join(parts)).encode())
+    return path
 
 
 def _table(table: Table) -> str:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TextIO, TypeVar
 
 import asm_gym
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
-from asm_gym.files import written_whole
+from asm_gym.files import named, written_whole
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 
 Item = TypeVar("Item")
@@ -79,9 +79,10 @@ def locked(folder: Path) -> Iterator[None]:
     file = _lock(path)
     try:
         since = time.strftime("%Y-%m-%d %H:%M:%S %Z")
-        file.write(f"process {os.getpid()} on {platform.node()}, since {since}")
-        file.flush()
-        yield
+        with named(folder):
+            file.write(f"process {os.getpid()} on {platform.node()}, since {since}")
+            file.flush()
+            yield
     finally:
         path.unlink(missing_ok=True)
         file.close()

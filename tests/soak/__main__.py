@@ -8,6 +8,7 @@ import shutil
 import sys
 import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,10 @@ from tests.soak.kills import WORKS
 
 SHARES = {"calls": 0.885, "command lines": 0.026, "files": 0.089}
 """Of the hostile cases: as in the campaign that found what this one looks for again."""
+SHARE_OF_LIFT = 0.02
+"""Steps of Lift for each of the synthetic arm: one costs fifteen times as much."""
+MOST_GROWTH = 5.0
+"""Of a process from the end of its first tenth on [%]."""
 MOST_RAW = 0.01
 """Share of refusals in words that name neither argument nor value."""
 
@@ -37,7 +42,7 @@ class Args:
     works: tuple[str, ...] = WORKS
     """What is killed; ``react`` goes on with what ``evaluate`` left."""
     steps: int = 1_000_000
-    """Guarded steps."""
+    """Guarded steps of the synthetic arm; a fiftieth as many are of Lift."""
     seed: int = 0
     """Of all that is drawn."""
     out: Path = Path("runs/soak")
@@ -46,6 +51,8 @@ class Args:
     def __post_init__(self) -> None:
         for name in ("cases", "kills", "steps", "seed"):
             check_number(name, getattr(self, name), low=0, whole=True)
+        if 0 < self.steps < 1000:
+            raise ValueError(f"steps must be 0, or at least 1000 for a table by tenths, got {self.steps}")
         for work in self.works:
             check_choice("work", work, WORKS)
         if "react" in self.works and "evaluate" not in self.works:
@@ -103,16 +110,25 @@ def killed(args: Args, console: Console) -> bool:
 
 
 def guarded(args: Args, console: Console) -> bool:
-    """Guarded steps under failing sensors and policies."""
+    """Guarded steps under failing sensors and policies: of a synthetic arm, and fewer of Lift."""
     if not args.steps:
         return True
-    found = guard.guarded(args.steps, args.seed)
-    counts = found.steps, found.episodes, found.alarms, found.failures, found.missed, found.let_through
-    names = "steps", "episodes", "in alarm", "sensor or policy failed", "without alarm", "bad actions done"
-    growth = 100 * (found.sizes[-1] / found.sizes[min(1, len(found.sizes) - 1)] - 1) if found.sizes else 0.0
-    row = (*map(str, counts), f"{growth:+.1f} %")
-    console.print(console_table(Table("guarded steps of Lift", (*names, "memory grew"), [row])))
-    return not (found.missed or found.let_through) and growth < 5.0
+    parts = {"synthetic arm": (guard.arm, args.steps), "Lift": (guard.lift, math.ceil(args.steps * SHARE_OF_LIFT))}
+    found = {}
+    for name, (made, steps) in parts.items():
+        tell = partial(_tell, name, steps)
+        found[name] = guard.guarded(made(), steps, args.seed, tell)
+    names = "robot", "steps", "episodes", "in alarm", "sensor or policy failed", "without alarm", "bad actions done"
+    counts = [(n, *map(str, f[:6]), f"{f.growth:+.1f} %") for n, f in found.items()]
+    console.print(console_table(Table("guarded steps", (*names, "memory grew"), counts)))
+    tenths = [(n, *(f"{size:.0f}" for size in f.sizes)) for n, f in found.items()]
+    title = "resident memory of the process after each tenth of the steps [MB]"
+    console.print(console_table(Table(title, ("robot", *(f"{k}0 %" for k in range(1, 11))), tenths)))
+    return all(not (f.missed or f.let_through) and f.growth < MOST_GROWTH for f in found.values())
+
+
+def _tell(name: str, steps: int, done: int, size: float) -> None:
+    print(f"{name}: {done} of {steps} steps, {size:.0f} MB", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import asdict, dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,6 +14,8 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
+
+from asm_gym.files import named
 
 ANCHOR = "anchor.pth"
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -46,14 +49,21 @@ def save(
     unfinished = out / ".checkpoint"
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
-    learner.save(unfinished / "learner.zip")
+    whole = BytesIO()  # torch does not say which disk is full
+    learner.save(whole)
+    with named(unfinished / "learner.zip"):
+        (unfinished / "learner.zip").write_bytes(whole.getvalue())
     if isinstance(learner, OffPolicyAlgorithm):
         buffer: Any = learner.replay_buffer
         size = buffer.size()
         arrays = {name: getattr(buffer, name)[:size] for name in _BUFFER}
-        np.savez(unfinished / "buffer.npz", pos=buffer.pos, full=buffer.full, **arrays)
+        with named(unfinished / "buffer.npz"):
+            np.savez(unfinished / "buffer.npz", pos=buffer.pos, full=buffer.full, **arrays)
     if anchor is not None:
-        torch.save(anchor.state_dict(), unfinished / ANCHOR)
+        kept = BytesIO()
+        torch.save(anchor.state_dict(), kept)
+        with named(unfinished / ANCHOR):
+            (unfinished / ANCHOR).write_bytes(kept.getvalue())
     state = asdict(reached) | {"steps": steps, "updates": counted._n_updates}
     (unfinished / "state.json").write_text(json.dumps(state), encoding="utf-8")
     shutil.rmtree(folder, ignore_errors=True)
