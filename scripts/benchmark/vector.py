@@ -53,15 +53,22 @@ def vector_table(
 def rivals(make: Callable[[], gym.Env[Any, Any]], n: int) -> Iterator[dict[str, Callable[[], Any]]]:
     """One step of ``n`` members by the name of who does it; all are closed in the end."""
     with ExitStack() as stack:
-        calls: dict[str, Callable[[], Any]] = {}
-        # Processes are forked before there are threads.
-        for kind in (AsyncVectorEnv, SyncVectorEnv, ThreadVectorEnv):
-            envs: Any = kind([make] * n)
-            stack.callback(envs.close)
-            envs.reset(seed=0)
-            # Held, as a policy's actions are: noise alone would keep the arms in place.
-            calls[kind.__name__] = partial(envs.step, np.full(envs.action_space.shape, 0.1, np.float32))
-        sim = envs.envs[0].unwrapped.simulation
+        many = AsyncVectorEnv([make] * n)  # processes are forked before there are threads
+        stack.callback(many.close)
+        envs = ThreadVectorEnv([make] * n)
+        stack.callback(envs.close)
+        for each in (many, envs):
+            each.reset(seed=0)
+        # Held, as a policy's actions are: noise alone would keep the arms in place.
+        actions = np.full(envs.action_space.shape, 0.1, np.float32)
+        # One after another are the same members, each waited for: another loaded model each is hundreds of megabytes.
+        calls: dict[str, Callable[[], Any]] = {
+            ONE_BY_ONE: partial(SyncVectorEnv.step, envs, actions),
+            THREADS: partial(envs.step, actions),
+            PROCESSES: partial(many.step, actions),
+        }
+        first: Any = envs.envs[0].unwrapped
+        sim = first.simulation
         data = [mujoco.MjData(sim.model) for _ in range(n)]
         state = np.zeros((n, mujoco.mj_stateSize(sim.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
         for row in state:
