@@ -60,7 +60,7 @@ def rivals(make: Callable[[], gym.Env[Any, Any]], n: int) -> Iterator[dict[str, 
         for each in (many, envs):
             each.reset(seed=0)
         # Held, as a policy's actions are: noise alone would keep the arms in place.
-        actions = np.full(envs.action_space.shape, 0.1, np.float32)
+        actions = np.full_like(envs.action_space.sample(), 0.1)
         # One after another are the same members, each waited for: another loaded model each is hundreds of megabytes.
         calls: dict[str, Callable[[], Any]] = {
             ONE_BY_ONE: partial(SyncVectorEnv.step, envs, actions),
