@@ -6,7 +6,8 @@
 There each is averaged over the last five steps: the detection ``moving_mean``. Source: Xu et al. 2025 (RSS), “Can we
 detect failures without failure data? Uncertainty-aware runtime failure detection for imitation learning policies”;
 Burda et al. 2019 (ICLR) for distillation, Lipman et al. 2023 (ICLR) for the flow. There an embedding of images and the
-action is scored; here the sensorimotor row: values, changes and the action.
+action is scored; here the sensorimotor row: values, changes and the action. There a band in time is calibrated, which
+has to know how far the task has come; here one threshold for all skills. The networks here are smaller.
 """
 
 from __future__ import annotations
