@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import asm_gym  # noqa: F401
 from asm_gym.envs.threads import ThreadVectorEnv
+from asm_gym.graphics import rendering_backend
 
 
 class Countdown(gym.Env):
@@ -101,3 +102,19 @@ def test_a_member_that_raises_leaves_none_under_way():
         envs.step(np.zeros((2, 1), np.float32))
     assert [env.unwrapped.left for env in envs.envs] == [8, 7, 7]
     envs.close()
+
+
+@pytest.mark.skipif(rendering_backend() is None, reason="this machine has no OpenGL to render with")
+def test_pictures_on_threads_are_those_taken_one_after_another():
+    """Each from a context of its own thread, of the shape that was drawn last."""
+    options = {"cameras": ("agentview",), "camera_size": (32, 32), "render_mode": "rgb_array", "render_size": (48, 48)}
+    make = [partial(gym.make, "asm_gym/Lift-v0", **options)] * 2
+    one, other = SyncVectorEnv(make), ThreadVectorEnv(make)
+    other.reset(seed=7)
+    other.render()
+    assert course(other, 2, 4) == course(one, 2, 4)
+    shown = other.render()
+    np.testing.assert_array_equal(shown, one.render())
+    assert (shown[0] != shown[1]).any()
+    one.close()
+    other.close()
