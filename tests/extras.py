@@ -47,7 +47,7 @@ CHECKS = {
     "rllib": Check("cluster", "tests/test_learners.py", "ray[rllib] torch", pins="gymnasium"),
     "cluster": Check("robosuite,report,cluster", "tests/test_parallel.py -k cluster"),
     "environments": Check("environments,report", "tests/test_elsewhere.py"),
-    "robosuite": Check("robosuite,report,video", "tests/test_robosuite_env.py -m 'not slow'"),
+    "robosuite": Check("robosuite,report,video", "tests/test_robosuite_env.py -m 'not slow'", "stable-baselines3"),
 }
 
 
