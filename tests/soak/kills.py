@@ -150,9 +150,9 @@ def killed_and_begun_again(work: Work, folder: Path, kills: int, rng: np.random.
     same, done, k = codes == [0, 0] and work.left(folder / "again") == expected, 0, 0
     while done < kills:
         place = folder / f"killed-{k}"
-        for _ in range(min(4, kills - done)):  # in a row, and then it may finish
+        for row in range(min(4, kills - done)):  # in a row, and then it may finish; what goes on has less to do
             process = started(work, place)
-            time.sleep(lasted * rng.uniform(0.05, 1.0))
+            time.sleep(lasted * rng.uniform(0.05, 0.5 if row else 1.0))
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process, signal.SIGKILL)
             codes.append(ended(process))
@@ -160,7 +160,8 @@ def killed_and_begun_again(work: Work, folder: Path, kills: int, rng: np.random.
                 lasted *= 0.8
                 break
             done += 1
-        codes.append(ended(started(work, place)))
+        else:
+            codes.append(ended(started(work, place)))
         same &= codes[-1] == 0 and work.left(place) == expected
         same &= not [p for p in place.rglob("*") if p.name.endswith(UNFINISHED)]
         k += 1
