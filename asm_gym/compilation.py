@@ -18,16 +18,18 @@ def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), n
     """Compiles ``function``, once a machine.
 
     Args:
-        fastmath: lets loops use vector registers; inputs must then be finite.
+        fastmath: lets loops use vector registers; inputs must then be finite. The order of sums is then the compiler's,
+            so what is called is compiled into its caller: of two copies that differ in it, the linker takes the first.
         calls: folders of the package, beside its own, that hold functions which it calls; ``"."`` for the package's.
         nogil: other threads run Python meanwhile; worth it for what takes long.
     """
-    dispatcher: Any = numba.njit(cache=True, nogil=nogil, fastmath=fastmath, error_model="numpy")(function)
+    how: dict[str, Any] = {"nogil": nogil, "fastmath": fastmath, "forceinline": fastmath, "error_model": "numpy"}
+    dispatcher: Any = numba.njit(cache=True, **how)(function)
     cache = _cache_of(dispatcher)
     if cache is not None:
         # numba looks at the function's own file alone, and would keep code that another file's change made stale.
         own, package = Path(function.__code__.co_filename).parent, Path(__file__).parent
-        cache._source_stamp = "".join(map(_digest, (own, *(package / name for name in calls))))
+        cache._source_stamp = f"{how}" + "".join(map(_digest, (own, *(package / name for name in calls))))
     return cast(F, dispatcher)
 
 

@@ -23,9 +23,10 @@ from asm_gym.evaluation.metrics import DetectionMetrics, Kind, false_alarms
 from asm_gym.evaluation.tables import Column, Table, console_table, count, markdown, percent_within, tabulate
 from asm_gym.monitors import MONITORS
 from asm_gym.rollouts.benchmark import detectability_of, result_of
-from asm_gym.rollouts.folder import recorded, tasks_in
+from asm_gym.rollouts.folder import recorded
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
+from asm_gym.scripts.reproduce.common import tasks_recorded
 
 Roles = Mapping[str, Sequence[Episode]]
 
@@ -67,10 +68,7 @@ def read_side(folder: Path, window_s: float) -> Side:
     Raises:
         ValueError: there are none.
     """
-    tasks = tuple(tasks_in(folder))
-    if not tasks:
-        raise ValueError(f"{folder} holds no recordings: run asm-gym evaluate first")
-    roles, _, twins = recorded(folder.resolve(), tasks)
+    roles, _, twins = recorded(folder.resolve(), tasks_recorded(folder))
     return Side(folder, roles, visible_kinds(detectability_of(twins, roles.get("faulty", []), window_s)))
 
 

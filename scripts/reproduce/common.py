@@ -23,7 +23,7 @@ from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.figures import save
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table, console_table, markdown
-from asm_gym.rollouts.folder import make_missing
+from asm_gym.rollouts.folder import make_missing, tasks_in
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, record
@@ -130,6 +130,18 @@ def shown(records: Sequence[Record], value: str, digits: int = 2, **where: Any) 
     """``mean ± spread`` over seeds, for a table; empty where there is nothing."""
     found = over_seeds(records, value, **where)
     return "" if np.isnan(found.mean) else found.text(digits=digits)
+
+
+def tasks_recorded(run: Path) -> tuple[str, ...]:
+    """Names of the tasks that an evaluation has recorded.
+
+    Raises:
+        ValueError: there are none.
+    """
+    tasks = tuple(tasks_in(run))
+    if not tasks:
+        raise ValueError(f"{run} holds no recordings: run asm-gym evaluate first")
+    return tasks
 
 
 def recorded(

@@ -35,11 +35,11 @@ from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
 from asm_gym.monitors.model import StreamModel
 from asm_gym.rollouts.benchmark import detectability_of, judged
-from asm_gym.rollouts.folder import recorded, tasks_in
+from asm_gym.rollouts.folder import recorded
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.scaling import StreamScaler, rows_apart
-from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce
+from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce, tasks_recorded
 from asm_gym.scripts.reproduce.learning_curve import in_turn
 from asm_gym.stream import StreamSpec
 
@@ -81,13 +81,11 @@ class Args(Common):
         conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
         if not self.ways or self.episodes < 1:
             raise ValueError("there must be a way of feedback, and one episode to learn from")
-        if not self.tasks:
-            raise ValueError(f"{self.run} holds no recordings: run asm-gym evaluate first")
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """What the run has recorded."""
-        return tuple(tasks_in(self.run))
+        """What the run has recorded; ValueError where there is nothing."""
+        return tasks_recorded(self.run)
 
 
 class FedAssociation(StreamModel):

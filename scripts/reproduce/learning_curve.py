@@ -29,10 +29,10 @@ from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import MONITORS
 from asm_gym.rollouts.benchmark import detectability_of, result_of
-from asm_gym.rollouts.folder import recorded, tasks_in
+from asm_gym.rollouts.folder import recorded
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce
+from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce, tasks_recorded
 
 QUICK = 40
 """With ``--quick``, nothing learns from more episodes than these."""
@@ -69,13 +69,11 @@ class Args(Common):
         conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
         if not self.monitors or not self.episodes or min(self.episodes) < 1:
             raise ValueError("there must be at least one monitor, and one episode to learn from")
-        if not self.tasks:
-            raise ValueError(f"{self.run} holds no recordings: run asm-gym evaluate first")
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """What the run has recorded."""
-        return tuple(tasks_in(self.run))
+        """What the run has recorded; ValueError where there is nothing."""
+        return tasks_recorded(self.run)
 
 
 class Job(NamedTuple):
