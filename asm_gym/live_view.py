@@ -63,7 +63,8 @@ class LiveView:
         self._drawn = [c for c in spec.channels if channels is None or c.name in channels]
         self._completion = model.completion_ if isinstance(model, Completes) else None
         self._before: NDArray[np.float64] | None = None
-        self._alarm, self._scenes = False, {"robot": False, "camera": False}
+        self._alarm = False
+        self._scenes: set[str] = set()  # that were seen: a log of rows has neither robot nor camera
         self.path.parent.mkdir(parents=True, exist_ok=True)
         os.environ.setdefault("RERUN_FLUSH_TICK_SECS", "1")  # read by the next line: by default 0.008, a chunk a row
         self._stream = self._rr.RecordingStream("asm-gym")
@@ -77,10 +78,9 @@ class LiveView:
         """How the viewer shows it at first: surprise with its threshold, each channel, and scenes that were seen."""
         views = require("rerun.blueprint", what="a live view")
         kinds = {"robot": views.Spatial3DView, "camera": views.Spatial2DView}
-        scenes = [kinds[name](name=name, origin=f"/{name}") for name, seen in self._scenes.items() if seen]
-        bare = views.PlotLegend(
-            visible=False
-        )  # dozens of names would cover the lines; pointing at one says which it is
+        scenes = [kind(name=name, origin=f"/{name}") for name, kind in kinds.items() if name in self._scenes]
+        # Dozens of names would cover the lines; pointing at one says which it is.
+        bare = views.PlotLegend(visible=False)
         senses = [views.TimeSeriesView(name=c.name, origin=f"/senses/{c.name}", plot_legend=bare) for c in self._drawn]
         return views.Blueprint(
             views.Grid(
@@ -138,20 +138,17 @@ class LiveView:
             said = f"alarm: {self.spec.labels[int(np.argmax(shares))]}, {surprise / threshold:.2f} thresholds"
             log("log", rr.TextLog(said + _named(cause), level="WARN"))
         self._alarm = alarm
-        scenes = {
-            "robot": None if links is None else rr.LineStrips3D(links),
-            "camera": None if picture is None else rr.Image(picture),
-        }
-        for name, scene in scenes.items():
-            if scene is not None:
-                self._show(name)
-                log(name, scene)
+        if picture is not None:
+            self._show("camera", rr.Image(picture))
+        if links is not None:
+            self._show("robot", rr.LineStrips3D(links))
 
-    def _show(self, name: str) -> None:
-        """Gives a scene its place when it is first seen: a log of rows has neither robot nor camera."""
-        if not self._scenes[name]:
-            self._scenes[name] = True
+    def _show(self, name: str, scene: Any) -> None:
+        """Logs a scene, and gives it its place when it is first seen."""
+        if name not in self._scenes:
+            self._scenes.add(name)
             self._stream.send_blueprint(self._arranged())
+        self._stream.log(name, scene)
 
     def _expected(self, row: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Expectation and band of every number (D,); of actions, which nobody expects, what they are."""

@@ -6,7 +6,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.policies import make_policy
 from asm_gym.policies.network import NetworkPolicy
@@ -19,7 +18,7 @@ class Weakened:
     """An agent of which every weight is off, by another draw in each episode."""
 
     def __init__(self, agent: NetworkPolicy) -> None:
-        self._agent, self._layers = agent, agent.layers
+        self._agent, self._layers, self.predict = agent, agent.layers, agent.predict
 
     def set_random_seed(self, seed: int) -> None:
         """Of how far off it is."""
@@ -28,15 +27,6 @@ class Weakened:
         self._agent.layers = [
             ((W * (1.0 + size * rng.standard_normal(W.shape))).astype(np.float32), b) for W, b in self._layers
         ]
-
-    def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], Any]:
-        return self._agent.predict(observation, state, episode_start, deterministic)
 
 
 def weakened(env: gym.Env[Any, Any], name: str) -> Weakened:
