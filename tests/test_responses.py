@@ -13,10 +13,10 @@ from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.arbitration import Arbiter
 from asm_gym.wrappers.arguments import make_fallback
 from asm_gym.wrappers.patience import Patience
-from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, responses_from
+from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, Responder, responses_from
 from tests.fakes import CueMonitor, FakeEnv
 from tests.needs import needs
-from tests.test_completion import MEMORY, SPEC, Arm, Judge, Named, offset
+from tests.test_completion import MEMORY, SPEC, Arm, Judge, Named, arm, offset
 
 ACT = np.array([0.5, -0.5], np.float32)
 
@@ -329,6 +329,34 @@ def test_nobody_goes_on_against_what_blocks_the_arm(family, fault, case, monkeyp
     assert (first >= 60 + 25) == case.startswith("lasting")
     assert any(s["intervened"] and s["transition"] != "slow" for s in said) or not case.startswith("lasting")
     assert said[-1]["gave_up"] == (case == "lasting actuator")
+
+
+@pytest.mark.parametrize(
+    ("family", "left_at", "case", "later"),
+    [
+        ("joint", 0, "contact", "contact"),
+        ("joint", 2, "contact", "contact"),
+        ("joint", 3, "actuator", "actuator"),
+        ("object", 0, "contact", "contact"),
+        ("sensor", 0, "sensor", "sensor"),
+    ],
+)
+def test_a_band_that_is_left_early_is_answered_as_a_contact_and_nothing_else_is_said_of_the_cause(
+    family, left_at, case, later
+):
+    monitor = Judge({10}, family)
+    responder = Responder(Acting(), monitor, {**DEFAULT, "sensor": "slow"}, repairs=True)
+    found = []
+    for t, row in enumerate(arm(40, 31)):
+        responder.read(row)
+        if t >= 20:
+            found.append(responder.respond(True, False, np.eye(monitor.spec.size)[0], felt=t == 20 + left_at))
+    unfelt = {"joint": "actuator"}.get(family, family)
+    assert [r.case for r in found[:left_at]] == [unfelt] * left_at
+    assert found[left_at].case == case
+    assert found[left_at + 5].case == later
+    assert {r.cause["family"] for r in found} == {unfelt}
+    assert found[left_at].name == {"contact": "hold", "actuator": "go on", "sensor": "slow"}[case]
 
 
 def test_a_diagnosis_that_raises_is_answered_as_the_unknown_is():

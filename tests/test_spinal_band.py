@@ -10,7 +10,7 @@ import pytest
 from asm_gym.episodes import Episode
 from asm_gym.faults import Push
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.spinal import FeltEpisode, SpinalBand
+from asm_gym.monitors.spinal import UNJUDGED, FeltEpisode, SpinalBand
 from asm_gym.rollouts.felt import felt_episodes
 from asm_gym.scripts.reproduce.spinal import main, table
 from asm_gym.stream import Channel, StreamSpec
@@ -203,6 +203,24 @@ def test_a_push_in_free_motion_is_an_alarm_within_ten_milliseconds_and_the_refle
     assert watched[10]["spinal_s"] <= 0.01
     assert not any(i["intervened"] for i in watched)
     pushed.undo_faults()
+
+
+def test_no_band_is_sent_while_a_reflex_acts_and_in_the_first_steps_after_it(swaying, monkeypatch):
+    env, memory, band = swaying
+    sent, step = [], 0
+    expect = env.unwrapped.expect
+    monkeypatch.setattr(env.unwrapped, "expect", lambda *a: (sent.append(step), expect(*a)))
+    pushed = FaultInjection(env, [Push(body="robot0_link5", newtons=20.0, onset=6, duration=2)])
+    guarded = NeuralASMSafety(pushed, memory, on_alarm="hold", spinal=band, release_after=4)
+    guarded.reset(seed=100)
+    policy, state, acted = Sways(env), None, []
+    for step in range(16):  # noqa: B007 (what is sent says in which step)
+        action, state = policy.predict(None, state)
+        acted.append(guarded.step(action)[-1]["asm"]["intervened"])
+    pushed.undo_faults()
+    back = acted.index(True) + 4
+    assert acted[:16] == [7 <= t < back for t in range(16)]
+    assert sent == [*range(UNJUDGED, 7), *range(back + UNJUDGED, 16)]
 
 
 class Replay(gym.Env):

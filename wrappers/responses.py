@@ -54,6 +54,9 @@ QUIET_S = 1.0
 SURE = 0.5
 """A family that is less probable is unknown."""
 
+FELT_BY = 3
+"""Diagnoses by which a band has been left where something touches the arm; a weak joint leaves it later."""
+
 
 class Response(NamedTuple):
     """What is to be done after a row.
@@ -140,7 +143,8 @@ class Responder:
     def _forget(self) -> None:
         """What was wrong is over."""
         self._since: dict[str, int] = {}  # rows since a family was first the cause
-        self._named: Cause | None = None
+        self._felt = False  # it began with a band that was left
+        self._touched = False  # the last alarm was answered as a contact, or looked like one
         self._belief, self._diagnoses = np.zeros(len(FAMILIES)), 0
         self._latest: dict[str, Cause] = {}  # the newest diagnosis of each family
 
@@ -196,13 +200,15 @@ class Responder:
         """(D,) the last row, repaired; None where nothing is."""
         return self._rows[-1] if self._rows and self.completed else None
 
-    def respond(self, alarm: bool, failed: bool, attribution: NDArray[np.float64]) -> Response:
+    def respond(self, alarm: bool, failed: bool, attribution: NDArray[np.float64], felt: bool = False) -> Response:
         """What is to be done about the last row.
 
         Args:
             alarm: surprise is over the threshold.
             failed: monitor, stream or policy failed, so that nothing is known.
             attribution: (D,) where the surprise is.
+            felt: a band on what the arm feels was left within the step. That early, but for a sensor at fault,
+                it is answered as a contact, whatever explains the row best.
         """
         dt = self._spec.dt
         self._quiet = 0 if alarm else self._quiet + 1
@@ -214,14 +220,17 @@ class Responder:
         if not alarm:
             return Response("", as_info(None), pressed)
         cause = self._believed(self._cause(failed, attribution))
-        self._named = cause
+        self._felt = self._felt or (felt and self._diagnoses <= FELT_BY)
         family = cause.family if cause is not None and cause.probability >= SURE else "unknown"
-        self._since.setdefault(family, 0)
-        case = self._case(family, cause)
+        touched = self._felt and cause is not None and cause.family != "sensor"
+        self._touched = touched or (cause is not None and cause.family == "contact")
+        answered = "contact" if touched else family
+        self._since.setdefault(answered, 0)
+        case = self._case(answered, cause)
         name = self._table[case]
-        if name in ("go on", "slow") and self._blocked(family, cause):
+        if name in ("go on", "slow") and self._blocked(answered, cause):
             # Whatever the policy goes on with, it does not move the arm, and presses.
-            case = "lasting actuator" if family == "actuator" else "lasting contact"
+            case = "lasting actuator" if answered == "actuator" else "lasting contact"
             name = self._table[case]
         if name == "complete" and not self._complete(cause):
             name = self._table["unknown"]
@@ -274,7 +283,7 @@ class Responder:
 
     def _pressed(self) -> bool | None:
         """Whether what touched the body still does."""
-        if self._named is None or self._named.family != "contact" or self._touch is None or len(self._rows) < 2:
+        if not self._touched or self._touch is None or len(self._rows) < 2:
             return None
         if not self._touch.presses(np.stack(self._rows[-2:])):
             return False

@@ -219,8 +219,11 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         overridden = self._arbiter.overriding or self._refused
         self._rows: list[RowReport] = []
         self._left: Left | None = None
-        if self._spinal is not None and not overridden:
-            self._spinal.send(self._observer.state, self._executed)
+        if self._spinal is not None:
+            if overridden:
+                self._spinal.pause()
+            else:
+                self._spinal.send(self._observer.state, self._executed)
         with self._within_steps():
             observation, reward, terminated, truncated, info = self.env.step(self._executed)
         self._look(*self._sensed(observation, info), ends_step=True)
@@ -297,7 +300,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             surprise = surprise if self._left is None else self._left.added_to(surprise, self.threshold)
         value = float(surprise.value[0])
         alarm = not value <= self.threshold
-        response = self._responder.respond(alarm, bool(failure), surprise.attribution[0])
+        response = self._responder.respond(alarm, bool(failure), surprise.attribution[0], self._left is not None)
         decision = self._arbiter.decide(
             value,
             row,

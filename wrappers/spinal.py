@@ -12,7 +12,7 @@ from asm_gym.abilities import FeelsWithinSteps
 from asm_gym.checks import shown
 from asm_gym.monitors import Monitor, NeuralASM, Surprise
 from asm_gym.monitors.monitor import MonitorState
-from asm_gym.monitors.spinal import Band, SpinalBand
+from asm_gym.monitors.spinal import UNJUDGED, Band, SpinalBand
 
 
 class Left(NamedTuple):
@@ -74,9 +74,17 @@ class SpinalCord:
     def reset(self) -> None:
         """A new episode begins."""
         self._sent: Band | None = None
+        self._unjudged = 0  # steps of the policy for which there is no band
+
+    def pause(self) -> None:
+        """Something else than the policy acts, from which the memory expects nothing that a nominal episode shows."""
+        self._unjudged = UNJUDGED
 
     def send(self, state: MonitorState, action: NDArray[np.floating[Any]]) -> None:
-        """Says what is expected of a step that is about to be made by the policy."""
+        """Says what is expected of a step that is about to be made by the policy; nothing where it has just begun."""
+        if self._unjudged:
+            self._unjudged -= 1
+            return
         self._sent = self._band.expect(state.model, action)
         if self._arm is not None and self._sent is not None:
             self._arm.expect(*self._sent, self._acts)
