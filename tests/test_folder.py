@@ -4,11 +4,16 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from asm_gym.rollouts.folder import LOCK, claimed, locked, make_missing
+from asm_gym.episodes import Episode, EpisodeLabel
+from asm_gym.evaluation.comparison import LeftOut
+from asm_gym.rollouts.folder import LOCK, NOMINAL_ROLES, Recordings, claimed, locked, make_missing
 from asm_gym.scripts.cli import main
+from tests.streams import sine_episodes
 
 HOLD = """
 import sys, time
@@ -83,3 +88,26 @@ def test_two_commands_on_one_folder_are_one_too_many(command, holder, tmp_path, 
     assert main([*command, "--out", str(tmp_path)]) == 2
     assert f"in use by process {holder.pid} on" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == [LOCK]
+
+
+def recording(role: str, seed: int, force: float, success: bool = True) -> Episode:
+    made = sine_episodes(1)[0]
+    kind = {"kind": "push", "severity": "mild", "onset": 5} if role == "faulty" else {}
+    forces = np.full(len(made), force, np.float32)
+    return replace(made, success=success, label=EpisodeLabel("Lift", role, seed=seed, **kind), contact_force=forces)
+
+
+def test_episodes_that_fail_or_crash_by_themselves_are_not_what_is_normal():
+    nominal = [recording(role, seed, 10.0) for seed, role in enumerate(["fit", "fit", "calibration", "nominal"])]
+    crash, failure = recording("nominal", 7, 21.0), recording("fit", 8, 90.0, success=False)
+    faulty = [recording("faulty", seed, 300.0) for seed in (3, 7)]
+    found = Recordings.of([*nominal, crash, failure, *faulty])
+    assert found.left_out == LeftOut(failed=1, crashed=1)
+    assert [e.labelled.seed for e in found.roles["faulty"]] == [3]
+    assert [e.labelled.seed for role in ("fit", "calibration", "nominal") for e in found.roles[role]] == [0, 1, 2, 3]
+    assert [e.labelled.seed for e in found.twins] == [3, 7]
+
+
+def test_where_no_force_is_known_nothing_counts_as_a_crash():
+    episodes = [replace(recording(role, 0, 1.0), contact_force=np.zeros(0, np.float32)) for role in NOMINAL_ROLES]
+    assert Recordings.of(episodes).left_out == LeftOut(0, 0)

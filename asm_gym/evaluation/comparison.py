@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -67,6 +68,18 @@ class MonitorResult:
     maxima: Floats = field(default_factory=lambda: np.zeros(0))
 
 
+class LeftOut(NamedTuple):
+    """Nominal episodes that are no example of what is normal.
+
+    Attributes:
+        failed: the policy did not do its task.
+        crashed: it did, but hit something by itself.
+    """
+
+    failed: int = 0
+    crashed: int = 0
+
+
 @dataclass(frozen=True, eq=False)
 class BenchmarkResult:
     """What monitors made of a run's episodes, and what an ideal observer could.
@@ -76,14 +89,14 @@ class BenchmarkResult:
         detectability: of every faulty episode.
         rate: the run's own false-alarm rate.
         window_s: how soon an alarm must come to count as detection [s].
-        failed: nominal episodes that did not succeed; they are left out.
+        left_out: how many nominal episodes are, and why.
     """
 
     monitors: Mapping[str, MonitorResult]
     detectability: Sequence[Detectability]
     rate: float
     window_s: float
-    failed: int = 0
+    left_out: LeftOut = field(default_factory=LeftOut)
 
     @cached_property
     def visible(self) -> dict[Kind, bool]:

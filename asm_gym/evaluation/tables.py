@@ -250,14 +250,15 @@ def _compared(result: BenchmarkResult) -> list[Compared]:
 def monitors_table(result: BenchmarkResult) -> Table:
     """Monitors side by side, the ideal observer on top."""
     hidden = [in_words(kind) for kind, seen in result.visible.items() if not seen]
-    left_out = f" Kinds no observer could see, left out: {', '.join(hidden)}." if hidden else ""
+    hidden_kinds = f" Kinds no observer could see, left out: {', '.join(hidden)}." if hidden else ""
     return tabulate(
         f"Detection within {1e3 * result.window_s:.0f} ms of the onset, over kinds of fault and severities that an "
         f"ideal observer can see; thresholds from separate nominal episodes, delays and accuracies at a false-alarm "
         f"rate of {100 * result.rate:g} % of episodes; in brackets 95 % intervals, from scenes and calibration "
         f"episodes drawn anew. AUROC: against nominal episodes over the same steps, and against the greatest surprise "
-        f"of whole ones, as a threshold sees it. Nominal episodes that did not succeed, {result.failed} in all, are "
-        f"left out.{left_out}",
+        f"of whole ones, as a threshold sees it. Left out are nominal episodes in which the policy failed "
+        f"({result.left_out.failed}) or hit something by itself ({result.left_out.crashed}), and faults in such "
+        f"scenes.{hidden_kinds}",
         MONITOR_COLUMNS,
         _compared(result),
     )

@@ -59,13 +59,13 @@ def benchmark(
         ask, list(models.values()), parallel, lambda k, n: progress(k * len(monitors) // n, len(monitors))
     )
     found = {name: result for results in made for name, result in results.items()}
-    by_role, failed, twins = Recordings.of(labelled(folder, labels))
+    by_role, left_out, twins = Recordings.of(labelled(folder, labels))
     return BenchmarkResult(
         {name: found[name] for name in monitors},
         detectability_of(twins, by_role.get("faulty", []), window_s),
         rate,
         window_s,
-        failed,
+        left_out,
     )
 
 

@@ -17,8 +17,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO, TypeVar
 
+import numpy as np
+
 import asm_gym
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
+from asm_gym.evaluation.comparison import LeftOut
 from asm_gym.files import named, written_whole
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 
@@ -27,6 +30,8 @@ Item = TypeVar("Item")
 LOCK = ".lock"
 NOMINAL_ROLES = ("fit", "calibration", "nominal")
 """Roles of the episodes that nothing is done to."""
+CRASH = 2.0
+"""How many times what the robot usually presses at most in nominal episodes of a task is a crash."""
 
 
 def versions() -> dict[str, str]:
@@ -141,33 +146,46 @@ class Recordings(NamedTuple):
     """What a run has recorded.
 
     Attributes:
-        roles: recordings by role, nominal ones that failed not among them.
-        failed: how many those are.
+        roles: recordings by role; nominal ones that are no example of what is normal not among them, nor what was done
+            to scenes in which the robot crashes by itself.
+        left_out: how many nominal ones that are.
         twins: every episode of the role nominal: a faulty one goes as its twin does until the onset.
     """
 
     roles: dict[str, list[Episode]]
-    failed: int
+    left_out: LeftOut
     twins: list[Episode]
 
     @classmethod
     def of(cls, recordings: Sequence[Episode]) -> Recordings:
         """By role. Raises ValueError where there is nothing normal to learn or to test on."""
         roles: dict[str, list[Episode]] = {}
-        failed = 0
+        crashes, failed = _crashes(recordings), 0
         for recording in recordings:
-            role = recording.labelled.role
+            label = recording.labelled
             # A nominal episode that fails is no example of what should feel normal, nor an alarm in it a false one.
-            if role in NOMINAL_ROLES and not recording.success:
+            if label.role in NOMINAL_ROLES and not recording.success:
                 failed += 1
-            else:
-                roles.setdefault(role, []).append(recording)
+            elif (label.task, label.seed) not in crashes:
+                roles.setdefault(label.role, []).append(recording)
         for role in NOMINAL_ROLES:
             if not roles.get(role):
                 raise ValueError(
-                    f"none of the {role} episodes succeeded: there is nothing normal to learn or to test on"
+                    f"none of the {role} episodes succeeded without a crash: "
+                    "there is nothing normal to learn or to test on"
                 )
-        return cls(roles, failed, [r for r in recordings if r.labelled.role == "nominal"])
+        return cls(roles, LeftOut(failed, len(crashes)), [r for r in recordings if r.labelled.role == "nominal"])
+
+
+def _crashes(recordings: Sequence[Episode]) -> set[tuple[str, int]]:
+    """Tasks and seeds of nominal episodes that succeed, and press ``CRASH`` times as hard as others of their task."""
+    hardest: dict[str, dict[int, float]] = {}
+    for recording in recordings:
+        label, force = recording.labelled, recording.contact_force
+        if label.role in NOMINAL_ROLES and recording.success and np.isfinite(force).any():
+            hardest.setdefault(label.task, {})[label.seed] = float(np.nanmax(force))
+    usual = {task: float(np.median(list(forces.values()))) for task, forces in hardest.items()}
+    return {(task, seed) for task, forces in hardest.items() for seed, f in forces.items() if f > CRASH * usual[task]}
 
 
 def labelled(run: Path, labels: Sequence[EpisodeLabel]) -> list[Episode]:

@@ -161,10 +161,10 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     jobs = [Job(way, seed) for seed in args.repetitions for way in args.ways]
     with stage("fitting and judging", console, seconds) as progress:
         found = parallel_map(partial(score, args=args), jobs, args.workers, progress)
-    _, failed, twins = recorded(args.run, args.tasks)
+    _, left_out, twins = recorded(args.run, args.tasks)
     seen = detectability_of(twins, roles_of(args)["faulty"], args.window)
     by_name = {job.monitor: result for job, result in zip(jobs, found, strict=True)}
-    result = BenchmarkResult(by_name, seen, args.false_alarm_rate, args.window, failed)
+    result = BenchmarkResult(by_name, seen, args.false_alarm_rate, args.window, left_out)
     records: list[Record] = [
         {**job._asdict(), "auroc": m.auroc, "found": m.found[args.false_alarm_rate].value}
         for job, m in zip(jobs, result.on_visible, strict=True)
