@@ -124,6 +124,8 @@ def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
     Raises:
         ValueError: naming the argument and what it was, where that is no array of numbers.
     """
+    if type(values) is np.ndarray and values.dtype == np.float32:
+        return values
     try:
         with np.errstate(over="ignore"):
             return np.asarray(values, np.float32)

@@ -122,10 +122,10 @@ class Comply(Hold):
         super().__init__(env)
         self._joints = _require_deltas(env, "comply")
         spec: StreamSpec = env.get_wrapper_attr("stream_spec")
-        self._columns = [
-            i for n, s in spec.slices.items() if n.endswith("external_torque") for i in range(spec.size)[s]
-        ]
-        if not self._columns:
+        self._columns = np.array(
+            [i for n, s in spec.slices.items() if n.endswith("external_torque") for i in range(spec.size)[s]], np.intp
+        )
+        if not self._columns.size:
             raise ValueError("comply needs the channel external_torque: make the environment with stream group torque")
         self.tolerated = check_number("tolerated", tolerated, low=0)
         self._each_step = check_number("compliance", compliance, low=0) * control_period(env)

@@ -17,14 +17,15 @@ from asm_gym.memory.energy import energy
 from asm_gym.memory.inference import direct_synapses
 from asm_gym.memory.learning import hebbian_change
 from asm_gym.memory.network import Network, initial_weights
-from asm_gym.memory.precision import LARGEST, SMALLEST, learn_precision, log_variance
+from asm_gym.memory.precision import BATCH, BATCHES, LARGEST, SMALLEST, learn_precision, log_variance
 from asm_gym.scaling import ScaledRows
 from tests.problems import CHANGES, some_association
 
 
-def test_precision_recovers_noise_that_depends_on_context():
+@pytest.mark.parametrize("rows", [8000, 3 * BATCH * BATCHES])
+def test_precision_recovers_noise_that_depends_on_context(rows):
     rng = np.random.default_rng(0)
-    context = rng.uniform(-1, 1, size=(8000, 6))
+    context = rng.uniform(-1, 1, size=(rows, 6))
     truth = np.stack([2.0 * context[:, 0] - 3.0, -1.0 - context[:, 1] + context[:, 2]], axis=1)
     error = rng.normal(size=truth.shape) * np.exp(truth / 2)
     f, W_S, b_S = context.astype(np.float32), np.ones((2, 6), np.float32), np.zeros(2, np.float32)
@@ -85,6 +86,18 @@ def test_what_is_linear_is_known_exactly_and_noise_is_not_learned_by_heart():
     assert w.remainder[2] < 2e-4  # tied to the others exactly
     error = inputs[:, 3] - complete(hidden_units(inputs, w.V), inputs, w.U, w.D)[:, 3]
     assert error.std() > 0.9 * delta[:, 3].std()  # tied to nothing
+
+
+def test_where_nothing_is_linear_the_others_change_as_by_synapses_of_nothing():
+    rng = np.random.default_rng(4)
+    a, delta = rng.normal(size=(4, 13)).astype(np.float32), rng.normal(size=(4, 5)).astype(np.float32)
+    V, U, D, *_ = some_association(rng, 13, 6, 5)
+    nothing, spread = np.zeros_like(D), np.ones(5, np.float32)
+    change, error = association_change(a, delta, spread, V, U, nothing[:, :0])
+    expected, errors = association_change(a, delta, spread, V, U, nothing)
+    np.testing.assert_array_equal(change.V, expected.V)
+    np.testing.assert_array_equal(change.U, expected.U)
+    np.testing.assert_array_equal(error, errors)
 
 
 def test_association_changes_are_the_gradient_of_half_the_squared_error():

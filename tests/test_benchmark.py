@@ -14,7 +14,7 @@ from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.model import model_outputs
 from asm_gym.scripts.benchmark import main
 from asm_gym.scripts.benchmark.experts import Attempt, _row, attempt
-from asm_gym.scripts.benchmark.fit import errors
+from asm_gym.scripts.benchmark.fit import errors, repeated
 from asm_gym.scripts.benchmark.memory import PlainTorch, synthetic
 from asm_gym.scripts.benchmark.turns import BusyError, Turns, check_quiet
 from asm_gym.scripts.benchmark.vector import vector_table
@@ -77,7 +77,32 @@ def test_errors_of_both_learners_are_those_their_surprise_is_made_of():
         ratio = run.errors[2:] / off  # 1/σ, whichever way the error went
         assert np.all(ratio > 0)
         assert off.shape == (len(episodes[-1]) - 2, 10)
-    assert main(["fit", "--tasks", "Lift", "--episodes", "5"]) == 0
+    assert main(["fit", "--tasks", "Lift", "--episodes", "5", "--even-if-busy"]) == 0
+
+
+def test_what_learning_costs_is_printed_of_repeated_episodes_and_on_a_quiet_machine_alone(capsys, monkeypatch):
+    asked = ["fit", "--tasks", "Lift", "--episodes", "6", "--recorded", "4", "--no-rival"]
+    assert main([*asked, "--even-if-busy"]) == 0
+    shown = capsys.readouterr().out
+    assert "6 episodes of Lift" in shown
+    assert "4 episodes were recorded" in shown
+    monkeypatch.setattr("asm_gym.scripts.benchmark.fit.os.getloadavg", lambda: (9.0, 9.0, 9.0))
+    assert main(asked) == 1
+    shown = capsys.readouterr().out
+    assert "too busy to tell" in shown
+    assert "median error" not in shown
+    assert main(["fit", "--recorded", "61"]) == 2
+
+
+def test_repeated_episodes_differ_by_the_noise_of_their_sensors():
+    episodes = synthetic(5, 2)
+    spec = episodes[0].spec
+    made = repeated(episodes, 7, seed=0)
+    assert [e.stream.shape for e in made] == [episodes[n % 2].stream.shape for n in range(7)]
+    np.testing.assert_array_equal(made[1].stream, episodes[1].stream)
+    off = made[6].stream - episodes[0].stream
+    np.testing.assert_allclose(off[:, spec.sensory].std(), 0.01, rtol=0.2)  # what its channels declare
+    assert not off[:, spec.motor].any()
 
 
 def test_an_attempt_says_what_the_episode_was():

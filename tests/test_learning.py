@@ -8,6 +8,8 @@ import pytest
 from asm_gym.memory.energy import energy
 from asm_gym.memory.inference import direct, direct_synapses, infer
 from asm_gym.memory.learning import (
+    RECALL_UPDATES,
+    UPDATES,
     Learner,
     Schedule,
     Synapse,
@@ -15,6 +17,7 @@ from asm_gym.memory.learning import (
     batches,
     cosine_decay,
     hebbian_change,
+    passes,
     power_iteration,
     side_by_side,
 )
@@ -139,6 +142,17 @@ def test_batches_hold_every_episode_once_and_let_short_ones_end():
     assert list(batch.active[-3:]) == [3, 2, 1]
     np.testing.assert_array_equal(batch.senses[:, 0], episodes[2].senses)
     np.testing.assert_array_equal(batch.commands[:20, 2], episodes[0].commands)
+
+
+def test_very_many_episodes_are_passed_over_less_often_and_more_often_to_run_on_alone():
+    episodes = trajectories(4)
+    steps = sum(len(t.senses) for t in episodes) / 4
+    assert passes(episodes, schedule(epochs=40)) == 40
+    many = schedule(epochs=10**6)
+    assert passes(episodes, many) * steps == pytest.approx(UPDATES, rel=0.01)
+    assert passes(episodes, many._replace(free_running_probability=0.6)) * steps == pytest.approx(
+        RECALL_UPDATES, rel=0.01
+    )
 
 
 def test_learning_lowers_the_energy_and_is_reproducible():

@@ -2,11 +2,13 @@
 
 import csv
 import json
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from asm_gym.envs.threads import ThreadVectorEnv
 from asm_gym.episodes import Episode
 from asm_gym.faults import Push
 from asm_gym.monitors import NeuralASM
@@ -130,6 +132,19 @@ def test_what_was_never_calibrated_is_refused(memory, nominal, tmp_path):
         band.calibrate(nominal[:30], 0.01)
 
 
+def test_what_is_sent_down_is_what_was_calibrated_whatever_was_sent_before(memory, nominal):
+    band = SpinalBand(memory).fit(nominal[:8]).calibrate(nominal[8:30], 0.05)
+    other = SpinalBand(memory).fit(nominal[8:16]).calibrate(nominal[16:38], 0.05)
+    x = band._read(0, nominal[0])[0][:5]
+    for _ in range(2):
+        for each, scale in ((band, band.scale_), (band, 2.0), (other, other.scale_)):
+            middle, half = each._at(x, scale)
+            sent = [each._sent_down(scale).at(row) for row in x]
+            np.testing.assert_allclose([m for m, _ in sent], middle, rtol=1e-9)
+            np.testing.assert_allclose([h for _, h in sent], half, rtol=1e-9)
+        other.learned_ = {**other.learned_, "middle": 2 * other.learned_["middle"]}
+
+
 @pytest.mark.parametrize("gone", ["external_torque", "wrist_force"])
 def test_a_memory_that_expects_no_torque_or_no_force_is_refused(nominal, gone):
     spec = StreamSpec(tuple(c for c in SPEC.channels if c.name != gone), 0.05)
@@ -221,6 +236,26 @@ def test_no_band_is_sent_while_a_reflex_acts_and_in_the_first_steps_after_it(swa
     back = acted.index(True) + 4
     assert acted[:16] == [7 <= t < back for t in range(16)]
     assert sent == [*range(UNJUDGED, 7), *range(back + UNJUDGED, 16)]
+
+
+def test_side_by_side_each_member_has_its_own_band(swaying):
+    _, memory, band = swaying
+
+    def made(newtons):
+        push = Push(body="robot0_link5", newtons=newtons, onset=10, duration=4)
+        return NeuralASMSafety(FaultInjection(gym.make("asm_gym/Lift-v0"), [push]), memory, "hold", spinal=band)
+
+    envs = ThreadVectorEnv([partial(made, newtons) for newtons in (0.1, 20.0)])
+    envs.reset(seed=100)
+    policy, state, left = Sways(None), None, []
+    for _ in range(12):
+        action, state = policy.predict(None, state)
+        infos = envs.step(np.stack([action, action]))[-1]
+        left.append(np.array(infos["asm"]["spinal_s"], np.float64))
+    envs.close()
+    left = np.array(left)
+    assert np.isnan(left[:10]).all()
+    assert left[10, 1] <= 0.01
 
 
 class Replay(gym.Env):

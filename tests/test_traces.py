@@ -22,7 +22,7 @@ def test_a_trace_is_the_exponentially_weighted_sum_of_all_rows():
 
 def test_gains_give_every_trace_a_mean_square_of_one():
     rng = np.random.default_rng(1)
-    episodes = [np.cumsum(rng.normal(size=(60, 4)), axis=0).astype(np.float32) for _ in range(3)]
+    episodes = [np.cumsum(rng.normal(size=(T, 4)), axis=0).astype(np.float32) for T in (60, 20, 90)]
     gains = fit_gains(episodes)
     squares = []
     for rows in episodes:

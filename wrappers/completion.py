@@ -71,6 +71,8 @@ class Repair:
     @property
     def unread(self) -> tuple[str, ...]:
         """Those of them that the policy does not read: it goes on without them, however long nothing tells of them."""
+        if not self._calm:
+            return ()
         return tuple(name for name, own in self._completion.sensors if name in self._calm and not self.reads(own))
 
     def reads(self, columns: NDArray[np.intp]) -> bool:
@@ -84,9 +86,13 @@ class Repair:
 
     def read(self, row: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """(D,) the next row, as it should be."""
-        self._earlier, self._raw = self._raw, np.asarray(row, np.float64)
+        self._earlier, self._raw = self._raw, np.array(row, np.float64)
         self.settling = max(0, self.settling - 1)
-        lost = ~np.isfinite(self._raw) & ~self.missing
+        finite = np.isfinite(self._raw)
+        if not self._calm and finite.all():  # as nearly always
+            self._good = self._before = self._raw
+            return row.astype(np.float32)
+        lost = ~finite & ~self.missing
         lost[self._spec.motor] = False
         if lost.any() and not lost[self._spec.sensory].all():
             self._doubt(lost)
@@ -129,7 +135,7 @@ class Repair:
 
     def _repaired(self) -> NDArray[np.float64]:
         if not self._calm:
-            return self._raw.copy()
+            return self._raw
         repaired, columns = self._raw.copy(), self._filling.columns
         before = self._raw if self._before is None else self._before
         value = self._completion.complete(self._filling, self._completion.lift(np.stack([before, self._raw])))[-1]

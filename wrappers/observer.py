@@ -72,10 +72,11 @@ class Observer:
             failures = tuple(joined(f, f"monitor: {error!r}") for f in failures)
             return Observation(_infinite(none, failures), None, failures, latency)
         lost = ~(surprise.value > -np.inf)  # NaN too
-        failures = tuple(
-            joined(f, f"monitor: its surprise is {v}") if no else f
-            for f, v, no in zip(failures, surprise.value, lost, strict=True)
-        )
+        if lost.any():
+            failures = tuple(
+                joined(f, f"monitor: its surprise is {v}") if no else f
+                for f, v, no in zip(failures, surprise.value, lost, strict=True)
+            )
         return Observation(_infinite(surprise, failures), expected, failures, latency)
 
     def forget(self, acted_on: Mask) -> str:
@@ -100,7 +101,7 @@ class Observer:
 
     def _checked(self, surprise: Surprise) -> Surprise:
         shapes = (self._batch,), (self._batch, self._monitor.spec.size)
-        value, attribution = (np.array(part, np.float64) for part in (surprise.value, surprise.attribution))
+        value, attribution = np.array(surprise.value, np.float64), np.array(surprise.attribution, np.float64)
         if (value.shape, attribution.shape) != shapes:
             raise ValueError(
                 f"a surprise must have values of shape {shapes[0]} and attributions of shape {shapes[1]}, "
@@ -119,7 +120,7 @@ class Observer:
 
 def joined(*failures: str) -> str:
     """Several failures in one line, each once; empty where there is none."""
-    return "; ".join(dict.fromkeys(f for f in failures if f))
+    return "; ".join(dict.fromkeys(filter(None, failures)))
 
 
 def _infinite(surprise: Surprise, failures: tuple[str, ...]) -> Surprise:

@@ -192,7 +192,7 @@ class Responder:
 
     def observed(self, observation: Any) -> Any:
         """The observation as the policy is to see it."""
-        if self._map is None or self.repair is None or not self._rows:
+        if self._map is None or self.repair is None or not self._rows or not self.completed:
             return observation
         return self._map.repaired(observation, self._rows[-1], self.repair.missing)
 
@@ -212,13 +212,13 @@ class Responder:
         """
         dt = self._spec.dt
         self._quiet = 0 if alarm else self._quiet + 1
-        if self._quiet > QUIET_S / dt:
+        if self._since and self._quiet > QUIET_S / dt:
             self._forget()
         pressed = self._pressed() if self._repairs else None
         for family in self._since:
             self._since[family] += 1
         if not alarm:
-            return Response("", as_info(None), pressed)
+            return NO_RESPONSE._replace(pressed=pressed)
         cause = self._believed(self._cause(failed, attribution))
         self._felt = self._felt or (felt and self._diagnoses <= FELT_BY)
         family = cause.family if cause is not None and cause.probability >= SURE else "unknown"

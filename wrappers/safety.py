@@ -286,7 +286,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         surprise, expected, (failure,), latency = self._observer.observe(row[None], (failure,))
         if self._late(latency):
             surprise = surprise._replace(value=np.full(1, np.inf))
-        surprise = surprise.without(self._responder.missing)
+        if self._responder.completed:
+            surprise = surprise.without(self._responder.missing)
         if self._responder.settling and not failure:
             surprise = surprise.silenced(np.ones(1, np.bool_))
         if self.learning_rate > 0 and not self._arbiter.overriding and not failure:
@@ -313,7 +314,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         )
         if not decision.intervened:
             self._largest = max(self._largest or 0.0, watched)
-        forgot = self._observer.forget(np.array([decision.acted_on or self._responder.settling]))
+        forget = decision.acted_on or self._responder.settling
+        forgot = self._observer.forget(np.ones(1, np.bool_)) if forget else ""
         failure = joined(failure, decision.failure, forgot)
         self._rows.append(RowReport(surprise, decision, latency, failure, response))
         if self._arbiter.overriding and not decision.intervened and not ends_step:

@@ -49,6 +49,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that they move.
         on_alarm: as in ``NeuralASMSafety``; a policy of yours is shared, and must keep what it knows in its state.
             Causes are not named here and senses not completed, so that ``"graded"`` holds as it does for the unknown.
+            Nor is a band sent down: for ``spinal``, wrap each member and put those side by side in ``ThreadVectorEnv``.
         release_after, release_below, max_override, try_after, truncate: as in ``NeuralASMSafety``.
         adapt: as there; all environments share one running threshold, and an episode keeps what it began with.
 

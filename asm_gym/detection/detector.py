@@ -200,12 +200,13 @@ class Detector:
         """v (T, G, X) and the running mean of the contexts (T, C) of a whole episode."""
         evidence = no_evidence(1, len(self.gains), len(self.whitening), run.contexts.shape[1])
         whitened = bounded(run.errors, self.bound) @ self.whitening
-        strengths, lately = [], []
+        vectors, lately = [], []
         for e, c in zip(whitened, run.contexts, strict=True):
             evidence = accumulate(evidence, e[None], c[None], self.gains)
-            strengths.append(strength(evidence, self.gains)[0])
+            vectors.append(evidence.vector[0])
             lately.append(evidence.context[0])
-        return np.array(strengths), np.array(lately)
+        whole = Evidence(np.array(vectors), np.array(lately), np.arange(1, len(vectors) + 1))
+        return strength(whole, self.gains), whole.context
 
 
 class EvidenceState(NamedTuple):

@@ -68,11 +68,13 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
     p = np.array([first, (happened[1] + np.where(noisy, first, 0.5)) / (chances[1] + 1.0)])
     counted = np.where(noisy | (happened.sum(axis=0) == 0), -np.log(p), 0.0)
     offset, steps = np.full(len(noisy), REPETITION_OFFSET), evidence_steps(counted)
-    for stream in streams:
-        state = unrepeated(1, len(noisy))
-        for row in np.asarray(stream, np.float64):
-            state = Repetition(*repeated(*state, row[None], steps, np.full(len(noisy), np.inf)))
-            offset = np.maximum(offset, state.unlikely[0])
+    ordered = sorted(streams, key=len, reverse=True)
+    state, unbounded = unrepeated(len(ordered), len(noisy)), np.full(len(noisy), np.inf)
+    for t in range(len(ordered[0])):
+        rows = np.array([stream[t] for stream in ordered if t < len(stream)], np.float64)
+        row, again, unlikely = (part[: len(rows)] for part in state)
+        state = Repetition(*repeated(row, again, unlikely, rows, steps, unbounded))
+        offset = np.maximum(offset, state.unlikely.max(axis=0))
     return np.concatenate([counted, offset[None]])
 
 

@@ -189,13 +189,14 @@ def association_change(
     """What each synapse changes by for inputs (B, I) and changes (B, X), as if all existed; and the errors (B, X).
 
     Args:
+        D: (X, I), or (X, 0) where nothing is linear.
         back: (X, M) by which errors come back to the hidden units; ``U`` where None.
     """
     f = hidden_units(a, V)
-    error = delta - complete(f, a, U, D)
+    error = delta - (complete(f, a, U, D) if D.size else outward(f, U))
     pulled = np.clip(error / spread, np.float32(-bound), np.float32(bound))
     upstream = (np.float32(1) - f * f) * (pulled @ (U if back is None else back))  # (B, M) ε_h
-    return Change(coincidence(upstream, a), coincidence(pulled, f), coincidence(pulled, a)), error
+    return Change(coincidence(upstream, a), coincidence(pulled, f), coincidence(pulled, a) if D.size else D), error
 
 
 def learn_association(
@@ -256,7 +257,7 @@ def _learn_hidden(
     """V and U from N rows (N, I) and what the linear part leaves of them (N, X), standardised."""
     updates = max(TICKS, min(updates, passes * len(a) // BATCH))
     V = rng.standard_normal(exists.V.shape).astype(np.float32) / np.float32(np.sqrt(a.shape[1])) * exists.V
-    U, nothing = np.zeros_like(exists.U), np.zeros_like(exists.D)
+    U, nothing = np.zeros_like(exists.U), exists.D[:, :0]
     into, out_of = Synapse(V), Synapse(U)
     spread = np.ones(left.shape[1], np.float32)
     feedback.begin(exists.U, rng)

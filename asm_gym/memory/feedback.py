@@ -82,7 +82,8 @@ class Settled(Feedback):
         self.by.learn(U, change, rate)
 
     def change(self, a: Array, left: Array, spread: Array, V: Array, U: Array, D: Array) -> tuple[Change, Array]:
-        drive, left, back, one = outward(a, V), left - outward(a, D), self.by.back(U), np.float32(1)
+        drive, back, one = outward(a, V), self.by.back(U), np.float32(1)
+        left = left - outward(a, D) if D.size else left
         norm, self._direction = power_iteration(U / np.sqrt(spread)[:, None], self._direction)
         stride = one / (self.prior_precision + np.float32(norm))
         h, f = drive, activate(drive)

@@ -19,11 +19,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, activate, energy, kernel
+from asm_gym.memory.energy import Array, activate, kernel
 from asm_gym.memory.inference import Weights, direct, direct_synapses, expect, infer, sense
 
-UPDATES = 50_000
-"""Steps of a batch that are learned from at most: with very many episodes fewer passes over them are enough."""
+UPDATES, RECALL_UPDATES = 15_000, 50_000
+"""Steps of a batch that are learned from at most, without and with learning to run on alone, which takes longer: with
+very many episodes fewer passes over them are enough."""
 
 REFERENCE_WIDTH = 256
 """Hidden units up to which ``learning_rate`` is taken as it is; beyond them learning would diverge."""
@@ -134,7 +135,9 @@ class Change(NamedTuple):
     W_D: Array
 
 
-def hebbian_change(c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: float) -> Change:
+def hebbian_change(
+    c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: float, exists: Array | None = None
+) -> Change:
     """The local learning rules.
 
     Args:
@@ -143,12 +146,14 @@ def hebbian_change(c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: 
         mu, z: (B, H) the expected state, and the inferred one.
         error: (B, S + A) Π_x ε_x at ``z``.
         pi_z: Π_z.
+        exists: ``direct_synapses`` of W_D, for whoever asks often.
     """
     motor = u.shape[1] - 1
+    exists = direct_synapses(error.shape[1] - motor, motor) if exists is None else exists
     return Change(
         W_C=coincidence(np.float32(pi_z) * (z - mu), c),
         W_F=coincidence(error, activate(z)),
-        W_D=coincidence(error, np.hstack([c, u])) * direct_synapses(error.shape[1] - motor, motor),
+        W_D=coincidence(error, np.hstack([c, u])) * exists,
     )
 
 
@@ -177,6 +182,8 @@ class Learner:
     def __init__(self, weights: Weights, schedule: Schedule, rng: np.random.Generator) -> None:
         self.weights, self.schedule, self.rng = weights, schedule, rng
         self.synapses = {name: Synapse(getattr(weights, name)) for name in Change._fields}
+        motor = weights.W_D.shape[1] - weights.W_C.shape[1] - 1
+        self._direct = direct_synapses(len(weights.W_D) - motor, motor)
         self._direction = rng.standard_normal(weights.W_F.shape[1]).astype(np.float32)
         for _ in range(20):
             self._norm, self._direction = power_iteration(weights.W_F, self._direction)
@@ -199,8 +206,8 @@ class Learner:
         mu = expect(c, w.W_C)
         z = infer(mu, left, w.W_F, pi_z, precision, pi_z + pi_x * self._norm, self.schedule.iterations)
         error = np.float32(pi_x) * (left - sense(z, w.W_F))
-        change = hebbian_change(c, taken, mu, z, error, pi_z)
-        total = float(energy(z, mu, left, w.W_F, pi_z, precision).sum())
+        change = hebbian_change(c, taken, mu, z, error, pi_z, self._direct)
+        total = 0.5 * (pi_z * float(np.sum((z - mu) ** 2)) + float(np.sum(error**2)) / pi_x)
         expected = past + sense(mu, w.W_F)
         for name, synapse in self.synapses.items():
             synapse.learn(getattr(change, name), rate)
@@ -212,7 +219,8 @@ class Learner:
 def passes(trajectories: Sequence[Trajectory], schedule: Schedule) -> int:
     """How often all episodes are learned from."""
     updates = sum(len(t.senses) for t in trajectories) / schedule.batch_size
-    return max(1, min(schedule.epochs, round(UPDATES / updates)))
+    most = RECALL_UPDATES if schedule.free_running_probability > 0 else UPDATES
+    return max(1, min(schedule.epochs, round(most / updates)))
 
 
 def largest_rate(weights: Weights, schedule: Schedule) -> float:

@@ -27,6 +27,9 @@ SURPRISED = 30.0
 
 PRECISION_EPOCHS = 20
 BATCH = 64
+BATCHES = 250
+"""In an epoch, at most: of many rows the batches are larger, which costs less a row."""
+
 RATE = 1e-3
 
 
@@ -61,7 +64,7 @@ def learn_precision(
     context, bias = Synapse(W_S), Synapse(b_S)
     for epoch in range(PRECISION_EPOCHS):
         order: NDArray[np.intp] = rng.permutation(len(f))
-        for rows in np.array_split(order, max(1, len(order) // BATCH)):
+        for rows in np.array_split(order, max(1, min(BATCHES, len(order) // BATCH))):
             change, bias_change = precision_change(f[rows], error[rows], W_S, b_S)
             context.learn(change, cosine_decay(rate, epoch / PRECISION_EPOCHS))
             bias.learn(bias_change, cosine_decay(rate, epoch / PRECISION_EPOCHS))

@@ -45,12 +45,13 @@ def at_rest(batch: int, row: int) -> NDArray[np.float32]:
 def fit_gains(episodes: Sequence[Array]) -> NDArray[np.float32]:
     """g (K,): such that each trace of these rows, (T, R) an episode, has a mean square of 1."""
     plain = np.float32(1) - DECAYS
-    squares, count = np.zeros(len(DECAYS)), 0
-    for rows in episodes:
-        traces = at_rest(1, rows.shape[1])
-        for row in np.ascontiguousarray(rows, np.float32):
-            traces = advance(traces, row[None], plain)
-            squares += np.mean(traces.reshape(len(DECAYS), -1) ** 2, axis=1, dtype=np.float64)
-            count += 1
+    ordered = sorted(episodes, key=len, reverse=True)
+    squares, width = np.zeros(len(DECAYS)), ordered[0].shape[1]
+    traces = at_rest(len(ordered), width)
+    for t in range(len(ordered[0])):
+        rows = np.array([episode[t] for episode in ordered if t < len(episode)], np.float32)
+        traces = advance(traces[: len(rows)], rows, plain)
+        squares += np.sum(traces.reshape(len(rows), len(DECAYS), width) ** 2, axis=(0, 2), dtype=np.float64)
+    count = width * sum(len(episode) for episode in episodes)
     gains: NDArray[np.float32] = (plain / np.maximum(np.sqrt(squares / count), FAINTEST)).astype(np.float32)
     return gains

@@ -79,6 +79,24 @@ class Band(NamedTuple):
         return np.where(np.isfinite(farthest), farthest, np.inf)
 
 
+class SentDown(NamedTuple):
+    """What is needed of a calibrated band once a control step, laid out to be read once."""
+
+    learned: dict[str, NDArray[np.float64]]  # what it was made of
+    scale: float  # Q
+    both: NDArray[np.float64]  # (2 N, I) M, then S
+    least: NDArray[np.float64]  # (N,) l
+    most: NDArray[np.float64]  # (N,) h
+    wide: NDArray[np.float64]  # (N,) q Q^(1/κ)
+    noise: NDArray[np.float64]  # (N,) 5 σ
+
+    def at(self, x: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """x̂ and w (N,) [N m], [N], from [c, a, 1] (I,)."""
+        found, N = self.both @ x, len(self.wide)
+        levels = np.minimum(np.maximum(found[N:], self.least), self.most)
+        return found[:N], self.wide * np.exp(levels) + self.noise
+
+
 class SpinalBand:
     """A band on external torques and forces at the wrist, from a memory.
 
@@ -117,6 +135,7 @@ class SpinalBand:
         self.scale_: float | None = None
         """Q; None before ``calibrate``."""
         self.maxima_: NDArray[np.float64] | None = None
+        self._sent: SentDown | None = None
 
     def fit(self, episodes: Sequence[FeltEpisode]) -> Self:
         """Learns what is usually felt, and how far off that is, from nominal episodes.
@@ -179,8 +198,8 @@ class SpinalBand:
         if state.steps[0] < UNJUDGED:
             return None
         mean, spread = self._of_motor
-        command = np.clip((np.asarray(action, np.float64) - mean) / spread, -FARTHEST, FARTHEST)
-        middle, half = self._at(np.concatenate([state.traces[0], command, ONE]), scale)
+        command = np.minimum(np.maximum((np.asarray(action, np.float64) - mean) / spread, -FARTHEST), FARTHEST)
+        middle, half = self._sent_down(scale).at(np.concatenate([state.traces[0], command, ONE]))
         return Band(middle - half, middle + half)
 
     def felt_in(self, row: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
@@ -243,6 +262,15 @@ class SpinalBand:
         if self.scale_ is None:
             raise RuntimeError("this band was never calibrated: call fit(episodes) and calibrate(others) first")
         return self.scale_
+
+    def _sent_down(self, scale: float) -> SentDown:
+        of, sent = self.learned_, self._sent
+        if sent is None or sent.learned is not of or sent.scale != scale:
+            wide = of["ceiling"] * scale ** (1.0 / of["tail"])
+            both = np.concatenate([of["middle"], of["spread"]])
+            least, most = of["span"].T.copy()
+            sent = self._sent = SentDown(of, scale, both, least, most, wide, self._noise)
+        return sent
 
     def _at(self, x: NDArray[np.floating[Any]], scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """x̂ and w (…, N) [N m], [N], from [c, a, 1] (…, I)."""

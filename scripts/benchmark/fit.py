@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from rich.console import Console
 
+from asm_gym.checks import check_number
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.memory.association import complete, hidden_units
@@ -20,6 +22,7 @@ from asm_gym.monitors.baselines.gru import GRU
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.benchmark.turns import check_quiet, machine
 
 HELD_OUT = 6
 """One in so many episodes is not learned but tested on."""
@@ -27,45 +30,79 @@ HELD_OUT = 6
 
 @dataclass
 class Fit:
-    """How long a memory takes to learn three skills, and how far off its expectations are, against a GRU."""
+    """How long a memory takes to learn some skills, and how far off its expectations are, against a GRU."""
 
     tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan")
     """Names of tasks."""
     episodes: int = 60
-    """Episodes of each task."""
+    """Episodes of each task to learn from."""
+    recorded: int | None = None
+    """Of which so many are recorded, and the others repeat them with sensor noise of their own: what learning costs
+    depends on how many there are. All by default."""
+    rival: bool = True
+    """Also fit the GRU."""
     seed: int = 0
     """Seed of the episodes and of both monitors."""
+    even_if_busy: bool = False
+    """Print figures though the machine has too much else to do."""
+
+    def __post_init__(self) -> None:
+        check_number("episodes", self.episodes, low=1, whole=True)
+        if self.recorded is not None:
+            check_number("recorded", self.recorded, low=1, high=self.episodes, whole=True)
 
     def run(self, console: Console) -> int:
         """Prints the table."""
+        recorded = self.recorded or self.episodes
         seconds: dict[str, float] = {}
-        episodes: list[Episode] = []
+        learned: list[Episode] = []
+        held_out: list[Episode] = []
         for task in self.tasks:
             with stage(f"recording {task}", console, seconds) as progress:
-                extra = -(-self.episodes // (HELD_OUT - 1))
-                env_id = f"asm_gym/{task}-v0"
-                episodes += collect(env_id, episodes=self.episodes + extra, seed=self.seed, progress=progress)
-        learned = [e for n, e in enumerate(episodes) if n % HELD_OUT]
-        held_out = [e for n, e in enumerate(episodes) if not n % HELD_OUT]
+                extra = -(-recorded // (HELD_OUT - 1))
+                made = collect(f"asm_gym/{task}-v0", episodes=recorded + extra, seed=self.seed, progress=progress)
+            held_out += made[::HELD_OUT]
+            learned += repeated([e for n, e in enumerate(made) if n % HELD_OUT], self.episodes, self.seed)
         rows: dict[str, tuple[float, float]] = {}
-        NeuralASM(episodes[0].spec, epochs=1).fit(learned[:4])  # compiles
-        for name in ("neural_asm", "gru"):
+        NeuralASM(learned[0].spec, epochs=1).fit(learned[:4])  # compiles
+        shares = []
+        for name in ("neural_asm", "gru") if self.rival else ("neural_asm",):
             with stage(f"fitting {name}", console, seconds) as progress:
-                start = time.process_time()
-                fitted: Any = make_monitor(name, episodes[0].spec, seed=self.seed).fit(learned, progress)
+                start, wall = time.process_time(), time.perf_counter()
+                fitted: Any = make_monitor(name, learned[0].spec, seed=self.seed).fit(learned, progress)
                 spent = time.process_time() - start
+                shares.append(spent / (time.perf_counter() - wall))
             rows[name] = spent, float(np.median(np.abs(np.concatenate(errors(fitted.model, held_out)))))
+        share = min(shares)
+        if not self.even_if_busy:
+            check_quiet(share, os.getloadavg()[0], os.cpu_count() or 1)
         table = Table(
-            f"{len(learned)} episodes of {', '.join(self.tasks)}, one core",
+            f"{len(learned)} episodes of {', '.join(self.tasks)}, {sum(map(len, learned))} rows, one core",
             ("", "s", "against the GRU", "median error of a step [sd of the change]"),
-            [(name, f"{t:.0f}", f"{t / rows['gru'][0]:.2f}×", f"{off:.3f}") for name, (t, off) in rows.items()],
+            [
+                (name, f"{t:.0f}", f"{t / rows['gru'][0]:.2f}×" if self.rival else "", f"{off:.3f}")
+                for name, (t, off) in rows.items()
+            ],
         )
         console.print(console_table(table))
+        if recorded < self.episodes:
+            console.print(f"Of each task {recorded} episodes were recorded; the others repeat them with other noise.")
         console.print(
             "The memory expects each group of senses from what the others do in the same step, the GRU from the past "
             "alone: the errors are of different questions."
         )
+        console.print(machine(share))
         return 0
+
+
+def repeated(episodes: Sequence[Episode], count: int, seed: int) -> list[Episode]:
+    """``count`` episodes: these, and then these again and again, each with sensor noise of its own."""
+    rng, made = np.random.default_rng(seed), list(episodes[:count])
+    while len(made) < count:
+        again = episodes[len(made) % len(episodes)]
+        noise = (rng.normal(size=again.stream.shape) * again.spec.noise).astype(np.float32)
+        made.append(replace(again, stream=again.stream + noise))
+    return made
 
 
 def errors(model: MemoryModel | GRU, episodes: Sequence[Episode]) -> list[NDArray[np.float32]]:

@@ -63,11 +63,8 @@ class Turns(NamedTuple):
         return f"{self.ratio(than, name).text(digits=1)}×"
 
     def where(self) -> str:
-        """The machine, and how much of it this process had."""
-        return (
-            f"{_processor()}, {os.cpu_count()} cores, of one of which this process had {100 * self.share:.0f} %. "
-            f"After ±: standard deviation over {REPETITIONS} repetitions."
-        )
+        """The machine, how much of it this process had, and what a spread is of."""
+        return f"{machine(self.share)} After ±: standard deviation over {REPETITIONS} repetitions."
 
 
 def take_turns(rivals: dict[str, Callable[[], Any]], turns: int, console: Console, even_if_busy: bool = False) -> Turns:
@@ -93,6 +90,11 @@ def take_turns(rivals: dict[str, Callable[[], Any]], turns: int, console: Consol
     if not even_if_busy:
         check_quiet(found.share, os.getloadavg()[0], os.cpu_count() or 1)
     return found
+
+
+def machine(share: float) -> str:
+    """What was measured on, and the ``share`` of a core that this process had."""
+    return f"{_processor()}, {os.cpu_count()} cores, of one of which this process had {100 * share:.0f} %."
 
 
 def check_quiet(share: float, load: float, cores: int) -> None:
