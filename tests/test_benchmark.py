@@ -39,6 +39,7 @@ def test_both_print_their_ratios(capsys):
     assert shown.count("×") >= 5
     assert "plain torch" in shown
     assert "under the wrapper" in shown
+    assert "A band takes" in shown
     assert "cores, of one of which this process had" in shown
 
 
