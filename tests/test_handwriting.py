@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from asm_gym.scripts.reproduce import splines
 from asm_gym.scripts.reproduce.handwriting import (
     DT,
     NOISE,
@@ -68,3 +69,22 @@ def test_pairs_begin_alike_or_have_one_middle():
     assert detour[: int(0.3 * 4000)].max() > 0.3
     assert detour[int(0.45 * 4000) : int(0.5 * 4000)].max() < 0.1
     assert detour[-1] > 1.0
+
+
+def test_a_spline_begins_at_the_origin_and_goes_as_far_as_its_knots():
+    rng = np.random.default_rng(0)
+    (spline,) = splines.repertoire(1, 3, rng)
+    episodes = splines.copybook([spline], 200, rng)
+    streams = np.stack([e.stream for e in episodes])
+    assert {e.info["skill"] for e in episodes} == {"a"}
+    # The noise of the pen averages out over writings, and so does the wobble of the knots.
+    reached = streams[:, [STEPS // 4 - 1, STEPS // 2 - 1, -1], :3].mean(axis=0)
+    np.testing.assert_allclose(reached, spline.knots[[1, 2, 4]] - spline.knots[0], atol=5 * 0.15 / np.sqrt(200))
+    travelled = np.cumsum(streams[:, :, 3:], axis=1) * DT
+    np.testing.assert_allclose(streams[:, :, :3] - travelled, 0.0, atol=6 * NOISE)
+
+
+def test_a_spline_has_no_corners():
+    (spline,) = splines.repertoire(1, 2, np.random.default_rng(1))
+    speed = splines.written(spline, np.random.default_rng(2)).stream[:, 2:]
+    assert np.abs(np.diff(speed, axis=0)).max() < 0.2 * np.abs(speed).max()

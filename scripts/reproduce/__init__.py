@@ -21,6 +21,7 @@ STUDIES = {
     "memorise_and_recall": Study("one network learns skills, recalls each from a cue"),
     "contextual_inference": Study("the state says which skill is running, untold"),
     "unnamed_skills": Study("how many skills a stream holds, and where each begins"),
+    "skill_change": Study("a change of skill is followed, and raises no alarm"),
     "express_skills": Study("one memory's own motor prediction drives the arm"),
     "local_learning": Study("local updates against backpropagation through time"),
     "retention": Study("skills learned one after another, with replay"),

@@ -66,14 +66,17 @@ class Memory:
         iterations: int = 5,
         rate: float = 3e-3,
         prior_precision: float = 30.0,
+        gain: float = 1.0,
     ) -> Memory:
         """From whole episodes, no labels.
 
         Args:
             steps: in which its synapses change, with 64 episodes side by side.
             free: ``free_running_probability`` of ``NeuralASM``, which explains the others too.
+            gain: of the synapses onto the state before it learns; large ones make units that tell beginnings apart.
         """
         blank = cls.untaught(episodes, hidden, rng, iterations, prior_precision)
+        blank.network.weights.W_C[:] *= np.float32(gain)
         return blank.taught(episodes, rng, steps, free, rate)
 
     @classmethod

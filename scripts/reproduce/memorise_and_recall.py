@@ -1,10 +1,8 @@
 """Memorise and recall: one network learns a repertoire without labels, and expresses each skill from a cue.
 
-Repertoires of handwriting-like movements in two and three dimensions, and three robosuite skills. The temporal
-predictive coding network on traces, learned by local rules, against a GRU and a plain RNN of the same width trained by
-backpropagation through time; the GRU with errors that go back one step, which is as local; a modern continuous Hopfield
-network, which keeps every window; and a library of movement primitives, which is told the skill. Online, every row is
-read after it was expected; offline, none after the cue.
+Repertoires of handwriting-like movements in two and three dimensions, of cubic splines, and of three robosuite skills.
+Online, every row is read after it was expected; offline, none after the cue. What recalls them is in ``recall_rivals``
+and ``robot_recall``.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -38,27 +36,9 @@ from asm_gym.scripts.reproduce.common import (
     wide_enough,
 )
 from asm_gym.scripts.reproduce.curves import curve
-from asm_gym.scripts.reproduce.expression import (
-    Backpropagated,
-    Expresser,
-    Hopfield,
-    Library,
-    Memory,
-    mean_demonstrations,
-    recalled,
-)
-from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, check_letters, copybook, repertoire
+from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters
+from asm_gym.scripts.reproduce.recall_rivals import CALLED, MODELS, Condition, recall
 from asm_gym.scripts.reproduce.robot_recall import RECALLED, ROBOT_CUE
-
-MODELS = ("memory", "gru", "rnn", "gru_one_step", "hopfield", "library")
-CALLED = {
-    "memory": "temporal predictive coding, local",
-    "gru": "GRU, BPTT",
-    "rnn": "RNN, BPTT",
-    "gru_one_step": "GRU, BPTT of one step",
-    "hopfield": "modern Hopfield",
-    "library": "primitives, told the skill",
-}
 
 
 @dataclass(frozen=True)
@@ -73,6 +53,10 @@ class Args(Common):
     """Hidden units for the other repertoires."""
     dims: tuple[int, ...] = (2, 3)
     """Dimensions to write in; 3 with a repertoire of eight only."""
+    splines: int = 16
+    """How many cubic splines one network learns; 0 leaves them out."""
+    width_seeds: int = 1
+    """How many of the seeds are repeated with other widths, and in three dimensions."""
     robot_hidden: int = 256
     """Hidden units for the robosuite skills."""
     cues: tuple[int, ...] = (1, 2, 5, 10, 20, 30)
@@ -97,7 +81,9 @@ class Args(Common):
             if not 1 <= cue < STEPS:
                 raise ValueError(f"a cue must be shorter than the letter, 1 to {STEPS - 1} steps, got {cue}")
         at_least(1, self, "writings", "steps", "updates")
-        at_least(0, self, "robot_episodes")
+        at_least(0, self, "robot_episodes", "splines", "width_seeds")
+        if self.splines:
+            check_letters(self.splines)
         if 2 not in self.dims or not set(self.dims) <= {2, 3}:
             raise ValueError(f"letters are written in 2 dimensions, or in 2 and 3, got {self.dims}")
 
@@ -105,76 +91,57 @@ class Args(Common):
         """With ``quick``, little of everything."""
         if not self.quick:
             return self
-        few = {"repertoires": (1, 4), "widths": (16, 32), "hidden": 32, "steps": 1500, "updates": 40}
+        few = {"repertoires": (1, 4), "widths": (16, 32), "hidden": 32, "steps": 1500, "updates": 40, "splines": 2}
         return replace(self, seeds=min(self.seeds, 2), robot_episodes=0, writings=4, **few)  # type: ignore[arg-type]
 
 
-class Condition(NamedTuple):
-    """What one network is asked to learn."""
-
-    seed: int
-    skills: int
-    hidden: int
-    dims: int
-
-
 def conditions(args: Args) -> list[Condition]:
-    """Repertoires, then widths, then three dimensions."""
-    middle = 8 if 8 in args.repertoires else max(args.repertoires)
-    plan = [(n, args.hidden, 2) for n in args.repertoires] + [(middle, h, 2) for h in args.widths]
-    plan += [(middle, args.hidden, d) for d in args.dims if d > 2]
-    return [Condition(s, *p) for s in args.repetitions for p in dict.fromkeys(plan)]
-
-
-def letters(condition: Condition, args: Args) -> list[Record]:
-    """Every model on one repertoire."""
-    seed, skills, hidden, dims = condition
-    rng = np.random.default_rng([seed, dims])
-    repertory = repertoire(len(NAMES), dims, rng)[:skills]
-    train, tests = copybook(repertory, args.writings, dims, rng), copybook(repertory, 4, dims, rng)
-    told = [str(e.info["skill"]) for e in tests]
-    models: dict[str, Expresser] = {
-        "memory": Memory.learned(train, hidden, rng, args.steps),
-        "gru": Backpropagated.learned(train, "gru", hidden, rng, args.updates),
-        "rnn": Backpropagated.learned(train, "rnn", hidden, rng, args.updates),
-        "gru_one_step": Backpropagated.learned(train, "gru", hidden, rng, args.updates, truncated=True),
-        "hopfield": Hopfield.learned(train),
-        "library": Library.learned(train, told),
-    }
-    means = mean_demonstrations(train, dims)
-    records: list[Record] = []
-    for name, model in models.items():
-        for cue in (*args.cues, STEPS):
-            error, right = recalled(model, tests, means, cue)
-            where = {"domain": "letters", "model": name, **condition._asdict(), "cue": cue, "online": cue == STEPS}
-            records.append({**where, "error_cm": error, "right": right})
-    return records
+    """Repertoires and splines for every seed; widths and three dimensions for some."""
+    middle = _middle(args)
+    all_seeds = [Condition(s, n, args.hidden, 2) for s in args.repetitions for n in args.repertoires]
+    all_seeds += [Condition(s, args.splines, args.hidden, 2, "splines") for s in args.repetitions if args.splines]
+    few = args.repetitions[: args.width_seeds]
+    wide = [Condition(s, middle, h, 2) for s in few for h in args.widths]
+    deep = [Condition(s, middle, args.hidden, d) for s in few for d in args.dims if d > 2]
+    return list(dict.fromkeys(all_seeds + wide + deep))
 
 
 def tables(records: Sequence[Record], args: Args) -> list[Table]:
-    """Repertoires, widths, cues, and robosuite."""
-    middle = 8 if 8 in args.repertoires else max(args.repertoires)
-    longest = max(args.cues)
+    """Repertoires, widths, cues, splines, and robosuite."""
+    middle, longest = _middle(args), max(args.cues)
+    basis: Record = {"domain": "letters", "dims": 2, "skills": middle, "hidden": args.hidden, "cue": longest}
 
-    def rows(key: str, values: Sequence[int], value: str = "error_cm", **where: Any) -> list[tuple[str, ...]]:
-        own = {"domain": "letters", "dims": 2, "skills": middle, "hidden": args.hidden, "cue": longest, **where}
-        return [(CALLED[m], *(shown(records, value, **own | {key: v, "model": m}) for v in values)) for m in MODELS]
+    def cell(right: bool, **where: Any) -> str:
+        error = shown(records, "error_cm", **basis | where)
+        return f"{error} ({over_seeds(records, 'right', **basis | where).mean:.2f})" if right and error else error
+
+    def rows(key: str, values: Sequence[int], right: bool = True, **where: Any) -> list[tuple[str, ...]]:
+        return [(CALLED[m], *(cell(right, **{**where, key: v, "model": m}) for v in values)) for m in MODELS]
 
     sizes, widths, cues = (("", *map(str, v)) for v in (args.repertoires, args.widths, args.cues))
-    units = f"{args.hidden} units, cue of {longest}; mean ± SD over seeds"
+    units = f"{args.hidden} units, cue of {longest}; mean ± SD over seeds, and share of right skills"
     made = [
-        Table(f"Offline error [cm] by skills, {units}", sizes, rows("skills", args.repertoires)),
-        Table(f"Right skill recalled [share] by skills, {units}", sizes, rows("skills", args.repertoires, "right")),
-        Table("Online error [cm] by skills", sizes, rows("skills", args.repertoires, cue=STEPS)),
-        Table(f"Offline error [cm] by hidden units, {middle} skills", widths, rows("hidden", args.widths)),
-        Table(f"Offline error [cm] by cue, {middle} skills", cues, rows("cue", args.cues)),
-        Table(f"Right skill recalled [share] by cue, {middle} skills", cues, rows("cue", args.cues, "right")),
+        Table(f"Offline error [cm] by letters, {units}", sizes, rows("skills", args.repertoires)),
+        Table("Online error [cm] by letters", sizes, rows("skills", args.repertoires, right=False, cue=STEPS)),
     ]
-    if len(args.dims) > 1:
-        heads = ("", *map(str, args.dims))
-        made.append(Table(f"Offline error [cm] by dimensions, {middle} skills", heads, rows("dims", args.dims)))
+    made += [
+        Table(f"Offline error [cm] by cue, {n} letters", cues, rows("cue", args.cues, skills=n))
+        for n in args.repertoires
+        if n >= middle
+    ]
+    if args.splines:
+        own = rows("cue", args.cues, domain="splines", skills=args.splines)
+        made.append(Table(f"Offline error [cm] by cue, {args.splines} splines", cues, own))
+    if args.width_seeds:
+        seeds = "one seed" if args.width_seeds == 1 else f"{args.width_seeds} seeds"
+        where = f"{middle} letters, {seeds} for widths other than {args.hidden}"
+        made.append(Table(f"Offline error [cm] by hidden units, {where}", widths, rows("hidden", args.widths)))
+        if len(args.dims) > 1:
+            heads = ("", *map(str, args.dims))
+            made.append(Table(f"Offline error [cm] by dimensions, {middle} letters", heads, rows("dims", args.dims)))
     if args.robot_episodes:
-        names = {**CALLED, "mean": "mean demonstration, told the skill"}
+        told = {"mean": "mean demonstration, told the skill"}
+        names = {m: name for m, name in CALLED.items() if m != "memory_wide"} | told
         made.append(
             Table(
                 f"Offline error of the hand [cm], one network for three robosuite skills, cue of {ROBOT_CUE}",
@@ -185,10 +152,14 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
     return made
 
 
+def _middle(args: Args) -> int:
+    """The repertoire for which widths and dimensions are tried."""
+    return 8 if 8 in args.repertoires else max(args.repertoires)
+
+
 def drawn(records: Sequence[Record], args: Args) -> Figure:
     """Error by repertoire, width and cue; robosuite."""
-    middle = 8 if 8 in args.repertoires else max(args.repertoires)
-    longest = max(args.cues)
+    middle, longest = _middle(args), max(args.cues)
     base = {"domain": "letters", "dims": 2, "skills": middle, "hidden": args.hidden, "cue": longest}
     panels: list[tuple[str, str, Sequence[int], str]] = [
         ("skills", "skills in the repertoire", args.repertoires, "error_cm"),
@@ -207,7 +178,10 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
                 ax.set_xscale("log", base=2)
             ax.set_xticks(values, [str(v) for v in values])
         _online(axes[1, 1], records, args, base)
-        _robot(axes[1, 2], records)
+        if args.robot_episodes:
+            _robot(axes[1, 2], records)
+        else:
+            axes[1, 2].set_visible(False)
         fig.legend(loc="outside upper center", ncols=3)
     return fig
 
@@ -225,7 +199,7 @@ def _online(ax: Any, records: Sequence[Record], args: Args, base: Record) -> Non
 
 
 def _robot(ax: Any, records: Sequence[Record]) -> None:
-    names = [*MODELS, "mean"]
+    names = [*(m for m in MODELS if m != "memory_wide"), "mean"]
     for i, model in enumerate(names):
         mean, spread = np.array([over_seeds(records, "error_cm", domain=t, model=model) for t in RECALLED]).T
         colour = look(i)[0] if model != "mean" else "#999999"
@@ -246,7 +220,8 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
         jobs += [partial(robot_recall.learned, seed, train, tests, *sizes) for seed in args.repetitions]
         jobs.append(partial(robot_recall.stored, train, tests, {"seed": args.seed, "hidden": args.robot_hidden}))
     # The longest first, so that no process is left with one of them at the end.
-    jobs += [partial(letters, condition, args) for condition in conditions(args)]
+    how = args.writings, args.steps, args.updates, args.cues
+    jobs += [partial(recall, condition, *how) for condition in conditions(args)]
     with stage("learning", console, seconds) as progress:
         records = [r for found in parallel_map(_done, jobs, args.workers, progress) for r in found]
     return Findings(records, tables(records, args), drawn(records, args), {})
