@@ -214,6 +214,9 @@ def test_spread_is_over_seeds_and_not_over_measurements():
         ("memorise_and_recall", ["--robot-episodes", "-1"], "robot_episodes must be at least 0, got -1"),
         ("fault_detection", ["--writings", "0"], "writings must be at least 1, got 0"),
         ("fault_detection", ["--tasks", "Lift", "Stack", "Lift"], "named twice"),
+        ("memorise_and_recall", ["--splines", "33"], "1 to 32 skills, got 33"),
+        ("skill_change", ["--tasks", "Lift", "PickPlaceCan"], "changed between, PickPlaceMilk is missing"),
+        ("skill_change", ["--switches", "0"], "switches must be at least 1, got 0"),
         ("fault_detection", ["--hidden", "20"], r"hidden \(robosuite's 75.*at least 38, got 20"),
     ],
 )
@@ -281,7 +284,7 @@ def test_the_mean_demonstration_is_as_far_off_as_it_is():
         robot_recall.stored(robot_episodes(spec, 140), train, {})
 
 
-COUNTED = ("failure", "spinal", "transfer")
+COUNTED = ("failure", "skill_change", "spinal", "transfer")
 """Studies that count episodes; the others print a mean over seeds."""
 
 
