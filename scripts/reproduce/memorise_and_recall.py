@@ -167,6 +167,8 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
         ("cue", "cue [steps]", args.cues, "error_cm"),
         ("cue", "cue [steps]", args.cues, "right"),
     ]
+    if not args.width_seeds:
+        del panels[1]
     with figure(height=6.0, width=9.0) as fig:
         axes = fig.subplots(2, 3)
         for ax, (key, label, values, value) in zip(axes.flat, panels, strict=False):
@@ -180,8 +182,8 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
         _online(axes[1, 1], records, args, base)
         if args.robot_episodes:
             _robot(axes[1, 2], records)
-        else:
-            axes[1, 2].set_visible(False)
+        for ax in axes.flat:
+            ax.set_visible(ax.has_data())
         fig.legend(loc="outside upper center", ncols=3)
     return fig
 
