@@ -95,7 +95,7 @@ class MemoryModel(StreamModel):
                 in common.
         """
         columns = spec.columns_in(self.spec)
-        if "moments" not in self.learned_ or not isinstance(self.network.weights, Weights):
+        if "moments" not in self.learned_ or isinstance(self.network, RecurrentNetwork):
             raise ValueError(
                 "this memory does not keep what its senses have in common (it was saved by an older asm-gym, has lost "
                 f"senses before, or has more than {MOST_INPUTS} inputs), so that none of them can be left out"
@@ -123,7 +123,8 @@ class MemoryModel(StreamModel):
         changes = np.ascontiguousarray(inputs[:, senses.changes])
         layout = senses.groups, senses.changes, self._units_each(senses)
         now = specialise(self.network.association, inputs, changes, *layout)
-        kept = {"mean", "spread", "change", "energy", "moments", *self.network.weights._fields}
+        temporal = RecurrentWeights._fields if isinstance(self.network, RecurrentNetwork) else Weights._fields
+        kept = {"mean", "spread", "change", "energy", "moments", *temporal}
         return self.restore({**{n: a for n, a in self.learned_.items() if n in kept}, **now._asdict()})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
