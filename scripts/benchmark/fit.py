@@ -76,13 +76,11 @@ class Fit:
         share = min(shares)
         if not self.even_if_busy:
             check_quiet(share, os.getloadavg()[0], os.cpu_count() or 1)
+        against = {name: (f"{t / rows['gru'][0]:.2f}×",) if self.rival else () for name, (t, _) in rows.items()}
         table = Table(
             f"{len(learned)} episodes of {', '.join(self.tasks)}, {sum(map(len, learned))} rows, one core",
-            ("", "s", "against the GRU", "median error of a step [sd of the change]"),
-            [
-                (name, f"{t:.0f}", f"{t / rows['gru'][0]:.2f}×" if self.rival else "", f"{off:.3f}")
-                for name, (t, off) in rows.items()
-            ],
+            ("", "s", *(("against the GRU",) if self.rival else ()), "median error of a step [sd of the change]"),
+            [(name, f"{t:.0f}", *against[name], f"{off:.3f}") for name, (t, off) in rows.items()],
         )
         console.print(console_table(table))
         if recorded < self.episodes:
