@@ -9,9 +9,8 @@ What predicts a change finds nothing odd in one that is just 0. Yet noise carrie
 readings to another, by steps of its resolution, and how seldom it stays is counted in nominal episodes. n_t is the
 evidence for "it repeats itself with probability ρ" against "with p", begun anew wherever that is best (Page 1954,
 Biometrika 41, 100-115). A sense that repeats itself as often as not, being read more slowly than the stream or coarsely
-rounded, then counts for little or nothing, and none for more than it came to in nominal episodes. One whose noise
-nobody declared is watched where it never repeated itself in any of them, and a command that reaches its limit for two
-rows is then nothing much.
+rounded, then counts for little or nothing, and none for more than it came to in nominal episodes. Where nobody
+declared the noise of any sense, those are watched that never repeated themselves in any of them.
 """
 
 from __future__ import annotations
@@ -54,7 +53,8 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
 
     Args:
         streams: (T, X) the senses in nominal episodes.
-        noisy: (X,) which are known to have noise. Of the others, one that ever repeats itself may well stand still.
+        noisy: (X,) which are known to have noise; the others may well stand still, as a command at its limit does.
+            Where none is known to have any, nobody said which: then those that never repeat themselves are watched.
     """
     chances, happened = np.zeros((2, len(noisy))), np.zeros((2, len(noisy)))
     for stream in streams:
@@ -63,10 +63,10 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
         chances += [(~before).sum(axis=0), before.sum(axis=0)]
         happened += [(now & ~before).sum(axis=0), (now & before).sum(axis=0)]
     first = (happened[0] + 0.5) / (chances[0] + 1.0)
-    # Noise is drawn anew, so a repetition is as rare after another as after none, until seen to be otherwise. What has
-    # no noise repeats itself where it reaches a limit, and once there it may well stay.
-    p = np.array([first, (happened[1] + np.where(noisy, first, 0.5)) / (chances[1] + 1.0)])
-    counted = np.where(noisy | (happened.sum(axis=0) == 0), -np.log(p), 0.0)
+    # As rare after a repetition as after none, until seen to be otherwise.
+    p = np.array([first, (happened[1] + first) / (chances[1] + 1.0)])
+    watched = noisy if noisy.any() else happened.sum(axis=0) == 0
+    counted = np.where(watched, -np.log(p), 0.0)
     offset, steps = np.full(len(noisy), REPETITION_OFFSET), evidence_steps(counted)
     ordered = sorted(streams, key=len, reverse=True)
     state, unbounded = unrepeated(len(ordered), len(noisy)), np.full(len(noisy), np.inf)
