@@ -5,6 +5,7 @@ import pytest
 
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.monitor import CalibratedMonitor
+from asm_gym.monitors.row import A_THREAD
 from asm_gym.scripts.benchmark.memory import synthetic
 
 
@@ -52,6 +53,13 @@ def test_streams_that_began_at_different_times_and_named_skills_make_no_differen
     state = asm.initial_state(5)
     state = state._replace(model=state.model._replace(steps=np.array([0, 1, 2, 5, 11])))
     both(asm, rows, state)
+
+
+def test_streams_by_the_hundred_on_threads_say_what_each_would_alone():
+    asm, rows, _ = memory()
+    many = np.tile(rows[:12], (1, 2 * A_THREAD // 5 + 7, 1))
+    assert many.shape[1] > 2 * A_THREAD
+    both(asm, many, asm.initial_state(many.shape[1]))
 
 
 def test_without_habituation_the_context_is_not_computed_and_surprise_is_the_same():

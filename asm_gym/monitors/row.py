@@ -8,8 +8,10 @@ long as they did. They stay as they are for every other pair of model and detect
 
 from __future__ import annotations
 
+import os
 import sys
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,9 @@ from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.monitor import MonitorState
 from asm_gym.scaling import _read
+
+A_THREAD = 256
+"""Streams that one thread observes at a time."""
 
 
 class CompiledRow:
@@ -67,12 +72,34 @@ class CompiledRow:
         model, (evidence, repetition) = state.model, state.detection
         old = (*model, *evidence, *repetition)
         new, found = tuple(map(np.empty_like, old)), (np.empty(len(rows)), np.empty_like(rows))
-        _observe(rows, old, new, found, *self._learned)
+
+        def observe(part: slice) -> None:
+            before, after, said = (tuple(a[part] for a in arrays) for arrays in (old, new, found))
+            _observe(rows[part], before, after, said, *self._learned)
+
+        parts = _parts(len(rows))
+        if len(parts) == 1:
+            observe(parts[0])
+        else:
+            list(_threads().map(observe, parts))
         detection = EvidenceState(Evidence(*new[6:9]), Repetition(*new[9:]))
         return MonitorState(MemoryState(*new[:6]), detection), Surprise(*found)
 
 
-@partial(compiled, calls=("memory", "detection", "."))
+def _parts(streams: int) -> list[slice]:
+    """What each thread observes: as many whatever the machine is, for products of other sizes have other last bits."""
+    return [slice(a, a + A_THREAD) for a in range(0, max(streams, 1), A_THREAD)]
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(len(os.sched_getaffinity(0)), thread_name_prefix="asm-gym")
+
+
+os.register_at_fork(after_in_child=_threads.cache_clear)  # a child has none of its parent's threads
+
+
+@partial(compiled, calls=("memory", "detection", "."), nogil=True)
 def _observe(
     rows: Any,
     old: Any,
