@@ -40,7 +40,7 @@ def test_both_print_their_ratios(capsys):
     assert "plain torch" in shown
     assert "under the wrapper" in shown
     assert "A band takes" in shown
-    assert "cores, of one of which this process had" in shown
+    assert "cores, of which this process kept" in shown
 
 
 def test_a_busy_machine_prints_no_figures(capsys, monkeypatch):

@@ -94,7 +94,7 @@ def take_turns(rivals: dict[str, Callable[[], Any]], turns: int, console: Consol
 
 def machine(share: float) -> str:
     """What was measured on, and the ``share`` of a core that this process had."""
-    return f"{_processor()}, {os.cpu_count()} cores, of one of which this process had {100 * share:.0f} %."
+    return f"{_processor()}, {os.cpu_count()} cores, of which this process kept {share:.1f} busy."
 
 
 def check_quiet(share: float, load: float, cores: int) -> None:
