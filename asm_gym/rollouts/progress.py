@@ -61,7 +61,7 @@ def _lines(name: str, console: Console) -> Iterator[Progress]:
     speaker.start()
     try:
         yield note
-        say(f"{reached[0]}done in ")
     finally:
         ended.set()
         speaker.join()
+    say(f"{reached[0]}done in ")

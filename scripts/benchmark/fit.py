@@ -37,7 +37,7 @@ class Fit:
     episodes: int = 60
     """Episodes of each task to learn from."""
     recorded: int | None = None
-    """Of which so many are recorded, and the others repeat them with sensor noise of their own: what learning costs
+    """Episodes of each task to record; the others repeat them with sensor noise of their own, for what learning costs
     depends on how many there are. All by default."""
     rival: bool = True
     """Also fit the GRU."""
