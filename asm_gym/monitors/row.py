@@ -8,10 +8,9 @@ long as they did. They stay as they are for every other pair of model and detect
 
 from __future__ import annotations
 
-import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -81,7 +80,8 @@ class CompiledRow:
         if len(parts) == 1:
             observe(parts[0])
         else:
-            list(_threads().map(observe, parts))
+            with ThreadPoolExecutor() as threads:
+                list(threads.map(observe, parts))
         detection = EvidenceState(Evidence(*new[6:9]), Repetition(*new[9:]))
         return MonitorState(MemoryState(*new[:6]), detection), Surprise(*found)
 
@@ -89,14 +89,6 @@ class CompiledRow:
 def _parts(streams: int) -> list[slice]:
     """What each thread observes: as many whatever the machine is, for products of other sizes have other last bits."""
     return [slice(a, a + A_THREAD) for a in range(0, max(streams, 1), A_THREAD)]
-
-
-@cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(len(os.sched_getaffinity(0)), thread_name_prefix="asm-gym")
-
-
-os.register_at_fork(after_in_child=_threads.cache_clear)  # a child has none of its parent's threads
 
 
 @partial(compiled, calls=("memory", "detection", "."), nogil=True)
