@@ -9,6 +9,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from asm_gym.checks import check_text
+from asm_gym.extras import needed_for
 
 ROBOTS = ("Panda", "Sawyer", "UR5e", "Kinova3", "IIWA", "Jaco")
 """Arms that the tasks are tested with."""
@@ -96,7 +97,7 @@ def env_id(name: str) -> str:
 
     Raises:
         ValueError: neither is known; the message lists the tasks.
-        ImportError: the module of ``module:id`` is not installed.
+        ImportError: the module of ``module:id`` is not installed; the message says what brings it.
     """
     try:
         env_spec(check_text("task", name))
@@ -109,7 +110,8 @@ def env_spec(name: str) -> EnvSpec:
     """Of a Gymnasium id, ``module:id`` included."""
     module, colon, identifier = name.rpartition(":")
     if colon:
-        import_module(module)
+        with needed_for(name):
+            import_module(module)
     return gym.spec(identifier)
 
 

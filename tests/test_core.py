@@ -70,6 +70,7 @@ print(json.dumps([
     said(lambda: asm_gym.wrappers.SurpriseOverlay),
     said(lambda: asm_gym.monitors.make_monitor("gru", spec)),
     said(lambda: __import__("asm_gym.datasets").datasets.require_minari()),
+    said(lambda: __import__("asm_gym.tasks").tasks.env_id("gymnasium_robotics:FetchReach-v4")),
 ]))
 """
 
@@ -79,6 +80,7 @@ SAID = [
     "SurpriseOverlay needs matplotlib: pip install 'asm-gym[report]'",
     "monitor gru needs torch: pip install 'asm-gym[agents]'",
     "a dataset needs h5py: pip install 'asm-gym[data]'",
+    "gymnasium_robotics:FetchReach-v4 needs gymnasium_robotics: pip install 'asm-gym[environments]'",
 ]
 
 NOTHING_ELSE = """
