@@ -5,9 +5,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from asm_gym.checkpoint import read_checkpoint
 from asm_gym.episodes import Episode
-from asm_gym.monitors import MONITORS, load_monitor, make_monitor
-from asm_gym.monitors.baselines import association_mlp, fail_detect, gru, lstm_vae
+from asm_gym.monitors import MONITORS, load_monitor, make_monitor, monitor_class
+from asm_gym.monitors.baselines import association_mlp, gru, lstm_vae
+from asm_gym.monitors.saved import restored
 from asm_gym.stream import MOTOR, Channel, StreamSpec
 from tests.needs import needs
 from tests.streams import sine_episodes, sine_spec
@@ -30,16 +32,15 @@ def episodes(count, seed=0):
 @cache
 def fitted(model):
     """Once, for it is the same under every detection; with few updates, for the contract asks for no skill."""
-    kwargs = {"epochs": 4, "hidden_size": 16, "seed": 1} if model == "neural_asm" else {"seed": 1}
+    few = {"neural_asm": {"epochs": 4, "hidden_size": 16}, "logpzo": {"updates": 300}, "rnd": {"updates": 300}}
     with pytest.MonkeyPatch.context() as less:
-        for module, how_much in (
-            (association_mlp, "UPDATES"),
-            (fail_detect, "UPDATES"),
-            (gru, "EPOCHS"),
-            (lstm_vae, "EPOCHS"),
+        for module, how_much, count in (
+            (association_mlp, "UPDATES", 300),
+            (gru, "EPOCHS", 100),
+            (lstm_vae, "EPOCHS", 100),
         ):
-            less.setattr(module, how_much, 300 if how_much == "UPDATES" else 100)
-        return make_monitor(model, SPEC, **kwargs).fit(episodes(20))
+            less.setattr(module, how_much, count)
+        return make_monitor(model, SPEC, **few.get(model, {}), seed=1).fit(episodes(20))
 
 
 @pytest.fixture(scope="module", params=list(MONITORS))
@@ -154,6 +155,26 @@ def test_unknown_names_and_hyperparameters_list_the_known():
         make_monitor("oracle", SPEC)
     with pytest.raises(ValueError, match=r"'hiden_size'.*did you mean 'hidden_size'"):
         make_monitor("neural_asm", SPEC, hiden_size=3)
+
+
+@pytest.mark.parametrize(
+    ("name", "setting"),
+    [("window_pca", {"rows": 3, "kept": 0.9}), ("kalman", {"ridge": 0.5}), ("gru", {"hidden_size": 8})],
+)
+def test_what_a_baseline_was_set_to_is_in_its_file_and_a_file_from_before_has_its_own(name, setting, tmp_path):
+    with pytest.MonkeyPatch.context() as less:
+        less.setattr(gru, "EPOCHS", 2)
+        monitor, own = (make_monitor(name, SPEC, **s).fit(episodes(12)) for s in (setting, {}))
+    one = episodes(1, seed=7)[0]
+    assert not np.array_equal(monitor.score(one).value, own.score(one).value)
+    for made in (monitor, own):
+        made.save(tmp_path / "m.asm")
+        np.testing.assert_array_equal(load_monitor(tmp_path / "m.asm").score(one).value, made.score(one).value)
+    # An older asm-gym wrote nothing of these.
+    saved = read_checkpoint(tmp_path / "m.asm", name)
+    before = {n: v for n, v in saved.header["hyperparameters"].items() if n not in setting}
+    older = restored("m.asm", saved._replace(header={**saved.header, "hyperparameters": before}), monitor_class(name))
+    np.testing.assert_array_equal(older.score(one).value, own.score(one).value)
 
 
 def test_the_parts_of_the_memory_expect_what_it_does():

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
-from asm_gym.monitors import registry
+from asm_gym.monitors import load_monitor, registry
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 from asm_gym.rollouts.seeds import draw_onset
 from asm_gym.rollouts.trial import RolloutConfig, record
@@ -169,6 +169,22 @@ class _Recorder:
 
     def __call__(self, label):
         return record(label, RolloutConfig(), self.folder)
+
+
+def test_a_search_asks_every_setting_of_a_monitor_and_keeps_each(run, tmp_path):
+    from asm_gym.scripts.reproduce import search
+
+    asked = ["--run", str(run), "--monitors", "kalman+evidence", "association_linear+evidence", "--episodes", "3"]
+    assert search.main([*asked, "--workers", "1", "--out", str(tmp_path)]) == 0
+    rows = list(csv.DictReader((tmp_path / "search.csv").open()))
+    assert [(r["monitor"], r["setting"]) for r in rows] == [
+        *(("kalman+evidence", s) for s in ("its own", "ridge 1e-06", "ridge 1e-05", "ridge 0.001", "ridge 0.01")),
+        ("association_linear+evidence", "its own"),
+    ]
+    assert len({r["auroc"] for r in rows[:5]}) > 1  # a setting says something
+    kept = {load_monitor(p).get_params().get("ridge") for p in (tmp_path / "search" / "monitors").iterdir()}
+    assert kept == {1e-4, 1e-6, 1e-5, 1e-3, 1e-2, None}
+    assert search.main(["--monitors", "oracle"]) == 2
 
 
 def test_a_learning_curve_learns_from_few_of_the_many(run, tmp_path):

@@ -121,14 +121,17 @@ def code_digest(package: Path = Path(asm_gym.__file__).parent, names: Sequence[s
     return made.hexdigest()[:8]
 
 
-def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) -> CalibratedMonitor:
+def fitted(
+    folder: Path, name: str, recordings: Sequence[Episode], seed: int, settings: Mapping[str, Any] | None = None
+) -> CalibratedMonitor:
     """The monitor fitted on these episodes; kept in the folder for the next time, by what it learned and by which code.
 
-    Warns where one is there that other code has learned, and fits anew.
+    ``settings`` are hyperparameters, where they are not its own. Warns where one is there that other code has learned,
+    and fits anew.
     """
     spec = recordings[0].spec
     model = name.removesuffix(EVIDENCE)
-    made = make_monitor(name, spec, seed=seed)
+    made = make_monitor(name, spec, seed=seed, **(settings or {}))
     learned = model, asm_gym.__version__, made.get_params(), sorted(str(r.labelled.path) for r in recordings)
     digest = hashlib.sha256(json.dumps(learned, default=str).encode()).hexdigest()[:12]
     path = folder / "monitors" / f"{model}-{digest}-{code_digest()}.asm"

@@ -34,6 +34,7 @@ STUDIES = {
     "reflexes": Study("what acting on alarms is worth, reflex by fault", needs_a_run=True),
     "adoption": Study("one policy's memory on another policy", needs_a_run=True),
     "learning_curve": Study("detection by the number of episodes learned from", needs_a_run=True),
+    "search": Study("the same few settings tried for every monitor", needs_a_run=True),
     "feedback": Study("what local learning of association costs", needs_a_run=True),
     "completion": Study("what a faulty sense should say, from all others", needs_a_run=True),
     "diagnosis": Study("what is wrong, of kinds of faults that were never seen", needs_a_run=True),

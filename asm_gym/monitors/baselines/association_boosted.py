@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.ensemble import HistGradientBoostingRegressor
 
+from asm_gym.checks import check_number
 from asm_gym.compilation import compiled
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
@@ -24,9 +25,8 @@ from asm_gym.memory.association import synapses
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.association_linear import FAINTEST, LinearAssociation
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context
-
-TREES, LEAVES = 100, 15
-"""Trees for a change, at most, and leaves of one; fewer where a tenth of the rows gains no more."""
+from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 
 FRESH = 5
 """One in so many episodes is not learned by the trees, but shows how wrong they are."""
@@ -40,9 +40,23 @@ LARGEST = 1e30
 
 
 class BoostedAssociation(LinearAssociation):
-    """Ridge regression of each group's changes, and boosted trees for what it leaves; it has no context."""
+    """Ridge regression of each group's changes, and boosted trees for what it leaves; it has no context.
+
+    Args:
+        spec: the stream it is to expect.
+        trees: for a change, at most; fewer where a tenth of the rows gains no more.
+        leaves: of a tree, at most.
+        learning_rate: in (0, 1], the share that each tree counts.
+    """
 
     kind = "association_boosted"
+
+    @typed
+    def __init__(self, spec: StreamSpec, trees: int = 100, leaves: int = 15, learning_rate: float = 0.1) -> None:
+        super().__init__(spec)
+        self.trees = check_number("trees", trees, low=1, whole=True)
+        self.leaves = check_number("leaves", leaves, low=2, whole=True)
+        self.learning_rate = check_number("learning_rate", learning_rate, above=0.0, high=1.0)
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         super().fit(episodes, rng, progress)
@@ -58,7 +72,11 @@ class BoostedAssociation(LinearAssociation):
         for i, seen in enumerate(synapses(senses.groups, senses.changes, senses.inputs, 1).D > 0):
             progress(i, target.shape[1])
             boosted = HistGradientBoostingRegressor(
-                max_iter=TREES, max_leaf_nodes=LEAVES, early_stopping=True, random_state=int(rng.integers(2**31))
+                learning_rate=self.learning_rate,
+                max_iter=self.trees,
+                max_leaf_nodes=self.leaves,
+                early_stopping=True,
+                random_state=int(rng.integers(2**31)),
             )
             forest.grow(boosted.fit(a[:, seen], target[:, i]), np.flatnonzero(seen))
         trees = forest.arrays

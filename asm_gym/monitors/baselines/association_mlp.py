@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.association import synapses
 from asm_gym.memory.linear import check_inputs
@@ -25,11 +26,9 @@ from asm_gym.monitors.baselines.base import Lagged, associated, no_context, noth
 from asm_gym.monitors.baselines.torch_model import FRESH, TorchModel, steps_of
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
 from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 
-UNITS = 960
-"""In each layer, shared out among the groups: as many as the memory has."""
-
-UPDATES, BATCH, RATE = 12_000, 256, 1e-3
+UPDATES, BATCH = 12_000, 256
 CHECK, PATIENCE = 200, 10
 """Updates between two looks at the fresh rows, and how many looks without a gain end the training."""
 
@@ -41,10 +40,10 @@ class _Module(nn.Module):
     exists: Tensor  # (G each, I) 1 where there is a synapse
     group: Tensor  # (X,)
 
-    def __init__(self, senses: StreamScaler) -> None:
+    def __init__(self, senses: StreamScaler, units: int) -> None:
         super().__init__()
         G = int(senses.groups.max()) + 1
-        each = max(1, UNITS // G)
+        each = max(1, units // G)
         exists = synapses(senses.groups, senses.changes, senses.inputs, each).V
         self.register_buffer("exists", torch.from_numpy(exists), persistent=False)
         self.register_buffer("group", torch.from_numpy(senses.groups), persistent=False)
@@ -62,18 +61,27 @@ class _Module(nn.Module):
 
 
 class MLPAssociation(TorchModel):
-    """Two layers of hidden units for each group of senses; it has no context."""
+    """Two layers of hidden units for each group of senses; it has no context.
+
+    Args:
+        spec: the stream it is to expect.
+        units: hidden units of each layer, shared out among the groups; by default as many as the memory has.
+        learning_rate: of Adam.
+    """
 
     kind = "association_mlp"
 
-    def __init__(self, spec: StreamSpec) -> None:
+    @typed
+    def __init__(self, spec: StreamSpec, units: int = 960, learning_rate: float = 1e-3) -> None:
         super().__init__(spec)
+        self.units = check_number("units", units, low=1, whole=True)
+        self.learning_rate = check_number("learning_rate", learning_rate, above=0.0)
         self.lag = rows_apart(spec.dt)
         self.shortest = 1 + self.lag
 
     def module(self, senses: StreamScaler) -> nn.Module:
         check_inputs(senses.inputs)
-        return _Module(senses)
+        return _Module(senses, self.units)
 
     def train(
         self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
@@ -81,7 +89,7 @@ class MLPAssociation(TorchModel):
         kept = len(readings) // FRESH
         learned = np.concatenate([_both(r, self.lag) for r in readings[kept:]])
         fresh = torch.from_numpy(np.concatenate([_both(r, self.lag) for r in readings[:kept] or readings]))
-        X, optimiser = len(self.spec.sensory), torch.optim.Adam(module.parameters(), RATE)
+        X, optimiser = len(self.spec.sensory), torch.optim.Adam(module.parameters(), self.learning_rate)
         best, lasted, kept_weights = float("inf"), 0, copy.deepcopy(module.state_dict())
         for n, rows in enumerate(steps_of(learned, BATCH, UPDATES, rng), 1):
             optimiser.zero_grad()

@@ -20,14 +20,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.base import Rows, no_context, no_rows, read
 from asm_gym.monitors.baselines.torch_model import TorchModel, adam, descend, steps_of
 from asm_gym.scaling import ScaledRows, StreamScaler
+from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 
-UPDATES, BATCH = 8000, 256
-WIDTH = 256
+BATCH = 256
 EMBEDDING = 64
 """Numbers that RND's networks give."""
 STAGES = 10
@@ -37,7 +39,19 @@ FARTHEST = 30.0
 
 
 class _Rowwise(TorchModel):
-    """A network on single rows: values, changes and the command."""
+    """A network on single rows: values, changes and the command.
+
+    Args:
+        spec: the stream it is to expect.
+        width: of each hidden layer.
+        updates: of the weights.
+    """
+
+    @typed
+    def __init__(self, spec: StreamSpec, width: int = 256, updates: int = 8000) -> None:
+        super().__init__(spec)
+        self.width = check_number("width", width, low=1, whole=True)
+        self.updates = check_number("updates", updates, low=1, whole=True)
 
     def start(self, batch: int, skills: Sequence[str] = ()) -> Rows:
         return no_rows(batch, self.spec.size)
@@ -57,10 +71,10 @@ class _Rowwise(TorchModel):
 
 
 class _Distillation(nn.Module):
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, width: int) -> None:
         super().__init__()
-        self.target = _mlp(size, EMBEDDING, 1).requires_grad_(False)
-        self.follower = _mlp(size, EMBEDDING, 2)
+        self.target = _mlp(size, EMBEDDING, 1, width).requires_grad_(False)
+        self.follower = _mlp(size, EMBEDDING, 2, width)
 
     def forward(self, x: Tensor) -> Tensor:
         difference: Tensor = self.follower(x) - self.target(x)
@@ -78,16 +92,16 @@ class RND(_Rowwise):
         return np.full(EMBEDDING, -1)
 
     def module(self, senses: StreamScaler) -> nn.Module:
-        return _Distillation(self.size(senses))
+        return _Distillation(self.size(senses), self.width)
 
     def train(
         self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
     ) -> None:
         assert isinstance(module, _Distillation)
-        optimiser, schedule = adam(module.follower, UPDATES)
+        optimiser, schedule = adam(module.follower, self.updates)
         rows = np.concatenate([_features(r) for r in readings])
-        for n, x in enumerate(steps_of(rows, BATCH, UPDATES, rng)):
-            tell(n, UPDATES)
+        for n, x in enumerate(steps_of(rows, BATCH, self.updates, rng)):
+            tell(n, self.updates)
             descend((module(x) ** 2).mean(), optimiser, schedule)
 
     def errors(self, x: Tensor) -> Tensor:
@@ -105,15 +119,15 @@ class LogpZO(_Rowwise):
         return np.concatenate([self.spec.sensory, self.senses_.slow, self.spec.motor])
 
     def module(self, senses: StreamScaler) -> nn.Module:
-        return _mlp(self.size(senses) + 1, self.size(senses), 3)
+        return _mlp(self.size(senses) + 1, self.size(senses), 3, self.width)
 
     def train(
         self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
     ) -> None:
-        optimiser, schedule = adam(module, UPDATES)
+        optimiser, schedule = adam(module, self.updates)
         rows = np.concatenate([_features(r) for r in readings])
-        for n, x in enumerate(steps_of(rows, BATCH, UPDATES, rng)):
-            tell(n, UPDATES)
+        for n, x in enumerate(steps_of(rows, BATCH, self.updates, rng)):
+            tell(n, self.updates)
             noise, s = torch.randn_like(x), torch.rand(len(x), 1)
             flow = module(torch.cat([(1.0 - s) * x + s * noise, s], dim=1))
             descend(((flow - (noise - x)) ** 2).mean(), optimiser, schedule)
@@ -130,8 +144,8 @@ def _features(reading: ScaledRows) -> NDArray[np.float32]:
     return np.clip(np.hstack([reading.senses, reading.commands[:, :-1]]), -FARTHEST, FARTHEST)
 
 
-def _mlp(inputs: int, outputs: int, depth: int) -> nn.Module:
+def _mlp(inputs: int, outputs: int, depth: int, width: int) -> nn.Module:
     layers: list[nn.Module] = []
     for n in range(depth):
-        layers += [nn.Linear(inputs if n == 0 else WIDTH, WIDTH), nn.SiLU()]
-    return nn.Sequential(*layers, nn.Linear(WIDTH, outputs))
+        layers += [nn.Linear(inputs if n == 0 else width, width), nn.SiLU()]
+    return nn.Sequential(*layers, nn.Linear(width, outputs))

@@ -18,12 +18,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.torch_model import TorchModel, converge, descend, padded, parted
 from asm_gym.scaling import ScaledRows, StreamScaler
+from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 
-HIDDEN = 256
 EPOCHS, BATCH = 200, 16
 """Passes at most; training ends where fresh episodes gain no more."""
 
@@ -39,10 +41,10 @@ class _Memory(NamedTuple):
 
 
 class _Module(nn.Module):
-    def __init__(self, senses: int, commands: int, changes: int) -> None:
+    def __init__(self, senses: int, commands: int, changes: int, hidden: int) -> None:
         super().__init__()
-        self.cell = nn.GRU(senses + commands, HIDDEN, batch_first=True)
-        self.out = nn.Linear(HIDDEN, 2 * changes)
+        self.cell = nn.GRU(senses + commands, hidden, batch_first=True)
+        self.out = nn.Linear(hidden, 2 * changes)
 
     def forward(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         states, _ = self.cell(inputs, hidden)
@@ -51,12 +53,24 @@ class _Module(nn.Module):
 
 
 class GRU(TorchModel):
-    """A gated recurrent network; its context is its hidden state."""
+    """A gated recurrent network; its context is its hidden state.
+
+    Args:
+        spec: the stream it is to expect.
+        hidden_size: H, hidden units.
+        learning_rate: of Adam, before the first plateau.
+    """
 
     kind = "gru"
 
+    @typed
+    def __init__(self, spec: StreamSpec, hidden_size: int = 256, learning_rate: float = 1e-3) -> None:
+        super().__init__(spec)
+        self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
+        self.learning_rate = check_number("learning_rate", learning_rate, above=0.0)
+
     def module(self, senses: StreamScaler) -> nn.Module:
-        return _Module(senses.size, len(self.spec.motor) + 1, len(self.spec.sensory))
+        return _Module(senses.size, len(self.spec.motor) + 1, len(self.spec.sensory), self.hidden_size)
 
     def train(
         self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
@@ -74,10 +88,10 @@ class GRU(TorchModel):
             for start in range(0, len(order), BATCH):
                 descend(loss(order[start : start + BATCH]), optimiser)
 
-        converge(module, epoch, lambda: loss(fresh), EPOCHS, tell)
+        converge(module, epoch, lambda: loss(fresh), EPOCHS, tell, self.learning_rate)
 
     def start(self, batch: int, skills: Sequence[str] = ()) -> _Memory:
-        hidden, last = np.zeros((batch, HIDDEN), np.float32), np.zeros((batch, self.senses_.size), np.float32)
+        hidden, last = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.senses_.size), np.float32)
         return _Memory(hidden, last, np.zeros((batch, self.spec.size)), np.zeros(batch, np.int64))
 
     def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:

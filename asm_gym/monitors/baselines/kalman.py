@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, solve_discrete_are
 
+from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput
 from asm_gym.episodes import Episode
 from asm_gym.memory.linear import check_inputs
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.base import Standard, no_context
 from asm_gym.monitors.model import StreamModel
-
-RIDGE = 1e-4
-"""Of the standardised inputs."""
+from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 
 FAINTEST = 1e-4
 """Smallest variance of w and v, of standardised channels; keeps the filter's equation solvable."""
@@ -35,9 +35,19 @@ class _State(NamedTuple):
 
 
 class Kalman(StreamModel):
-    """A steady-state Kalman filter; its errors are innovations in standard deviations."""
+    """A steady-state Kalman filter; its errors are innovations in standard deviations.
+
+    Args:
+        spec: the stream it is to expect.
+        ridge: penalty on A, B and c, of the standardised inputs.
+    """
 
     kind = "kalman"
+
+    @typed
+    def __init__(self, spec: StreamSpec, ridge: float = 1e-4) -> None:
+        super().__init__(spec)
+        self.ridge = check_number("ridge", ridge, low=0.0)
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         check_inputs(self.spec.size + 1)
@@ -47,7 +57,7 @@ class Kalman(StreamModel):
         before, after = (np.concatenate([x[k : len(x) - 1 + k] for x in xs]) for k in (0, 1))
         u = np.concatenate([s[1:, self.spec.motor] for s in streams]).astype(np.float64)
         Z = np.hstack([before, u, np.ones((len(u), 1))])
-        weights = np.linalg.solve(Z.T @ Z + RIDGE * len(Z) * np.eye(Z.shape[1]), Z.T @ after)  # (X + A + 1, X)
+        weights = np.linalg.solve(Z.T @ Z + self.ridge * len(Z) * np.eye(Z.shape[1]), Z.T @ after)  # (X + A + 1, X)
         X = len(self.spec.sensory)
         A, residual = weights[:X].T, after - Z @ weights
         R = np.diag(np.maximum((self.spec.noise[self.spec.sensory] / standard.spread) ** 2, FAINTEST))
