@@ -47,9 +47,9 @@ _HARMLESS = (*HARMLESS, *EXECUTIONS)
 SHOWN = 2
 """Typical episodes in the video."""
 
-_QUICK = ("neural_asm", "logpzo", "kalman+evidence", "autoregression", "external_torque_limit", "force_limit")
-"""Monitors that are fitted in seconds."""
 _QUICK_ELSEWHERE = ("neural_asm", "association_linear+evidence", "window_pca+evidence", "kalman+evidence")
+_QUICK = (*_QUICK_ELSEWHERE, "logpzo", "autoregression", "external_torque_limit", "force_limit")
+"""Monitors that are fitted in seconds."""
 
 
 @dataclass(frozen=True)

@@ -178,7 +178,7 @@ def test_a_search_asks_every_setting_of_a_monitor_and_keeps_each(run, tmp_path):
     assert search.main([*asked, "--workers", "1", "--out", str(tmp_path)]) == 0
     rows = list(csv.DictReader((tmp_path / "search.csv").open()))
     assert [(r["monitor"], r["setting"]) for r in rows] == [
-        *(("kalman+evidence", s) for s in ("its own", "ridge 1e-06", "ridge 1e-05", "ridge 0.001", "ridge 0.01")),
+        *(("kalman+evidence", s) for s in ("its own", "ridge 1e-05", "ridge 0.0001", "ridge 0.001", "ridge 0.01")),
         ("association_linear+evidence", "its own"),
     ]
     assert len({r["auroc"] for r in rows[:5]}) > 1  # a setting says something

@@ -47,10 +47,10 @@ SETTINGS: dict[str, tuple[Setting, ...]] = {
     "association_linear+evidence": ({},),
     "association_mlp+evidence": (
         {},
-        {"units": 480},
-        {"units": 1920},
         {"learning_rate": 3e-4},
+        {"units": 480},
         {"learning_rate": 3e-3},
+        {"units": 1920},
     ),
     "association_boosted+evidence": (
         {},
@@ -59,16 +59,16 @@ SETTINGS: dict[str, tuple[Setting, ...]] = {
         {"learning_rate": 0.05},
         {"learning_rate": 0.2},
     ),
-    "window_pca+evidence": ({}, {"rows": 3}, {"rows": 10}, {"kept": 0.95}, {"kept": 0.999}),
-    "kalman+evidence": ({}, {"ridge": 1e-6}, {"ridge": 1e-5}, {"ridge": 1e-3}, {"ridge": 1e-2}),
+    "window_pca+evidence": ({}, {"rows": 3}, {"rows": 10}, {"kept": 0.95}, {"kept": 0.99}),
+    "kalman+evidence": ({}, {"ridge": 1e-5}, {"ridge": 1e-4}, {"ridge": 1e-3}, {"ridge": 1e-2}),
     "gru+evidence": (
         {},
-        {"hidden_size": 128},
-        {"hidden_size": 512},
-        {"learning_rate": 3e-4},
         {"learning_rate": 3e-3},
+        {"hidden_size": 128},
+        {"learning_rate": 3e-4},
+        {"hidden_size": 512},
     ),
-    "logpzo+evidence": ({}, {"width": 128}, {"width": 512}, {"updates": 4000}, {"updates": 16000}),
+    "logpzo+evidence": ({}, {"updates": 4000}, {"width": 512}, {"width": 128}, {"updates": 16000}),
 }
 
 
@@ -84,6 +84,8 @@ class Args(Common):
     """Names of monitors."""
     episodes: int = 60
     """How many episodes are learned from, of all tasks together."""
+    settings: int = 5
+    """How many settings of each are tried, at most: its own first."""
     false_alarm_rate: float = 0.05
     """Share of nominal episodes that may raise an alarm."""
     window: float = 1.0
@@ -93,7 +95,7 @@ class Args(Common):
         super().__post_init__()
         for name in self.monitors:
             check_choice("monitor", name, SETTINGS)
-        at_least(1, self, "episodes")
+        at_least(1, self, "episodes", "settings")
         conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
         if not self.monitors:
             raise ValueError("there must be at least one monitor")
@@ -135,9 +137,8 @@ def score(job: Job, args: Args) -> Record:
 
 def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     """Fits and asks every monitor in every setting."""
-    jobs = [Job(m, n, s) for m in args.monitors for n in range(len(SETTINGS[m])) for s in args.repetitions]
-    if args.quick:
-        jobs = [job for job in jobs if job.setting < 2]
+    most = min(args.settings, 2) if args.quick else args.settings
+    jobs = [Job(m, n, s) for m in args.monitors for n in range(len(SETTINGS[m][:most])) for s in args.repetitions]
     with stage("fitting and judging", console, seconds) as progress:
         records = parallel_map(partial(score, args=args), jobs, args.workers, progress)
     return Findings(records, [table(records, args)], scatter(records, args), {"tasks": args.tasks})

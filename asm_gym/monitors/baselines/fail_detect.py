@@ -7,7 +7,11 @@ There each is averaged over the last five steps: the detection ``moving_mean``. 
 detect failures without failure data? Uncertainty-aware runtime failure detection for imitation learning policies”;
 Burda et al. 2019 (ICLR) for distillation, Lipman et al. 2023 (ICLR) for the flow. There an embedding of images and the
 action is scored; here the sensorimotor row: values, changes and the action. There a band in time is calibrated, which
-has to know how far the task has come; here one threshold for all skills. The networks here are smaller.
+has to know how far the task has come; here one threshold for all skills.
+
+The networks here are smaller: three layers of 256, 0.2 million weights, where the authors train a one-dimensional U-Net
+of 256, 512 and 1024 channels, 59 million. On a core that is an hour for each pass over 48,000 rows, and a row takes
+longer to score than it lasts at 20 Hz: a size for a graphics card. ``width`` and ``updates`` go part of the way.
 """
 
 from __future__ import annotations

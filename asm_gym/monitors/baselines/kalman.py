@@ -45,7 +45,7 @@ class Kalman(StreamModel):
     kind = "kalman"
 
     @typed
-    def __init__(self, spec: StreamSpec, ridge: float = 1e-4) -> None:
+    def __init__(self, spec: StreamSpec, ridge: float = 1e-6) -> None:
         super().__init__(spec)
         self.ridge = check_number("ridge", ridge, low=0.0)
 

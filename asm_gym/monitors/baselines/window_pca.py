@@ -46,7 +46,7 @@ class WindowPCA(StreamModel):
     kind = "window_pca"
 
     @typed
-    def __init__(self, spec: StreamSpec, rows: int = 5, kept: float = 0.99) -> None:
+    def __init__(self, spec: StreamSpec, rows: int = 5, kept: float = 0.999) -> None:
         super().__init__(spec)
         self.rows = check_number("rows", rows, low=1, whole=True)
         self.kept = check_number("kept", kept, above=0.0, high=1.0)
