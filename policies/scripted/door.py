@@ -19,7 +19,9 @@ from asm_gym.policies.scripted.base import (
 REACH, APPROACH, GRASP, TURN, PULL, REST = range(6)
 
 _TURNED = 1.4  # how far the handle is pressed before the latch is out of its hole for sure [rad]
+_PRESSED = 1.55  # how far to ask for; its spring and the hand's give take some of it [rad]
 _BEFORE = 0.09  # how far in front of the handle to come from [m]
+_ROLL = 0.8  # how far to roll the hand at once [rad]
 _OPENED = 0.36  # [rad]; the task asks for 0.3
 
 
@@ -68,6 +70,8 @@ class DoorExpert(Expert):
         state = self._advance(state, hand_at, turned, opened, left)
         target, grip = self._target(state, turned, opened)
         facing = self._facing(state, turned, opened)
+        if state.phase == REACH:
+            facing = self._rolling(state, hand, facing)
         command = np.append(move(hand_at, target, hand, facing, state.speed, gain=2.0), grip)
         if not deterministic:
             command[:6] += state.drift[:6]
@@ -128,21 +132,39 @@ class DoorExpert(Expert):
         if phase == GRASP:
             return state.anchor, CLOSE
         if phase == TURN:
-            return self._grip(hardware, min(turned + 0.4, _TURNED + 0.05), opened), CLOSE
+            return self._grip(hardware, min(turned + 0.4, _PRESSED), opened), CLOSE
         if phase == PULL:
-            return self._grip(hardware, _TURNED, min(opened + 0.12, _OPENED + 0.04)), CLOSE
+            return self._grip(hardware, _PRESSED, min(opened + 0.12, _OPENED + 0.04)), CLOSE
         return state.anchor, CLOSE
 
-    @staticmethod
-    def _facing(state: DoorState, turned: float, opened: float) -> Vector:
+    @classmethod
+    def _facing(cls, state: DoorState, turned: float, opened: float) -> Vector:
         """(3, 3) the hand in front of the door, fingers above and below the handle; it turns with what it holds."""
-        z = -state.hardware.normal
-        y = np.array([0.0, 0.0, 1.0])
-        facing = np.stack([np.cross(y, z), y, z], axis=1)
-        if state.phase >= TURN:
-            facing = _about(state.hardware.axis, turned) @ facing
-        turn: Vector = _about([0.0, 0.0, 1.0], opened) @ facing
-        return turn
+        held = cls._held(state.hardware, turned if state.phase >= TURN else 0.0)
+        facing: Vector = _about([0.0, 0.0, 1.0], opened) @ held
+        return facing
+
+    @staticmethod
+    def _held(hardware: Hardware, turned: float) -> Vector:
+        """(3, 3) the hand on the handle of a closed door. Its y axis points down: pressing the handle turns it back.
+
+        The other way up it turns further, until the Panda's last joint meets its stop.
+        """
+        z = -hardware.normal
+        y = np.array([0.0, 0.0, -1.0])
+        held: Vector = _about(hardware.axis, turned) @ np.stack([np.cross(y, z), y, z], axis=1)
+        return held
+
+    @classmethod
+    def _rolling(cls, state: DoorState, hand: Vector, facing: Vector) -> Vector:
+        """(3, 3) where to turn first on the way to ``facing``: rolled a little, by the way back that pressing takes.
+
+        The shortest turn is nearly half a one, and may lead any way round.
+        """
+        pressed = cls._held(state.hardware, _TURNED)
+        left = _roll(hand, pressed) + _roll(pressed, facing)
+        first: Vector = facing @ _about([0.0, 0.0, 1.0], left - np.clip(left, -_ROLL, _ROLL))
+        return first
 
     @staticmethod
     def _grip(hardware: Hardware, turned: float, opened: float) -> Vector:
@@ -155,6 +177,15 @@ class DoorExpert(Expert):
 def _between(a: Vector, b: Vector) -> float:
     """The angle between two orientations [rad]."""
     return float(np.arccos(np.clip((np.trace(a.T @ b) - 1) / 2, -1.0, 1.0)))
+
+
+def _roll(hand: Vector, to: Vector) -> float:
+    """How far the hand is rolled from another orientation, about its z axis, once that points the same way [rad]."""
+    axis = np.cross(hand[:, 2], to[:, 2])
+    sine = float(np.linalg.norm(axis))
+    tilt = _about(axis / sine, float(np.arctan2(sine, hand[:, 2] @ to[:, 2]))) if sine > 1e-9 else np.eye(3)
+    across = to.T @ tilt @ hand[:, 1]
+    return float(np.arctan2(-across[0], across[1]))
 
 
 def _about(axis: Any, angle: float) -> Vector:
