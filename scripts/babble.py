@@ -6,8 +6,10 @@ never showed. A run lives in one folder and can be killed at any time: what was 
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,8 +25,9 @@ from asm_gym.evaluation.tables import console_table, markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies.registry import EXPERTS, agents
-from asm_gym.rollouts.babbling import LEADING, LED, curriculum, record_lesson
-from asm_gym.rollouts.body import CALIBRATED_ON, healthy, learn_body
+from asm_gym.rollouts.babbling import LED, curriculum, held_out, leads, record_lesson
+from asm_gym.rollouts.benchmark import code_digest
+from asm_gym.rollouts.body import healthy, learn_body
 from asm_gym.rollouts.examination import Exam, Marks, card, examine, summary
 from asm_gym.rollouts.folder import claimed, make_missing, versions
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
@@ -36,6 +39,11 @@ from asm_gym.tasks import task as task_spec
 
 SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
+LEARNING = (
+    *("memory", "detection", "scaling.py", "stream.py", "rollouts/body.py"),
+    *("monitors/memory_model.py", "monitors/monitor.py", "monitors/neural_asm.py"),
+)
+"""What decides, in the package, over what a body learns of the same lessons."""
 _PANDAS = {"Door", "NutAssemblySquare", "NutAssemblyRound"}
 """Tasks whose experts are at home with the Panda: with other arms some of them never succeed."""
 _GRIPPED = tuple(name for name, task in TASKS.items() if task.arms == 1 and name in EXPERTS and name != "Wipe")
@@ -54,6 +62,8 @@ class Args:
     """Shipped agents that lead in turn with the experts; none by default, so that the examination meets them first."""
     episodes: int = 36
     """Lessons in each task; a second call with more of them goes on."""
+    reaching: bool = False
+    """Whether the hand reaches for places where noise alone would move it, and experts lead all held-out lessons."""
     stream_freq: int | None = None
     """Rows of the stream a second [Hz]; one each control step by default."""
     false_alarm_rate: float = 0.05
@@ -90,11 +100,12 @@ class Args:
         if not self.window > 0:
             raise ValueError(f"window must be > 0 s, got {self.window}")
         needed = conformal_episodes(self.false_alarm_rate)
-        there = int(len(self.shown) * (self.episodes // CALIBRATED_ON) * LEADING.count(LED) / len(LEADING))
+        calm = [n for n in range(self.episodes) if held_out(n) and leads(n, self.reaching) == LED]
+        there = len(self.shown) * len(calm)
         if there < needed:
             raise ValueError(
                 f"a false-alarm rate of {self.false_alarm_rate:g} needs {needed} undisturbed lessons to calibrate "
-                f"on, and {self.episodes} lessons in each of {len(self.shown)} tasks hold about {there}"
+                f"on, and {self.episodes} lessons in each of {len(self.shown)} tasks hold {there}"
             )
 
     def scaled(self) -> Args:
@@ -149,23 +160,32 @@ class Args:
 
 
 def learn(args: Args, console: Console) -> NeuralASM:
-    """Records what is missing, and fits, calibrates and saves the memory."""
-    wanted = curriculum(args.shown, args.episodes, args.seed, args.guides)
+    """Records what is missing, and fits, calibrates and saves the memory, unless this code has learned it already."""
+    wanted = curriculum(args.shown, args.episodes, args.seed, args.guides, args.reaching)
     with stage("babbling", console, {}) as progress:
         make = partial(record_lesson, config=args.config, folder=args.out.resolve())
         files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, args.parallel, progress)
     lessons = healthy([load_episode(file) for file in files])
-    with stage("learning", console, {}) as progress:
-        memory = learn_body(lessons, args.false_alarm_rate, args.seed, progress)
     inner: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
-    curriculum_of = {n: getattr(args, n) for n in ("tasks", "guides", "episodes", "seed", "false_alarm_rate")}
-    counts = {
+    about = {
+        "name": args.name,
+        "controller": inner.controller,
+        **{n: getattr(args, n) for n in ("tasks", "guides", "reaching", "episodes", "seed", "false_alarm_rate")},
         "lessons": len(lessons.fit),
         "rows": sum(map(len, lessons.fit)),
         "calibrated_on": len(lessons.calibration),
+        "code": code_digest(names=LEARNING),
+        **versions(),
     }
-    memory.about = {"name": args.name, "controller": inner.controller, **curriculum_of, **counts, **versions()}
-    memory.save(args.out / f"{args.name}.asm")
+    about, path = json.loads(json.dumps(about)), args.out / f"{args.name}.asm"
+    with suppress(FileNotFoundError, ValueError):  # one that is damaged or of an older asm-gym is learned anew
+        memory = NeuralASM.load(path)
+        if memory.about == about:
+            return memory
+    with stage("learning", console, {}) as progress:
+        memory = learn_body(lessons, args.false_alarm_rate, args.seed, progress)
+    memory.about = about
+    memory.save(path)
     return memory
 
 
@@ -193,6 +213,7 @@ def babble(args: Args, console: Console) -> None:
     """Records, learns, examines, and says what came of it."""
     args = args.scaled()
     claim = {n: getattr(args, n) for n in ("robot", "guides", "stream_freq", "seed")}
+    claim |= {"reaching": True} if args.reaching else {}  # folders of before there was any are of other lessons
     with claimed(args.out, "babble.json", claim):
         memory = learn(args, console)
         marks = examined(args, memory, console) if args.exam_episodes else []

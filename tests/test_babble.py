@@ -3,16 +3,30 @@
 from dataclasses import replace
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.monitors import NeuralASM
+from asm_gym.policies.scripted.base import ObservationReader
 from asm_gym.rollouts import harmless
-from asm_gym.rollouts.babbling import ALONE, DRIVEN, LEADING, LED, Babbler, Lesson, curriculum, record_lesson
+from asm_gym.rollouts.babbling import (
+    ALONE,
+    DRIVEN,
+    LEADING,
+    LED,
+    REACHING,
+    Babbler,
+    Lesson,
+    curriculum,
+    held_out,
+    record_lesson,
+)
 from asm_gym.rollouts.body import healthy
 from asm_gym.rollouts.examination import Exam
 from asm_gym.rollouts.folder import make_missing
+from asm_gym.rollouts.reaching import AROUND, PACE, TURNED, Reaching
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.babble import Args, main
 from asm_gym.stream import Channel, StreamSpec
@@ -51,12 +65,48 @@ def test_each_task_has_the_experts_own_course_disturbed_courses_and_noise_alone(
         assert {n.pause > 0 for n in lessons} == {n.weight == 1 for n in lessons} == {True, False}
 
 
+def test_hands_reach_where_noise_alone_would_lead_and_experts_lead_what_the_threshold_is_set_on():
+    usual, reaching = (curriculum(["Lift"], 60, seed=0, reaching=r) for r in (False, True))
+    kinds = [REACHING if n.guide == REACHING else LED if n.noise == 0 else DRIVEN for n in reaching]
+    assert kinds[2::3] == [LED] * 20
+    assert [kinds.count(kind) for kind in (LED, DRIVEN, REACHING)] == [36, 16, 8]
+    for old, new in zip(usual, reaching, strict=True):
+        if not held_out(new.number):
+            assert new == old._replace(guide=old.guide or REACHING)  # all else stays
+
+
 def test_agents_take_turns_with_the_expert_of_their_own_task():
     lessons = curriculum(["Lift", "Door"], 40, seed=0, guides=["lift_sac"])
     guides = {task: {n.guide for n in lessons if n.task == task} for task in ("Lift", "Door")}
     assert guides == {"Lift": {"scripted", "lift_sac", ""}, "Door": {"scripted", ""}}
     with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
         curriculum(["Lift"], 0, seed=0)
+
+
+@pytest.mark.parametrize("robot", ["Panda", "IIWA"])
+def test_a_hand_that_reaches_comes_near_one_place_after_another_and_turns(robot):
+    env = gym.make("asm_gym/Lift-v0", robot=robot)
+    reach, read, state = Reaching(env, seed=5), ObservationReader(env), None
+    observation, _ = env.reset(seed=5)
+    aims, came = [], []
+    for _ in range(95):
+        action, state = reach.predict(observation, state)
+        assert np.linalg.norm(action[:3]) <= PACE * (1 + 1e-6)
+        if not aims or state.place is not aims[-1].place:
+            far = np.linalg.norm(read(observation, "hand_position") - state.place)
+            aims.append(state)
+            came.append(0.0)
+        observation = env.step(action)[0]
+        came[-1] = max(came[-1], 1 - np.linalg.norm(read(observation, "hand_position") - state.place) / far)
+    env.close()
+    assert len(aims) >= 2
+    assert came[0] > 0.3  # of the way
+    away = np.array([a.place - a.began for a in aims])
+    assert (away >= AROUND[0]).all()
+    assert (away <= AROUND[1]).all()
+    assert {a.grip for a in aims} <= {-1.0, 1.0}
+    turned = [np.arccos(np.clip((np.trace(a.upright.T @ a.turned) - 1) / 2, -1, 1)) for a in aims]
+    assert 0 < min(turned) <= max(turned) <= np.linalg.norm(TURNED)
 
 
 @pytest.mark.parametrize("smoothness", [0.0, 0.9])
@@ -165,7 +215,7 @@ def replace_weight(lesson):
         ({"exam_faults": ("pushes",)}, "unknown kind of fault 'pushes'"),
         ({"exam_episodes": -1}, "exam_episodes must be at least 0, got -1"),
         ({"window": 0.0}, "window must be > 0 s, got 0"),
-        ({"episodes": 18, "tasks": ("Lift",)}, "needs 19 undisturbed lessons .* hold about 2"),
+        ({"episodes": 18, "tasks": ("Lift",)}, "needs 19 undisturbed lessons .* hold 2$"),
     ],
 )
 def test_the_command_refuses_what_makes_no_sense(given, why):

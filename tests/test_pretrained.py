@@ -57,7 +57,8 @@ def test_another_body_is_refused_with_what_there_is_and_what_to_do(shelf, spec, 
     with pytest.raises(ValueError, match="no shipped memory fits") as refused:
         pretrained_for(spec, controller)
     assert f"sines: {why}" in str(refused.value)
-    assert "asm-gym babble --robot" in str(refused.value)
+    made = f"asm-gym babble --robot {spec.source}" + (" --stream-freq 100 for" if spec.dt == 0.01 else " for")
+    assert made in str(refused.value)
 
 
 def test_the_wrapper_without_a_monitor_says_what_there_is_where_none_fits(shelf):

@@ -17,6 +17,8 @@ SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
 """Where they lie."""
 MAKE = "asm-gym babble"
 """The command that makes one."""
+USUAL = 20
+"""Rows of a stream a second where each control step has one [Hz]."""
 
 
 def pretrained() -> dict[str, Path]:
@@ -58,9 +60,14 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
     raise ValueError(
         f"no shipped memory fits this stream of {spec.source or 'an unnamed body'} at {1 / spec.dt:g} Hz"
         f"{f' under {controller}' if controller else ''}. There are:\n" + "\n".join(lines) + f"\nFit one of your own: "
-        f"{MAKE} --robot {spec.source or 'ROBOT'} for an arm of robosuite, asm-gym fit DATA for recordings, and hand "
-        "it over as monitor"
+        f"{made_by(spec)} for an arm of robosuite, asm-gym fit DATA for recordings, and hand it over as monitor"
     )
+
+
+def made_by(spec: StreamSpec) -> str:
+    """The command that makes a memory of this body at this rate."""
+    rate = round(1.0 / spec.dt)
+    return f"{MAKE} --robot {spec.source or 'ROBOT'}" + (f" --stream-freq {rate}" if rate != USUAL else "")
 
 
 def _named(known: StreamSpec, about: dict[str, Any], spec: StreamSpec, controller: str) -> list[tuple[str, str, str]]:

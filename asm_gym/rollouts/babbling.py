@@ -3,9 +3,10 @@
     a_t = clip(e_t + s x_t),   x_t = ρ x_{t-1} + √(1 - ρ²) ξ_t      e the guide's action, 0 without one; ξ white
 
 Each lesson is one episode. Two in five are the expert's own, at many speeds; in two of five noise drives the expert off
-its course, in jerks or slowly; in one noise alone moves the arm. In half of all the arm stops now and then, whatever it
-holds or leans on, and in half a thing weighs more or less. No noise is so strong that most of a lesson would be hits:
-those taught the memory to expect them, and cost more faults than they spared alarms.
+its course, in jerks or slowly; in one noise alone moves the arm, or the hand reaches for one place after another, for
+nothing there. In half of all the arm stops now and then, whatever it holds or leans on, and in half a thing weighs more
+or less. No noise is so strong that most of a lesson would be hits: those taught the memory to expect them, and cost
+more faults than they spared alarms. One lesson in three is not learned from: the threshold is set on those.
 
 Sources: Laskey et al. 2017 (CoRL, DART) for noise on an expert's commands; Saegusa et al. 2009 (ROBIO) for babbling.
 """
@@ -27,14 +28,17 @@ from asm_gym.faults.harmless import ObjectMass
 from asm_gym.faults.object import movable
 from asm_gym.policies import Policy, make_policy
 from asm_gym.policies.scripted.base import Style
+from asm_gym.rollouts.reaching import Reaching
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial, environment, play, staged
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import StreamRecorder
 
-ALONE, LED, DRIVEN = "noise", "expert", "disturbed"
+ALONE, LED, DRIVEN, REACHING = "noise", "expert", "disturbed", "reaching"
 LEADING = (LED, DRIVEN, ALONE, LED, DRIVEN)
 """What leads, lesson by lesson of a task."""
+HELD_OUT = 3
+"""One in so many lessons of a task is not learned from: the threshold is set on those."""
 SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
 """ρ: from the noise by which agents explore to pushing on in one direction, as half-trained ones do."""
 NOISE = 0.02, 0.2
@@ -54,7 +58,7 @@ class Lesson(NamedTuple):
         task: its name.
         number: among the lessons of its task.
         seed: of the environment, of the guide and of the noise.
-        guide: what leads, a policy's name; noise alone where empty.
+        guide: what leads, ``"reaching"`` or a policy's name; noise alone where empty.
         noise: s, standard deviation of the noise [action units].
         smoothness: ρ.
         speed: of a scripted guide, relative to its usual one.
@@ -83,13 +87,16 @@ class Lesson(NamedTuple):
         return EpisodeLabel(self.task, "babble", seed=self.seed)
 
 
-def curriculum(tasks: Sequence[str], episodes: int, seed: int, guides: Sequence[str] = ()) -> list[Lesson]:
+def curriculum(
+    tasks: Sequence[str], episodes: int, seed: int, guides: Sequence[str] = (), reaching: bool = False
+) -> list[Lesson]:
     """Lessons, task by task; all of them follow from ``seed``, and fewer ``episodes`` are the first of more.
 
     Args:
         tasks: their names.
         episodes: of each task.
         guides: agents that take turns with the experts, in the tasks that each was trained in.
+        reaching: the hand reaches for places where noise alone would lead, as ``leads`` says.
 
     Raises:
         ValueError: fewer than one episode.
@@ -97,20 +104,39 @@ def curriculum(tasks: Sequence[str], episodes: int, seed: int, guides: Sequence[
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     return [
-        _lesson(task, number, drawn, ["scripted", *(g for g in guides if g.split("_")[0] == task.lower())])
+        _lesson(
+            task, number, drawn, leads(number, reaching), ["scripted", *(g for g in guides if _trained_in(g, task))]
+        )
         for task in tasks
         for number, drawn in enumerate(role_seeds(seed, task, "babble", episodes))
     ]
 
 
-def _lesson(task: str, number: int, seed: int, guides: Sequence[str]) -> Lesson:
-    rng, leads = np.random.default_rng([seed, 3]), LEADING[number % len(LEADING)]
+def held_out(number: int) -> bool:
+    """Whether the lesson of this number is for the threshold."""
+    return number % HELD_OUT == HELD_OUT - 1
+
+
+def leads(number: int, reaching: bool = False) -> str:
+    """What leads the lesson of this number; where hands reach, the expert leads each that the threshold is set on."""
+    usual = LEADING[number % len(LEADING)]
+    if not reaching:
+        return usual
+    return LED if held_out(number) else REACHING if usual == ALONE else usual
+
+
+def _trained_in(guide: str, task: str) -> bool:
+    return guide.split("_")[0] == task.lower()
+
+
+def _lesson(task: str, number: int, seed: int, lead: str, guides: Sequence[str]) -> Lesson:
+    rng, guide = np.random.default_rng([seed, 3]), guides[number // len(LEADING) % len(guides)]
     return Lesson(
         task,
         number,
         seed,
-        guide="" if leads == ALONE else guides[number // len(LEADING) % len(guides)],
-        noise=0.0 if leads == LED else float(np.exp(rng.uniform(*np.log(NOISE)))),
+        guide={ALONE: "", REACHING: REACHING}.get(lead, guide),
+        noise=0.0 if lead == LED else float(np.exp(rng.uniform(*np.log(NOISE)))),
         smoothness=float(rng.choice(SMOOTHNESS)),
         speed=float(rng.uniform(*SPEED)),
         pause=PAUSE * float(rng.random() < 0.5),
@@ -126,8 +152,7 @@ class Babbler:
     """
 
     def __init__(self, env: gym.Env[Any, Any], lesson: Lesson) -> None:
-        style = {"style": Style(speed=lesson.speed)} if lesson.guide == "scripted" else {}
-        self._guide: Policy | None = make_policy(lesson.guide, env, seed=lesson.seed, **style) if lesson.guide else None
+        self._guide = _guide(lesson, env)
         self._lesson, self._rng = lesson, np.random.default_rng([lesson.seed, 1])
         self._noise = self._rng.standard_normal(env.action_space.shape or ())
         self._grip = np.isin(np.arange(len(self._noise)), list(getattr(env.unwrapped, "gripper_actions", ())))
@@ -154,6 +179,13 @@ class Babbler:
         if self._left:  # it keeps its grip
             action = np.where(self._grip, action, 0.0)
         return np.clip(action, -1.0, 1.0).astype(np.float32), state
+
+
+def _guide(lesson: Lesson, env: gym.Env[Any, Any]) -> Policy | None:
+    if lesson.guide == REACHING:
+        return Reaching(env, lesson.seed, lesson.speed)
+    style = {"style": Style(speed=lesson.speed)} if lesson.guide == "scripted" else {}
+    return make_policy(lesson.guide, env, seed=lesson.seed, **style) if lesson.guide else None
 
 
 def record_lesson(lesson: Lesson, config: RolloutConfig, folder: Path) -> Path:

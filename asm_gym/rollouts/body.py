@@ -10,10 +10,9 @@ import numpy as np
 from asm_gym.episodes import Episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import Progress
+from asm_gym.rollouts.babbling import held_out
 from asm_gym.rollouts.training.exploration import SHORTEST, Gentle, peak_torques
 
-CALIBRATED_ON = 3
-"""One in so many lessons of a task is not learned from: the threshold is set on those."""
 LEARNED_UP_TO = 2.0
 """How many times what an undisturbed expert usually feels at most may be felt in what is learned from."""
 AROUND_S = 0.2
@@ -56,7 +55,7 @@ def healthy(recordings: Sequence[Episode]) -> Lessons:
     found = Lessons([], [])
     for episode in recordings:
         usual = np.median(felt[episode.labelled.task], axis=0)
-        if _lesson(episode)["number"] % CALIBRATED_ON < CALIBRATED_ON - 1:
+        if not held_out(_lesson(episode)["number"]):
             found.fit.extend(gentle_pieces(episode, Gentle(*(LEARNED_UP_TO * usual))))
         elif _undisturbed(episode):
             found.calibration.extend(gentle_pieces(episode, Gentle(*usual)))

@@ -14,7 +14,7 @@ from asm_gym.evaluation.tables import Column, Table, count, milliseconds, percen
 from asm_gym.evaluation.trace import NOMINAL, Trace
 from asm_gym.monitors import CalibratedMonitor
 from asm_gym.rollouts.benchmark import detectability_of, traces_of
-from asm_gym.rollouts.folder import labelled
+from asm_gym.rollouts.folder import crashes, labelled
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.tasks import task as task_spec
 
@@ -57,12 +57,14 @@ class Marks(NamedTuple):
     Attributes:
         name: of the exam.
         solved: traces of healthy episodes in which the task was solved.
-        failed: traces of healthy episodes in which it was not.
-        metrics: on the faults that an ideal observer could see.
+        crashed: of those in which it was, but something pressed twice as hard as is usual there.
+        failed: of those in which it was not.
+        metrics: on the faults that an ideal observer could see, in scenes where the policy does not crash by itself.
     """
 
     name: str
     solved: list[Trace]
+    crashed: list[Trace]
     failed: list[Trace]
     metrics: DetectionMetrics
 
@@ -73,19 +75,22 @@ def examine(
     """What ``memory`` makes of the recordings of these labels; faults are to be found within ``window`` [s]."""
     recordings = labelled(folder, labels)
     traces = traces_of(exam.name, memory, recordings, memory.threshold)
-    nominal = [t for t in traces if t.kind == NOMINAL]
+    hit = {seed for _, seed in crashes(recordings)}
     twins = [r for r in recordings if r.labelled.role == "nominal"]
-    faulty = [r for r in recordings if r.labelled.role == "faulty"]
+    faulty = [r for r in recordings if r.labelled.role == "faulty" and r.labelled.seed not in hit]
     seen = visible_kinds(detectability_of(twins, faulty, window))
-    faults = [t for t in traces if t.onset is not None and seen[t.kind, t.severity]]
-    solved, failed = ([t for t in nominal if t.outcome.success is want] for want in (True, False))
-    return Marks(exam.name, solved, failed, DetectionMetrics(exam.name, faults, nominal, window))
+    faults = [t for t in traces if t.onset is not None and t.seed not in hit and seen[t.kind, t.severity]]
+    nominal = [t for t in traces if t.kind == NOMINAL]
+    done, failed = ([t for t in nominal if t.outcome.success is want] for want in (True, False))
+    solved, crashed = ([t for t in done if (t.seed in hit) is want] for want in (False, True))
+    return Marks(exam.name, solved, crashed, failed, DetectionMetrics(exam.name, faults, solved, window))
 
 
 COLUMNS: Sequence[Column[Marks]] = (
     Column("", lambda m: m.name),
     Column("healthy, alarm", lambda m: count(false_alarms(m.solved))),
     Column("per hour", lambda m: f"{false_alarms_per_hour(m.solved):.1f}"),
+    Column("crashed, alarm", lambda m: count(false_alarms(m.crashed)) if m.crashed else ""),
     Column("failed, alarm", lambda m: count(false_alarms(m.failed)) if m.failed else ""),
     Column("AUROC", lambda m: f"{m.metrics.auroc:.3f}" if m.metrics.faulty else ""),
     Column("found", lambda m: f"{percent(m.metrics.detected)} of {m.metrics.detected.n}" if m.metrics.faulty else ""),
@@ -99,9 +104,9 @@ def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Ta
     learned = f"learned from {about['lessons']} lessons of {', '.join(about['tasks'])} ({about['rows']} rows)"
     limit = f"threshold {memory.threshold:.3g} from {about['calibrated_on']} others at {about['false_alarm_rate']:g}"
     return tabulate(
-        f"{about['name']}: {learned}, {limit}. Episodes with an alarm, apart those that solved the task and those that "
-        "failed; faults of medium and strong severity that an ideal observer could see, found within "
-        f"{window:g} s.",
+        f"{about['name']}: {learned}, {limit}. Episodes with an alarm, apart those that solved the task, "
+        "those that solved it but pressed twice as hard as is usual there, and those that failed; faults of medium and "
+        f"strong severity that an ideal observer could see, found within {window:g} s.",
         COLUMNS,
         marks,
     )

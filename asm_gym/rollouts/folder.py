@@ -160,13 +160,13 @@ class Recordings(NamedTuple):
     def of(cls, recordings: Sequence[Episode]) -> Recordings:
         """By role. Raises ValueError where there is nothing normal to learn or to test on."""
         roles: dict[str, list[Episode]] = {}
-        crashes, failed = _crashes(recordings), 0
+        hit, failed = crashes(recordings), 0
         for recording in recordings:
             label = recording.labelled
             # A nominal episode that fails is no example of what should feel normal, nor an alarm in it a false one.
             if label.role in NOMINAL_ROLES and not recording.success:
                 failed += 1
-            elif (label.task, label.seed) not in crashes:
+            elif (label.task, label.seed) not in hit:
                 roles.setdefault(label.role, []).append(recording)
         for role in NOMINAL_ROLES:
             if not roles.get(role):
@@ -174,10 +174,10 @@ class Recordings(NamedTuple):
                     f"none of the {role} episodes succeeded without a crash: "
                     "there is nothing normal to learn or to test on"
                 )
-        return cls(roles, LeftOut(failed, len(crashes)), [r for r in recordings if r.labelled.role == "nominal"])
+        return cls(roles, LeftOut(failed, len(hit)), [r for r in recordings if r.labelled.role == "nominal"])
 
 
-def _crashes(recordings: Sequence[Episode]) -> set[tuple[str, int]]:
+def crashes(recordings: Sequence[Episode]) -> set[tuple[str, int]]:
     """Tasks and seeds of nominal episodes that succeed, and press ``CRASH`` times as hard as others of their task."""
     hardest: dict[str, dict[int, float]] = {}
     for recording in recordings:

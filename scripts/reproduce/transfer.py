@@ -22,9 +22,9 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.faults.suite import kinds_of
 from asm_gym.monitors import EVIDENCE, MONITORS, CalibratedMonitor, NeuralASM
-from asm_gym.rollouts.babbling import LEADING, LED, curriculum, record_lesson
+from asm_gym.rollouts.babbling import LED, curriculum, held_out, leads, record_lesson
 from asm_gym.rollouts.benchmark import fitted
-from asm_gym.rollouts.body import CALIBRATED_ON, harmless, healthy, learn_body
+from asm_gym.rollouts.body import harmless, healthy, learn_body
 from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.trial import RolloutConfig
@@ -98,7 +98,7 @@ class Args(Common):
         at_least(1, self, "nominal_episodes")
         at_least(0, self, "faulty_episodes")
         needed = conformal_episodes(self.false_alarm_rate)
-        calm = sum(leads(n) for n in range(self.lessons))  # lessons to calibrate on
+        calm = sum(held_out(n) and leads(n) == LED for n in range(self.lessons))  # lessons to calibrate on
         given = (len(self.tasks) - bool(self.without)) * calm, 3 * self.calibration_episodes
         if min(given) < needed:
             raise ValueError(
@@ -154,11 +154,6 @@ def recordings(args: Args, console: Console, seconds: dict[str, float]) -> tuple
     for watched, label in jobs:
         own[watched].append(load_episode(folder / watched.folder / label.path))
     return [load_episode(file) for file in files], own
-
-
-def leads(number: int) -> bool:
-    """Whether the expert itself leads a lesson, and the threshold is set on it."""
-    return number % CALIBRATED_ON == CALIBRATED_ON - 1 and LEADING[number % len(LEADING)] == LED
 
 
 def of_its_own(
