@@ -215,6 +215,7 @@ def test_spread_is_over_seeds_and_not_over_measurements():
         ("fault_detection", ["--writings", "0"], "writings must be at least 1, got 0"),
         ("fault_detection", ["--tasks", "Lift", "Stack", "Lift"], "named twice"),
         ("memorise_and_recall", ["--splines", "33"], "1 to 32 skills, got 33"),
+        ("memorise_and_recall", ["--repertoires", "--splines", "0", "--robot-episodes", "0"], "nothing to recall: rep"),
         ("skill_change", ["--tasks", "Lift", "PickPlaceCan"], "changed between, PickPlaceMilk is missing"),
         ("skill_change", ["--switches", "0"], "switches must be at least 1, got 0"),
         ("fault_detection", ["--hidden", "20"], r"hidden \(robosuite's 75.*at least 38, got 20"),
@@ -282,6 +283,21 @@ def test_the_mean_demonstration_is_as_far_off_as_it_is():
     assert all(r["seed"] == 7 and not r["online"] for r in records)
     with pytest.raises(ValueError, match="no successful episode of PickPlaceCan is 160 steps long"):
         robot_recall.stored(robot_episodes(spec, 140), train, {})
+
+
+def test_robosuite_can_be_recalled_without_letters():
+    args = memorise_and_recall.Args(repertoires=(), splines=0)
+    assert memorise_and_recall.conditions(args) == []
+    models = [m for m in memorise_and_recall.MODELS if m != "memory_wide"] + ["mean"]
+    records = [
+        {"domain": task, "model": model, "seed": 0, "error_cm": 1.0 + n}
+        for task in robot_recall.RECALLED
+        for n, model in enumerate(models)
+    ]
+    (table,) = memorise_and_recall.tables(records, args)
+    assert [row[1] for row in table.rows] == [f"{1.0 + n:.1f}" for n in range(len(models))]
+    (panel,) = memorise_and_recall.drawn(records, args).axes
+    assert len(panel.patches) == len(models) * len(robot_recall.RECALLED)
 
 
 COUNTED = ("failure", "skill_change", "spinal", "transfer")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -10,9 +11,9 @@ import numpy as np
 import pytest
 
 from asm_gym.episodes import Episode
-from asm_gym.scripts.reproduce import skill_change
+from asm_gym.scripts.reproduce import skill_change, skill_names
 from asm_gym.scripts.reproduce.skill_switch import Switch
-from asm_gym.stream import Channel, StreamSpec
+from asm_gym.stream import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("x", 2, "m"),), dt=0.1)
 
@@ -35,13 +36,42 @@ def test_it_is_right_for_good_from_the_last_wrong_step_on():
 
 def test_a_forest_follows_a_change_once_the_new_moments_outweigh_the_old():
     told = [episode(v, 40, s) for v, s in ((-1.0, "a"), (1.0, "b")) for _ in range(3)]
-    found = skill_change.by_forest(told, told[:1], [changed(-1.0, 1.0, 30, 90)], seed=0)
+    found = skill_names.by_forest(told, told[:1], [changed(-1.0, 1.0, 30, 90)], seed=0)
     assert found.nominal[0].all()
     (right,) = found.switched
     assert len(right) == 60
     assert not right[0]
     # Moments are forgotten by a tenth a step: what is left of thirty is outweighed once 1 - 0.9**n passes a half.
     assert skill_change.for_good(right, 1.0) == pytest.approx(math.ceil(math.log(0.5) / math.log(0.9)) - 1, abs=1)
+
+
+def hands(points: list[list[float]], closed: int, skill: str) -> Episode:
+    spec = StreamSpec((Channel("hand_position", 3, "m"), Channel("action", 1, group=MOTOR)), dt=0.1)
+    command = np.where(np.arange(len(points)) < closed, -1.0, 1.0)
+    return Episode.from_stream(np.column_stack([points, command]), spec, info={"skill": skill})
+
+
+def test_a_forest_that_was_shown_other_changes_follows_where_single_skills_say_nothing():
+    told = [episode(v, 40, s) for v, s in ((-1.0, "a"), (-3.0, "b")) for _ in range(3)]
+    switches = [changed(-1.0, 1.0, 30, 60 + n) for n in range(6)]
+    told_alone = skill_names.by_forest(told, [], switches, seed=0)
+    shown = skill_names.by_forest_shown(told, switches, seed=0)
+    assert not shown.nominal
+    assert skill_change.share_right(shown.switched, 15) == 1.0
+    assert skill_change.share_right(told_alone.switched, 15) == 0.0
+
+
+def test_the_hand_is_nearer_to_the_new_skill_from_half_way_on():
+    told = [hands([[x, 0.0, 0.0]] * 3, 1, skill) for x, skill in ((0.0, "a"), (1.0, "b"))]
+    way = hands([[x, 0.0, 0.0] for x in (0.0, 0.0, 0.2, 0.4, 0.6, 0.8)], 6, "a")
+    found = skill_names.by_place(told, [Switch(way, np.repeat(["a", "b"], [2, 4]), 2)])
+    np.testing.assert_array_equal(found.switched[0], [False, False, True, True])
+
+
+def test_a_lift_is_asked_as_long_after_its_grasp_as_a_stack_leaves_for_the_side():
+    stack = hands([[0.0, 0.0, 0.0]] * 4 + [[0.0, 0.0, 0.1]] * 3 + [[0.03, 0.0, 0.1]] * 3, 4, "Stack")
+    lift = hands([[0.0, 0.0, 0.0]] * 2 + [[0.01, 0.0, 0.1]] * 8, 2, "Lift")
+    assert skill_names.partings([lift, hands([[0.0] * 3] * 3, 1, "Door"), stack]) == [5, None, 7]
 
 
 def test_an_alarm_is_put_down_to_the_change_where_it_comes_within_two_seconds():
@@ -54,8 +84,19 @@ def test_an_alarm_is_put_down_to_the_change_where_it_comes_within_two_seconds():
     assert [r["alarm"] for r in records] == [True, True, True]
     assert [r["after_change"] for r in records[1:]] == [False, True]
     table = skill_change.alarms_table(records)
-    assert [row[:2] for row in table.rows] == [
-        ("a", "1 of 1"),
-        ("change", "2 of 2"),
-        ("change, alarm in the 2 s after it", "1 of 2"),
+    assert [(*row[:2], row[3]) for row in table.rows] == [
+        ("a", "1 of 1", "1 of 1"),
+        ("change", "2 of 2", "2 of 2"),
+        ("change, alarm in the 2 s after it", "1 of 2", "1 of 2"),
     ]
+
+
+def test_episodes_that_crash_stand_apart():
+    def score(e: Episode) -> Any:
+        return SimpleNamespace(value=np.full(len(e), e.contact_force.max(initial=0.0)))
+
+    memory = cast(Any, SimpleNamespace(score=score, threshold=40.0))
+    felt = [replace(episode(0.0, 20), contact_force=np.full(20, f, np.float32)) for f in (9.0, 11.0, 10.0, 50.0)]
+    records = skill_change.alarms(memory, felt, [changed(0.0, 1.0, 30, 90)])
+    assert [r["crash"] for r in records] == [False, False, False, True, False]
+    assert skill_change.alarms_table(records).rows[0][1::2] == ("1 of 4", "0 of 3")

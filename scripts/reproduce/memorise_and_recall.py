@@ -46,7 +46,7 @@ class Args(Common):
     """Recall from a cue, against what else can recall."""
 
     repertoires: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
-    """How many letters one network learns."""
+    """How many letters one network learns; none leaves letters out."""
     widths: tuple[int, ...] = (16, 32, 64, 128, 256, 512)
     """Hidden units, for a repertoire of eight."""
     hidden: int = 64
@@ -73,7 +73,7 @@ class Args(Common):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_letters(*self.repertoires)
-        at_least(1, self, "repertoires", "widths", "cues")
+        at_least(1, self, "widths", "cues")
         for hidden in (*self.widths, self.hidden):
             wide_enough(hidden, 2 * 3)
         wide_enough(self.robot_hidden, SENSED)
@@ -84,6 +84,8 @@ class Args(Common):
         at_least(0, self, "robot_episodes", "splines", "width_seeds")
         if self.splines:
             check_letters(self.splines)
+        if not (self.repertoires or self.splines or self.robot_episodes):
+            raise ValueError("there is nothing to recall: repertoires, splines and robot_episodes are all left out")
         if 2 not in self.dims or not set(self.dims) <= {2, 3}:
             raise ValueError(f"letters are written in 2 dimensions, or in 2 and 3, got {self.dims}")
 
@@ -98,9 +100,9 @@ class Args(Common):
 def conditions(args: Args) -> list[Condition]:
     """Repertoires and splines for every seed; widths and three dimensions for some."""
     middle = _middle(args)
+    few = args.repetitions[: args.width_seeds if args.repertoires else 0]
     all_seeds = [Condition(s, n, args.hidden, 2) for s in args.repetitions for n in args.repertoires]
     all_seeds += [Condition(s, args.splines, args.hidden, 2, "splines") for s in args.repetitions if args.splines]
-    few = args.repetitions[: args.width_seeds]
     wide = [Condition(s, middle, h, 2) for s in few for h in args.widths]
     deep = [Condition(s, middle, args.hidden, d) for s in few for d in args.dims if d > 2]
     return list(dict.fromkeys(all_seeds + wide + deep))
@@ -120,10 +122,11 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
 
     sizes, widths, cues = (("", *map(str, v)) for v in (args.repertoires, args.widths, args.cues))
     units = f"{args.hidden} units, cue of {longest}; mean ± SD over seeds, and share of right skills"
-    made = [
-        Table(f"Offline error [cm] by letters, {units}", sizes, rows("skills", args.repertoires)),
-        Table("Online error [cm] by letters", sizes, rows("skills", args.repertoires, right=False, cue=STEPS)),
-    ]
+    made = []
+    if args.repertoires:
+        made.append(Table(f"Offline error [cm] by letters, {units}", sizes, rows("skills", args.repertoires)))
+        online = rows("skills", args.repertoires, right=False, cue=STEPS)
+        made.append(Table("Online error [cm] by letters", sizes, online))
     made += [
         Table(f"Offline error [cm] by cue, {n} letters", cues, rows("cue", args.cues, skills=n))
         for n in args.repertoires
@@ -132,7 +135,7 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
     if args.splines:
         own = rows("cue", args.cues, domain="splines", skills=args.splines)
         made.append(Table(f"Offline error [cm] by cue, {args.splines} splines", cues, own))
-    if args.width_seeds:
+    if args.repertoires and args.width_seeds:
         seeds = "one seed" if args.width_seeds == 1 else f"{args.width_seeds} seeds"
         where = f"{middle} letters, {seeds} for widths other than {args.hidden}"
         made.append(Table(f"Offline error [cm] by hidden units, {where}", widths, rows("hidden", args.widths)))
@@ -154,7 +157,7 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
 
 def _middle(args: Args) -> int:
     """The repertoire for which widths and dimensions are tried."""
-    return 8 if 8 in args.repertoires else max(args.repertoires)
+    return 8 if 8 in args.repertoires else max(args.repertoires, default=0)
 
 
 def drawn(records: Sequence[Record], args: Args) -> Figure:
@@ -169,6 +172,11 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
     ]
     if not args.width_seeds:
         del panels[1]
+    if not args.repertoires:
+        with figure(height=4.0, width=7.6) as fig:
+            _robot(fig.subplots(), records, named=True)
+            fig.legend(loc="outside right upper")
+        return fig
     with figure(height=6.0, width=9.0) as fig:
         axes = fig.subplots(2, 3)
         for ax, (key, label, values, value) in zip(axes.flat, panels, strict=False):
@@ -200,13 +208,14 @@ def _online(ax: Any, records: Sequence[Record], args: Args, base: Record) -> Non
     ax.set(xlabel="skills in the repertoire", ylabel="online error [cm]", ylim=0)
 
 
-def _robot(ax: Any, records: Sequence[Record]) -> None:
+def _robot(ax: Any, records: Sequence[Record], named: bool = False) -> None:
     names = [*(m for m in MODELS if m != "memory_wide"), "mean"]
     for i, model in enumerate(names):
         mean, spread = np.array([over_seeds(records, "error_cm", domain=t, model=model) for t in RECALLED]).T
         colour = look(i)[0] if model != "mean" else "#999999"
         x = np.arange(len(RECALLED)) + 0.12 * (i - 3)
-        ax.bar(x, mean, 0.11, yerr=spread, color=colour, error_kw={"linewidth": 1})
+        label = CALLED.get(model, "the mean") if named else None
+        ax.bar(x, mean, 0.11, yerr=spread, color=colour, error_kw={"linewidth": 1}, label=label)
     ax.set_xticks(range(len(RECALLED)), [task.replace("Place", "Place\n") for task in RECALLED])
     ax.set(ylabel="offline hand error [cm]", title="robosuite; grey: the mean")
 

@@ -1,10 +1,13 @@
-"""A change of skill: does the memory of a body follow it, and does it take it for a fault?
+"""A change of skill: is it followed, and is it taken for a fault? And how soon is the skill that runs named at all?
 
 The arm sorts a can, then a carton of milk, or the other way round. No lesson of the shipped memory held that change.
-Its threshold is the one on its card. What runs is named by what it was told of episodes with one skill each; a random
-forest is told the same of the same rows, and its moments add up too, so that it has what the rows say.
+Its threshold is the one on its card. What runs is named by what it was told of episodes with one skill each. A random
+forest is told the same of the same rows, and its moments add up too, so that it has what the rows say. Two more rows
+say what limits everybody: a forest that has been shown other changes, and where the hand is.
 
     right for good    from then on the name is right in every step
+    crash             an episode that presses much harder than the usual one of its kind, as in the evaluation
+    parting           where a Stack leaves for the side, and as long after its grasp in a Lift
 """
 
 from __future__ import annotations
@@ -13,39 +16,44 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from rich.console import Console
-from sklearn.ensemble import RandomForestClassifier
 
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table
-from asm_gym.memory.readout import KEPT, SMALLEST
 from asm_gym.monitors import NeuralASM
+from asm_gym.rollouts.folder import CRASH
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, demonstrations, reproduce
+from asm_gym.scripts.reproduce.skill_names import (
+    Named,
+    Right,
+    by_forest,
+    by_forest_shown,
+    by_memory,
+    by_place,
+    partings,
+)
 from asm_gym.scripts.reproduce.skill_recognition import AFTER_S, naming_figure, share_right
 from asm_gym.scripts.reproduce.skill_switch import NAMES, Switch, record_switch
 
 FOLLOWED_S = 2.0
 """An alarm so long after a change is put down to it [s]."""
 
-TREES = 100
-
-Right = NDArray[np.bool_]
+PARTED_S = (0.0, 0.5, 1.0)
+"""How long after the parting of Lift and Stack they are asked for [s]."""
 
 
 @dataclass(frozen=True)
 class Args(Common):
     """Episodes in which one skill follows another."""
 
-    tasks: tuple[str, ...] = ("Lift", "Stack", "Door", "PickPlaceCan", "PickPlaceMilk")
+    tasks: tuple[str, ...] = ("Lift", "Stack", "Door", "PickPlaceCan", "PickPlaceMilk", "NutAssemblySquare")
     """Skills that are told apart."""
     told: int = 20
     """Episodes of each skill whose name is told."""
@@ -66,13 +74,6 @@ class Args(Common):
         return replace(self, tasks=tuple(NAMES.values()), told=2, nominal=1, switches=1) if self.quick else self
 
 
-class Named(NamedTuple):
-    """In which steps one way of naming is right; (T,) for each episode, of a change those from it on."""
-
-    nominal: list[Right]
-    switched: list[Right]
-
-
 def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     """Records, names, judges and sums up."""
     args = args.scaled()
@@ -83,40 +84,23 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
         wanted = [args.out / "switches" / f"{args.seed + n}.npz" for n in range(args.switches)]
         paths = parallel_map(record_switch, wanted, args.workers, progress)
     switches = [Switch.read(path, memory.spec) for path in paths]
+    with stage("learning", console, seconds):
+        learned = NeuralASM(memory.spec, seed=args.seed).fit(told)
     with stage("naming", console, seconds):
-        named = {"memory of the body": by_memory(memory, told, nominal, switches)}
-        named["random forest on the rows"] = by_forest(told, nominal, switches, args.seed)
+        named = {
+            "memory of the body": by_memory(memory, told, nominal, switches),
+            "memory that learned from them": by_memory(learned, told, nominal, switches),
+            "random forest on the rows": by_forest(told, nominal, switches, args.seed),
+            "random forest, shown other changes": by_forest_shown(told, switches, args.seed),
+            "the nearer place of the hand": by_place(told, switches),
+        }
     with stage("judging", console, seconds):
         records = alarms(memory, nominal, switches)
     dt = nominal[0].spec.dt
     tables = [alarms_table(records), *named_tables(named, dt)]
+    if {"Lift", "Stack"} <= set(args.tasks):
+        tables.append(parted_table(named, nominal))
     return Findings(records, tables, _drawn(named, dt), {"threshold": memory.threshold})
-
-
-def by_memory(
-    memory: NeuralASM, told: Sequence[Episode], nominal: Sequence[Episode], switches: Sequence[Switch]
-) -> Named:
-    """What a memory names that is told these skills; surprise and weights do not depend on it."""
-    memory.name_skills(told)
-    switched = [(memory.skills(s.episode.stream) == s.skills)[s.changed :] for s in switches]
-    return Named([memory.skills(e.stream) == e.info["skill"] for e in nominal], switched)
-
-
-def by_forest(told: Sequence[Episode], nominal: Sequence[Episode], switches: Sequence[Switch], seed: int) -> Named:
-    """The same by a random forest, whose moments add up as those of the memory do."""
-    names = np.repeat([str(e.info["skill"]) for e in told], [len(e) for e in told])
-    forest = RandomForestClassifier(TREES, min_samples_leaf=5, class_weight="balanced", random_state=seed, n_jobs=1)
-    forest.fit(np.concatenate([e.stream for e in told]), names)
-
-    def skills(episode: Episode) -> NDArray[np.str_]:
-        total, found = np.zeros(len(forest.classes_)), []
-        for moment in np.log(forest.predict_proba(episode.stream) + SMALLEST):
-            total = KEPT * total + moment
-            found.append(forest.classes_[total.argmax()])
-        return np.array(found)
-
-    switched = [(skills(s.episode) == s.skills)[s.changed :] for s in switches]
-    return Named([skills(e) == e.info["skill"] for e in nominal], switched)
 
 
 def alarms(memory: NeuralASM, nominal: Sequence[Episode], switches: Sequence[Switch]) -> list[Record]:
@@ -126,13 +110,25 @@ def alarms(memory: NeuralASM, nominal: Sequence[Episode], switches: Sequence[Swi
         return np.asarray(memory.score(episode).value > memory.threshold)
 
     records: list[Record] = [
-        {"kind": e.info["skill"], "seed": n, "alarm": bool(over(e).any())} for n, e in enumerate(nominal)
+        {"kind": e.info["skill"], "seed": n, "force": _force(e), "alarm": bool(over(e).any())}
+        for n, e in enumerate(nominal)
     ]
     for number, s in enumerate(switches):
         found, until = over(s.episode), s.changed + round(FOLLOWED_S / s.episode.spec.dt)
         after = bool(found[s.changed : until].any())
-        records.append({"kind": "change", "seed": number, "alarm": bool(found.any()), "after_change": after})
+        records.append({"kind": "change", "seed": number, "force": _force(s.episode), "alarm": bool(found.any()),
+                        "after_change": after})  # fmt: skip
+    for kind in dict.fromkeys(r["kind"] for r in records):
+        own = [r for r in records if r["kind"] == kind]
+        usual = float(np.median([r["force"] for r in own]))
+        for record in own:
+            record["crash"] = record["force"] > CRASH * usual
     return records
+
+
+def _force(episode: Episode) -> float:
+    """The largest contact force [N]; 0 where none was recorded."""
+    return float(np.nanmax(episode.contact_force, initial=0.0))
 
 
 def alarms_table(records: Sequence[Record]) -> Table:
@@ -143,10 +139,17 @@ def alarms_table(records: Sequence[Record]) -> Table:
         low, high = share.interval
         return (name, f"{share.k} of {share.n}", f"{100 * low:.0f} to {100 * high:.0f}")
 
-    changes = [r for r in records if r["kind"] == "change"]
-    rows = [row(k, [r["alarm"] for r in records if r["kind"] == k]) for k in dict.fromkeys(r["kind"] for r in records)]
-    rows.append(row(f"change, alarm in the {FOLLOWED_S:g} s after it", [r["after_change"] for r in changes]))
-    return Table("Episodes with an alarm, at the threshold of the card.", ("", "alarms", "95 % interval [%]"), rows)
+    rows = []
+    for kind in dict.fromkeys(r["kind"] for r in records):
+        own = [r for r in records if r["kind"] == kind]
+        asked = {kind: "alarm"}
+        if kind == "change":
+            asked[f"change, alarm in the {FOLLOWED_S:g} s after it"] = "after_change"
+        for name, which in asked.items():
+            whole = row(name, [r[which] for r in own if not r["crash"]])
+            rows.append((*row(name, [r[which] for r in own]), *whole[1:]))
+    heads = ("", "alarms", "95 % interval [%]", "without crashes", "95 % interval [%]")
+    return Table("Episodes with an alarm, at the threshold of the card.", heads, rows)
 
 
 def named_tables(named: dict[str, Named], dt: float) -> list[Table]:
@@ -166,7 +169,7 @@ def named_tables(named: dict[str, Named], dt: float) -> list[Table]:
         Table(
             f"Right skill named so long after an episode began [% of {count} episodes].",
             heads,
-            [(name, *cells(found.nominal)) for name, found in named.items()],
+            [(name, *cells(found.nominal)) for name, found in named.items() if found.nominal],
         ),
         Table(
             "Right skill named so long after a change [% of episodes], and until it is right for good, median [s].",
@@ -174,6 +177,24 @@ def named_tables(named: dict[str, Named], dt: float) -> list[Table]:
             [row(name, found) for name, found in named.items()],
         ),
     ]
+
+
+def parted_table(named: dict[str, Named], nominal: Sequence[Episode]) -> Table:
+    """Lift and Stack, from where they part."""
+    parted = [(n, step) for n, step in enumerate(partings(nominal)) if step is not None]
+    dt = nominal[0].spec.dt
+
+    def cells(found: Named) -> list[str]:
+        return [
+            f"{100 * share_right([found.nominal[n][step:] for n, step in parted], 1 + round(s / dt)):.0f}"
+            for s in PARTED_S
+        ]
+
+    return Table(
+        f"Lift or Stack named rightly, of all skills, so long after they part [% of {len(parted)} episodes].",
+        ("", *(f"{s:g} s" for s in PARTED_S)),
+        [(name, *cells(found)) for name, found in named.items() if found.nominal],
+    )
 
 
 def for_good(right: Right, dt: float) -> float:

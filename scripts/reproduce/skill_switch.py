@@ -67,15 +67,18 @@ def _sort_both(seed: int) -> Episode | None:
     simulator: Any = env.unwrapped.robosuite_env  # type: ignore[attr-defined]
     expert = PickPlaceExpert(env, seed=seed, things=tuple(NAMES))
     observation, _ = env.reset(seed=seed)
-    state, skills, rest = None, [], 0
+    state, rest = None, 0
+    skills: list[str] = []
+    forces: list[float] = []
     start = np.ones(1, np.bool_)
     for _ in range(HORIZON):
         action, state = expert.predict(observation, state, start)
         start = np.zeros(1, np.bool_)
         if state.task is None:
             break
-        observation, *_ = env.step(action)
+        observation, *_, info = env.step(action)
         skills.append(NAMES[state.task.name])
+        forces.append(info["contact_force"])
         simulator = env.unwrapped.robosuite_env  # type: ignore[attr-defined]
         left = any(
             simulator.not_in_bin(expert.pose(observation, thing.name)[0], i)
@@ -89,4 +92,5 @@ def _sort_both(seed: int) -> Episode | None:
     changes = [t for t, (a, b) in enumerate(pairwise(skills), 1) if a != b]
     if len(changes) != 1 or not rest:
         return None
-    return replace(episode, info={**episode.info, "skills": [skills[0], skills[-1]], "changed": changes[0]})
+    told = {"skills": [skills[0], skills[-1]], "changed": changes[0]}
+    return replace(episode, contact_force=np.asarray(forces, np.float32), info={**episode.info, **told})
