@@ -55,6 +55,15 @@ def test_surprise_of_one_is_seldom_exceeded(asm):
     assert 0.8 < np.mean(value < 1.0) < 0.99  # 0.95 on the episodes that habituation learned from
 
 
+def test_movements_far_from_all_that_was_learned_are_an_alarm_though_the_body_can_do_them(asm):
+    """Twice as fast, and about another place: the channels go together as they always do."""
+    mixing = np.random.default_rng(12345).normal(size=(6, 12))  # that of the sines
+    faster = [replace(e, stream=e.stream[::2]) for e in sine_episodes(20, seed=7, steps=(80, 100))]
+    elsewhere = [replace(e, stream=e.stream + np.r_[3.0 * mixing[0], 0, 0]) for e in sine_episodes(20, seed=8)]
+    for far in (faster, elsewhere):
+        assert np.mean([s.value.max() > asm.threshold for s in asm.score_episodes(far)]) >= 0.95
+
+
 def test_attribution_adds_up_to_the_value_and_spares_the_action(asm):
     surprise = asm.score(sine_episodes(1, seed=5)[0])
     np.testing.assert_allclose(surprise.attribution.sum(axis=1), surprise.value, rtol=1e-12)
