@@ -23,6 +23,7 @@ from asm_gym.rollouts.babbling import (
     held_out,
     record_lesson,
 )
+from asm_gym.rollouts.benchmark import detectability_of, onset_row
 from asm_gym.rollouts.body import healthy
 from asm_gym.rollouts.examination import Exam
 from asm_gym.rollouts.folder import make_missing
@@ -182,6 +183,19 @@ def test_an_exam_pairs_every_fault_with_a_healthy_twin():
     assert [n.kind for n in faulty] == ["push", "push", "slip", "slip"]
     assert {n.seed for n in faulty} == {n.seed for n in nominal}
     assert all(n.onset is not None and n.onset >= 10 for n in faulty)
+
+
+@pytest.mark.parametrize("rows", [1, 5])
+def test_a_fault_begins_in_the_row_of_its_step_where_a_step_has_several(rows):
+    label = EpisodeLabel("Lift", "faulty", "push", "strong", seed=1, onset=12)
+    jump = replace(lesson_of([0] * 40, [0] * (40 * rows), rows=rows), label=label)
+    jump.stream[12 * rows :, 0] += 5.0
+    twin = replace(lesson_of([0] * 40, [0] * (40 * rows), rows=rows), label=replace(label, role="nominal", onset=None))
+    assert onset_row(jump) == 12 * rows
+    assert onset_row(twin) is None
+    assert onset_row(replace(jump, contact_force=np.zeros(0, np.float32))) == 12  # nobody says otherwise
+    (seen,) = detectability_of([twin], [jump], window_s=0.05)
+    assert seen.earliest == 0
 
 
 def test_a_recorded_lesson_is_the_same_again_and_leaves_the_simulator_as_it_was(tmp_path):

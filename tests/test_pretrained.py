@@ -91,6 +91,17 @@ def test_an_environment_of_the_panda_is_watched_by_the_memory_of_its_body():
     envs.close()
 
 
+def test_a_stream_of_100_hz_has_a_memory_of_its_own_and_a_healthy_episode_is_quiet():
+    env = NeuralASMSafety(gym.make("asm_gym/Lift-v0", stream_freq=100), on_alarm="monitor")
+    assert env.monitor.about["name"] == "panda_100hz"
+    assert env.threshold == NeuralASM.pretrained("panda_100hz").threshold
+    infos = []
+    assert rollout(env, make_policy("scripted", env, seed=4), 4, infos.append)
+    assert max(max(info["asm"]["surprises"]) for info in infos) < env.threshold
+    assert len(infos[0]["asm"]["surprises"]) == 5
+    env.close()
+
+
 def test_the_panda_knows_rest_on_the_handle_of_a_door():
     base = gym.make("asm_gym/Door-v0")
     env = NeuralASMSafety(base, on_alarm="monitor", on_overrun="ignore")

@@ -158,6 +158,13 @@ def _scores(monitor: CalibratedMonitor, recordings: Sequence[Episode]) -> list[A
     return list(monitor.score_episodes(recordings)) if recordings else []
 
 
+def onset_row(episode: Episode) -> int | None:
+    """The row at which the fault of a faulty episode begins; its label counts control steps, of several rows each."""
+    label = episode.labelled
+    rows = len(episode) // (len(episode.contact_force) or len(episode))
+    return label.onset * rows if label.role == "faulty" and label.onset is not None else None
+
+
 def traces_of(name: str, monitor: CalibratedMonitor, episodes: Sequence[Episode], threshold: float) -> list[Trace]:
     """What a monitor made of recordings, judged at this threshold."""
     made = []
@@ -169,7 +176,7 @@ def traces_of(name: str, monitor: CalibratedMonitor, episodes: Sequence[Episode]
             dt=episode.spec.dt,
             threshold=threshold,
             surprise=surprise.value,
-            onset=label.onset if label.role == "faulty" else None,
+            onset=onset_row(episode),
             severity=label.severity,
             task=label.task,
             monitor=name,
@@ -208,7 +215,7 @@ def detectability_of(nominal: Sequence[Episode], faulty: Sequence[Episode], wind
         if label.task not in noises:
             own = [e.stream for e in nominal if e.labelled.task == label.task]
             noises[label.task] = noise_floor(episode.spec.noise, own)
-        summed = separation(episode.stream, twins[label.task, label.seed], noises[label.task], label.onset or 0)
+        summed = separation(episode.stream, twins[label.task, label.seed], noises[label.task], onset_row(episode) or 0)
         window = summed[: window_steps(window_s, episode.spec.dt)]
         seen = float(window[-1]) if len(window) else 0.0
         which = label.task, label.kind, label.severity, label.seed
