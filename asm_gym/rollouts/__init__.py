@@ -7,9 +7,10 @@ from asm_gym.extras import needed_for
 with needed_for("running episodes"):
     from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 try:
-    from asm_gym.rollouts.body import harmless
-    from asm_gym.rollouts.collect import collect
-    from asm_gym.rollouts.trial import RolloutConfig, Trial
+    with needed_for("a robosuite environment or a fault in one"):
+        from asm_gym.rollouts.body import harmless
+        from asm_gym.rollouts.collect import collect
+        from asm_gym.rollouts.trial import RolloutConfig, Trial
 except ImportError as error:
     # Who watches logs has no simulator, and who asks for one of these is told what is missing. They are not looked up
     # when they are asked for, as in ``asm_gym.wrappers``: ``collect`` is a module too, which would be found first.

@@ -6,8 +6,8 @@ forest is told the same of the same rows, and its moments add up too, so that it
 say what limits everybody: a forest that has been shown other changes, and where the hand is.
 
     right for good    from then on the name is right in every step
-    crash             an episode that presses much harder than the usual one of its kind, as in the evaluation
-    parting           where a Stack leaves for the side, and as long after its grasp in a Lift
+    crash             it presses much harder than is usual, as in the evaluation
+    parting           when a Stack goes aside; a Lift, as long after its grasp
 """
 
 from __future__ import annotations
