@@ -36,12 +36,12 @@ from tests.fakes import FakeEnv
 ARM = StreamSpec((Channel("external_torque_peak", 2, "N m"), Channel("action", 1, group="action")), dt=0.05)
 
 
-def lesson_of(forces, torques, noise=0.0, number=0, task="Lift", rows=1):
+def lesson_of(forces, torques, noise=0.0, number=0, task="Lift", rows=1, guide="scripted"):
     """A recorded lesson that felt these forces [N] in its steps, and these torques [N m] in its rows."""
     stream = np.zeros((len(torques), 3), np.float32)
     stream[:, 0] = np.negative(torques)
     assert len(stream) == rows * len(forces)
-    lesson = Lesson(task, number, seed=number, noise=noise)
+    lesson = Lesson(task, number, seed=number, noise=noise, guide=guide)
     about = {"skill": task, "lesson": lesson._asdict()}
     return Episode(
         stream, ARM, success=True, contact_force=np.array(forces, np.float32), label=lesson.label, info=about
@@ -125,6 +125,14 @@ def test_an_arm_that_pauses_keeps_its_grip():
     resting = (actions[:, :2] == 0).all(axis=1)
     assert 0.8 < resting.mean() < 1.0  # between two pauses it moves
     assert (actions[:, 2] != 0).all()  # the gripper of a FakeEnv
+
+
+def test_what_is_usual_under_one_guide_is_not_measured_by_another():
+    gentle = [lesson_of([5, 9, 0] * 20, [1, 2, 3] * 20, number=n) for n in (0, 4)]
+    firm = [lesson_of([40] * 60, [30] * 60, number=n, guide="lift_sac") for n in (1, 7)]
+    pressed = lesson_of([40] * 60, [30] * 60, noise=0.1, number=3)
+    kept = healthy([*gentle, *firm, pressed, undisturbed()]).fit
+    assert [e.labelled.seed for e in kept] == [0, 4, 1, 7]
 
 
 def test_what_presses_twice_as_hard_as_the_undisturbed_expert_is_cut_out_with_what_is_near():

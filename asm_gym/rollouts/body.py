@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -35,26 +36,27 @@ class Lessons(NamedTuple):
 
 
 def healthy(recordings: Sequence[Episode]) -> Lessons:
-    """What of each recording presses no harder than is usual, as told by undisturbed experts of its task.
+    """What of each recording presses no harder than is usual, as told by its guide where nothing disturbs it.
 
     Noise drives arms into tables and joints into their stops. That is no fault of the body, but a memory that takes it
-    for usual would be blind to every collision. So learning goes up to twice what they usually feel at most, and the
-    threshold is set on what stays below once that.
+    for usual would be blind to every collision. So learning goes up to twice what the guide usually feels at most in
+    that task, and the threshold is set on what stays below once that. Where noise alone leads, all guides tell.
 
     Raises:
         ValueError: a task has no undisturbed lesson that was solved, to measure by, or too little is left.
     """
-    felt: dict[str, list[tuple[float, float]]] = {}
+    felt: defaultdict[str, defaultdict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
     for episode in recordings:
         if _undisturbed(episode):
             most = float(np.nanmax(episode.contact_force)), float(peak_torques(episode).max())
-            felt.setdefault(episode.labelled.task, []).append(most)
+            felt[episode.labelled.task][_lesson(episode)["guide"]].append(most)
     missing = {e.labelled.task for e in recordings} - set(felt)
     if missing:
         raise ValueError(f"no undisturbed lesson of {', '.join(sorted(missing))} was solved, to say what is usual")
     found = Lessons([], [])
     for episode in recordings:
-        usual = np.median(felt[episode.labelled.task], axis=0)
+        there = felt[episode.labelled.task]
+        usual = np.median(there.get(_lesson(episode)["guide"]) or [m for own in there.values() for m in own], axis=0)
         if not held_out(_lesson(episode)["number"]):
             found.fit.extend(gentle_pieces(episode, Gentle(*(LEARNED_UP_TO * usual))))
         elif _undisturbed(episode):
