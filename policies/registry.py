@@ -56,6 +56,23 @@ def agents() -> tuple[str, ...]:
     return tuple(sorted(f.stem for f in SHIPPED.glob("*.npz")))
 
 
+def trained_in(name: str) -> str:
+    """The id of the environment that an agent was trained in; empty where its file does not say.
+
+    Args:
+        name: of an agent that comes with the package, or the path of what ``asm-gym train`` left.
+
+    Raises:
+        FileNotFoundError: there is no such agent.
+        ValueError: the file is damaged.
+    """
+    return str(NetworkPolicy.load(_agent_file(name)).trained_in.get("env", ""))
+
+
+def _agent_file(name: str) -> Path:
+    return SHIPPED / f"{name}.npz" if name in agents() else Path(name)
+
+
 @typed
 def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kwargs: Any) -> Policy:
     """The policy called ``name`` for ``env``.
@@ -90,9 +107,7 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
         return read_archive(Path(name), seed).fit_to(env, name)
     if name.endswith(".asm"):
         return NeuralASMPolicy.load(name, env)
-    if name.endswith(".npz"):
-        return NetworkPolicy.load(name).fit_to(env, name)
-    if name in agents():
-        return NetworkPolicy.load(SHIPPED / f"{name}.npz").fit_to(env, name)
+    if name.endswith(".npz") or name in agents():
+        return NetworkPolicy.load(_agent_file(name)).fit_to(env, name)
     known = ", ".join((*POLICIES, *agents()))
     raise ValueError(f"unknown policy {name!r}; known: {known}, or the path of an agent (.npz, .zip, .asm)")

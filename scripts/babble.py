@@ -24,10 +24,11 @@ from asm_gym.episodes import EpisodeLabel, load_episode
 from asm_gym.evaluation.tables import console_table, markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
-from asm_gym.policies.registry import EXPERTS, agents
-from asm_gym.rollouts.babbling import LED, curriculum, held_out, leads, record_lesson
+from asm_gym.policies import make_policy
+from asm_gym.policies.registry import EXPERTS, agents, trained_in
+from asm_gym.rollouts.babbling import LED, curriculum, leads, record_lesson
 from asm_gym.rollouts.benchmark import code_digest
-from asm_gym.rollouts.body import healthy, learn_body
+from asm_gym.rollouts.body import healthy, held_out, learn_body
 from asm_gym.rollouts.examination import Exam, Marks, card, examine, summary
 from asm_gym.rollouts.folder import claimed, make_missing, versions
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
@@ -59,7 +60,7 @@ class Args:
     tasks: tuple[str, ...] | None = None
     """Tasks to babble in; by default seven with the Panda, and with other arms those of them that their experts do."""
     guides: tuple[str, ...] = ()
-    """Shipped agents that lead in turn with the experts; none by default, so that the examination meets them first."""
+    """Agents that lead in turn with the experts, by name or the files of asm-gym train; none by default."""
     episodes: int = 36
     """Lessons in each task; a second call with more of them goes on."""
     reaching: bool = False
@@ -91,7 +92,8 @@ class Args:
         check_choice("robot", self.robot, ROBOTS)
         for name in (*self.shown, *self.left_out):
             check_choice("task of one arm with a gripper", name, _GRIPPED)
-        for name in (*self.guides, *(self.exam_policies or ())):
+        shipped = [name for name in self.guides if not name.endswith(".npz")]  # whether a file is there is asked later
+        for name in (*shipped, *(self.exam_policies or ())):
             check_choice("agent", name, agents())
         if not self.shown:
             raise ValueError("there must be at least one task to babble in")
@@ -149,14 +151,32 @@ class Args:
     def exams(self) -> list[Exam]:
         """What to examine it on."""
         policies = agents() if self.exam_policies is None else self.exam_policies
-        trained_in = {p: next(t for t in TASKS if t.lower() == p.split("_")[0]) for p in policies}
+        homes = {p: task_spec(trained_in(p)).name for p in policies}
         if self.robot != "Panda":  # which all of them were trained with
-            trained_in = {}
+            homes = {}
         return [
             *(Exam(t, "scripted", known=True) for t in self.shown),
             *(Exam(t, "scripted", known=False) for t in self.left_out if t not in self.shown),
-            *(Exam(t, p, known=p in self.guides) for p, t in trained_in.items()),
+            *(Exam(t, p, known=p in self.guides) for p, t in homes.items()),
         ]
+
+
+def check(args: Args) -> None:
+    """Raises what is wrong with the agents that are to lead, before the folder is claimed.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is damaged, of another arm, or of a task in which nothing babbles.
+    """
+    there = {task_spec(name).id for name in args.shown}
+    for guide in args.guides:
+        home = trained_in(guide)
+        if home not in there:
+            raise ValueError(
+                f"{guide} was trained in {home or 'an environment without a name'} and can lead only there; "
+                f"tasks to babble in: {', '.join(args.shown)}"
+            )
+        make_policy(guide, environment(home, args.config.settings))
 
 
 def learn(args: Args, console: Console) -> NeuralASM:
@@ -211,6 +231,7 @@ def _place(label: EpisodeLabel, folder: Path) -> Path:
 
 def babble(args: Args, console: Console) -> None:
     """Records, learns, examines, and says what came of it."""
+    check(args)
     args = args.scaled()
     claim = {n: getattr(args, n) for n in ("robot", "guides", "stream_freq", "seed")}
     claim |= {"reaching": True} if args.reaching else {}  # folders of before there was any are of other lessons

@@ -1,5 +1,6 @@
 """Motor babbling: what its curriculum holds, how it acts, and what of it a memory may take for healthy."""
 
+import re
 from dataclasses import replace
 from functools import partial
 
@@ -9,6 +10,8 @@ import pytest
 
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.monitors import NeuralASM
+from asm_gym.policies.network import NetworkPolicy
+from asm_gym.policies.registry import SHIPPED
 from asm_gym.policies.scripted.base import ObservationReader
 from asm_gym.rollouts import harmless
 from asm_gym.rollouts.babbling import (
@@ -20,11 +23,10 @@ from asm_gym.rollouts.babbling import (
     Babbler,
     Lesson,
     curriculum,
-    held_out,
     record_lesson,
 )
 from asm_gym.rollouts.benchmark import detectability_of, onset_row
-from asm_gym.rollouts.body import healthy
+from asm_gym.rollouts.body import healthy, held_out
 from asm_gym.rollouts.examination import Exam
 from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.reaching import AROUND, PACE, TURNED, Reaching
@@ -82,6 +84,24 @@ def test_agents_take_turns_with_the_expert_of_their_own_task():
     assert guides == {"Lift": {"scripted", "lift_sac", ""}, "Door": {"scripted", ""}}
     with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
         curriculum(["Lift"], 0, seed=0)
+
+
+def test_a_file_of_an_agent_leads_as_one_that_is_shipped_and_acts_as_it_does(tmp_path):
+    file = tmp_path / "half_trained.npz"
+    agent = NetworkPolicy.load(SHIPPED / "lift_sac.npz")
+    agent.layers[-1] = (0.5 * agent.layers[-1][0], agent.layers[-1][1])
+    agent.save(file)
+    lessons, shipped = (curriculum(["Lift", "Door"], 10, seed=0, guides=[g]) for g in (str(file), "lift_sac"))
+    assert [n._replace(guide="") for n in lessons] == [n._replace(guide="") for n in shipped]
+    assert [n.guide == str(file) for n in lessons] == [n.guide == "lift_sac" for n in shipped]
+    env = gym.make("asm_gym/Lift-v0")
+    observation, _ = env.reset(seed=1)
+    led = next(n for n in lessons if n.guide == str(file) and not n.noise)._replace(pause=0.0)
+    action, _ = Babbler(env, led).predict(observation)
+    np.testing.assert_array_equal(action, agent.fit_to(env, "the agent").predict(observation)[0])
+    env.close()
+    with pytest.raises(FileNotFoundError):
+        curriculum(["Lift"], 10, seed=0, guides=[str(tmp_path / "none.npz")])
 
 
 @pytest.mark.parametrize("robot", ["Panda", "IIWA"])
@@ -243,6 +263,27 @@ def replace_weight(lesson):
 def test_the_command_refuses_what_makes_no_sense(given, why):
     with pytest.raises(ValueError, match=why):
         Args(**given)
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (["--guides", "none.npz"], "none.npz: no such file"),
+        (
+            ["--guides", str(SHIPPED / "lift_sac.npz"), "--tasks", "Door", "Stack"],
+            "Lift-v0.* only there.*: Door, Stack",
+        ),
+        (["--guides", "lift_sac", "--robot", "Sawyer"], "Panda"),
+        (["--guides", "damaged.npz"], "damaged.npz"),
+    ],
+)
+def test_guides_that_cannot_lead_are_refused_when_the_command_starts(options, why, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "damaged.npz").write_bytes((SHIPPED / "lift_sac.npz").read_bytes()[:1000])
+    Args(guides=("runs/of/somebody.npz",))  # a page's command is read where its files are not
+    assert main([*options, "--episodes", "90", "--out", "run"]) == 2
+    assert re.search(why, " ".join(capsys.readouterr().err.split()))
+    assert not (tmp_path / "run").exists()
 
 
 def test_agents_are_examined_where_they_were_trained_and_nowhere_else():

@@ -27,7 +27,9 @@ from asm_gym.episodes import Episode, EpisodeLabel, save_episode
 from asm_gym.faults.harmless import ObjectMass
 from asm_gym.faults.object import movable
 from asm_gym.policies import Policy, make_policy
+from asm_gym.policies.registry import trained_in
 from asm_gym.policies.scripted.base import Style
+from asm_gym.rollouts.body import held_out
 from asm_gym.rollouts.reaching import Reaching
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial, environment, play, staged
@@ -37,8 +39,6 @@ from asm_gym.wrappers import StreamRecorder
 ALONE, LED, DRIVEN, REACHING = "noise", "expert", "disturbed", "reaching"
 LEADING = (LED, DRIVEN, ALONE, LED, DRIVEN)
 """What leads, lesson by lesson of a task."""
-HELD_OUT = 3
-"""One in so many lessons of a task is not learned from: the threshold is set on those."""
 SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
 """ρ: from the noise by which agents explore to pushing on in one direction, as half-trained ones do."""
 NOISE = 0.02, 0.2
@@ -58,7 +58,7 @@ class Lesson(NamedTuple):
         task: its name.
         number: among the lessons of its task.
         seed: of the environment, of the guide and of the noise.
-        guide: what leads, ``"reaching"`` or a policy's name; noise alone where empty.
+        guide: what leads, ``"reaching"``, a policy's name or its file; noise alone where empty.
         noise: s, standard deviation of the noise [action units].
         smoothness: ρ.
         speed: of a scripted guide, relative to its usual one.
@@ -95,26 +95,28 @@ def curriculum(
     Args:
         tasks: their names.
         episodes: of each task.
-        guides: agents that take turns with the experts, in the tasks that each was trained in.
+        guides: agents that take turns with the experts, in the tasks that each was trained in; by name, or the files
+            of ``asm-gym train``.
         reaching: the hand reaches for places where noise alone would lead, as ``leads`` says.
 
     Raises:
         ValueError: fewer than one episode.
+        FileNotFoundError: there is no such agent.
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
+    homes = {guide: trained_in(guide) for guide in guides}
     return [
         _lesson(
-            task, number, drawn, leads(number, reaching), ["scripted", *(g for g in guides if _trained_in(g, task))]
+            task,
+            number,
+            drawn,
+            leads(number, reaching),
+            ["scripted", *(guide for guide, home in homes.items() if home == task_spec(task).id)],
         )
         for task in tasks
         for number, drawn in enumerate(role_seeds(seed, task, "babble", episodes))
     ]
-
-
-def held_out(number: int) -> bool:
-    """Whether the lesson of this number is for the threshold."""
-    return number % HELD_OUT == HELD_OUT - 1
 
 
 def leads(number: int, reaching: bool = False) -> str:
@@ -123,10 +125,6 @@ def leads(number: int, reaching: bool = False) -> str:
     if not reaching:
         return usual
     return LED if held_out(number) else REACHING if usual == ALONE else usual
-
-
-def _trained_in(guide: str, task: str) -> bool:
-    return guide.split("_")[0] == task.lower()
 
 
 def _lesson(task: str, number: int, seed: int, lead: str, guides: Sequence[str]) -> Lesson:

@@ -11,15 +11,21 @@ import numpy as np
 from asm_gym.episodes import Episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import Progress
-from asm_gym.rollouts.babbling import held_out
 from asm_gym.rollouts.training.exploration import SHORTEST, Gentle, peak_torques
 
+HELD_OUT = 3
+"""One in so many lessons of a task is not learned from: the threshold is set on those."""
 LEARNED_UP_TO = 2.0
 """How many times what an undisturbed expert usually feels at most may be felt in what is learned from."""
 AROUND_S = 0.2
 """What is left out before and after a hit [s]."""
 PASSES = 4
 """Of the temporal network over the lessons."""
+
+
+def held_out(number: int) -> bool:
+    """Whether the lesson of this number is for the threshold."""
+    return number % HELD_OUT == HELD_OUT - 1
 
 
 class Lessons(NamedTuple):

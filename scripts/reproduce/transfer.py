@@ -22,9 +22,9 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.faults.suite import kinds_of
 from asm_gym.monitors import EVIDENCE, MONITORS, CalibratedMonitor, NeuralASM
-from asm_gym.rollouts.babbling import LED, curriculum, held_out, leads, record_lesson
+from asm_gym.rollouts.babbling import LED, curriculum, leads, record_lesson
 from asm_gym.rollouts.benchmark import fitted
-from asm_gym.rollouts.body import harmless, healthy, learn_body
+from asm_gym.rollouts.body import harmless, healthy, held_out, learn_body
 from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.trial import RolloutConfig
