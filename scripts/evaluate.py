@@ -6,6 +6,7 @@ same arguments give the same table.
 
 from __future__ import annotations
 
+import ast
 import json
 import math
 import platform
@@ -30,6 +31,7 @@ from asm_gym.evaluation.tables import brief_monitors_table, console_table, harml
 from asm_gym.faults import anywhere
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of, possible
 from asm_gym.monitors import MONITORS, PARTS, make_monitor, monitor_class
+from asm_gym.monitors.registry import model_of
 from asm_gym.policies import make_policy
 from asm_gym.rollouts.benchmark import benchmark, calibrated
 from asm_gym.rollouts.folder import claimed, make_missing
@@ -66,6 +68,8 @@ class Args:
     """Length of an episode, in an environment by its id; by default its own."""
     monitors: tuple[str, ...] = tuple(name for name in MONITORS if name not in PARTS)
     """Names of monitors; any model goes under any detection, as in external_torque_limit+evidence."""
+    settings: tuple[str, ...] = ()
+    """Hyperparameters of these monitors that are not their own, as in gru.learning_rate=0.0003."""
     faults: tuple[str, ...] = ()
     """Kinds of fault, by default all that there are; development or test for robosuite's to choose by, or to report."""
     severities: tuple[str, ...] = SEVERITIES
@@ -109,6 +113,7 @@ class Args:
         for name in self.monitors:
             if name not in MONITORS:
                 monitor_class(name)  # refuses what is no model under a detection
+        _ = self.hyperparameters  # refuses what no monitor has
         for what, names, known in (
             ("severity", self.severities, SEVERITIES),
             ("harmless variation", self.harmless, _HARMLESS),
@@ -135,6 +140,25 @@ class Args:
             raise ValueError(f"window must be > 0 s, got {self.window}")
         if not self.tasks or not self.monitors or not self.severities:
             raise ValueError("there must be at least one task, monitor and severity")
+
+    @property
+    def hyperparameters(self) -> dict[str, dict[str, Any]]:
+        """Those in ``settings``, by model and name. Raises ValueError where none of the monitors has one so named."""
+        found: dict[str, dict[str, Any]] = {}
+        for setting in self.settings:
+            where, equals, value = setting.partition("=")
+            model, dot, parameter = where.partition(".")
+            if not equals or not dot:
+                raise ValueError(f"settings must be like gru.learning_rate=0.0003, got {setting!r}")
+            check_choice("monitor with settings", model, dict.fromkeys(map(model_of, self.monitors)))
+            check_choice(f"hyperparameter of {model}", parameter, monitor_class(model).hyperparameters)
+            try:
+                found.setdefault(model, {})[parameter] = ast.literal_eval(value)
+            except (ValueError, SyntaxError) as error:
+                raise ValueError(
+                    f"{where} must be a number, True, False or a tuple of numbers, got {value!r}"
+                ) from error
+        return found
 
     @property
     def elsewhere(self) -> bool:
@@ -180,14 +204,18 @@ def able(args: Args, console: Console) -> Args:
     """With the monitors that can watch the environment; says which others there were.
 
     Raises:
-        ValueError: none of them can.
+        ValueError: none of them can, or one refuses a hyperparameter.
     """
-    if not args.elsewhere:
+    settings = args.hyperparameters
+    if not args.elsewhere and not settings:
         return args
     env = gym.make(env_id(args.tasks[0]), **dict(args.config.settings))
     spec, refused = StreamSource(env).spec, {}
     env.close()
     for name in args.monitors:
+        if model_of(name) in settings:
+            make_monitor(name, spec, **settings[model_of(name)])
+            continue
         try:
             make_monitor(name, spec)
         except ValueError as error:
@@ -227,7 +255,8 @@ def labels(args: Args) -> list[EpisodeLabel]:
 def show_examples(args: Args, result: BenchmarkResult, wanted: Sequence[EpisodeLabel], progress: Progress) -> Path:
     """The first of the typical episodes, as the first monitor saw them."""
     name = args.monitors[0]
-    monitor = calibrated(args.out, name, wanted, args.seed, result.monitors[name].thresholds[args.false_alarm_rate])
+    threshold, settings = result.monitors[name].thresholds[args.false_alarm_rate], args.hyperparameters
+    monitor = calibrated(args.out, name, wanted, args.seed, threshold, settings.get(model_of(name)))
     clips = [
         Clip(Trial.of(EpisodeLabel(t.task, "faulty", t.kind, t.severity, t.seed, t.onset)), t.condition)
         for t in result.monitors[name].examples[:SHOWN]
@@ -249,7 +278,7 @@ def evaluate(args: Args, console: Console) -> BenchmarkResult:
             make_missing(make, wanted, lambda label: args.out / label.path, args.parallel, progress)
         with stage("fitting and judging", console, seconds) as progress:
             how = args.false_alarm_rate, args.window, args.seed, args.parallel
-            result = benchmark(args.out, wanted, args.monitors, *how, progress)
+            result = benchmark(args.out, wanted, args.monitors, *how, progress, args.hyperparameters)
         video = None
         if (
             args.video

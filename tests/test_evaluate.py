@@ -99,6 +99,11 @@ def test_a_folder_of_other_settings_is_refused(run, capsys):
         ("--backend dask", "address"),
         ("--policy door_sac", "door_sac takes observations of 41"),
         ("--policy nobody.npz", "nobody.npz"),
+        ("--settings gru.hidden_size=8", "monitor with settings 'gru'; known: "),
+        ("--settings kalman.ridges=1", "hyperparameter of kalman 'ridges'; known: .*did you mean 'ridge'"),
+        ("--settings kalman.ridge", "like gru.learning_rate=0.0003, got 'kalman.ridge'"),
+        ("--settings kalman.ridge=one", "kalman.ridge must be a number.*'one'"),
+        ("--settings kalman.ridge=-1", "ridge must be"),
     ],
 )
 def test_arguments_that_make_no_sense_are_refused(arguments, message, tmp_path, capsys):
@@ -111,6 +116,14 @@ def test_any_model_may_be_asked_for_under_any_detection():
     name = "external_torque_limit+evidence"
     assert name not in registry.MONITORS
     assert Args(monitors=(name, "neural_asm")).monitors[0] == name
+
+
+def test_a_monitor_of_the_table_is_set_otherwise_under_every_detection(run):
+    asked = [*SMALL, "--out", str(run), "--monitors", "kalman", "kalman+evidence", "force_limit"]
+    assert main([*asked, "--settings", "kalman.ridge=0.03"]) == 0
+    fitted = [load_monitor(p) for p in (run / "monitors").glob("kalman-*")]
+    assert sorted(m.get_params()["ridge"] for m in fitted)[-1] == 0.03
+    assert "kalman.ridge=0.03" in (run / "report.html").read_text()
 
 
 def test_quick_is_less_of_everything():

@@ -27,6 +27,7 @@ DETECTIONS: dict[str, Any] = {
     "mahalanobis": "asm_gym.detection.scores:Mahalanobis",
     "moving_mean": "asm_gym.detection.scores:MovingMean",
     "largest": "asm_gym.detection.scores:Largest",
+    "band": "asm_gym.detection.band:Band",
     "latent_threshold": "asm_gym.monitors.baselines.lstm_vae:LatentThreshold",
 }
 """The class of each detection, or where it stands."""
@@ -149,6 +150,11 @@ def register_monitor(model: type[Any], detection: str = "evidence") -> None:
     MONITORS.update({name: row, name + EVIDENCE: row.under("evidence")})
 
 
+def model_of(name: str) -> str:
+    """The name of a monitor without that of a detection, as in ``gru`` of ``gru+evidence``."""
+    return name.partition("+")[0]
+
+
 @typed
 def monitor_class(name: str) -> MonitorKind:
     """What makes and loads the monitors of that name; torch is imported only for those that need it.
@@ -183,7 +189,7 @@ def make_monitor(
     Raises:
         ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists.
     """
-    kind = monitor_class(name if not isinstance(detection, str) else f"{name.partition('+')[0]}+{detection}")
+    kind = monitor_class(name if not isinstance(detection, str) else f"{model_of(name)}+{detection}")
     for parameter in hyperparameters.keys() - RENAMED.keys():
         check_choice(f"hyperparameter of {name}", parameter, kind.hyperparameters)
     made = kind(spec, **hyperparameters)

@@ -22,11 +22,15 @@ from asm_gym.evaluation.ideal import earliest, noise_floor, separation
 from asm_gym.evaluation.metrics import typical
 from asm_gym.evaluation.trace import NOMINAL, InterventionOutcome, Trace, TraceDetail, window_steps
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
+from asm_gym.monitors.registry import model_of
 from asm_gym.rollouts.folder import NOMINAL_ROLES, Recordings, labelled
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 
 EXAMPLES = ("push", "collision", "weak_joint", "frozen_encoder", "snatch")
 """Kinds of which the report shows an episode."""
+
+NO_SETTINGS: Mapping[str, Mapping[str, Any]] = {}
+"""Every monitor has its own hyperparameters."""
 
 
 def benchmark(
@@ -38,6 +42,7 @@ def benchmark(
     seed: int,
     parallel: ParallelConfig,
     progress: Progress,
+    settings: Mapping[str, Mapping[str, Any]] = NO_SETTINGS,
 ) -> BenchmarkResult:
     """Reads the recordings, and lets every monitor judge them.
 
@@ -48,13 +53,14 @@ def benchmark(
         window_s: how soon an alarm must come to count as detection [s].
         seed: of the monitors.
         parallel: who judges; each monitor is one task.
+        settings: by the names of models, hyperparameters that are not their own.
     """
     progress(0, len(monitors))
     # One that is judged in two ways is fitted once.
     models: dict[str, list[str]] = {}
     for name in monitors:
         models.setdefault(name.removesuffix(EVIDENCE), []).append(name)
-    ask = partial(_results, folder=folder.resolve(), labels=tuple(labels), rate=rate, seed=seed)
+    ask = partial(_results, folder=folder.resolve(), labels=tuple(labels), rate=rate, seed=seed, settings=settings)
     made = parallel_map(
         ask, list(models.values()), parallel, lambda k, n: progress(k * len(monitors) // n, len(monitors))
     )
@@ -70,14 +76,24 @@ def benchmark(
 
 
 def _results(
-    names: Sequence[str], folder: Path, labels: Sequence[EpisodeLabel], rate: float, seed: int
+    names: Sequence[str],
+    folder: Path,
+    labels: Sequence[EpisodeLabel],
+    rate: float,
+    seed: int,
+    settings: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, MonitorResult]:
     by_role = Recordings.of(labelled(folder, labels)).roles
-    return {name: result_of(name, folder, by_role, rate, seed) for name in names}
+    return {name: result_of(name, folder, by_role, rate, seed, settings.get(model_of(name))) for name in names}
 
 
 def result_of(
-    name: str, folder: Path, by_role: Mapping[str, Sequence[Episode]], rate: float, seed: int
+    name: str,
+    folder: Path,
+    by_role: Mapping[str, Sequence[Episode]],
+    rate: float,
+    seed: int,
+    settings: Mapping[str, Any] | None = None,
 ) -> MonitorResult:
     """What one monitor makes of the episodes.
 
@@ -85,8 +101,9 @@ def result_of(
         folder: where fitted monitors are kept.
         by_role: fit, calibration and nominal episodes, and perhaps faulty and harmless ones.
         rate: share of nominal episodes that may raise an alarm.
+        settings: hyperparameters that are not its own.
     """
-    return judged(name, fitted(folder, name, by_role["fit"], seed), by_role, rate)
+    return judged(name, fitted(folder, name, by_role["fit"], seed, settings), by_role, rate)
 
 
 def judged(
@@ -147,11 +164,16 @@ def fitted(
 
 
 def calibrated(
-    folder: Path, name: str, labels: Sequence[EpisodeLabel], seed: int, threshold: float
+    folder: Path,
+    name: str,
+    labels: Sequence[EpisodeLabel],
+    seed: int,
+    threshold: float,
+    settings: Mapping[str, Any] | None = None,
 ) -> CalibratedMonitor:
     """The monitor as it judged the run, with the threshold it judged by."""
     nominal = Recordings.of(labelled(folder, [label for label in labels if label.role in NOMINAL_ROLES]))
-    return fitted(folder, name, nominal.roles["fit"], seed).with_threshold(threshold)
+    return fitted(folder, name, nominal.roles["fit"], seed, settings).with_threshold(threshold)
 
 
 def _scores(monitor: CalibratedMonitor, recordings: Sequence[Episode]) -> list[Any]:

@@ -68,6 +68,13 @@ SETTINGS: dict[str, tuple[Setting, ...]] = {
         {"learning_rate": 3e-4},
         {"hidden_size": 512},
     ),
+    "lstm_vae+evidence": (
+        {},
+        {"hidden_size": 256},
+        {"latent_size": 32},
+        {"hidden_size": 64},
+        {"learning_rate": 3e-4},
+    ),
     "logpzo+evidence": ({}, {"updates": 4000}, {"width": 512}, {"width": 128}, {"updates": 16000}),
 }
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sklearn.svm import SVR
 from torch import Tensor, nn
 
+from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput, Nominal
 from asm_gym.detection.scores import Squares
 from asm_gym.monitors.base import Progress
@@ -24,8 +25,8 @@ from asm_gym.monitors.baselines.base import Rows, no_rows, read
 from asm_gym.monitors.baselines.torch_model import TorchModel, converge, descend, padded, parted
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.stream import StreamSpec
+from asm_gym.typed import typed
 
-HIDDEN, LATENT = 128, 16
 EPOCHS, BATCH = 200, 16
 """Passes at most; training ends where fresh episodes gain no more."""
 
@@ -47,12 +48,12 @@ class _Memory(NamedTuple):
 
 
 class _Module(nn.Module):
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, hidden: int, latent: int) -> None:
         super().__init__()
-        self.encoder = nn.LSTM(size, HIDDEN, batch_first=True)
-        self.to_latent = nn.Linear(HIDDEN, 2 * LATENT)
-        self.decoder = nn.LSTM(LATENT, HIDDEN, batch_first=True)
-        self.out = nn.Linear(HIDDEN, 2 * size)
+        self.encoder = nn.LSTM(size, hidden, batch_first=True)
+        self.to_latent = nn.Linear(hidden, 2 * latent)
+        self.decoder = nn.LSTM(latent, hidden, batch_first=True)
+        self.out = nn.Linear(hidden, 2 * size)
 
     def encode(self, x: Tensor, state: Any = None) -> tuple[Tensor, Tensor, Any]:
         hidden, state = self.encoder(x, state)
@@ -66,12 +67,28 @@ class _Module(nn.Module):
 
 
 class LSTMVAE(TorchModel):
-    """A recurrent variational autoencoder of values and changes; its context is its latent state."""
+    """A recurrent variational autoencoder of values and changes; its context is its latent state.
+
+    Args:
+        spec: the stream it is to expect.
+        hidden_size: H, units of the encoder, and of the decoder.
+        latent_size: numbers of the latent state.
+        learning_rate: of Adam, before the first plateau.
+    """
 
     kind = "lstm_vae"
 
+    @typed
+    def __init__(
+        self, spec: StreamSpec, hidden_size: int = 128, latent_size: int = 16, learning_rate: float = 1e-3
+    ) -> None:
+        super().__init__(spec)
+        self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
+        self.latent_size = check_number("latent_size", latent_size, low=1, whole=True)
+        self.learning_rate = check_number("learning_rate", learning_rate, above=0.0)
+
     def module(self, senses: StreamScaler) -> nn.Module:
-        return _Module(senses.size)
+        return _Module(senses.size, self.hidden_size, self.latent_size)
 
     @property
     def error_columns(self) -> NDArray[np.intp]:
@@ -101,10 +118,10 @@ class LSTMVAE(TorchModel):
             for start in range(0, len(order), BATCH):
                 descend(loss(order[start : start + BATCH]), optimiser)
 
-        converge(module, epoch, lambda: loss(fresh, noise=0.0), EPOCHS, tell)
+        converge(module, epoch, lambda: loss(fresh, noise=0.0), EPOCHS, tell, self.learning_rate)
 
     def start(self, batch: int, skills: Sequence[str] = ()) -> _Memory:
-        nothing = _Cell(np.zeros((batch, HIDDEN), np.float32), np.zeros((batch, HIDDEN), np.float32))
+        nothing = _Cell(*np.zeros((2, batch, self.hidden_size), np.float32))
         return _Memory(nothing, nothing, no_rows(batch, self.spec.size))
 
     def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
@@ -137,7 +154,7 @@ class LatentThreshold(Squares):
         scores = 0.5 * (np.concatenate([r.errors for r in outputs]) ** 2).sum(axis=1)
         chosen = np.random.default_rng(self.seed).permutation(len(scores))[:REGRESSED]
         centre, spread = contexts.mean(axis=0), np.maximum(contexts.std(axis=0), 1e-6)
-        machine = SVR(C=10.0, gamma=1.0 / LATENT, epsilon=0.1)
+        machine = SVR(C=10.0, gamma=1.0 / contexts.shape[1], epsilon=0.1)
         machine.fit((contexts[chosen] - centre) / spread, np.log(scores[chosen] + 1e-6))
         return self.restore(
             {
@@ -153,7 +170,7 @@ class LatentThreshold(Squares):
         found = self.learned_
         z = (output.contexts - found["centre"]) / found["scale"]
         distance = ((z[:, None] - found["support"]) ** 2).sum(axis=-1)  # (B, support vectors)
-        usual = np.exp(np.exp(-distance / LATENT) @ found["pull"] + found["offset"])
+        usual = np.exp(np.exp(-distance / z.shape[1]) @ found["pull"] + found["offset"])
         parts: NDArray[np.float64] = 0.5 * np.asarray(output.errors, np.float64) ** 2 / usual[:, None]
         return parts
 
