@@ -25,7 +25,8 @@ def episode(value: float, steps: int, skill: str = "a") -> Episode:
 
 def changed(first: float, then: float, at: int, steps: int) -> Switch:
     stream = np.concatenate([episode(first, at).stream, episode(then, steps - at).stream])
-    return Switch(Episode.from_stream(stream, SPEC), np.repeat(["a", "b"], [at, steps - at]), at)
+    info = {"skills": ["a", "b"], "changed": at}
+    return Switch(Episode.from_stream(stream, SPEC, info=info), np.repeat(["a", "b"], [at, steps - at]), at)
 
 
 def test_it_is_right_for_good_from_the_last_wrong_step_on():
@@ -55,10 +56,36 @@ def test_a_forest_that_was_shown_other_changes_follows_where_single_skills_say_n
     told = [episode(v, 40, s) for v, s in ((-1.0, "a"), (-3.0, "b")) for _ in range(3)]
     switches = [changed(-1.0, 1.0, 30, 60 + n) for n in range(6)]
     told_alone = skill_names.by_forest(told, [], switches, seed=0)
-    shown = skill_names.by_forest_shown(told, switches, seed=0)
-    assert not shown.nominal
+    shown = skill_names.by_forest_shown(told, told[:1], switches, seed=0)
+    assert shown.nominal[0].all()
     assert skill_change.share_right(shown.switched, 15) == 1.0
     assert skill_change.share_right(told_alone.switched, 15) == 0.0
+
+
+class Teller:
+    """A memory that names as a change it was shown, and says which those were."""
+
+    def __init__(self) -> None:
+        self.told: list[int] = []
+
+    def name_skills(self, episodes: list[Episode]) -> Teller:
+        self.told = [e.info["changed"] for e in episodes if "changed" in e.info]
+        return self
+
+    def skills(self, stream: np.ndarray) -> np.ndarray:
+        return np.where(np.isin(len(stream), np.add(self.told, 30)), "b", "a").repeat(len(stream))
+
+
+def test_no_memory_is_asked_for_a_change_that_it_was_shown():
+    told = [episode(v, 40, s) for v, s in ((-1.0, "a"), (1.0, "b"))]
+    switches = [changed(-1.0, 1.0, at, at + 30) for at in (20, 21, 22, 23, 24)]
+    memory = cast(Any, Teller())
+    found = skill_names.by_memory_shown(memory, told, told, switches)
+    assert not np.concatenate(found.switched).any()  # whoever was shown a change of that length names it
+    assert [r.all() for r in found.nominal] == [True, False]
+    assert memory.told == []
+    asked = memory.name_skills([s.episode for s in switches]).skills(switches[0].episode.stream)
+    assert (asked == "b").all()
 
 
 def test_the_hand_is_nearer_to_the_new_skill_from_half_way_on():

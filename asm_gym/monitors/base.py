@@ -197,7 +197,7 @@ class NamesSkills(Protocol):
     """A monitor that can be taught the names of skills, and says which one runs."""
 
     def name_skills(self, episodes: Sequence[Episode]) -> Self:
-        """Learns the names from episodes whose ``info["skill"]`` says them."""
+        """Learns the names from episodes that say them, as ``NeuralASM.name_skills`` does."""
         ...
 
     def skills(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.str_]:

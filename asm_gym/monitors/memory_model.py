@@ -30,7 +30,7 @@ from asm_gym.memory.recurrent import RecurrentNetwork, RecurrentWeights, recurre
 from asm_gym.memory.specialise import specialise
 from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.model import StreamModel, model_outputs, skills_of
+from asm_gym.monitors.model import StreamModel, model_outputs, running
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.stream import StreamSpec
 
@@ -178,17 +178,19 @@ class MemoryModel(StreamModel):
 
     def name_skills(self, episodes: Sequence[Episode], rng: np.random.Generator) -> Self:
         """Learns to tell which skill is running. Raises ValueError where an episode says none, or all say the same."""
-        names = skills_of(episodes)
-        if "" in names:
-            raise ValueError(f"episode {names.index('')} does not say its skill: set info['skill']")
-        known = sorted(set(names))
+        told = []
+        for n, episode in enumerate(episodes):
+            try:
+                told.append(running(episode))
+            except ValueError as error:
+                raise ValueError(f"episode {n} {error}") from error
+        known, skills = np.unique(np.concatenate(told), return_inverse=True)
         if len(known) < 2:
             raise ValueError(f"two skills at least are needed to tell them apart, got {', '.join(known)}")
         inputs = np.concatenate([self.senses_.read_episode(e.stream).inputs for e in episodes])
-        skills = np.repeat([known.index(name) for name in names], [len(e) for e in episodes])
         states, V = np.concatenate([o.contexts for o in model_outputs(self, episodes)]), self.network.association.V
         W_K, b_K = learn_readout(lambda i: np.hstack([hidden_units(inputs[i], V), states[i]]), skills, len(known), rng)
-        return self.restore({**self.learned_, "W_K": W_K, "b_K": b_K}, tuple(known))
+        return self.restore({**self.learned_, "W_K": W_K, "b_K": b_K}, tuple(map(str, known)))
 
     def skills(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.str_]:
         """(T,) the skill that seems to run in each step of a stream (T, D), once some have a name."""

@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.checks import check_number, shown
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episodes import Episode
@@ -78,6 +79,34 @@ def parameter_names(kind: Callable[..., Any]) -> tuple[str, ...]:
 def skills_of(episodes: Sequence[Episode]) -> list[str]:
     """What each says of its skill; empty where it says nothing."""
     return [str(e.info.get("skill", "")) for e in episodes]
+
+
+def running(episode: Episode) -> NDArray[np.str_]:
+    """(T,) the skill that runs in each row, by what the episode says of itself.
+
+    ``info["skill"]`` names the one that runs all through it. Where one follows another, ``info["skills"]`` names them
+    in order, and ``info["changed"]`` says in which row each next one begins.
+
+    Raises:
+        ValueError: it says neither; or of not as many skills where they begin; or they cannot begin there.
+    """
+    told = episode.info.get("skills")
+    if told is None:
+        (name,) = skills_of([episode])
+        if not name:
+            raise ValueError("does not say its skill: set info['skill']")
+        return np.repeat(name, len(episode))
+    if not isinstance(told, list | tuple) or not told or not all(isinstance(name, str) and name for name in told):
+        raise ValueError(f"must name its skills in order, info['skills'], got {shown(told)}")
+    changed = episode.info.get("changed", [])
+    rows = changed if isinstance(changed, list | tuple) else [changed]
+    begins = [0, *(check_number("info['changed']", row, low=1, whole=True) for row in rows)]
+    if len(begins) != len(told):
+        raise ValueError(f"names {len(told)} skills, and says of {len(begins) - 1} where they begin: info['changed']")
+    lengths = np.diff([*begins, len(episode)])
+    if (lengths < 1).any():
+        raise ValueError(f"has {len(episode)} rows, in which skills cannot begin at {', '.join(map(str, begins))}")
+    return np.repeat(told, lengths)
 
 
 def model_outputs(model: Model, episodes: Sequence[Episode]) -> list[ModelOutput]:

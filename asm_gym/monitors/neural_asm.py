@@ -316,12 +316,16 @@ class NeuralASM(CalibratedMonitor):
         return other
 
     def name_skills(self, episodes: Sequence[Episode]) -> Self:
-        """Learns to tell which skill is running, from episodes whose ``info["skill"]`` says it.
+        """Learns to tell which skill is running, from episodes that say it.
+
+        ``info["skill"]`` is the skill of a whole episode. Of one in which skills follow each other, ``info["skills"]``
+        names them in order, and ``info["changed"]`` says in which row each next one begins (a number, or a list of
+        them). A change is followed sooner by who was shown some.
 
         Only ``surprise.skill`` depends on it: neither the weights nor the surprise do.
 
         Raises:
-            ValueError: an episode says none, or all say the same.
+            ValueError: an episode says none, or rows in which nothing can change; or all say the same.
         """
         self._check(episodes)
         with threadpool_limits(1):

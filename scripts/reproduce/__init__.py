@@ -34,6 +34,7 @@ STUDIES = {
     "reflexes": Study("what acting on alarms is worth, reflex by fault", needs_a_run=True),
     "adoption": Study("one policy's memory on another policy", needs_a_run=True),
     "learning_curve": Study("detection by the number of episodes learned from", needs_a_run=True),
+    "recall_search": Study("the same few settings tried for all that recalls"),
     "search": Study("the same few settings tried for every monitor", needs_a_run=True),
     "feedback": Study("what local learning of association costs", needs_a_run=True),
     "completion": Study("what a faulty sense should say, from all others", needs_a_run=True),

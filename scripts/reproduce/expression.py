@@ -208,9 +208,17 @@ class Library:
     skills: tuple[str, ...]
 
     @classmethod
-    def learned(cls, episodes: Sequence[Episode], skills: Sequence[str]) -> Library:
-        """From episodes that say their skill; ``skills`` are those of the streams that ``express`` will be given."""
-        return cls(make_monitor("skill_library", episodes[0].spec).fit(episodes), tuple(skills))
+    def learned(
+        cls, episodes: Sequence[Episode], skills: Sequence[str], bases: int = 40, stiffness: float = 25.0
+    ) -> Library:
+        """From episodes that say their skill.
+
+        Args:
+            skills: those of the streams that ``express`` will be given.
+            bases, stiffness: of a primitive; see ``SkillLibrary``.
+        """
+        library = make_monitor("skill_library", episodes[0].spec, bases=bases, stiffness=stiffness)
+        return cls(library.fit(episodes), tuple(skills))
 
     def express(self, streams: Rows, cue: int) -> Rows:
         library, made = self.library.model, np.full(streams.shape, np.nan)

@@ -37,7 +37,7 @@ from asm_gym.scripts.reproduce.common import (
 )
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters
-from asm_gym.scripts.reproduce.recall_rivals import CALLED, MODELS, Condition, recall
+from asm_gym.scripts.reproduce.recall_rivals import CALLED, MODELS, Condition, Practice, recall
 from asm_gym.scripts.reproduce.robot_recall import RECALLED, ROBOT_CUE
 
 
@@ -231,8 +231,8 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
         jobs += [partial(robot_recall.learned, seed, train, tests, *sizes) for seed in args.repetitions]
         jobs.append(partial(robot_recall.stored, train, tests, {"seed": args.seed, "hidden": args.robot_hidden}))
     # The longest first, so that no process is left with one of them at the end.
-    how = args.writings, args.steps, args.updates, args.cues
-    jobs += [partial(recall, condition, *how) for condition in conditions(args)]
+    practice = Practice(args.writings, args.steps, args.updates)
+    jobs += [partial(recall, c, practice, args.cues) for c in conditions(args)]
     with stage("learning", console, seconds) as progress:
         records = [r for found in parallel_map(_done, jobs, args.workers, progress) for r in found]
     return Findings(records, tables(records, args), drawn(records, args), {})

@@ -36,6 +36,7 @@ from asm_gym.scripts.reproduce.skill_names import (
     by_forest,
     by_forest_shown,
     by_memory,
+    by_memory_shown,
     by_place,
     partings,
 )
@@ -89,9 +90,11 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     with stage("naming", console, seconds):
         named = {
             "memory of the body": by_memory(memory, told, nominal, switches),
+            "memory of the body, shown changes": by_memory_shown(memory, told, nominal, switches),
             "memory that learned from them": by_memory(learned, told, nominal, switches),
+            "that one, shown changes": by_memory_shown(learned, told, nominal, switches),
             "random forest on the rows": by_forest(told, nominal, switches, args.seed),
-            "random forest, shown other changes": by_forest_shown(told, switches, args.seed),
+            "random forest, shown changes": by_forest_shown(told, nominal, switches, args.seed),
             "the nearer place of the hand": by_place(told, switches),
         }
     with stage("judging", console, seconds):
@@ -205,7 +208,7 @@ def for_good(right: Right, dt: float) -> float:
 
 
 def _drawn(named: dict[str, Named], dt: float) -> Figure:
-    return naming_figure({f"{name}, after a change": found.switched for name, found in named.items()}, dt)
+    return naming_figure({name: found.switched for name, found in named.items()}, dt, since="a change of skill")
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from functools import partial
+from itertools import cycle
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +16,7 @@ from sklearn.ensemble import RandomForestClassifier
 from asm_gym.episodes import Episode
 from asm_gym.memory.readout import KEPT, SMALLEST
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.model import running
 from asm_gym.scripts.reproduce.skill_switch import Switch
 
 ASIDE = 0.02
@@ -26,7 +30,7 @@ Right = NDArray[np.bool_]
 class Named(NamedTuple):
     """In which steps one way of naming is right; (T,) for each episode, of a change those from it on.
 
-    Of one that is only there to tell of changes no nominal episode is asked for.
+    Where the hand is says nothing of an episode with one skill.
     """
 
     nominal: list[Right]
@@ -37,24 +41,46 @@ def by_memory(
     memory: NeuralASM, told: Sequence[Episode], nominal: Sequence[Episode], switches: Sequence[Switch]
 ) -> Named:
     """What a memory names that is told these skills; surprise and weights do not depend on it."""
-    memory.name_skills(told)
-    switched = [(memory.skills(s.episode.stream) == s.skills)[s.changed :] for s in switches]
-    return Named([memory.skills(e.stream) == e.info["skill"] for e in nominal], switched)
+    return _right([memory.name_skills(told).skills], nominal, switches)
+
+
+def by_memory_shown(
+    memory: NeuralASM, told: Sequence[Episode], nominal: Sequence[Episode], switches: Sequence[Switch]
+) -> Named:
+    """By a memory that was shown every other change too, but none of those that it is asked for."""
+    shown = ([*told, *(s.episode for s in others)] for others in _others(switches))
+    return _right([deepcopy(memory).name_skills(lessons).skills for lessons in shown], nominal, switches)
 
 
 def by_forest(told: Sequence[Episode], nominal: Sequence[Episode], switches: Sequence[Switch], seed: int) -> Named:
     """The same by a random forest, whose moments add up as those of the memory do."""
-    forest = _forest([(e.stream, np.repeat(str(e.info["skill"]), len(e))) for e in told], seed)
-    switched = [(_skills(forest, s.episode) == s.skills)[s.changed :] for s in switches]
-    return Named([_skills(forest, e) == e.info["skill"] for e in nominal], switched)
+    forest = _forest([(e.stream, running(e)) for e in told], seed)
+    return _right([partial(_skills, forest)], nominal, switches)
 
 
-def by_forest_shown(told: Sequence[Episode], switches: Sequence[Switch], seed: int) -> Named:
+def by_forest_shown(
+    told: Sequence[Episode], nominal: Sequence[Episode], switches: Sequence[Switch], seed: int
+) -> Named:
     """By forests that were shown every other change too, but none of those that they are asked for."""
-    lessons = [(e.stream, np.repeat(str(e.info["skill"]), len(e))) for e in told]
-    halves = [_forest(lessons + [(s.episode.stream, s.skills) for s in switches[n::2]], seed) for n in (1, 0)]
-    right = [_skills(halves[n % 2], s.episode) == s.skills for n, s in enumerate(switches)]
-    return Named([], [r[s.changed :] for r, s in zip(right, switches, strict=True)])
+    lessons = [(e.stream, running(e)) for e in told]
+    shown = (lessons + [(s.episode.stream, s.skills) for s in others] for others in _others(switches))
+    return _right([partial(_skills, _forest(each, seed)) for each in shown], nominal, switches)
+
+
+def _others(switches: Sequence[Switch]) -> tuple[Sequence[Switch], Sequence[Switch]]:
+    """What is shown to who is asked for the first, third, … change, and to who is asked for the rest."""
+    return switches[1::2], switches[::2]
+
+
+def _right(
+    naming: Sequence[Callable[[NDArray[np.floating[Any]]], NDArray[np.str_]]],
+    nominal: Sequence[Episode],
+    switches: Sequence[Switch],
+) -> Named:
+    """Episodes asked in turn of each that names the rows (T,) of a stream (T, D)."""
+    turn = cycle(naming)
+    switched = [(name(s.episode.stream) == s.skills)[s.changed :] for s, name in zip(switches, turn, strict=False)]
+    return Named([name(e.stream) == e.info["skill"] for e, name in zip(nominal, cycle(naming), strict=False)], switched)
 
 
 def by_place(told: Sequence[Episode], switches: Sequence[Switch]) -> Named:
@@ -77,10 +103,10 @@ def _forest(lessons: Sequence[tuple[NDArray[np.float32], NDArray[np.str_]]], see
     return forest.fit(np.concatenate(streams), np.concatenate(skills))
 
 
-def _skills(forest: RandomForestClassifier, episode: Episode) -> NDArray[np.str_]:
+def _skills(forest: RandomForestClassifier, stream: NDArray[np.floating[Any]]) -> NDArray[np.str_]:
     """(T,) what it names, its moments adding up."""
     total, found = np.zeros(len(forest.classes_)), []
-    for moment in np.log(forest.predict_proba(episode.stream) + SMALLEST):
+    for moment in np.log(forest.predict_proba(stream) + SMALLEST):
         total = KEPT * total + moment
         found.append(forest.classes_[total.argmax()])
     return np.array(found)

@@ -108,12 +108,16 @@ def alarms_table(found: Mapping[str, Sequence[Alarms]]) -> Table:
     return Table("Episodes with an alarm [%].", ("Memory", "with a change of skill", "nominal"), rows)
 
 
-def naming_figure(curves: Mapping[str, Sequence[NDArray[np.bool_]]], dt: float, longest_s: float = 8.0) -> Figure:
+def naming_figure(
+    curves: Mapping[str, Sequence[NDArray[np.bool_]]], dt: float, longest_s: float = 8.0, since: str = "the skill began"
+) -> Figure:
     """How often the right skill was named, over the time since it began.
 
     Args:
         curves: (T,) for each episode, by the name of the line.
         dt: control period [s].
+        longest_s: the last time shown [s].
+        since: from when time is counted.
     """
     steps = np.arange(1, round(longest_s / dt) + 1)
     with figure(height=4.0, width=7.6) as fig:
@@ -122,8 +126,8 @@ def naming_figure(curves: Mapping[str, Sequence[NDArray[np.bool_]]], dt: float, 
             colour, line, _ = look(i)
             shares = [100 * share_right(right, int(n)) for n in steps]
             ax.plot(dt * steps, shares, color=colour, linestyle=line, linewidth=1.8, label=name)
-        ax.set(xlim=(0, longest_s), ylim=(0, 101), xlabel="time since the skill began [s]")
+        ax.set(xlim=(0, longest_s), ylim=(0, 101), xlabel=f"time since {since} [s]")
         ax.set_ylabel("right skill named [% of episodes]")
         ax.grid(color="#dddddd", linewidth=0.6)
-        fig.legend(loc="outside right upper", handlelength=3.5)
+        fig.legend(loc="outside upper center", ncols=2, handlelength=3.5)
     return fig

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.episodes import Episode, load_episode, save_episode
+from asm_gym.monitors.model import running
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
 from asm_gym.rollouts.trial import environment
 from asm_gym.stream import StreamSpec
@@ -43,8 +44,7 @@ class Switch:
         """What ``record_switch`` wrote."""
         episode = load_episode(path, spec)
         spec.require(episode.spec, str(path))
-        changed = int(episode.info["changed"])
-        return cls(episode, np.repeat(episode.info["skills"], [changed, len(episode) - changed]), changed)
+        return cls(episode, running(episode), int(episode.info["changed"]))
 
 
 def record_switch(path: Path) -> Path:
