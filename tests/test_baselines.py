@@ -159,11 +159,17 @@ def test_unknown_names_and_hyperparameters_list_the_known():
 
 @pytest.mark.parametrize(
     ("name", "setting"),
-    [("window_pca", {"rows": 3, "kept": 0.9}), ("kalman", {"ridge": 0.5}), ("gru", {"hidden_size": 8})],
+    [
+        ("window_pca", {"rows": 3, "kept": 0.9}),
+        ("kalman", {"ridge": 0.5}),
+        ("gru", {"hidden_size": 8}),
+        ("lstm_vae", {"hidden_size": 8, "latent_size": 3}),
+    ],
 )
 def test_what_a_baseline_was_set_to_is_in_its_file_and_a_file_from_before_has_its_own(name, setting, tmp_path):
     with pytest.MonkeyPatch.context() as less:
-        less.setattr(gru, "EPOCHS", 2)
+        for module in (gru, lstm_vae):
+            less.setattr(module, "EPOCHS", 2)
         monitor, own = (make_monitor(name, SPEC, **s).fit(episodes(12)) for s in (setting, {}))
     one = episodes(1, seed=7)[0]
     assert not np.array_equal(monitor.score(one).value, own.score(one).value)
