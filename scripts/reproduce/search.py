@@ -47,7 +47,7 @@ SETTINGS: dict[str, tuple[Setting, ...]] = {
     "association_linear+evidence": ({},),
     "association_mlp+evidence": (
         {},
-        {"learning_rate": 3e-4},
+        {"learning_rate": 1e-3},
         {"units": 480},
         {"learning_rate": 3e-3},
         {"units": 1920},

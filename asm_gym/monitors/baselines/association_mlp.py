@@ -72,7 +72,7 @@ class MLPAssociation(TorchModel):
     kind = "association_mlp"
 
     @typed
-    def __init__(self, spec: StreamSpec, units: int = 960, learning_rate: float = 1e-3) -> None:
+    def __init__(self, spec: StreamSpec, units: int = 960, learning_rate: float = 3e-4) -> None:
         super().__init__(spec)
         self.units = check_number("units", units, low=1, whole=True)
         self.learning_rate = check_number("learning_rate", learning_rate, above=0.0)
