@@ -11,7 +11,7 @@ import asm_gym  # noqa: F401
 from asm_gym.envs.simulation import Simulation
 from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS
-from asm_gym.policies.scripted.base import ObservationReader, Style, grasping, gripping, has_settled
+from asm_gym.policies.scripted.base import ObservationReader, Style, grasping, gripping, has_settled, rotation
 from asm_gym.policies.scripted.door import _about
 from asm_gym.policies.scripted.handover import Hammer, Meeting
 from asm_gym.policies.scripted.two_arms import Hand, move_arm
@@ -34,7 +34,7 @@ QUICK = [
     "PickPlaceCereal",
 ]
 
-MEET_STOPS = {"TwoArmPegInHole", "TwoArmHandover", "NutAssemblySquare", "NutAssemblyRound", "PickPlaceMilk"}
+MEET_STOPS = {"TwoArmPegInHole", "TwoArmHandover"}
 """Where the pose of the objects may turn an arm's last joint to the end of its range."""
 
 
@@ -129,6 +129,41 @@ def test_a_hand_is_turned_no_further_than_its_grasp_asks_for():
         np.testing.assert_allclose(turned.T @ turned, np.eye(3), atol=1e-12)
         assert np.linalg.det(turned) == pytest.approx(1)
         np.testing.assert_allclose(turned[:, 1], side * hand[1, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("wrist", "turn", "first"),
+    [(2.0, 2.5, 1.0), (2.0, -2.5, 1.0), (-2.0, 2.5, -1.0), (0.0, -2.5, -1.0), (2.8, -0.2, -0.2)],
+)
+def test_a_hand_is_not_turned_through_the_stops_of_its_last_joint(wrist, turn, first, monkeypatch):
+    # The joint, which turns the other way than the hand, ends at `wrist - turn`, or at that and a full turn.
+    env = gym.make("asm_gym/NutAssemblySquare-v0")
+    expert = make_policy("scripted", env, seed=0)
+    monkeypatch.setattr(expert, "_wrist", lambda observation: wrist)
+    down = np.diag([1.0, -1.0, -1.0])
+    turned = expert._turning(None, down, _about([0.0, 0.0, 1.0], turn) @ down)
+    assert np.arctan2(turned[1, 0], turned[0, 0]) == pytest.approx(first)
+    env.close()
+
+
+@pytest.mark.parametrize("heading", np.linspace(-3.0, 3.0, 9))
+def test_a_nut_is_held_so_that_the_last_joint_has_room_all_along(heading, monkeypatch):
+    env = gym.make("asm_gym/NutAssemblySquare-v0")
+    expert = make_policy("scripted", env, seed=0)
+    observation, _ = env.reset(seed=0)
+    data = env.unwrapped.simulation.data
+    hand = rotation(expert._read(observation, "hand_orientation"))
+    turned = _about([0.0, 0.0, 1.0], heading)
+    monkeypatch.setattr(expert, "pose", lambda observation, name: (np.array([-0.1, 0.1, 0.85]), turned))
+    task = expert.next_task(observation)
+    # Where nothing but the last joint turned the hand: the arm's bearing, small here, is left out.
+    place = _about([0.0, 0.0, 1.0], task.headings[0] - heading) @ turned
+    for held in (turned, place):
+        closing = held @ task.closing
+        turn = np.arctan2(closing[1], closing[0]) - np.arctan2(hand[1, 1], hand[0, 1])
+        joint = data.joint("robot0_joint7").qpos[0] - turn
+        assert abs((joint + np.pi) % (2 * np.pi) - np.pi) < 2.9 - 0.25
+    env.close()
 
 
 @pytest.mark.parametrize("length", [0.1, 0.15, 0.2, 0.25])  # those that robosuite draws from [m]

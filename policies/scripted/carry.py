@@ -25,6 +25,9 @@ from asm_gym.policies.scripted.base import (
 
 REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT = range(8)
 
+_AHEAD = 1.0  # how far to turn the hand at once [rad]
+_EXACT = 0.005  # what has to fit as exactly as this is not lowered beside its place [m]
+
 
 class CarryTask(NamedTuple):
     """What to carry where.
@@ -134,7 +137,7 @@ class CarryExpert(Expert, ABC):
         if phase == GRASP:
             return to(RAISE) if has_settled(fingers, state.since, 7) else state
         if phase in (RAISE, CARRY, LOWER) and lost:
-            return to(REACH)
+            return to(RETREAT)  # and see where it falls: it may be where it belongs
         place = task.place + np.array([0.0, 0.0, task.over])
         # Whoever cannot get nearer, at the end of his reach, makes do with less in time.
         fit = task.fit * (1 + state.since / 60) if self._careful else task.fit
@@ -165,9 +168,9 @@ class CarryExpert(Expert, ABC):
             return np.append(np.zeros(6), OPEN)
         at, turned = self.pose(observation, task.name)
         grip = at + turned @ task.grip
-        held = self._held(task, hand, turned)
+        held = self._turning(observation, hand, self._held(task, hand, turned))
         if phase in (REACH, DESCEND):
-            aligned = self._grasp(task, hand, turned)
+            aligned = self._turning(observation, hand, self._grasp(task, hand, turned))
             above = np.array([0.0, 0.0, task.clearance]) + 0.3 * state.spread
             target = grip + above if phase == REACH else grip
             # From afar, first high: the way may lead over a wall or another object.
@@ -184,7 +187,7 @@ class CarryExpert(Expert, ABC):
         if phase == CARRY:
             return np.append(move(at, goal, hand, held, state.speed, self._gain), CLOSE)
         if phase == LOWER:
-            place = self._lower(task, at) if self._careful else task.place
+            place = self._lower(task, at) if self._careful or task.fit <= _EXACT else task.place
             return np.append(move(at, place, hand, held, 0.6 * state.speed, self._gain), CLOSE)
         up = state.anchor + np.array([0.0, 0.0, 0.0 if phase == RELEASE else 0.12])
         return np.append(move(hand_at, up, hand, gripping(hand, None), state.speed), OPEN)
@@ -196,6 +199,49 @@ class CarryExpert(Expert, ABC):
         down = 0.025 * float(np.clip(1.5 - 0.5 * astray / task.fit, 0.0, 1.0))
         return np.array([*task.place[:2], max(task.place[2], at[2] - down)])
 
+    def _at_ease(self, task: CarryTask, observation: Any) -> CarryTask:
+        """The task with one of its two grasps and one of its headings: those that keep the last joint from its stops.
+
+        Of a hand that points down, the last joint turns back with the hand and onwards with the arm's bearing.
+        """
+        at, turned = self.pose(observation, task.name)
+        hand = rotation(self._read(observation, "hand_orientation"))
+        base = self.env.unwrapped.robosuite_env.robots[0].base_pos  # type: ignore[attr-defined]
+        along = self._wrist(observation) + _yaw(hand[:, 1]) - _yaw(self._read(observation, "hand_position") - base)
+        heading = _yaw(turned[:, 0])
+
+        def strain(choice: tuple[Vector, float]) -> float:
+            """How far from its middle the last joint comes, at the grasp and over the place [rad]."""
+            closing, wanted = choice
+            turn = _about_vertical(wanted - heading)
+            grasp = along - _yaw(turned @ closing) + _yaw(at + turned @ task.grip - base)
+            place = along - _yaw(turn @ turned @ closing) + _yaw(task.place + turn @ turned @ task.grip - base)
+            return max(abs(_wrapped(grasp)), abs(_wrapped(place)))
+
+        if task.closing is None:
+            return task
+        choices = [(c, h) for c in (task.closing, -task.closing) for h in task.headings or (heading,)]
+        closing, wanted = min(choices, key=strain)
+        return task._replace(closing=closing, turns=2 * np.pi, headings=(wanted,) if task.headings else ())
+
+    def _turning(self, observation: Any, hand: Vector, target: Vector) -> Vector:
+        """(3, 3) where to turn the hand first on its way to ``target``: not through the last joint's stops.
+
+        The shortest turn may lead there where it is nearly half a one.
+        """
+        down = gripping(hand, None)
+        left = _wrapped(_yaw(target[:, 1]) - _yaw(down[:, 1]))
+        if abs(left) <= _AHEAD:
+            return target
+        wrist = self._wrist(observation)
+        left = wrist - _wrapped(wrist - left)
+        first: Vector = _about_vertical(float(np.clip(left, -_AHEAD, _AHEAD))) @ down
+        return first
+
+    def _wrist(self, observation: Any) -> float:
+        """Angle of the arm's last joint [rad]."""
+        return float(self._read(observation, "joint_position")[-1])
+
     @staticmethod
     def _grasp(task: CarryTask, hand: Vector, turned: Vector) -> Vector:
         """(3, 3) how to hold the hand for grasping."""
@@ -203,15 +249,27 @@ class CarryExpert(Expert, ABC):
 
     def _held(self, task: CarryTask, hand: Vector, turned: Vector) -> Vector:
         """(3, 3) how to hold the hand so that the object in it comes to fit its place."""
-        down = gripping(hand, None)
-        angle = _to_fit(task.headings, turned)
-        c, s = np.cos(angle), np.sin(angle)
-        turn: Vector = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ down
-        return turn
+        return _about_vertical(_to_fit(task.headings, turned)) @ gripping(hand, None)
 
 
 def _to_fit(headings: tuple[float, ...], turned: Vector) -> float:
     """The smallest turn about the vertical that gives an object one of the ``headings`` [rad]; 0 without any."""
-    heading = float(np.arctan2(turned[1, 0], turned[0, 0]))
-    left = [(h - heading + np.pi) % (2 * np.pi) - np.pi for h in headings]
+    heading = _yaw(turned[:, 0])
+    left = [_wrapped(h - heading) for h in headings]
     return float(min(left, key=abs, default=0.0))
+
+
+def _yaw(direction: Vector) -> float:
+    """Angle of a direction (3,) about the vertical [rad]."""
+    return float(np.arctan2(direction[1], direction[0]))
+
+
+def _wrapped(angle: float) -> float:
+    """The same angle in [-π, π) [rad]."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _about_vertical(angle: float) -> Vector:
+    """(3, 3) rotation about the vertical [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

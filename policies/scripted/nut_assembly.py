@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from asm_gym.policies.scripted.base import Vector
 from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
 
 _HANDLE = {"SquareNut": 0.054, "RoundNut": 0.06}  # from the nut's middle to that of its handle [m]
@@ -23,27 +22,23 @@ class NutAssemblyExpert(CarryExpert):
         for i, nut in enumerate(env.nuts):
             if env.single_object_mode and i != env.nut_id:
                 continue
-            at, turned = self.pose(observation, nut.name)
+            at, _ = self.pose(observation, nut.name)
             if not env.on_peg(at, i):
                 peg = env.sim.data.body_xpos[(env.peg1_body_id, env.peg2_body_id)[i]]
-                return CarryTask(
+                square = nut.name == "SquareNut"
+                task = CarryTask(
                     name=nut.name,
                     grip=np.array([_HANDLE[nut.name], 0.0, 0.0]),
                     closing=np.array([0.0, 1.0, 0.0]),
                     turns=np.pi,
                     clearance=0.1,
-                    place=np.array([peg[0], peg[1], env.table_offset[2] + 0.03]),
+                    # Lower, and the palm would stand on the peg.
+                    place=np.array([peg[0], peg[1], env.table_offset[2] + 0.05]),
                     over=0.14,
-                    headings=self._headings(nut.name, turned),
-                    heading_fit=0.06 if nut.name == "SquareNut" else 0.4,
+                    # The handle points towards the robot, which could not reach further.
+                    headings=(np.pi,) if square else (np.pi - 0.5, np.pi, np.pi + 0.5),
+                    heading_fit=0.06 if square else 0.2,
                     fit=0.005,
                 )
+                return self._at_ease(task, observation)
         return None
-
-    @staticmethod
-    def _headings(name: str, turned: Vector) -> tuple[float, ...]:
-        """Where the handle may point over the peg: not away from the robot, which could not reach that far."""
-        sideways = (np.pi / 2, -np.pi / 2)
-        if name == "SquareNut":
-            return (*sideways, np.pi)
-        return sideways if turned[0, 0] > 0.3 else ()

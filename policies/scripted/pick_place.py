@@ -12,6 +12,7 @@ from asm_gym.policies.scripted.base import Style, Vector
 from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
 
 _WALL = 0.09  # how high above the bins' floor the fingertips stay clear of the walls' tops with the palm [m]
+_REACH = 0.8  # further from its base than this a Panda's hand comes down with its elbow at its stop [m]
 
 
 class PickPlaceExpert(CarryExpert):
@@ -54,11 +55,11 @@ class PickPlaceExpert(CarryExpert):
         at, turned = self.pose(observation, name)
         half = self._half_extents(name)
         grip = max(0.0, half[2] - 0.02)
-        place = self._place(env, nearest, half[2], grip, 0.07 if self._careful else 0.04)
+        place = self._place(env, nearest, half[2], grip, self._careful)
         if self._careful:  # let go over the walls: stretched out, the arm may stand nearer to one than it should
             place[2] += 0.04
         closing = self._closing(half, at, turned, env.bin1_pos, env.bin_size, self._careful and name == "Can")
-        return CarryTask(
+        task = CarryTask(
             name=name,
             grip=np.array([0.0, 0.0, grip]),
             closing=closing,
@@ -70,6 +71,7 @@ class PickPlaceExpert(CarryExpert):
             heading_fit=0.3,
             fit=0.03,
         )
+        return self._at_ease(task, observation)
 
     @staticmethod
     def _headings(closing: Vector, reach: Vector) -> tuple[float, ...]:
@@ -91,11 +93,17 @@ class PickPlaceExpert(CarryExpert):
         return max(axes, key=room)
 
     @staticmethod
-    def _place(env: Any, compartment: int, half_height: float, grip: float, nearer: float) -> Vector:
-        """(3,) where to let go: ``nearer`` to the arm [m], because it is stretched out at the far side of the bins."""
+    def _place(env: Any, compartment: int, half_height: float, grip: float, careful: bool) -> Vector:
+        """(3,) where to let go: nearer to the arm, because it is stretched out at the far side of the bins."""
         place = np.array(env.target_bin_placements[compartment], np.float64)
         away = place[:2] - env.robots[0].base_pos[:2]
-        place[:2] -= nearer * away / np.linalg.norm(away)
+        if np.linalg.norm(away) > _REACH and not careful:
+            # Also away from the nearest wall, and higher: the arm reaches furthest at the height of its shoulder.
+            inwards = env.bin2_pos[:2] - place[:2]
+            place[:2] += 0.08 * inwards / np.linalg.norm(inwards)
+            place[2] += 0.02
+        else:
+            place[:2] -= (0.07 if careful else 0.04) * away / np.linalg.norm(away)
         # Lower, and the palm would stand on a wall.
         place[2] += max(half_height + 0.015, _WALL - grip)
         return place
