@@ -26,6 +26,7 @@ from asm_gym.policies.scripted.base import (
 REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT = range(8)
 
 _AHEAD = 1.0  # how far to turn the hand at once [rad]
+_ROOM = 0.9  # how far from its stops the last joint is to stay [rad]
 _EXACT = 0.005  # what has to fit as exactly as this is not lowered beside its place [m]
 
 
@@ -200,26 +201,30 @@ class CarryExpert(Expert, ABC):
         return np.array([*task.place[:2], max(task.place[2], at[2] - down)])
 
     def _at_ease(self, task: CarryTask, observation: Any) -> CarryTask:
-        """The task with one of its two grasps and one of its headings: those that keep the last joint from its stops.
+        """The task with one of its two grasps and one of its headings: those that leave the last joint room.
 
-        Of a hand that points down, the last joint turns back with the hand and onwards with the arm's bearing.
+        Of a hand that points down, the last joint turns back with the hand and onwards with the arm's bearing. Of
+        grasps that leave room enough, the one is chosen that turns it least.
         """
-        at, turned = self.pose(observation, task.name)
-        hand = rotation(self._read(observation, "hand_orientation"))
-        base = self.env.unwrapped.robosuite_env.robots[0].base_pos  # type: ignore[attr-defined]
-        along = self._wrist(observation) + _yaw(hand[:, 1]) - _yaw(self._read(observation, "hand_position") - base)
-        heading = _yaw(turned[:, 0])
-
-        def strain(choice: tuple[Vector, float]) -> float:
-            """How far from its middle the last joint comes, at the grasp and over the place [rad]."""
-            closing, wanted = choice
-            turn = _about_vertical(wanted - heading)
-            grasp = along - _yaw(turned @ closing) + _yaw(at + turned @ task.grip - base)
-            place = along - _yaw(turn @ turned @ closing) + _yaw(task.place + turn @ turned @ task.grip - base)
-            return max(abs(_wrapped(grasp)), abs(_wrapped(place)))
-
         if task.closing is None:
             return task
+        at, turned = self.pose(observation, task.name)
+        hand = rotation(self._read(observation, "hand_orientation"))
+        env = self.env.unwrapped
+        robot = env.robosuite_env.robots[0]  # type: ignore[attr-defined]
+        most = env.simulation.model.jnt_range[robot._ref_joint_indexes[-1], 1] - _ROOM  # type: ignore[attr-defined]
+        now, base = self._wrist(observation), robot.base_pos
+        along = now + _yaw(hand[:, 1]) - _yaw(self._read(observation, "hand_position") - base)
+        heading = _yaw(turned[:, 0])
+
+        def strain(choice: tuple[Vector, float]) -> tuple[float, float]:
+            """How far the last joint comes beyond where it has room, and how far it turns in all [rad]."""
+            closing, wanted = choice
+            fitting = _about_vertical(wanted - heading) @ turned
+            grasp = _wrapped(along - _yaw(turned @ closing) + _yaw(at + turned @ task.grip - base))
+            place = _wrapped(along - _yaw(fitting @ closing) + _yaw(task.place + fitting @ task.grip - base))
+            return max(abs(grasp) - most, abs(place) - most, 0.0), abs(grasp - now) + abs(place - grasp)
+
         choices = [(c, h) for c in (task.closing, -task.closing) for h in task.headings or (heading,)]
         closing, wanted = min(choices, key=strain)
         return task._replace(closing=closing, turns=2 * np.pi, headings=(wanted,) if task.headings else ())

@@ -36,9 +36,14 @@ class NutAssemblyExpert(CarryExpert):
                     place=np.array([peg[0], peg[1], env.table_offset[2] + 0.05]),
                     over=0.14,
                     # The handle points towards the robot, which could not reach further.
-                    headings=(np.pi,) if square else (np.pi - 0.5, np.pi, np.pi + 0.5),
+                    headings=(np.pi,) if square else self._headings(),
                     heading_fit=0.06 if square else 0.2,
                     fit=0.005,
                 )
                 return self._at_ease(task, observation)
         return None
+
+    def _headings(self) -> tuple[float, ...]:
+        """Where the handle of a round nut may point: a Panda's elbow reaches its stop sooner than others'."""
+        aside = np.pi / 2 if self._careful else 0.5
+        return np.pi - aside, np.pi, np.pi + aside
