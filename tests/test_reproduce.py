@@ -22,6 +22,8 @@ from asm_gym.scripts.reproduce import (
     memorise_and_recall,
     retention,
     robot_recall,
+    robot_unnamed,
+    segments,
     speed_accuracy,
     unnamed_skills,
 )
@@ -373,11 +375,35 @@ def test_a_stream_of_letters_is_parted_and_counted_without_a_label():
     assert state["true"] > 0.9
     assert state["index"] > 0.8
     assert state["skills_found"] in (3, 4)
+    # A pen that jumps where a letter ends tells as much without a memory.
+    assert next(r for r in records if r["source"] == "row")["found"] > 0.9
+
+
+def test_rows_begin_anew_where_they_move_further_than_is_usual():
+    rng = np.random.default_rng(0)
+    still = [0.1 * rng.normal(size=(100, 3)) for _ in range(4)]
+    stream = np.concatenate([still[0], still[1] + 5.0, still[2][:4], still[3]])
+    begins = segments.jumps(stream, still)
+    assert {0, 100, 200} <= set(begins)
+    assert np.diff(begins).min() >= segments.SHORTEST
+    assert len(begins) <= 5
+
+
+def test_a_stream_of_whole_episodes_says_where_they_begin_and_where_their_skills_change():
+    rows = np.arange(12, dtype=np.float32)[:, None]
+    spec = StreamSpec((Channel("x", 1, "m"),), dt=0.1)
+    first = Episode.from_stream(rows[:5], spec, info={"skill": "a"})
+    second = Episode.from_stream(rows[5:], spec, info={"skills": ["b", "a"], "changed": 3})
+    stream, skill, starts, changes = robot_unnamed.joined([first, second])
+    np.testing.assert_array_equal(stream, rows)
+    assert "".join(skill) == "aaaaabbbaaaa"
+    assert starts.tolist() == [0, 5]
+    assert changes.tolist() == [8]
 
 
 def test_a_segment_is_clustered_by_its_states_and_every_step_gets_its_cluster():
     values = np.repeat([[0.0], [5.0], [0.1], [5.1], [0.05]], 12, axis=0)
-    named, count = unnamed_skills.unnamed(values, np.arange(0, 60, 12), 4)
+    named, count = segments.unnamed(segments.Parted(values, np.arange(0, 60, 12)), 4, slice(5, 10))
     assert count == 2
     assert named.reshape(5, 12).std(axis=1).max() == 0.0
     assert named[0] == named[24] == named[48] != named[12] == named[36]

@@ -61,6 +61,10 @@ CHOSEN: dict[str, Setting] = {
 }
 """How each learns; what each number means is said where it is taken."""
 
+LARGE = 256
+CHOSEN_LARGE = CHOSEN | {"rnn": {"rate": 1e-2, "noise": 0.6}}
+"""How each learns with so many units or more: at three times the rate an RNN of 512 learns nothing."""
+
 
 class Condition(NamedTuple):
     """What one network is asked to learn."""
@@ -94,7 +98,8 @@ def recall(condition: Condition, practice: Practice, cues: Sequence[int]) -> lis
     for name in MODELS:
         if name == "memory_wide" and WIDER * condition.hidden > WIDEST:
             continue
-        model = learned(name, CHOSEN[name], train, tests, condition.hidden, practice, rng)
+        how = (CHOSEN if condition.hidden < LARGE else CHOSEN_LARGE)[name]
+        model = learned(name, how, train, tests, condition.hidden, practice, rng)
         for cue in (*cues, STEPS):
             error, right = recalled(model, tests, means, cue)
             where = {**condition._asdict(), "model": name, "cue": cue, "online": cue == STEPS}

@@ -1,71 +1,50 @@
 """Unnamed skills: how many there are in a stream, and where each begins, found without a label.
 
 A memory has learned letters, and nobody said how many. Then it reads one long stream of letters in random order, each
-broken off somewhere after its middle, and is never told where one ends. Where the error of the prediction leaves what
-is usual, it asks whether the next few rows are better explained by what it carries on, or by beginning anew, and takes
-the better. The states inside a segment, averaged, are clustered; there are as many skills as make the clusters stand
-apart best. The adjusted Rand index says how well the segments, step by step, are
-the letters that were written. The same is done with the rows instead of the states.
-
-Sources: Zacks et al. 2007 (Psychological Bulletin 133(2)) for segments between errors of prediction; Rousseeuw 1987 for
-the silhouette; Hubert and Arabie 1985 for the index.
+broken off somewhere after its middle, and is never told where one ends. ``segments`` says how it finds that, and which
+are the same. The adjusted Rand index (Hubert and Arabie 1985) says how well the segments, step by step, are the letters
+that were written. The same is asked of the rows alone. Then all of it is asked of robosuite skills: whole episodes in
+random order, and some in which one skill follows another.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
-from sklearn.cluster import AgglomerativeClustering
-from sklearn.metrics import adjusted_rand_score, silhouette_score
 
 from asm_gym.episodes import Episode
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.tables import Table
-from asm_gym.memory.energy import Array
-from asm_gym.memory.recall import Recalled, follow
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import at_least
+from asm_gym.scripts.reproduce import robot_unnamed
 from asm_gym.scripts.reproduce.common import (
+    SENSED,
     Common,
     Findings,
     Record,
+    demonstrations,
     over_seeds,
     reproduce,
     shown,
     wide_enough,
 )
 from asm_gym.scripts.reproduce.curves import curve
-from asm_gym.scripts.reproduce.expression import Memory, Rows, read
+from asm_gym.scripts.reproduce.expression import Memory, Rows
 from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters, copybook, repertoire
+from asm_gym.scripts.reproduce.segments import NEAR, SOURCES, judged, parted, unnamed
+from asm_gym.scripts.reproduce.skill_switch import Switch, record_switch
 
-USUAL = 0.999
-"""Quantile of the errors within letters, over which another has begun."""
-
-SHORTEST = 10
-"""Steps between two beginnings at least."""
-
-CONVINCED = 0.5
-"""Share of the error of going on that beginning anew must stay below."""
-
-AHEAD = 5
-"""Steps by which it is settled whether something has begun."""
-
-EARLY = 10
-"""A segment is known by its states from this step on, for as many: all segments are long enough."""
-
-NEAR = 3
-"""Steps that a beginning may be off to count as found."""
-
-SOURCES = {"state": "state of the memory", "row": "rows alone"}
+EARLY = slice(10, 20)
+"""Steps of a segment by which its letter is known: all segments are long enough."""
 
 
 @dataclass(frozen=True)
@@ -82,20 +61,36 @@ class Args(Common):
     """How often each letter comes in the stream."""
     steps: int = 12000
     """Steps in which the synapses change."""
+    tasks: tuple[str, ...] = ("Lift", "Stack", "Door", "PickPlaceCan", "PickPlaceMilk", "NutAssemblySquare")
+    """The robosuite skills."""
+    robot_episodes: int = 16
+    """Episodes of each robosuite skill to learn from; 0 leaves robosuite out."""
+    robot_asked: int = 6
+    """Episodes of each in the stream."""
+    switches: int = 8
+    """Episodes in the stream in which one skill follows another."""
+    robot_hidden: int = 256
+    """Hidden units for robosuite."""
+    robot_steps: int = 4000
+    """Steps in which the synapses change, for robosuite."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(1, self, "repertoires")
         check_letters(*self.repertoires, least=2)
-        at_least(1, self, "writings", "steps")
+        at_least(1, self, "tasks", "writings", "steps", "robot_asked", "robot_steps")
         at_least(2, self, "length")
+        at_least(0, self, "robot_episodes", "switches")
         wide_enough(self.hidden, 4)
+        wide_enough(self.robot_hidden, SENSED)
+        if not (self.repertoires or self.robot_episodes):
+            raise ValueError("there is nothing to find: repertoires and robot_episodes are both left out")
 
     def scaled(self) -> Args:
         """With ``quick``, little of everything."""
         if not self.quick:
             return self
-        return replace(self, seeds=min(self.seeds, 2), repertoires=(3,), hidden=32, writings=4, steps=1500)
+        few = {"repertoires": (3,), "hidden": 32, "writings": 4, "steps": 1500}
+        return replace(self, seeds=min(self.seeds, 2), robot_episodes=0, **few)  # type: ignore[arg-type]
 
 
 def one(condition: tuple[int, int], args: Args) -> list[Record]:
@@ -106,16 +101,11 @@ def one(condition: tuple[int, int], args: Args) -> list[Record]:
     train = copybook(letters, args.writings, 2, rng)
     memory = Memory.learned(train, args.hidden, rng, args.steps)
     stream, skill, begins = strung(copybook(letters, args.length, 2, rng), rng)
-    rows = (stream - memory.reader.mean) / memory.reader.spread
-    states, found = read_on(memory, stream, usual_error(memory, train))
-    features = {"state": np.tanh(states), "row": rows}
-    hits = [np.abs(found - b).min() <= NEAR for b in begins]
-    true = [np.abs(begins - f).min() <= NEAR for f in found]
     records = []
-    for source, values in features.items():
-        named, skills = unnamed(values, found, 2 * count + 2)
-        where = {"seed": seed, "skills": count, "source": source, "index": adjusted_rand_score(skill, named)}
-        records.append({**where, "skills_found": skills, "found": float(np.mean(hits)), "true": float(np.mean(true))})
+    for source, found in parted(memory, train, stream).items():
+        named, skills = unnamed(found, 2 * count + 2, EARLY)
+        where = {"domain": "letters", "seed": seed, "skills": count, "source": source, "skills_found": skills}
+        records.append(where | judged(found, named, skill, begins))
     return records
 
 
@@ -128,88 +118,56 @@ def strung(episodes: Sequence[Episode], rng: np.random.Generator) -> tuple[Rows,
     return np.concatenate(parts).astype(np.float64), skill, np.cumsum(lengths) - lengths
 
 
-def usual_error(memory: Memory, episodes: Sequence[Episode]) -> float:
-    """What the error of a row stays below in these; their first rows, of which little is known yet, do not count."""
-    senses, commands = read(memory.reader, np.stack([e.stream for e in episodes], axis=1).astype(np.float64))
-    start = memory.network.at_rest(len(episodes))
-    return float(np.quantile(errors(memory, start, senses, commands)[0][SHORTEST:], USUAL))
-
-
-def errors(memory: Memory, c: Array, senses: Array, commands: Array) -> tuple[NDArray[np.float64], Recalled]:
-    """(T, B) mean square of what was not expected of each row, read after the traces ``c``; and what was."""
-    recalled = follow(memory.network, c, senses, commands)
-    wrong = np.concatenate([senses - recalled.senses, commands[:, :, :-1] - recalled.commands], axis=2)
-    return np.mean(wrong.astype(np.float64) ** 2, axis=2), recalled
-
-
-def read_on(memory: Memory, stream: Rows, usual: float) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-    """The states (T, H) of a stream (T, D), and the steps where something was taken to begin."""
-    senses, commands = read(memory.reader, stream[:, None])
-    rest = memory.network.at_rest(1)
-    c, begins, states = rest, [0], []
-    for t in range(len(stream)):
-        on, now = errors(memory, c, senses[t : t + 1], commands[t : t + 1])
-        if on[0, 0] > usual and t - begins[-1] >= SHORTEST:
-            on = errors(memory, c, senses[t : t + 1 + AHEAD], commands[t : t + 1 + AHEAD])[0]
-            fresh = read(memory.reader, stream[t : t + 1 + AHEAD, None])  # nothing has moved yet
-            anew = errors(memory, rest, *fresh)[0]
-            if anew[1:].sum() < CONVINCED * on[1:].sum():
-                begins.append(t)
-                now = errors(memory, rest, fresh[0][:1], fresh[1][:1])[1]
-        c = now.traces
-        states.append(now.hidden[0, 0])
-    return np.stack(states), np.array(begins)
-
-
-def unnamed(values: NDArray[np.floating[Any]], found: NDArray[np.intp], most: int) -> tuple[NDArray[np.intp], int]:
-    """(T,) the cluster of each step, and how many there are.
-
-    Args:
-        values: (T, C) what says which skill runs.
-        found: where each segment begins.
-        most: skills that are thought possible.
-    """
-    lengths = np.diff([*found, len(values)])
-    parts = np.split(values, found[1:])
-    segments = np.stack([part[min(EARLY, len(part) // 2) : 2 * EARLY].mean(axis=0) for part in parts])
-    best = (-1.0, np.zeros(len(segments), np.intp))
-    for count in range(2, min(most, len(segments) - 1) + 1):
-        clusters = AgglomerativeClustering(count).fit_predict(segments)
-        best = max(best, (float(silhouette_score(segments, clusters)), clusters), key=lambda b: b[0])
-    return np.repeat(best[1], lengths), int(best[1].max()) + 1
-
-
 def tables(records: Sequence[Record], args: Args) -> list[Table]:
-    """Skills, beginnings and segments."""
-    heads = ("", *map(str, args.repertoires))
+    """Skills, beginnings and segments; of letters, and of robosuite."""
+    made = []
+    if args.repertoires:
+        heads = ("", *map(str, args.repertoires))
 
-    def row(label: str, value: str, source: str, digits: int = 2) -> tuple[str, ...]:
-        return (label, *(shown(records, value, digits, skills=n, source=source) for n in args.repertoires))
+        def rows(value: str, digits: int = 2) -> list[tuple[str, ...]]:
+            return [
+                (
+                    label,
+                    *(shown(records, value, digits, domain="letters", skills=n, source=s) for n in args.repertoires),
+                )
+                for s, label in SOURCES.items()
+            ]
 
-    return [
-        Table(
-            "Skills found, by how many there are; mean ± SD over seeds",
-            heads,
-            [row(label, "skills_found", s, 1) for s, label in SOURCES.items()],
-        ),
-        Table("Adjusted Rand index of the segments", heads, [row(label, "index", s) for s, label in SOURCES.items()]),
-        Table(
-            f"Beginnings [share], within {NEAR} steps",
-            heads,
-            [row("of those that are, found", "found", "state"), row("of those found, true", "true", "state")],
-        ),
-    ]
+        made += [
+            Table("Skills found, by how many there are; mean ± SD over seeds", heads, rows("skills_found", 1)),
+            Table("Adjusted Rand index of the segments", heads, rows("index")),
+            Table(f"Beginnings found [share of those that are], within {NEAR} steps", heads, rows("found")),
+            Table(f"Beginnings that are true [share of those found], within {NEAR} steps", heads, rows("true")),
+        ]
+    if args.robot_episodes:
+        asked = {
+            f"skills found, of {len(args.tasks)}": ("skills_found", 1),
+            "adjusted Rand index": ("index", 2),
+            "beginnings of episodes, found": ("starts", 2),
+            "changes within an episode, found": ("changes", 2),
+            "beginnings that are true, of those found": ("true", 2),
+        }
+        of = {"domain": "robosuite"}
+        each = [
+            (label, *(shown(records, value, digits, source=s, **of) for s in SOURCES))
+            for label, (value, digits) in asked.items()
+        ]
+        episodes = f"{args.robot_asked} episodes of each skill, {args.switches} with a change"
+        made.append(Table(f"Robosuite, {episodes}; mean ± SD over seeds", ("", *SOURCES.values()), each))
+    return made
 
 
 def drawn(records: Sequence[Record], args: Args) -> Figure:
-    """Skills found, and the index."""
+    """Skills found, and the index; of letters by how many there are, or of robosuite."""
     with figure(height=3.0, width=7) as fig:
         axes = fig.subplots(1, 2)
+        letters = bool(args.repertoires)
+        counts = args.repertoires if letters else (len(args.tasks),)
         for i, (source, label) in enumerate(SOURCES.items()):
             for ax, value in zip(axes, ("skills_found", "index"), strict=True):
-                found = [over_seeds(records, value, skills=n, source=source) for n in args.repertoires]
-                curve(ax, args.repertoires, found, i, label)
-        axes[0].plot(args.repertoires, args.repertoires, color="#888888", linewidth=1, linestyle=look(0)[1])
+                of = {"domain": "letters" if letters else "robosuite", "source": source}
+                curve(ax, counts, [over_seeds(records, value, skills=n, **of) for n in counts], i, label)
+        axes[0].plot(counts, counts, color="#888888", linewidth=1, linestyle=look(0)[1])
         axes[0].set(xlabel="skills there are", ylabel="skills found", ylim=0)
         axes[1].set(xlabel="skills there are", ylabel="adjusted Rand index", ylim=(0, 1.02))
         axes[1].legend(fontsize=8)
@@ -217,13 +175,27 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
 
 
 def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
-    """Every seed and repertoire."""
+    """Every seed and repertoire, and robosuite."""
     args = args.scaled()
-    conditions = [(seed, count) for seed in args.repetitions for count in args.repertoires]
-    with stage("learning letters, and finding them", console, seconds) as progress:
-        found = parallel_map(partial(one, args=args), conditions, args.workers, progress)
+    jobs: list[Callable[[], list[Record]]] = []
+    if args.robot_episodes:
+        train = demonstrations(args, args.tasks, "fit", args.robot_episodes, console, seconds)
+        asked = demonstrations(args, args.tasks, "nominal", args.robot_asked, console, seconds)
+        with stage("changing skills", console, seconds) as progress:
+            wanted = [args.out / "switches" / f"{args.seed + n}.npz" for n in range(args.switches)]
+            paths = parallel_map(record_switch, wanted, args.workers, progress)
+        asked += [Switch.read(path, train[0].spec).episode for path in paths]
+        sizes = args.robot_hidden, args.robot_steps
+        jobs += [partial(robot_unnamed.found, seed, train, asked, *sizes) for seed in args.repetitions]
+    jobs += [partial(one, (seed, count), args) for seed in args.repetitions for count in args.repertoires]
+    with stage("learning skills, and finding them", console, seconds) as progress:
+        found = parallel_map(_done, jobs, args.workers, progress)
     records = [r for own in found for r in own]
     return Findings(records, tables(records, args), drawn(records, args), {})
+
+
+def _done(job: Callable[[], list[Record]]) -> list[Record]:
+    return job()
 
 
 def main(argv: list[str] | None = None) -> int:
