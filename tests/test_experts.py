@@ -84,7 +84,7 @@ def test_other_arms_succeed_on_most_of_100_seeds(task, robot):
     assert sum(m.solved for m in made) >= least
 
 
-LEAST = {"NutAssembly": 0.5, "PickPlace": 0.22, "TwoArmHandover": 0.9, "TwoArmTransport": 0.7, "ToolHang": 0.9}
+LEAST = {"NutAssembly": 0.85, "PickPlace": 0.55, "TwoArmHandover": 0.9, "TwoArmTransport": 0.7, "ToolHang": 0.9}
 """What share is asked for where it is not 95 %: a few points under what ``asm-gym benchmark experts`` printed."""
 
 
