@@ -44,7 +44,7 @@ def grid(**values: Sequence[float]) -> tuple[Setting, ...]:
 
 
 _MEMORY = grid(rate=(3e-3, 6e-3, 1e-2), gain=(1.0, 4.0, 8.0))
-_RECURRENT = grid(rate=(3e-3, 1e-2, 3e-2), noise=(0.1, 0.3, 0.6))
+_RECURRENT = grid(rate=(1e-2, 3e-2, 6e-2), noise=(0.1, 0.3, 0.6))
 SETTINGS: dict[str, tuple[Setting, ...]] = {
     "memory": _MEMORY,
     "memory_wide": _MEMORY,
