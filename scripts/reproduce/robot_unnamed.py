@@ -13,8 +13,8 @@ from asm_gym.scripts.reproduce.common import Record
 from asm_gym.scripts.reproduce.expression import Memory, Rows
 from asm_gym.scripts.reproduce.segments import judged, parted, share_near, unnamed
 
-KNOWN_BY = slice(10, 80)
-"""Rows of a segment by which its skill is known."""
+KNOWN_BY = slice(0, None), slice(-20, None)
+"""Rows of a segment by which its skill is known: all, and how it ends."""
 
 
 def found(seed: int, train: Sequence[Episode], asked: Sequence[Episode], hidden: int, steps: int) -> list[Record]:
@@ -32,7 +32,7 @@ def found(seed: int, train: Sequence[Episode], asked: Sequence[Episode], hidden:
     count = len(set(skill))
     records = []
     for source, own in parted(memory, train, stream).items():
-        named, skills = unnamed(own, 2 * count + 2, KNOWN_BY)
+        named, skills = unnamed(own, 2 * count + 2, *KNOWN_BY)
         where = {"domain": "robosuite", "seed": seed, "skills": count, "source": source, "skills_found": skills}
         record = where | judged(own, named, skill, np.sort(np.concatenate([starts, changes])))
         record |= {"starts": share_near(starts, own.begins), "changes": share_near(changes, own.begins)}

@@ -2,7 +2,8 @@
 
 By the memory: where its error leaves what is usual, it asks whether the next few rows are better explained by what it
 carries on, or by beginning anew, and takes the better. By the rows alone: where they move further in a step than is
-usual. Segments are then clustered by their means; there are as many skills as make the clusters stand apart best.
+usual. Segments are then clustered by means over some of their rows; there are as many skills as make the clusters stand
+apart best.
 
 Sources: Zacks et al. 2007 (Psychological Bulletin 133(2)) for segments between errors of prediction; Rousseeuw 1987 for
 the silhouette.
@@ -99,19 +100,15 @@ def read_on(memory: Memory, stream: Rows, usual: float) -> tuple[NDArray[np.floa
 
 
 def jumps(rows: Rows, train: Sequence[Rows]) -> NDArray[np.intp]:
-    """The steps where standardised rows (T, D) move further than is usual in those of ``train``."""
-    usual = np.quantile(np.concatenate([_moved(x) for x in train]), USUAL)
+    """The steps where rows (T, D) move further than in those of ``train``, each number by what it usually moves."""
+    steps = np.concatenate([np.diff(x, axis=0) for x in train])
+    usual = np.maximum(steps.std(axis=0), 1e-9)
+    most = np.quantile(np.mean((steps / usual) ** 2, axis=1), USUAL)
     begins = [0]
-    for t in np.flatnonzero(_moved(rows) > usual) + 1:
+    for t in np.flatnonzero(np.mean((np.diff(rows, axis=0) / usual) ** 2, axis=1) > most) + 1:
         if t - begins[-1] >= SHORTEST:
             begins.append(int(t))
     return np.array(begins)
-
-
-def _moved(rows: Rows) -> NDArray[np.float64]:
-    """(T - 1,) mean square of what changes in each step."""
-    squared: NDArray[np.float64] = np.mean(np.diff(rows, axis=0) ** 2, axis=1)
-    return squared
 
 
 def _standard(memory: Memory, stream: NDArray[np.floating[Any]]) -> Rows:
@@ -119,16 +116,17 @@ def _standard(memory: Memory, stream: NDArray[np.floating[Any]]) -> Rows:
     return np.asarray((stream - memory.reader.mean) / memory.reader.spread, np.float64)
 
 
-def unnamed(found: Parted, most: int, early: slice) -> tuple[NDArray[np.intp], int]:
+def unnamed(found: Parted, most: int, *known_by: slice) -> tuple[NDArray[np.intp], int]:
     """(T,) the cluster of each step, and how many there are.
 
     Args:
         most: skills that are thought possible.
-        early: the rows by which a segment is known; of one that ends before, its second half.
+        known_by: the rows by whose means a segment is known; of one that ends before, its last row.
     """
     parts = np.split(found.values, found.begins[1:])
     lengths = [len(part) for part in parts]
-    segments = np.stack([part[min(early.start, len(part) // 2) : early.stop].mean(axis=0) for part in parts])
+    means = [[(part[rows] if len(part[rows]) else part[-1:]).mean(axis=0) for part in parts] for rows in known_by]
+    segments = np.hstack([np.stack(each) for each in means])
     best = (-1.0, np.zeros(len(segments), np.intp))
     for count in range(2, min(most, len(segments) - 1) + 1):
         clusters = AgglomerativeClustering(count).fit_predict(segments)
