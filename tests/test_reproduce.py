@@ -383,7 +383,7 @@ def test_rows_begin_anew_where_they_move_further_than_is_usual():
     rng = np.random.default_rng(0)
     still = [0.1 * rng.normal(size=(100, 3)) for _ in range(4)]
     stream = np.concatenate([still[0], still[1] + 5.0, still[2][:4], still[3]])
-    begins = segments.jumps(stream, still)
+    begins = segments.jumps(stream, still, 0.999)
     assert {0, 100, 200} <= set(begins)
     assert np.diff(begins).min() >= segments.SHORTEST
     assert len(begins) <= 5

@@ -16,6 +16,9 @@ from asm_gym.scripts.reproduce.segments import judged, parted, share_near, unnam
 KNOWN_BY = slice(0, None), slice(-20, None)
 """Rows of a segment by which its skill is known: all, and how it ends."""
 
+USUAL = 1.0
+"""Quantile of what is usual within skills: the most, for there are ten times as many rows as in letters."""
+
 
 def found(seed: int, train: Sequence[Episode], asked: Sequence[Episode], hidden: int, steps: int) -> list[Record]:
     """What one memory finds in a stream of robosuite episodes.
@@ -31,7 +34,7 @@ def found(seed: int, train: Sequence[Episode], asked: Sequence[Episode], hidden:
     stream, skill, starts, changes = joined([asked[n] for n in rng.permutation(len(asked))])
     count = len(set(skill))
     records = []
-    for source, own in parted(memory, train, stream).items():
+    for source, own in parted(memory, train, stream, USUAL).items():
         named, skills = unnamed(own, 2 * count + 2, *KNOWN_BY)
         where = {"domain": "robosuite", "seed": seed, "skills": count, "source": source, "skills_found": skills}
         record = where | judged(own, named, skill, np.sort(np.concatenate([starts, changes])))

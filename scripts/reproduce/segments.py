@@ -24,9 +24,6 @@ from asm_gym.memory.energy import Array
 from asm_gym.memory.recall import Recalled, follow
 from asm_gym.scripts.reproduce.expression import Memory, Rows, read
 
-USUAL = 0.999
-"""Quantile of what is usual within skills, over which another has begun."""
-
 SHORTEST = 10
 """Steps between two beginnings at least."""
 
@@ -49,28 +46,26 @@ class Parted(NamedTuple):
     begins: NDArray[np.intp]  # where each segment begins
 
 
-def parted(memory: Memory, train: Sequence[Episode], stream: Rows) -> dict[str, Parted]:
+def parted(memory: Memory, train: Sequence[Episode], stream: Rows, usual: float) -> dict[str, Parted]:
     """What the memory finds, and what the rows alone do, by ``SOURCES``.
 
     Args:
         train: what the memory has learned from, which says what is usual.
         stream: (T, D) skills one after another.
+        usual: quantile of errors, and of how far rows move, within skills, over which another may have begun.
     """
-    states, begins = read_on(memory, stream, usual_error(memory, train))
-    rows = [_standard(memory, e.stream) for e in train]
-    return {
-        "state": Parted(np.tanh(states), begins),
-        "row": Parted(_standard(memory, stream), jumps(_standard(memory, stream), rows)),
-    }
+    states, begins = read_on(memory, stream, usual_error(memory, train, usual))
+    rows, known = _standard(memory, stream), [_standard(memory, e.stream) for e in train]
+    return {"state": Parted(np.tanh(states), begins), "row": Parted(rows, jumps(rows, known, usual))}
 
 
-def usual_error(memory: Memory, episodes: Sequence[Episode]) -> float:
+def usual_error(memory: Memory, episodes: Sequence[Episode], quantile: float) -> float:
     """What the error of a row stays below in these; their first rows, of which little is known yet, do not count."""
     found = []
     for e in episodes:
         reading = read(memory.reader, e.stream[:, None].astype(np.float64))
         found.append(errors(memory, memory.network.at_rest(1), *reading)[0][SHORTEST:, 0])
-    return float(np.quantile(np.concatenate(found), USUAL))
+    return float(np.quantile(np.concatenate(found), quantile))
 
 
 def errors(memory: Memory, c: Array, senses: Array, commands: Array) -> tuple[NDArray[np.float64], Recalled]:
@@ -99,11 +94,11 @@ def read_on(memory: Memory, stream: Rows, usual: float) -> tuple[NDArray[np.floa
     return np.stack(states), np.array(begins)
 
 
-def jumps(rows: Rows, train: Sequence[Rows]) -> NDArray[np.intp]:
+def jumps(rows: Rows, train: Sequence[Rows], quantile: float) -> NDArray[np.intp]:
     """The steps where rows (T, D) move further than in those of ``train``, each number by what it usually moves."""
     steps = np.concatenate([np.diff(x, axis=0) for x in train])
     usual = np.maximum(steps.std(axis=0), 1e-9)
-    most = np.quantile(np.mean((steps / usual) ** 2, axis=1), USUAL)
+    most = np.quantile(np.mean((steps / usual) ** 2, axis=1), quantile)
     begins = [0]
     for t in np.flatnonzero(np.mean((np.diff(rows, axis=0) / usual) ** 2, axis=1) > most) + 1:
         if t - begins[-1] >= SHORTEST:

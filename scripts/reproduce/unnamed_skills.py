@@ -43,6 +43,9 @@ from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters, copybook
 from asm_gym.scripts.reproduce.segments import NEAR, SOURCES, judged, parted, unnamed
 from asm_gym.scripts.reproduce.skill_switch import Switch, record_switch
 
+USUAL = 0.999
+"""Quantile of what is usual within letters."""
+
 EARLY = slice(10, 20)
 """Steps of a segment by which its letter is known: all segments are long enough."""
 
@@ -102,7 +105,7 @@ def one(condition: tuple[int, int], args: Args) -> list[Record]:
     memory = Memory.learned(train, args.hidden, rng, args.steps)
     stream, skill, begins = strung(copybook(letters, args.length, 2, rng), rng)
     records = []
-    for source, found in parted(memory, train, stream).items():
+    for source, found in parted(memory, train, stream, USUAL).items():
         named, skills = unnamed(found, 2 * count + 2, EARLY)
         where = {"domain": "letters", "seed": seed, "skills": count, "source": source, "skills_found": skills}
         records.append(where | judged(found, named, skill, begins))
