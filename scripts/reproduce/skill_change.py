@@ -2,8 +2,8 @@
 
 The arm sorts a can, then a carton of milk, or the other way round. No lesson of the shipped memory held that change.
 Its threshold is the one on its card. What runs is named by what it was told of episodes with one skill each. A random
-forest is told the same of the same rows, and its moments add up too, so that it has what the rows say. Two more rows
-say what limits everybody: a forest that has been shown other changes, and where the hand is.
+forest is told the same of the same rows, and its moments add up too, so that it has what the rows say. Then both are
+shown every other change too, and asked for the rest. One more row says what limits who is not: where the hand is.
 
     right for good    from then on the name is right in every step
     crash             it presses much harder than is usual, as in the evaluation
@@ -92,7 +92,6 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
             "memory of the body": by_memory(memory, told, nominal, switches),
             "memory of the body, shown changes": by_memory_shown(memory, told, nominal, switches),
             "memory that learned from them": by_memory(learned, told, nominal, switches),
-            "that one, shown changes": by_memory_shown(learned, told, nominal, switches),
             "random forest on the rows": by_forest(told, nominal, switches, args.seed),
             "random forest, shown changes": by_forest_shown(told, nominal, switches, args.seed),
             "the nearer place of the hand": by_place(told, switches),
