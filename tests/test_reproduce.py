@@ -394,11 +394,12 @@ def test_a_stream_of_whole_episodes_says_where_they_begin_and_where_their_skills
     spec = StreamSpec((Channel("x", 1, "m"),), dt=0.1)
     first = Episode.from_stream(rows[:5], spec, info={"skill": "a"})
     second = Episode.from_stream(rows[5:], spec, info={"skills": ["b", "a"], "changed": 3})
-    stream, skill, starts, changes = robot_unnamed.joined([first, second])
-    np.testing.assert_array_equal(stream, rows)
-    assert "".join(skill) == "aaaaabbbaaaa"
-    assert starts.tolist() == [0, 5]
-    assert changes.tolist() == [8]
+    stream = robot_unnamed.joined([first, second])
+    np.testing.assert_array_equal(stream.rows, rows)
+    assert "".join(stream.skill) == "aaaaabbbaaaa"
+    assert stream.starts.tolist() == [0, 5]
+    assert stream.changes.tolist() == [8]
+    assert stream.single.tolist() == [True] * 5 + [False] * 7
 
 
 def test_a_segment_is_clustered_by_its_states_and_every_step_gets_its_cluster():

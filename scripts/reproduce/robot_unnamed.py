@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.metrics import adjusted_rand_score
 
 from asm_gym.episodes import Episode
 from asm_gym.monitors.model import running
@@ -31,27 +33,35 @@ def found(seed: int, train: Sequence[Episode], asked: Sequence[Episode], hidden:
     """
     rng = np.random.default_rng(seed)
     memory = Memory.learned(train, hidden, rng, steps)
-    stream, skill, starts, changes = joined([asked[n] for n in rng.permutation(len(asked))])
-    count = len(set(skill))
+    stream = joined([asked[n] for n in rng.permutation(len(asked))])
+    count = len(set(stream.skill))
     records = []
-    for source, own in parted(memory, train, stream, USUAL).items():
+    for source, own in parted(memory, train, stream.rows, USUAL).items():
         named, skills = unnamed(own, 2 * count + 2, *KNOWN_BY)
         where = {"domain": "robosuite", "seed": seed, "skills": count, "source": source, "skills_found": skills}
-        record = where | judged(own, named, skill, np.sort(np.concatenate([starts, changes])))
-        record |= {"starts": share_near(starts, own.begins), "changes": share_near(changes, own.begins)}
+        record = where | judged(own, named, stream.skill, np.sort(np.concatenate([stream.starts, stream.changes])))
+        for name, rows in (("starts", stream.starts), ("changes", stream.changes)):
+            record[name] = share_near(rows, own.begins) if len(rows) else None
+        record["index_single"] = adjusted_rand_score(stream.skill[stream.single], named[stream.single])
         records.append(record)
     return records
 
 
-def joined(
-    episodes: Sequence[Episode],
-) -> tuple[Rows, NDArray[np.str_], NDArray[np.intp], NDArray[np.intp]]:
-    """One stream (T, D) of whole episodes, (T,) the skill that runs, where each episode begins, and where each changes.
+class Stream(NamedTuple):
+    """Whole episodes one after another."""
 
-    A change of skill within an episode goes without a jump.
-    """
+    rows: Rows  # (T, D)
+    skill: NDArray[np.str_]  # (T,) what runs
+    starts: NDArray[np.intp]  # where each episode begins
+    changes: NDArray[np.intp]  # where one skill follows another within an episode, which goes without a jump
+    single: NDArray[np.bool_]  # (T,) rows of episodes with one skill
+
+
+def joined(episodes: Sequence[Episode]) -> Stream:
+    """One stream of these, which say which skill runs in each row."""
     skills = [running(e) for e in episodes]
     starts = np.cumsum([0, *map(len, episodes)])[:-1]
     changes = [start + np.flatnonzero(s[1:] != s[:-1]) + 1 for start, s in zip(starts, skills, strict=True)]
-    stream = np.concatenate([e.stream for e in episodes]).astype(np.float64)
-    return stream, np.concatenate(skills), starts, np.concatenate(changes)
+    single = np.concatenate([np.full(len(s), len(set(s)) == 1) for s in skills])
+    rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)
+    return Stream(rows, np.concatenate(skills), starts, np.concatenate(changes), single)

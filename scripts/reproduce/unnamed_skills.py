@@ -146,6 +146,7 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
         asked = {
             f"skills found, of {len(args.tasks)}": ("skills_found", 1),
             "adjusted Rand index": ("index", 2),
+            "the same, of episodes with one skill": ("index_single", 2),
             "beginnings of episodes, found": ("starts", 2),
             "changes within an episode, found": ("changes", 2),
             "beginnings that are true, of those found": ("true", 2),
