@@ -91,14 +91,17 @@ def test_an_environment_of_the_panda_is_watched_by_the_memory_of_its_body():
     envs.close()
 
 
-def test_a_stream_of_100_hz_has_a_memory_of_its_own_and_a_healthy_episode_is_quiet():
-    env = NeuralASMSafety(gym.make("asm_gym/Lift-v0", stream_freq=100), on_alarm="monitor")
-    assert env.monitor.about["name"] == "panda_100hz"
-    assert env.threshold == NeuralASM.pretrained("panda_100hz").threshold
+@pytest.mark.parametrize("robot", ["Panda", "Sawyer", "IIWA"])
+@pytest.mark.parametrize("stream_freq", [None, 100])
+def test_each_arm_and_rate_has_a_memory_of_its_own_and_a_healthy_episode_is_quiet(robot, stream_freq):
+    env = NeuralASMSafety(gym.make("asm_gym/Lift-v0", robot=robot, stream_freq=stream_freq), on_alarm="monitor")
+    name = robot.lower() + ("_100hz" if stream_freq else "")
+    assert env.monitor.about["name"] == name
+    assert env.threshold == NeuralASM.pretrained(name).threshold
     infos = []
     assert rollout(env, make_policy("scripted", env, seed=4), 4, infos.append)
     assert max(max(info["asm"]["surprises"]) for info in infos) < env.threshold
-    assert len(infos[0]["asm"]["surprises"]) == 5
+    assert len(infos[0]["asm"]["surprises"]) == (5 if stream_freq else 1)
     env.close()
 
 
