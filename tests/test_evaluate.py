@@ -8,6 +8,7 @@ import sys
 import time
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -62,6 +63,14 @@ def test_faulty_episodes_are_twins_until_the_onset(run):
         np.testing.assert_array_equal(episode.stream[:onset], twin[:onset])
         assert episode.faults.argmax() == onset
         assert len(episode) == onset + 40
+
+
+def test_recordings_say_where_the_cube_was_seen(run):
+    env = gym.make("asm_gym/Lift-v0", robot="Panda", observation="dict")
+    for path in sorted((run / "episodes/Lift").glob("*/*.npz"))[::9]:
+        episode = load_episode(path)
+        seen, _ = env.reset(seed=episode.label.seed)
+        np.testing.assert_array_equal(episode.info["goal"], np.append(seen["cube_pos"], seen["gripper_to_cube_pos"]))
 
 
 def test_it_goes_on_where_it_was_killed_and_gives_the_same_table(run):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
@@ -20,6 +20,9 @@ Progress = Callable[[int, int], object]
 
 State = Any
 """A monitor's running state: a value, passed in and handed back, never kept in the monitor."""
+
+Told = Mapping[str, Any]
+"""What an episode says of itself, its ``info``; ``"skill"`` and ``"goal"`` are what models may have to be told."""
 
 
 class Surprise(NamedTuple):
@@ -126,11 +129,11 @@ class Model(Protocol):
         """Takes what another has learned. Raises ValueError where that does not fit together."""
         ...
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> State:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> State:
         """Before the first row of ``batch`` streams: a NamedTuple of arrays whose first axis is B.
 
         Args:
-            skills: which runs in each stream, for models that have to be told; others do not look.
+            told: of each stream its skill and goal, for models that have to be told; others do not look.
         """
         ...
 

@@ -29,7 +29,7 @@ from asm_gym.memory.recall import continued
 from asm_gym.memory.recurrent import RecurrentNetwork, RecurrentWeights, recurrent_shapes
 from asm_gym.memory.specialise import specialise
 from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.model import StreamModel, model_outputs, running
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.stream import StreamSpec
@@ -154,7 +154,7 @@ class MemoryModel(StreamModel):
         self.completion_ = Completion.found(learned, senses)
         return super().restore(learned, skills)
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> MemoryState:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> MemoryState:
         return at_start(batch, self.network, self.lag, self.spec.size, len(self.skills_))
 
     def predict(self, state: MemoryState, rows: NDArray[np.float64]) -> tuple[MemoryState, ModelOutput]:

@@ -13,7 +13,7 @@ from asm_gym.checks import check_number, shown
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episodes import Episode
-from asm_gym.monitors.base import Model, State
+from asm_gym.monitors.base import Model, State, Told
 from asm_gym.stream import StreamSpec
 
 HELD_OUT = 5
@@ -121,17 +121,17 @@ def model_outputs(model: Model, episodes: Sequence[Episode]) -> list[ModelOutput
 
 def side_by_side(
     episodes: Sequence[Episode],
-    start: Callable[[int, Sequence[str]], State],
+    start: Callable[[int, Sequence[Told]], State],
     advance: Callable[[State, NDArray[np.float64]], tuple[State, Any]],
 ) -> Iterator[tuple[list[int], list[Any]]]:
     """Runs many episodes together, the longest first; those that have ended are left out.
 
     Yields, for each group of episodes, their indices and what ``advance`` said of each step.
     """
-    order, skills = sorted(range(len(episodes)), key=lambda i: -len(episodes[i])), skills_of(episodes)
+    order = sorted(range(len(episodes)), key=lambda i: -len(episodes[i]))
     for first in range(0, len(order), AT_ONCE):
         group = order[first : first + AT_ONCE]
-        state, said = start(len(group), [skills[i] for i in group]), []
+        state, said = start(len(group), [episodes[i].info for i in group]), []
         for t in range(len(episodes[group[0]])):
             rows = np.stack([episodes[i].stream[t] for i in group if t < len(episodes[i])]).astype(np.float64)
             state, step = advance(first_of(state, len(rows)), rows)

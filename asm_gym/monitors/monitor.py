@@ -17,7 +17,7 @@ from asm_gym.checks import check_flag, check_number, shown
 from asm_gym.choices import check_choice
 from asm_gym.detection import Detection, ModelOutput, Nominal, Promise, conformal_episodes, conformal_threshold
 from asm_gym.episodes import Episode
-from asm_gym.monitors.base import Model, Progress, Specialises, State, Surprise
+from asm_gym.monitors.base import Model, Progress, Specialises, State, Surprise, Told
 from asm_gym.monitors.model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.nominal import check_nominal
 from asm_gym.monitors.saved import MAXIMA, SavedMonitor
@@ -211,15 +211,16 @@ class CalibratedMonitor:
         self.threshold_, self.maxima_ = conformal_threshold(maxima, rate), maxima
 
     @typed
-    def initial_state(self, batch: int = 1, skills: Sequence[str] = ()) -> MonitorState:
+    def initial_state(self, batch: int = 1, told: Sequence[Told] = ()) -> MonitorState:
         """The state before the first row of ``batch`` streams.
 
         Args:
-            skills: which runs in each, for a model that has to be told; others do not look.
+            told: of each its skill and goal, as ``info`` of an episode says them, for a model that has to be told;
+                others do not look.
         """
         check_number("batch", batch, low=1, whole=True)
         self._fitted()
-        return MonitorState(self.model.start(batch, skills), self.detection.start(batch, len(self.model.error_columns)))
+        return MonitorState(self.model.start(batch, told), self.detection.start(batch, len(self.model.error_columns)))
 
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
         """The next row of each stream: the new state, and how surprising the row was.

@@ -24,7 +24,7 @@ from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
 from asm_gym.memory.network import Network
-from asm_gym.monitors.base import Progress, Surprise
+from asm_gym.monitors.base import Progress, Surprise, Told
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.model import parameter_names
@@ -212,8 +212,8 @@ class NeuralASM(CalibratedMonitor):
             self._row, self._row_of = CompiledRow.of(self.model, self.detection), now
         return self._row
 
-    def initial_state(self, batch: int = 1, skills: Sequence[str] = ()) -> MonitorState:
-        state = super().initial_state(batch, skills)
+    def initial_state(self, batch: int = 1, told: Sequence[Told] = ()) -> MonitorState:
+        state = super().initial_state(batch, told)
         return state if self.skill_ is None else state._replace(skill=self.skill_.monitor.initial_state(batch))
 
     def reset_evidence(self, state: MonitorState) -> MonitorState:

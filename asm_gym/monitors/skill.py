@@ -26,7 +26,7 @@ from asm_gym.episodes import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.memory.state import newest, past
 from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
-from asm_gym.monitors.base import Progress, Surprise
+from asm_gym.monitors.base import Progress, Surprise, Told
 from asm_gym.monitors.model import StreamModel
 from asm_gym.monitors.monitor import CalibratedMonitor
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
@@ -102,7 +102,7 @@ class SkillModel(StreamModel):
             raise ValueError(f"D of a skill should be of shape {shape}, found {learned['D'].shape}")
         return super().restore(learned, skills)
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> SkillState:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> SkillState:
         nothing = np.zeros((batch, self.lag, self.spec.size))
         width = self.senses_.size + len(self.spec.motor) + 1
         return SkillState(at_rest(batch, width), nothing, nothing, np.zeros(batch, np.int64))

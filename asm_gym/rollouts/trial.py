@@ -291,9 +291,20 @@ def record(label: EpisodeLabel, config: RolloutConfig, folder: Path) -> Path:
         faults=recorded.faults,
         contact_force=np.asarray([] if np.isnan(forces).all() else forces, np.float32),
         label=replace(label, affected_channels=frozenset().union(*affected)),
-        info={"skill": label.task},
+        info={"skill": label.task, **goal_in(base, recorded)},
     )
     return save_episode(folder / label.path, kept)
+
+
+def goal_in(env: gym.Env[Any, Any], recorded: Episode) -> dict[str, list[float]]:
+    """``"goal"``: where the objects were seen before the first step [m]; nothing where that is not told apart."""
+    inner = env.unwrapped
+    if not isinstance(inner, RobosuiteEnv) or not len(recorded.observations):
+        return {}
+    objects = {c.name for c in inner.measured_spec.channels if c.group == "object" and c.size == 3}
+    ends = np.cumsum(list(inner.observation_layout.values()))
+    parts = zip(inner.observation_layout, np.split(recorded.observations[0], ends[:-1]), strict=True)
+    return {"goal": [float(number) for name, part in parts if name in objects for number in part]}
 
 
 def watch(trial: Trial, config: RolloutConfig, memory: Path) -> Trace:

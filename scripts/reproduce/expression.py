@@ -222,7 +222,7 @@ class Library:
 
     def express(self, streams: Rows, cue: int) -> Rows:
         library, made = self.library.model, np.full(streams.shape, np.nan)
-        state = library.start(streams.shape[1], self.skills)
+        state = library.start(streams.shape[1], [{"skill": name} for name in self.skills])
         hand = [
             i for n, s in library.spec.slices.items() if n.endswith("hand_position") for i in range(s.start, s.stop)
         ]

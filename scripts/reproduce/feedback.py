@@ -31,7 +31,7 @@ from asm_gym.faults.suite import KINDS, kinds_of
 from asm_gym.memory.association import Association, learn_association, normalised_errors, spans
 from asm_gym.memory.feedback import FEEDBACK
 from asm_gym.monitors import CalibratedMonitor, make_monitor
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
 from asm_gym.monitors.model import StreamModel
 from asm_gym.rollouts.benchmark import detectability_of, judged
@@ -114,7 +114,7 @@ class FedAssociation(StreamModel):
         self.spans_ = spans(self.association_.U)
         return super().restore(learned, skills)
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> Lagged:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> Lagged:
         return nothing_before(batch, self.lag, self.spec.size)
 
     def predict(self, state: Lagged, rows: NDArray[np.float64]) -> tuple[Lagged, ModelOutput]:

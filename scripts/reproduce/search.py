@@ -64,18 +64,18 @@ SETTINGS: dict[str, tuple[Setting, ...]] = {
     "gru+evidence": (
         {},
         {"learning_rate": 3e-3},
-        {"hidden_size": 128},
+        {"hidden_size": 256},
         {"learning_rate": 3e-4},
         {"hidden_size": 512},
     ),
     "lstm_vae+evidence": (
         {},
         {"hidden_size": 256},
-        {"latent_size": 32},
+        {"latent_size": 16},
         {"hidden_size": 64},
         {"learning_rate": 3e-4},
     ),
-    "logpzo+evidence": ({}, {"updates": 4000}, {"width": 512}, {"width": 128}, {"updates": 16000}),
+    "logpzo+evidence": ({}, {"updates": 4000}, {"width": 256}, {"width": 128}, {"updates": 16000}),
 }
 
 

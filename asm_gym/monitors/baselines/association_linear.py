@@ -18,7 +18,7 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episodes import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
 from asm_gym.monitors.model import StreamModel
 from asm_gym.scaling import StreamScaler, rows_apart
@@ -52,7 +52,7 @@ class LinearAssociation(StreamModel):
         self.senses_ = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
         return super().restore(learned, skills)
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> Lagged:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> Lagged:
         return nothing_before(batch, self.lag, self.spec.size)
 
     def predict(self, state: Lagged, rows: NDArray[np.float64]) -> tuple[Lagged, ModelOutput]:

@@ -21,7 +21,7 @@ from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.association import synapses
 from asm_gym.memory.linear import check_inputs
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
 from asm_gym.monitors.baselines.torch_model import FRESH, TorchModel, steps_of
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
@@ -108,7 +108,7 @@ class MLPAssociation(TorchModel):
                 break
         module.load_state_dict(kept_weights)
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> Lagged:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> Lagged:
         return nothing_before(batch, self.lag, self.spec.size)
 
     def predict(self, state: Lagged, rows: NDArray[np.float64]) -> tuple[Lagged, ModelOutput]:

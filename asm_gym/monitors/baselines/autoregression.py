@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.episodes import Episode
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Standard, no_context
 from asm_gym.monitors.model import StreamModel
 
@@ -50,7 +50,7 @@ class Autoregression(StreamModel):
         deviation = np.maximum((Y - Z @ weights).std(axis=0), 1e-9)
         return self.restore({**standard.arrays, "weights": weights, "deviation": deviation})
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> _State:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> _State:
         unknown = np.full((batch, len(self.spec.sensory)), np.nan)
         return _State(unknown, unknown)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.episodes import Episode
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
 from asm_gym.monitors.model import StreamModel
 
@@ -42,7 +42,7 @@ class ElapsedTime(StreamModel):
             spread.append(near.std(axis=0) + 0.01 * overall)
         return self.restore({"mean": np.array(mean), "spread": np.array(spread)})
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> _Clock:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> _Clock:
         return _Clock(np.zeros(batch, np.int64))
 
     def predict(self, state: _Clock, rows: NDArray[np.float64]) -> tuple[_Clock, ModelOutput]:

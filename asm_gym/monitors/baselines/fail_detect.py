@@ -10,7 +10,7 @@ detect failures without failure data? Uncertainty-aware runtime failure detectio
 Burda et al. 2019 (ICLR) for distillation, Lipman et al. 2023 (ICLR) for the flow. There an embedding of images and the
 action is scored; here the sensorimotor row: values, changes and the action.
 
-The networks here are smaller: three layers of 256, 0.2 million weights, where the authors train a one-dimensional U-Net
+The networks here are smaller: three layers of 512, 0.6 million weights, where the authors train a one-dimensional U-Net
 of 256, 512 and 1024 channels, 59 million. On a core that is an hour for each pass over 48,000 rows, and a row takes
 longer to score than it lasts at 20 Hz: a size for a graphics card. ``width`` and ``updates`` go part of the way.
 """
@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Rows, no_context, no_rows, read
 from asm_gym.monitors.baselines.torch_model import TorchModel, adam, descend, steps_of
 from asm_gym.scaling import ScaledRows, StreamScaler
@@ -58,7 +58,7 @@ class _Rowwise(TorchModel):
         self.width = check_number("width", width, low=1, whole=True)
         self.updates = check_number("updates", updates, low=1, whole=True)
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> Rows:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> Rows:
         return no_rows(batch, self.spec.size)
 
     @abstractmethod
@@ -118,6 +118,10 @@ class LogpZO(_Rowwise):
     """A flow from rows to noise."""
 
     kind = "logpzo"
+
+    @typed
+    def __init__(self, spec: StreamSpec, width: int = 512, updates: int = 8000) -> None:
+        super().__init__(spec, width, updates)
 
     @property
     def error_columns(self) -> NDArray[np.intp]:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.torch_model import TorchModel, converge, descend, padded, parted
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.stream import StreamSpec
@@ -64,7 +64,7 @@ class GRU(TorchModel):
     kind = "gru"
 
     @typed
-    def __init__(self, spec: StreamSpec, hidden_size: int = 256, learning_rate: float = 1e-3) -> None:
+    def __init__(self, spec: StreamSpec, hidden_size: int = 128, learning_rate: float = 1e-3) -> None:
         super().__init__(spec)
         self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
         self.learning_rate = check_number("learning_rate", learning_rate, above=0.0)
@@ -90,7 +90,7 @@ class GRU(TorchModel):
 
         converge(module, epoch, lambda: loss(fresh), EPOCHS, tell, self.learning_rate)
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> _Memory:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> _Memory:
         hidden, last = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.senses_.size), np.float32)
         return _Memory(hidden, last, np.zeros((batch, self.spec.size)), np.zeros(batch, np.int64))
 

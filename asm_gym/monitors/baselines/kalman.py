@@ -19,7 +19,7 @@ from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput
 from asm_gym.episodes import Episode
 from asm_gym.memory.linear import check_inputs
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Standard, no_context
 from asm_gym.monitors.model import StreamModel
 from asm_gym.stream import StreamSpec
@@ -72,7 +72,7 @@ class Kalman(StreamModel):
         filtered = {"weights": weights, "gain": gain, "deviation": np.sqrt(np.diag(S))}
         return self.restore(standard.arrays | filtered)
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> _State:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> _State:
         return _State(np.zeros((batch, len(self.spec.sensory))), np.zeros(batch, np.int64))
 
     def predict(self, state: _State, rows: NDArray[np.float64]) -> tuple[_State, ModelOutput]:

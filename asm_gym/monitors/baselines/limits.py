@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.episodes import Episode
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
 from asm_gym.monitors.model import StreamModel
 from asm_gym.stream import StreamSpec
@@ -46,7 +46,7 @@ class _Limit(StreamModel):
     def error_columns(self) -> NDArray[np.intp]:
         return self._columns
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> _Nothing:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> _Nothing:
         return _Nothing(np.zeros(batch, np.bool_))
 
     def predict(self, state: _Nothing, rows: NDArray[np.float64]) -> tuple[_Nothing, ModelOutput]:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput, Nominal
 from asm_gym.detection.scores import Squares
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Rows, no_rows, read
 from asm_gym.monitors.baselines.torch_model import TorchModel, converge, descend, padded, parted
 from asm_gym.scaling import ScaledRows, StreamScaler
@@ -80,7 +80,7 @@ class LSTMVAE(TorchModel):
 
     @typed
     def __init__(
-        self, spec: StreamSpec, hidden_size: int = 128, latent_size: int = 16, learning_rate: float = 1e-3
+        self, spec: StreamSpec, hidden_size: int = 128, latent_size: int = 32, learning_rate: float = 1e-3
     ) -> None:
         super().__init__(spec)
         self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
@@ -120,7 +120,7 @@ class LSTMVAE(TorchModel):
 
         converge(module, epoch, lambda: loss(fresh, noise=0.0), EPOCHS, tell, self.learning_rate)
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> _Memory:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> _Memory:
         nothing = _Cell(*np.zeros((2, batch, self.hidden_size), np.float32))
         return _Memory(nothing, nothing, no_rows(batch, self.spec.size))
 

@@ -19,7 +19,7 @@ from asm_gym.detection.base import Arrays
 from asm_gym.episodes import Episode
 from asm_gym.memory.inference import direct, expect, sense
 from asm_gym.memory.state import MemoryState, past
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
 from asm_gym.monitors.model import StreamModel, model_outputs
 from asm_gym.monitors.neural_asm import NeuralASM
@@ -44,7 +44,7 @@ class _Part(StreamModel):
         self.memory.restore(learned)
         return super().restore(learned, skills)
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> MemoryState:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> MemoryState:
         return self.memory.start(batch)
 
 

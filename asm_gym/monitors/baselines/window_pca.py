@@ -19,7 +19,7 @@ from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput
 from asm_gym.episodes import Episode
 from asm_gym.memory.linear import check_inputs
-from asm_gym.monitors.base import Progress
+from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
 from asm_gym.monitors.model import StreamModel
 from asm_gym.stream import StreamSpec
@@ -65,7 +65,7 @@ class WindowPCA(StreamModel):
         deviation = np.maximum(np.sqrt(np.mean(left**2, axis=0)), FAINTEST)
         return self.restore({"mean": mean, "spread": spread, "components": W, "deviation": deviation})
 
-    def start(self, batch: int, skills: Sequence[str] = ()) -> _Window:
+    def start(self, batch: int, told: Sequence[Told] = ()) -> _Window:
         return _Window(np.zeros((batch, self.rows - 1, self.spec.size)), np.zeros(batch, np.int64))
 
     def predict(self, state: _Window, rows: NDArray[np.float64]) -> tuple[_Window, ModelOutput]:
