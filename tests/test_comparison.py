@@ -1,6 +1,7 @@
 """Tables of monitors, from verdicts made by hand."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,7 +77,10 @@ def test_the_tables_of_a_benchmark_put_the_ideal_observer_first_and_hide_what_no
     assert asm["AUROC, same steps"].startswith("0.750 (")
     # Whole nominal episodes peak at 1, 2, 3 and 4: the push of 5 is above all, the one of 2.5 above half.
     assert asm["AUROC, whole episodes"] == "0.750"
-    assert (asm["at 1 %"], asm["Found at 0.5 %"]) == ("50 %", "")
+    assert (asm["at 1 %"], asm["Found at 0.5 %"]) == ("50 %", "needs 199")
+    assert "Needs: so many calibration episodes" in monitors_table(result).caption
+    enough = replace(RESULT, thresholds={**RESULT.thresholds, 0.005: 4.0})
+    assert "Needs" not in monitors_table(replace(result, monitors={"asm": enough})).caption
     assert (asm["False alarms"], asm["Median delay [ms]"], asm["p95 [ms]"]) == ("1 of 4", "50", "missed")
     assert "left out: noise mild" in monitors_table(result).caption
     assert kinds_table(result).rows[2] == ("(noise mild)", "0.59 / 0 %", "0.00 / 0 %")

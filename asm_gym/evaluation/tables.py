@@ -13,8 +13,9 @@ from typing import Any, Generic, NamedTuple, TypeVar
 from rich.markup import escape
 from rich.table import Table as ConsoleTable
 
+from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import metrics
-from asm_gym.evaluation.comparison import BenchmarkResult
+from asm_gym.evaluation.comparison import RATES, BenchmarkResult
 from asm_gym.evaluation.metrics import ActingMetrics, Delays, DetectionMetrics, KindMetrics, in_words
 from asm_gym.evaluation.resampling import interval
 from asm_gym.evaluation.statistics import Estimate, Share
@@ -193,8 +194,12 @@ def _of_monitor(cell: Callable[[DetectionMetrics], str]) -> Callable[[Compared],
 
 
 def _found(rate: float) -> Callable[[Compared], str]:
+    """Or how many calibration episodes it takes to promise that rate, where there were fewer."""
+
     def cell(m: Compared) -> str:
         share = m.found.get(rate)
+        if share is None and isinstance(m, DetectionMetrics):
+            return f"needs {conformal_episodes(rate)}"
         if share is None or not share.n or not isinstance(m, DetectionMetrics) or rate not in m.draws.found:
             return percent(share)
         return _percent(interval(share.value, m.draws.found[rate]))
@@ -251,6 +256,8 @@ def monitors_table(result: BenchmarkResult) -> Table:
     """Monitors side by side, the ideal observer on top."""
     hidden = [in_words(kind) for kind, seen in result.visible.items() if not seen]
     hidden_kinds = f" Kinds no observer could see, left out: {', '.join(hidden)}." if hidden else ""
+    few = any(rate not in m.found for m in result.on_visible for rate in RATES)
+    needed = " Needs: so many calibration episodes, and there were fewer." if few else ""
     return tabulate(
         f"Detection within {1e3 * result.window_s:.0f} ms of the onset, over kinds of fault and severities that an "
         f"ideal observer can see; thresholds from separate nominal episodes, delays and accuracies at a false-alarm "
@@ -258,7 +265,7 @@ def monitors_table(result: BenchmarkResult) -> Table:
         f"episodes drawn anew. AUROC: against nominal episodes over the same steps, and against the greatest surprise "
         f"of whole ones, as a threshold sees it. Left out are nominal episodes in which the policy failed "
         f"({result.left_out.failed}) or hit something by itself ({result.left_out.crashed}), and faults in such "
-        f"scenes.{hidden_kinds}",
+        f"scenes.{hidden_kinds}{needed}",
         MONITOR_COLUMNS,
         _compared(result),
     )
