@@ -76,6 +76,8 @@ SETTINGS: dict[str, tuple[Setting, ...]] = {
         {"learning_rate": 3e-4},
     ),
     "logpzo+evidence": ({}, {"updates": 4000}, {"width": 256}, {"width": 128}, {"updates": 16000}),
+    "rnd+evidence": ({}, {"updates": 4000}, {"width": 512}, {"width": 128}, {"updates": 16000}),
+    "skill_library+evidence": ({}, {"bases": 20}, {"bases": 80}, {"stiffness": 12.5}, {"stiffness": 50.0}),
 }
 
 
