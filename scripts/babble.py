@@ -26,10 +26,10 @@ from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
-from asm_gym.rollouts.babbling import LED, curriculum, leads, record_lesson
+from asm_gym.rollouts.babbling import curriculum, record_lesson
 from asm_gym.rollouts.benchmark import code_digest
 from asm_gym.rollouts.body import healthy, held_out, learn_body
-from asm_gym.rollouts.examination import Exam, Marks, card, examine, summary
+from asm_gym.rollouts.examination import Exam, Marks, at_rates, card, examine
 from asm_gym.rollouts.folder import claimed, make_missing, versions
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
 from asm_gym.rollouts.progress import stage
@@ -40,6 +40,8 @@ from asm_gym.tasks import task as task_spec
 
 SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
+RATES = 0.01, 0.05
+"""Rates at which an examination is also told."""
 LEARNING = (
     *("memory", "detection", "scaling.py", "stream.py", "rollouts/body.py"),
     *("monitors/memory_model.py", "monitors/monitor.py", "monitors/neural_asm.py"),
@@ -61,10 +63,10 @@ class Args:
     """Tasks to babble in; by default seven with the Panda, and with other arms those of them that their experts do."""
     guides: tuple[str, ...] = ()
     """Agents that lead in turn with the experts, by name or the files of asm-gym train; none by default."""
-    episodes: int = 36
+    episodes: int = 60
     """Lessons in each task; a second call with more of them goes on."""
     reaching: bool = False
-    """Whether the hand reaches for places where noise alone would move it, and experts lead all held-out lessons."""
+    """Whether the hand reaches for places where noise alone would move it."""
     stream_freq: int | None = None
     """Rows of the stream a second [Hz]; one each control step by default."""
     false_alarm_rate: float = 0.05
@@ -72,11 +74,13 @@ class Args:
     exam_tasks: tuple[str, ...] | None = None
     """Further tasks to examine in; by default two that Panda experts do, with other arms those of them they do."""
     exam_policies: tuple[str, ...] | None = None
-    """Agents to examine under; by default all that are shipped and fit this arm."""
+    """Agents to examine under, as guides are named; by default all that are shipped and fit this arm."""
     exam_episodes: int = 12
     """Healthy episodes of each examination; 0 examines nothing."""
     exam_faults: tuple[str, ...] = (TEST,)
-    """Kinds of fault, each medium and strong, where the policy or the task was left out."""
+    """Kinds of fault, each medium and strong but for pushes of 20 N, where the policy or the task was left out."""
+    exam_pushes: int = 3
+    """Pushes of 20 N in each such examination; they are judged by how soon they are noticed."""
     window: float = 1.0
     """How soon after its onset a fault must be noticed [s]."""
     parallel: tyro.conf.OmitArgPrefixes[ParallelConfig] = TWO_PROCESSES
@@ -92,18 +96,18 @@ class Args:
         check_choice("robot", self.robot, ROBOTS)
         for name in (*self.shown, *self.left_out):
             check_choice("task of one arm with a gripper", name, _GRIPPED)
-        shipped = [name for name in self.guides if not name.endswith(".npz")]  # whether a file is there is asked later
-        for name in (*shipped, *(self.exam_policies or ())):
-            check_choice("agent", name, agents())
+        for name in (*self.guides, *(self.exam_policies or ())):
+            if not name.endswith(".npz"):  # whether a file is there is asked later
+                check_choice("agent", name, agents())
         if not self.shown:
             raise ValueError("there must be at least one task to babble in")
         kinds_of(self.exam_faults)
         at_least(0, self, "exam_episodes")
+        at_least(0, self, "exam_pushes")
         if not self.window > 0:
             raise ValueError(f"window must be > 0 s, got {self.window}")
         needed = conformal_episodes(self.false_alarm_rate)
-        calm = [n for n in range(self.episodes) if held_out(n) and leads(n, self.reaching) == LED]
-        there = len(self.shown) * len(calm)
+        there = len(self.shown) * sum(map(held_out, range(self.episodes)))
         if there < needed:
             raise ValueError(
                 f"a false-alarm rate of {self.false_alarm_rate:g} needs {needed} undisturbed lessons to calibrate "
@@ -122,6 +126,7 @@ class Args:
             exam_policies=(),
             exam_episodes=min(2, self.exam_episodes),
             exam_faults=(),
+            exam_pushes=0,
             false_alarm_rate=0.34,
         )
 
@@ -162,7 +167,7 @@ class Args:
 
 
 def check(args: Args) -> None:
-    """Raises what is wrong with the agents that are to lead, before the folder is claimed.
+    """Raises what is wrong with the agents that are to lead or to be examined under, before the folder is claimed.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -177,6 +182,8 @@ def check(args: Args) -> None:
                 f"tasks to babble in: {', '.join(args.shown)}"
             )
         make_policy(guide, environment(home, args.config.settings))
+    for exam in args.exams:
+        make_policy(exam.policy, environment(task_spec(exam.task).id, args.config.settings))
 
 
 def learn(args: Args, console: Console) -> NeuralASM:
@@ -185,7 +192,7 @@ def learn(args: Args, console: Console) -> NeuralASM:
     with stage("babbling", console, {}) as progress:
         make = partial(record_lesson, config=args.config, folder=args.out.resolve())
         files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, args.parallel, progress)
-    lessons = healthy([load_episode(file) for file in files])
+    lessons = healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
     inner: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
     about = {
         "name": args.name,
@@ -214,10 +221,10 @@ def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
     marks = []
     for exam in args.exams:
         config = replace(args.config, policy=exam.policy)
-        folder = (args.out / "exams" / exam.policy).resolve()
+        folder = (args.out / "exams" / exam.policy.removesuffix(".npz").replace("/", "-")).resolve()
         inner: Any = environment(task_spec(exam.task).id, config.settings).unwrapped
         kinds = [] if exam.known else [k for k in kinds_of(args.exam_faults) if possible(k, inner)]
-        labels = exam.labels(args.exam_episodes, kinds, args.seed)
+        labels = exam.labels(args.exam_episodes, kinds, args.seed, 0 if exam.known else args.exam_pushes)
         with stage(exam.name, console, {}) as progress:
             make = partial(record, config=config, folder=folder)
             make_missing(make, labels, partial(_place, folder=folder), args.parallel, progress)
@@ -239,10 +246,11 @@ def babble(args: Args, console: Console) -> None:
         memory = learn(args, console)
         marks = examined(args, memory, console) if args.exam_episodes else []
         if marks:
-            table = card(marks, memory, args.window)
-            (args.out / "card.md").write_text(f"{markdown(table)}\n\n{summary(marks)}\n", encoding="utf-8")
+            others = [rate for rate in RATES if rate != args.false_alarm_rate]
+            table, said = card(marks, memory, args.window), at_rates(marks, memory, others)
+            (args.out / "card.md").write_text(f"{markdown(table)}\n\n{said}\n", encoding="utf-8")
             console.print(console_table(table))
-            console.print(summary(marks))
+            console.print(said)
     console.print(f"Wrote {args.out / args.name}.asm: NeuralASMSafety(env, NeuralASM.load(...)) watches with it")
 
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,7 +23,7 @@ from rich.console import Console
 from asm_gym.choices import check_choice
 from asm_gym.datasets import read_dataset
 from asm_gym.episodes import Episode, load_episode
-from asm_gym.policies.network import NetworkPolicy
+from asm_gym.policies.network import NetworkPolicy, describe
 from asm_gym.rollouts.collect import check as check_policy
 from asm_gym.rollouts.collect import collect_to
 from asm_gym.rollouts.folder import claimed
@@ -29,6 +31,7 @@ from asm_gym.rollouts.parallel import THIS_PROCESS, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.learners import ALGORITHMS
+from asm_gym.rollouts.training.recurrent import RECURRENT, clone_recurrent
 from asm_gym.rollouts.training.run import BEST, CLONE, Plan, TrainingRun, success_rate
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import at_least, run
@@ -39,6 +42,9 @@ KEPT = ("env_id", "algorithm", "robot", "demonstrations", "dataset", "cloning_up
 FREE = ("task", "out", "quick", "parallel")
 """What is left out of the command that is noted down."""
 
+Curve = tuple[tuple[int, float], ...]
+"""Control steps, and the share of successes after them."""
+
 
 @dataclass(frozen=True)
 class Args:
@@ -47,7 +53,7 @@ class Args:
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")] = "Lift"
     """Name of a task, or any Gymnasium id with Box spaces."""
     algorithm: str = "sac"
-    """sac, td3 or ppo."""
+    """sac, td3 or ppo; or gru, a recurrent clone, with steps 0."""
     robot: str | None = None
     """The arm; the task's own by default."""
     steps: int = 20_000
@@ -76,7 +82,7 @@ class Args:
     """Few demonstrations, few steps: to see that everything runs."""
 
     def __post_init__(self) -> None:
-        check_choice("algorithm", self.algorithm, ALGORITHMS)
+        check_choice("algorithm", self.algorithm, (*ALGORITHMS, RECURRENT))
         if self.task not in gym.registry:
             task_spec(self.task)
         at_least(1, self, "cloning_updates", "evaluate_every", "evaluation_episodes", "final_episodes")
@@ -84,6 +90,8 @@ class Args:
         at_least(0, self, "steps", "demonstrations")
         if not self.steps and not self.demonstrations and self.dataset is None:
             raise ValueError("there is nothing to learn from: neither steps nor demonstrations")
+        if self.algorithm == RECURRENT and self.steps:
+            raise ValueError(f"{RECURRENT} learns from demonstrations alone: steps must be 0, got {self.steps}")
 
     def scaled(self) -> Args:
         """With ``quick``, little of everything."""
@@ -159,22 +167,15 @@ def _train(args: Args, console: Console) -> dict[str, Any]:
     start = time.perf_counter()
     with stage("recording demonstrations", console, seconds) as tick:
         episodes = demonstrate(args, tick)
-    run = TrainingRun(args.plan, args.out, episodes)
-    try:
-        with stage("cloning", console, seconds) as tick:
-            run.begin(tick)
-        with stage("learning", console, seconds) as tick:
-            run.learn(tick)
-        with stage("judging", console, seconds):
-            agent = NetworkPolicy.load(args.out / (BEST if args.steps else CLONE)).fit_to(run.env, "the agent")
-            seeds = episode_seeds(args.seed, args.final_episodes, stage=3)
-            success = success_rate(agent, run.env, seeds)
-    finally:
-        run.close()
+    learn = _cloned if args.algorithm == RECURRENT else _learned
+    agent, curve = learn(args, episodes, console, seconds)
+    with stage("judging", console, seconds), closing(args.plan.make()) as env:
+        seeds = episode_seeds(args.seed, args.final_episodes, stage=3)
+        success = success_rate(agent.fit_to(env, "the agent"), env, seeds)
     result = {
         "success": success,
         "episodes": args.final_episodes,
-        "curve": run.state.curve,
+        "curve": curve,
         "seconds": seconds,
         "minutes": round((time.perf_counter() - start) / 60, 1),
         "command": _command(args),
@@ -182,6 +183,28 @@ def _train(args: Args, console: Console) -> dict[str, Any]:
     agent.save(args.out / "agent.npz", **result)
     (args.out / "result.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     return result
+
+
+def _learned(
+    args: Args, episodes: Sequence[Episode], console: Console, seconds: dict[str, float]
+) -> tuple[NetworkPolicy, Curve]:
+    """The best agent of its evaluations, and what those found."""
+    with closing(TrainingRun(args.plan, args.out, episodes)) as training:
+        with stage("cloning", console, seconds) as tick:
+            training.begin(tick)
+        with stage("learning", console, seconds) as tick:
+            training.learn(tick)
+        return NetworkPolicy.load(args.out / (BEST if args.steps else CLONE)), training.state.curve
+
+
+def _cloned(
+    args: Args, episodes: Sequence[Episode], console: Console, seconds: dict[str, float]
+) -> tuple[NetworkPolicy, Curve]:
+    """A recurrent clone, which nothing evaluates on the way."""
+    with stage("cloning", console, seconds) as tick, closing(args.plan.make()) as env:
+        agent = clone_recurrent(episodes, args.cloning_updates, args.seed, tick)
+        agent.trained_in = describe(env)
+    return agent, ()
 
 
 def _command(args: Args) -> str:

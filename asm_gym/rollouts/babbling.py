@@ -2,11 +2,13 @@
 
     a_t = clip(e_t + s x_t),   x_t = ρ x_{t-1} + √(1 - ρ²) ξ_t      e the guide's action, 0 without one; ξ white
 
-Each lesson is one episode. Two in five are the expert's own, at many speeds; in two of five noise drives the expert off
-its course, in jerks or slowly; in one noise alone moves the arm, or the hand reaches for one place after another, for
-nothing there. In half of all the arm stops now and then, whatever it holds or leans on, and in half a thing weighs more
-or less. No noise is so strong that most of a lesson would be hits: those taught the memory to expect them, and cost
-more faults than they spared alarms. One lesson in three is not learned from: the threshold is set on those.
+Each lesson is one episode. One in three is the expert's own and not learned from: the threshold is set on those. Of the
+others two in five are the expert's own too, at many speeds; in two of five noise drives the expert off its course, in
+jerks or slowly; in one noise alone moves the arm, or the hand reaches for one place after another, for nothing there.
+Where there is noise, the arm also drifts now and then, turning and with what it holds, as agents do once they have done
+their task. In half of all lessons the arm stops now and then, whatever it holds or leans on, and in half a thing weighs
+more or less. No noise is so strong that most of a lesson would be hits: those taught the memory to expect them, and
+cost more faults than they spared alarms.
 
 Sources: Laskey et al. 2017 (CoRL, DART) for noise on an expert's commands; Saegusa et al. 2009 (ROBIO) for babbling.
 """
@@ -49,6 +51,13 @@ WEIGHT = 0.7, 1.4
 """What the mass of a thing is multiplied by."""
 PAUSE, PAUSED = 0.01, (5, 60)
 """Probability in a step that the arm stops, and for how many steps."""
+DRIFT, DRIFTED, DRIFTING = 0.01, (5, 60), (0.05, 0.5)
+"""Probability in a step of a disturbed lesson that the arm drifts, for how many steps, and by which commands [action
+units]."""
+
+LOOSENED, LOOSE = 0.05, 0.05
+"""Probability in a step of a disturbed lesson that the grip is commanded more or less firmly from then on, and the
+least share of what the guide would: agents seldom command it all, and a gripper may go by the sign alone."""
 
 
 class Lesson(NamedTuple):
@@ -64,6 +73,7 @@ class Lesson(NamedTuple):
         speed: of a scripted guide, relative to its usual one.
         pause: probability in a step that the arm stops for a while.
         weight: what the mass of the task's thing is multiplied by.
+        drift: probability in a step that the arm drifts for a while, in one direction that is drawn.
     """
 
     task: str
@@ -75,6 +85,7 @@ class Lesson(NamedTuple):
     speed: float = 1.0
     pause: float = 0.0
     weight: float = 1.0
+    drift: float = 0.0
 
     @property
     def path(self) -> Path:
@@ -120,11 +131,9 @@ def curriculum(
 
 
 def leads(number: int, reaching: bool = False) -> str:
-    """What leads the lesson of this number; where hands reach, the expert leads each that the threshold is set on."""
+    """What leads the lesson of this number: the expert alone, where the threshold is set on it."""
     usual = LEADING[number % len(LEADING)]
-    if not reaching:
-        return usual
-    return LED if held_out(number) else REACHING if usual == ALONE else usual
+    return LED if held_out(number) else REACHING if reaching and usual == ALONE else usual
 
 
 def _lesson(task: str, number: int, seed: int, lead: str, guides: Sequence[str]) -> Lesson:
@@ -139,6 +148,7 @@ def _lesson(task: str, number: int, seed: int, lead: str, guides: Sequence[str])
         speed=float(rng.uniform(*SPEED)),
         pause=PAUSE * float(rng.random() < 0.5),
         weight=float(np.exp(rng.uniform(*np.log(WEIGHT)))) if rng.random() < 0.5 else 1.0,
+        drift=DRIFT * (lead != LED),
     )
 
 
@@ -155,7 +165,7 @@ class Babbler:
         self._noise = self._rng.standard_normal(env.action_space.shape or ())
         self._grip = np.isin(np.arange(len(self._noise)), list(getattr(env.unwrapped, "gripper_actions", ())))
         self._fumbles = bool(self._rng.random() < 0.5)
-        self._left = 0
+        self._left, self._course, self._grasp = 0, np.zeros_like(self._noise), 1.0
 
     def predict(
         self,
@@ -172,11 +182,26 @@ class Babbler:
         if self._guide is not None:
             meant, state = self._guide.predict(observation, state, episode_start)
             # A hand that never keeps hold would never learn what holding feels like.
+            if lesson.noise and rng.random() < LOOSENED:
+                self._grasp = rng.uniform(LOOSE, 1.0)
+            meant = np.where(self._grip, self._grasp, 1.0) * meant
             action = np.where(self._grip & (not self._fumbles), 0.0, action) + meant
-        self._left = self._left - 1 if self._left else int(rng.integers(*PAUSED)) * (rng.random() < lesson.pause)
+        self._left = self._left - 1 if self._left else self._leaves()
         if self._left:  # it keeps its grip
-            action = np.where(self._grip, action, 0.0)
+            action = np.where(self._grip, action, self._course)
         return np.clip(action, -1.0, 1.0).astype(np.float32), state
+
+    def _leaves(self) -> int:
+        """For how many steps nothing leads from now on: 0, or as long as the arm stops or drifts."""
+        rng, lesson = self._rng, self._lesson
+        if rng.random() < lesson.pause:
+            self._course = np.zeros_like(self._noise)
+            return int(rng.integers(*PAUSED))
+        if rng.random() < lesson.drift:
+            strength = np.exp(rng.uniform(*np.log(DRIFTING)))
+            self._course = strength * rng.standard_normal(self._noise.shape)
+            return int(rng.integers(*DRIFTED))
+        return 0
 
 
 def _guide(lesson: Lesson, env: gym.Env[Any, Any]) -> Policy | None:

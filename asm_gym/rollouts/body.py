@@ -13,10 +13,13 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import Progress
 from asm_gym.rollouts.training.exploration import SHORTEST, Gentle, peak_torques
 
+EXPERT = "scripted"
+"""The guide that says what is usual."""
 HELD_OUT = 3
 """One in so many lessons of a task is not learned from: the threshold is set on those."""
-LEARNED_UP_TO = 2.0
-"""How many times what an undisturbed expert usually feels at most may be felt in what is learned from."""
+LEARNED_UP_TO, DISTURBED_UP_TO = 2.0, 1.0
+"""How many times what an undisturbed expert usually feels at most may be felt in what is learned from, of a guide's own
+course and of a disturbed one. In the latter contact is an accident: a memory that knows it feels no push."""
 AROUND_S = 0.2
 """What is left out before and after a hit [s]."""
 PASSES = 4
@@ -34,7 +37,7 @@ class Lessons(NamedTuple):
     Attributes:
         fit: to learn from.
         calibration: of lessons that are not learned from, those that are as healthy as a policy that does its task: the
-            expert's own course, and solved.
+            guide's own course, and solved.
     """
 
     fit: list[Episode]
@@ -42,29 +45,32 @@ class Lessons(NamedTuple):
 
 
 def healthy(recordings: Sequence[Episode]) -> Lessons:
-    """What of each recording presses no harder than is usual, as told by its guide where nothing disturbs it.
+    """What of each recording presses no harder than is usual, as told by the expert where nothing disturbs it.
 
-    Noise drives arms into tables and joints into their stops. That is no fault of the body, but a memory that takes it
-    for usual would be blind to every collision. So learning goes up to twice what the guide usually feels at most in
-    that task, and the threshold is set on what stays below once that. Where noise alone leads, all guides tell.
+    Noise drives arms into tables and joints into their stops, and so do agents that are half trained. That is no fault
+    of the body, but a memory that takes it for usual would be blind to every collision. So learning goes up to twice
+    what the expert usually feels at most in that task, and up to once that where a guide was disturbed. The threshold
+    is set on what stays below once that.
 
     Raises:
         ValueError: a task has no undisturbed lesson that was solved, to measure by, or too little is left.
     """
-    felt: defaultdict[str, defaultdict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
+    felt: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
     for episode in recordings:
-        if _undisturbed(episode):
+        if _undisturbed(episode) and _lesson(episode)["guide"] == EXPERT:
             most = float(np.nanmax(episode.contact_force)), float(peak_torques(episode).max())
-            felt[episode.labelled.task][_lesson(episode)["guide"]].append(most)
+            felt[episode.labelled.task].append(most)
     missing = {e.labelled.task for e in recordings} - set(felt)
     if missing:
-        raise ValueError(f"no undisturbed lesson of {', '.join(sorted(missing))} was solved, to say what is usual")
+        raise ValueError(
+            f"no undisturbed lesson of {', '.join(sorted(missing))} was solved by the expert, to say what is usual"
+        )
     found = Lessons([], [])
     for episode in recordings:
-        there = felt[episode.labelled.task]
-        usual = np.median(there.get(_lesson(episode)["guide"]) or [m for own in there.values() for m in own], axis=0)
+        usual = np.median(felt[episode.labelled.task], axis=0)
         if not held_out(_lesson(episode)["number"]):
-            found.fit.extend(gentle_pieces(episode, Gentle(*(LEARNED_UP_TO * usual))))
+            share = DISTURBED_UP_TO if _lesson(episode)["noise"] else LEARNED_UP_TO
+            found.fit.extend(gentle_pieces(episode, Gentle(*(share * usual))))
         elif _undisturbed(episode):
             found.calibration.extend(gentle_pieces(episode, Gentle(*usual)))
     if not all(found):
@@ -106,7 +112,7 @@ def gentle_pieces(episode: Episode, limit: Gentle) -> list[Episode]:
 
 
 def _undisturbed(episode: Episode) -> bool:
-    """Whether an expert did its task in its own way."""
+    """Whether a guide did its task in its own way."""
     return episode.success and _lesson(episode)["noise"] == 0.0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ from asm_gym.tasks import task as task_spec
 SEVERITIES = "medium", "strong"
 """Of the faults in an examination; mild ones are hardly to be seen."""
 
+PUSH = "push", "medium"
+"""Kind and severity of a push of 20 N."""
 PROMPT_S = 0.1
 """How soon a push should be noticed [s]."""
 
@@ -35,20 +38,21 @@ class Exam(NamedTuple):
     @property
     def name(self) -> str:
         """For people."""
-        who = "expert" if self.policy == "scripted" else self.policy
+        who = "expert" if self.policy == "scripted" else "/".join(Path(self.policy).with_suffix("").parts[-2:])
         return f"{self.task}, {who}" + ("" if self.known else " (left out)")
 
-    def labels(self, episodes: int, kinds: Sequence[str], seed: int) -> list[EpisodeLabel]:
-        """Nominal episodes; and a twin of the first for each of ``kinds`` and severity, the second for the next."""
+    def labels(self, episodes: int, kinds: Sequence[str], seed: int, pushes: int = 0) -> list[EpisodeLabel]:
+        """Nominal episodes; and a twin of the first for each of ``kinds`` and severity, the second for the next.
+
+        Then pushes of 20 N, in the last of the scenes.
+        """
         seeds = role_seeds(seed, self.task, "nominal", episodes)
         horizon = task_spec(self.task).horizon
         nominal = [EpisodeLabel(self.task, "nominal", seed=s) for s in seeds]
         faults = [(kind, severity) for kind in kinds for severity in SEVERITIES]
-        twins = [seeds[n % episodes] for n in range(len(faults))]
-        return nominal + [
-            EpisodeLabel(self.task, "faulty", *fault, s, draw_onset(s, horizon))
-            for fault, s in zip(faults, twins, strict=True)
-        ]
+        pairs = [(fault, seeds[n % episodes]) for n, fault in enumerate(faults)]
+        pairs += [(PUSH, s) for s in seeds[::-1][:pushes] if (PUSH, s) not in pairs]
+        return nominal + [EpisodeLabel(self.task, "faulty", *fault, s, draw_onset(s, horizon)) for fault, s in pairs]
 
 
 class Marks(NamedTuple):
@@ -59,14 +63,27 @@ class Marks(NamedTuple):
         solved: traces of healthy episodes in which the task was solved.
         crashed: of those in which it was, but something pressed twice as hard as is usual there.
         failed: of those in which it was not.
-        metrics: on the faults that an ideal observer could see, in scenes where the policy does not crash by itself.
+        pushes: those of pushes of 20 N.
+        metrics: on the other faults that an ideal observer could see. Of all faults those are left out in whose scenes
+            the policy crashes by itself.
     """
 
     name: str
     solved: list[Trace]
     crashed: list[Trace]
     failed: list[Trace]
+    pushes: list[Trace]
     metrics: DetectionMetrics
+
+    def at(self, threshold: float) -> Marks:
+        """What it would have made of it at another threshold."""
+
+        def judged(traces: Sequence[Trace]) -> list[Trace]:
+            return [t.at(threshold) for t in traces]
+
+        solved, crashed, failed, pushes = map(judged, (self.solved, self.crashed, self.failed, self.pushes))
+        metrics = DetectionMetrics(self.name, judged(self.metrics.faulty), solved, self.metrics.window_s)
+        return Marks(self.name, solved, crashed, failed, pushes, metrics)
 
 
 def examine(
@@ -79,11 +96,12 @@ def examine(
     twins = [r for r in recordings if r.labelled.role == "nominal"]
     faulty = [r for r in recordings if r.labelled.role == "faulty" and r.labelled.seed not in hit]
     seen = visible_kinds(detectability_of(twins, faulty, window))
-    faults = [t for t in traces if t.onset is not None and t.seed not in hit and seen[t.kind, t.severity]]
+    visible = [t for t in traces if t.onset is not None and t.seed not in hit and seen[t.kind, t.severity]]
+    pushes, faults = ([t for t in visible if ((t.kind, t.severity) == PUSH) is want] for want in (True, False))
     nominal = [t for t in traces if t.kind == NOMINAL]
     done, failed = ([t for t in nominal if t.outcome.success is want] for want in (True, False))
     solved, crashed = ([t for t in done if (t.seed in hit) is want] for want in (False, True))
-    return Marks(exam.name, solved, crashed, failed, DetectionMetrics(exam.name, faults, solved, window))
+    return Marks(exam.name, solved, crashed, failed, pushes, DetectionMetrics(exam.name, faults, solved, window))
 
 
 COLUMNS: Sequence[Column[Marks]] = (
@@ -113,12 +131,23 @@ def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Ta
 
 
 def summary(marks: Sequence[Marks]) -> str:
-    """Alarms and faults found in all exams together."""
+    """Alarms, and faults and pushes found, in all exams together."""
     solved = Share.of([bool(t.false_alarms) for m in marks for t in m.solved])
     found = Share(sum(m.metrics.detected.k for m in marks), sum(m.metrics.detected.n for m in marks))
-    pushes = [t.delay for m in marks for t in m.metrics.faulty if (t.kind, t.severity) == ("push", "medium")]
-    prompt = Share.of([delay is not None and delay <= PROMPT_S + 1e-9 for delay in pushes])
+    delays = [t.delay for m in marks for t in m.pushes]
+    prompt = Share.of([delay is not None and delay <= PROMPT_S + 1e-9 for delay in delays])
     return (
-        f"In all: {count(solved)} healthy episodes alarm, {count(found)} faults found, {count(prompt)} pushes of 20 N "
-        f"noticed within {1e3 * PROMPT_S:.0f} ms."
+        f"{count(solved)} healthy episodes alarm, {count(found)} faults found, {count(prompt)} pushes of 20 N "
+        f"noticed within {1e3 * PROMPT_S:.0f} ms"
     )
+
+
+def at_rates(marks: Sequence[Marks], memory: CalibratedMonitor, rates: Sequence[float]) -> str:
+    """``summary`` at the memory's threshold, and at that of each of ``rates`` that it can promise."""
+    said = [f"In all: {summary(marks)}."]
+    for rate in rates:
+        with suppress(ValueError):  # it was calibrated on too few
+            threshold = memory.threshold_at(rate)
+            there = summary([m.at(threshold) for m in marks])
+            said.append(f"At the threshold for {rate:g}, {threshold:.3g}: {there}.")
+    return " ".join(said)
