@@ -29,8 +29,8 @@ from asm_gym.policies.registry import EXPERTS, agents, trained_in
 from asm_gym.rollouts.babbling import curriculum, record_lesson
 from asm_gym.rollouts.benchmark import code_digest
 from asm_gym.rollouts.body import healthy, held_out, learn_body
-from asm_gym.rollouts.examination import Exam, Marks, at_rates, card, examine
-from asm_gym.rollouts.folder import claimed, make_missing, versions
+from asm_gym.rollouts.examination import Exam, Marks, at_rates, card, examine, usual_force
+from asm_gym.rollouts.folder import claimed, labelled, make_missing, versions
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.trial import RolloutConfig, environment, record
@@ -219,6 +219,7 @@ def learn(args: Args, console: Console) -> NeuralASM:
 def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
     """What the memory made of each exam, whose missing episodes are recorded."""
     marks = []
+    usual: dict[str, float] = {}  # of each task, by its expert, who comes first
     for exam in args.exams:
         config = replace(args.config, policy=exam.policy)
         folder = (args.out / "exams" / exam.policy.removesuffix(".npz").replace("/", "-")).resolve()
@@ -228,7 +229,9 @@ def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
         with stage(exam.name, console, {}) as progress:
             make = partial(record, config=config, folder=folder)
             make_missing(make, labels, partial(_place, folder=folder), args.parallel, progress)
-            marks.append(examine(memory, exam, folder, labels, args.window))
+            recordings = labelled(folder, labels)
+            expected = usual.setdefault(exam.task, usual_force(recordings))
+            marks.append(examine(memory, exam.name, recordings, args.window, expected))
     return marks
 
 

@@ -12,7 +12,7 @@ import pytest
 from asm_gym.episodes import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.trace import Trace
-from asm_gym.monitors import NeuralASM
+from asm_gym.monitors import NeuralASM, Surprise
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.registry import SHIPPED
 from asm_gym.policies.scripted.base import ObservationReader
@@ -30,7 +30,7 @@ from asm_gym.rollouts.babbling import (
 )
 from asm_gym.rollouts.benchmark import detectability_of, onset_row
 from asm_gym.rollouts.body import healthy, held_out
-from asm_gym.rollouts.examination import Exam, Marks, at_rates
+from asm_gym.rollouts.examination import Exam, Marks, at_rates, examine, usual_force
 from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.reaching import AROUND, PACE, TURNED, Reaching
 from asm_gym.rollouts.trial import RolloutConfig
@@ -278,6 +278,23 @@ def test_an_examination_is_told_at_each_rate_that_the_memory_can_promise():
         "At the threshold for 0.1, 2: 1 of 2 healthy episodes alarm, 1 of 1 faults found, "
         "2 of 2 pushes of 20 N noticed within 100 ms."
     )
+
+
+def test_an_agent_that_crashes_in_most_of_its_episodes_does_not_say_what_is_usual():
+    def nominal(seed, force, success=True):
+        label = EpisodeLabel("Lift", "nominal", seed=seed)
+        return replace(lesson_of([0, force, 0] * 20, [0] * 60), label=label, success=success)
+
+    agents_own = [nominal(0, 9), nominal(1, 80), nominal(2, 90), nominal(3, 500, success=False)]
+    assert usual_force(agents_own) == 80
+    memory = SimpleNamespace(threshold=1.0, spec=ARM, score_episodes=lambda episodes: [quiet(e) for e in episodes])
+    marks = examine(memory, "Lift", agents_own, 1.0, usual=10.0)
+    assert [[t.seed for t in own] for own in (marks.solved, marks.crashed, marks.failed)] == [[0], [1, 2], [3]]
+
+
+def quiet(episode):
+    """No surprise at all."""
+    return Surprise(np.zeros(len(episode)), np.zeros_like(episode.stream))
 
 
 @pytest.mark.parametrize("rows", [1, 5])

@@ -7,7 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from asm_gym.episodes import EpisodeLabel
+import numpy as np
+
+from asm_gym.episodes import Episode, EpisodeLabel
 from asm_gym.evaluation.comparison import visible_kinds
 from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, false_alarms_per_hour
 from asm_gym.evaluation.statistics import Share
@@ -15,7 +17,7 @@ from asm_gym.evaluation.tables import Column, Table, count, milliseconds, percen
 from asm_gym.evaluation.trace import NOMINAL, Trace
 from asm_gym.monitors import CalibratedMonitor
 from asm_gym.rollouts.benchmark import detectability_of, traces_of
-from asm_gym.rollouts.folder import crashes, labelled
+from asm_gym.rollouts.folder import CRASH
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.tasks import task as task_spec
 
@@ -61,7 +63,7 @@ class Marks(NamedTuple):
     Attributes:
         name: of the exam.
         solved: traces of healthy episodes in which the task was solved.
-        crashed: of those in which it was, but something pressed twice as hard as is usual there.
+        crashed: of those in which it was, but something pressed twice as hard as is usual under the task's expert.
         failed: of those in which it was not.
         pushes: those of pushes of 20 N.
         metrics: on the other faults that an ideal observer could see. Of all faults those are left out in whose scenes
@@ -86,13 +88,24 @@ class Marks(NamedTuple):
         return Marks(self.name, solved, crashed, failed, pushes, metrics)
 
 
-def examine(
-    memory: CalibratedMonitor, exam: Exam, folder: Path, labels: Sequence[EpisodeLabel], window: float
-) -> Marks:
-    """What ``memory`` makes of the recordings of these labels; faults are to be found within ``window`` [s]."""
-    recordings = labelled(folder, labels)
-    traces = traces_of(exam.name, memory, recordings, memory.threshold)
-    hit = {seed for _, seed in crashes(recordings)}
+def usual_force(recordings: Sequence[Episode]) -> float:
+    """What healthy episodes that succeed usually feel at most [N]; infinite where none does, or none says it."""
+    nominal = [e for e in recordings if e.labelled.role == "nominal" and e.success]
+    most = [float(np.nanmax(e.contact_force)) for e in nominal if np.isfinite(e.contact_force).any()]
+    return float(np.median(most)) if most else np.inf
+
+
+def examine(memory: CalibratedMonitor, name: str, recordings: Sequence[Episode], window: float, usual: float) -> Marks:
+    """What ``memory`` makes of the recordings of an exam.
+
+    Args:
+        name: of the exam.
+        window: within which faults are to be found [s].
+        usual: what the task's expert usually feels at most [N]: an agent that crashes in half of its episodes does not
+            say what is usual.
+    """
+    traces = traces_of(name, memory, recordings, memory.threshold)
+    hit = {e.labelled.seed for e in recordings if CRASH * usual < usual_force([e]) < np.inf}
     twins = [r for r in recordings if r.labelled.role == "nominal"]
     faulty = [r for r in recordings if r.labelled.role == "faulty" and r.labelled.seed not in hit]
     seen = visible_kinds(detectability_of(twins, faulty, window))
@@ -101,7 +114,7 @@ def examine(
     nominal = [t for t in traces if t.kind == NOMINAL]
     done, failed = ([t for t in nominal if t.outcome.success is want] for want in (True, False))
     solved, crashed = ([t for t in done if (t.seed in hit) is want] for want in (False, True))
-    return Marks(exam.name, solved, crashed, failed, pushes, DetectionMetrics(exam.name, faults, solved, window))
+    return Marks(name, solved, crashed, failed, pushes, DetectionMetrics(name, faults, solved, window))
 
 
 COLUMNS: Sequence[Column[Marks]] = (
@@ -122,9 +135,9 @@ def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Ta
     learned = f"learned from {about['lessons']} lessons of {', '.join(about['tasks'])} ({about['rows']} rows)"
     limit = f"threshold {memory.threshold:.3g} from {about['calibrated_on']} others at {about['false_alarm_rate']:g}"
     return tabulate(
-        f"{about['name']}: {learned}, {limit}. Episodes with an alarm, apart those that solved the task, "
-        "those that solved it but pressed twice as hard as is usual there, and those that failed; faults of medium and "
-        f"strong severity that an ideal observer could see, found within {window:g} s.",
+        f"{about['name']}: {learned}, {limit}. Episodes with an alarm, apart those that solved the task, those that "
+        "solved it but pressed twice as hard as its expert usually does at most, and those that failed; faults of "
+        f"medium and strong severity that an ideal observer could see, found within {window:g} s.",
         COLUMNS,
         marks,
     )
