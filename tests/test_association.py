@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from asm_gym.memory.association import (
+    ROWS_PER_INPUT,
+    Association,
     association_change,
     complete,
     hidden_units,
@@ -86,6 +88,32 @@ def test_what_is_linear_is_known_exactly_and_noise_is_not_learned_by_heart():
     assert w.remainder[2] < 2e-4  # tied to the others exactly
     error = inputs[:, 3] - complete(hidden_units(inputs, w.V), inputs, w.U, w.D)[:, 3]
     assert error.std() > 0.9 * delta[:, 3].std()  # tied to nothing
+
+
+def few(rows: int) -> Association:
+    """Association from rows of two groups with one cause, each change a line of the past and of noise they share."""
+    rng = np.random.default_rng(6)
+    past = rng.normal(size=(rows, 3))
+    noise = rng.normal(size=(rows, 1))
+    delta = past @ np.array([[0.5, 0.0], [0.0, -0.7], [0.2, 0.2]]) + 0.3 * noise
+    inputs = np.hstack([past, delta, np.ones((rows, 1))]).astype(np.float32)
+    return learn_association(inputs, inputs[:, 3:5], np.array([0, 1]), slice(3, 5), 8, rng, updates=20)
+
+
+def test_from_few_rows_changes_are_expected_from_the_past_alone_and_by_a_line():
+    w = few(ROWS_PER_INPUT * 6 - 1)
+    for nothing in (w.U, w.W_S, w.b_S):
+        assert not nothing.any()
+    assert not w.D[:, 3:5].any()  # what the others do now
+    np.testing.assert_allclose(w.D[:, :3], [[0.5, 0.0, 0.2], [0.0, -0.7, 0.2]], atol=0.12)
+    np.testing.assert_allclose(w.remainder, 0.3, rtol=0.2)
+    assert w.V.any()  # units that names can be read from
+
+
+def test_from_more_rows_what_one_sense_tells_of_another_is_known():
+    w = few(ROWS_PER_INPUT * 6)
+    np.testing.assert_allclose([w.D[0, 4], w.D[1, 3]], 1.0, atol=0.05)
+    assert w.U.any() or w.W_S.any()
 
 
 def test_where_nothing_is_linear_the_others_change_as_by_synapses_of_nothing():

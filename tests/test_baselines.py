@@ -188,7 +188,7 @@ def test_the_parts_of_the_memory_expect_what_it_does():
     rows = episodes(1, seed=6)[0].stream.astype(np.float64)
     both = [association.model.memory, temporal.model.memory]
     assert all(np.array_equal(m.network.weights.W_C, both[0].network.weights.W_C) for m in both)  # learned alike
-    assert temporal.detection.detector_.context_quantile.any()
+    assert len(temporal.detection.detector_.context_quantile) == 2 * both[0].hidden_size + 1  # its state
     assert len(association.detection.detector_.context_quantile) == 1  # no context: only a bias
     # What the temporal network expects is better than nothing expected at all, on episodes that it has not seen.
     state, left, all_of_it = temporal.model.start(1), [], []

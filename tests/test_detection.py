@@ -20,7 +20,7 @@ from asm_gym.detection import (
     whitening,
     worst_case,
 )
-from asm_gym.detection.habituation import USUAL, Habituation, habituate, usual, usual_levels
+from asm_gym.detection.habituation import STEPS_PER_NUMBER, USUAL, Habituation, habituate, usual, usual_levels
 from asm_gym.detection.tails import TAIL_INDEX
 
 
@@ -190,6 +190,18 @@ def test_what_is_usual_in_a_context_alarms_no_more_than_elsewhere():
         calm.append(value[settled & (run.contexts[:, 0] == 0)])
     a, b = (np.quantile(np.concatenate(v), 0.95) for v in (rough, calm))
     assert 0.6 < a / b < 1.7  # 16 without habituation, for the evidence is squared
+
+
+def test_what_is_usual_in_a_context_is_left_out_where_few_steps_tell_of_it():
+    few, enough = 4 * STEPS_PER_NUMBER - 1, 4 * STEPS_PER_NUMBER  # two numbers, now and lately
+    rng = np.random.default_rng(3)
+    for steps, learned in ((few, False), (enough, True)):
+        nominal = runs(rng, 1, steps)
+        how = nominal, [], [0.8, 0.2], 10.0, 1e-3, np.random.default_rng(0)
+        found, without = Detector.fit(*how), Detector.fit(*how, habituates=False)
+        assert found.context_quantile[:-1].any() == learned
+        same = np.array_equal(judged(found, nominal[0]), judged(without, nominal[0]))
+        assert same != learned
 
 
 def test_a_fault_in_a_calm_error_is_not_drowned_by_a_wild_one():

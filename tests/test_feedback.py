@@ -50,7 +50,7 @@ def test_what_is_given_nothing_else_is_taught_by_the_transposed_weights():
 
 
 def test_a_memory_remembers_how_it_was_taught(tmp_path):
-    episodes = sine_episodes(6)
+    episodes = sine_episodes(16)
     taught = NeuralASM(episodes[0].spec, hidden_size=8, association_size=16, epochs=1, feedback="learned").fit(episodes)
     plain = NeuralASM(episodes[0].spec, hidden_size=8, association_size=16, epochs=1).fit(episodes)
     assert not np.array_equal(taught.learned_["V"], plain.learned_["V"])

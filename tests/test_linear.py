@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from asm_gym.episodes import Episode
-from asm_gym.memory.linear import PENALTIES, conditional, learn_linear, moments
+from asm_gym.memory.linear import FEW_PENALTY, PENALTIES, conditional, learn_from_past, learn_linear, moments
 from asm_gym.monitors import make_monitor
 from asm_gym.stream import Channel, StreamSpec
 
@@ -33,6 +33,17 @@ def test_one_inverse_gives_the_ridge_regression_of_every_group_on_all_else(penal
         np.testing.assert_allclose(D[g == GROUPS][:, others], W.T, atol=1e-6)
         assert not D[g == GROUPS][:, own].any()
         np.testing.assert_allclose(a @ D[g == GROUPS].T - a[:, own], X @ W - Y, atol=1e-5)
+
+
+def test_from_few_rows_each_change_is_the_ridge_regression_on_all_that_is_no_change():
+    a = rows(60)
+    D, exact = learn_from_past(a, CHANGES), a.astype(np.float64)
+    past = np.setdiff1d(np.arange(12), np.arange(12)[CHANGES])
+    X, Y = (exact[:, part] - exact[:, part].mean(axis=0) for part in (past, CHANGES))
+    W = np.linalg.solve(X.T @ X / len(X) + FEW_PENALTY * np.eye(len(past)), X.T @ Y / len(X))
+    np.testing.assert_allclose(D[:, past], W.T, atol=1e-5)
+    assert not D[:, CHANGES].any()
+    np.testing.assert_allclose((exact @ D.T).mean(axis=0), exact[:, CHANGES].mean(axis=0), atol=1e-4)
 
 
 def test_each_sense_gets_the_penalty_that_fresh_rows_ask_for():

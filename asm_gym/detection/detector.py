@@ -21,7 +21,7 @@ from asm_gym.checks import check_flag, check_number, shown
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Array, Arrays, ModelOutput, Nominal, Place
 from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, accumulate, no_evidence, pool, strength
-from asm_gym.detection.habituation import usual_levels
+from asm_gym.detection.habituation import STEPS_PER_NUMBER, usual_levels
 from asm_gym.detection.repetition import (
     MOST_BEYOND,
     REPETITION_OFFSET,
@@ -144,10 +144,10 @@ class Detector:
         plain = cls(matrix, ones, ones, np.zeros(1), ANYTHING, a, bound)
         everything = [*learned, *held_out]
         ceiling, tail = worst_case(np.array([plain._strengths(r)[0].max(axis=0) for r in everything]))
-        if not habituates:
-            nothing = np.zeros(2 * everything[0].contexts.shape[1] + 1)
-            return cls(matrix, ceiling, tail, nothing, np.zeros(2), a, bound)
-        apart = -(-sum(len(r.errors) for r in everything) // MOST_ROWS)
+        steps, numbers = sum(len(r.errors) for r in everything), 2 * everything[0].contexts.shape[1]
+        if not habituates or steps < STEPS_PER_NUMBER * numbers:
+            return cls(matrix, ceiling, tail, np.zeros(numbers + 1), np.zeros(2), a, bound)
+        apart = -(-steps // MOST_ROWS)
         contexts, levels = [], []
         for r in everything:
             strengths, lately = plain._strengths(r)

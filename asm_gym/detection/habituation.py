@@ -33,6 +33,9 @@ FEWEST = 40
 BATCH = 512
 RATE = 1e-2
 
+STEPS_PER_NUMBER = 8
+"""With fewer nominal steps than that for each number of a context, nothing is learned of what is usual in it."""
+
 EXTREME = 0.005
 """Share of nominal steps beyond l, and beyond h."""
 

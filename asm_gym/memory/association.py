@@ -10,7 +10,8 @@
 
 A joint that moves and a hand that does not, a torque commanded and none measured: each group is completed from the
 rest, so that what a body cannot do is an error, in whatever skill. What is linear is solved at once; the hidden units
-learn what is left of it, and are believed as far as rows that they have not learned bear them out.
+learn what is left of it, and are believed as far as rows that they have not learned bear them out. From very few rows
+neither the one nor the other is known: D then reads the past and the command alone, and U and W_S are 0.
 
 The rule equals the gradient of a Huber loss, and Uᵀ is the transpose of the weights that predict (weight transport):
 this is backpropagation through one layer, at one moment, and only ΔU is local. Nor is D, from the inverse of what all
@@ -30,8 +31,8 @@ from numpy.typing import NDArray
 
 from asm_gym.memory.energy import Array, activate, kernel, outward
 from asm_gym.memory.learning import Synapse, coincidence, cosine_decay, shuffled
-from asm_gym.memory.linear import learn_linear, tried_on
-from asm_gym.memory.precision import learn_precision, log_variance
+from asm_gym.memory.linear import learn_from_past, learn_linear, tried_on
+from asm_gym.memory.precision import PRECISION_EPOCHS, learn_precision, log_variance
 
 UPDATES, PASSES = 6000, 40
 """Batches learned from at most, and passes over the steps at most: with more, few steps would be learned by heart."""
@@ -43,6 +44,9 @@ WARM_UP = 0.1
 
 TICKS = 20
 """How often learning tells of its progress."""
+
+ROWS_PER_INPUT = 12
+"""With fewer rows than that for each input, what one sense tells of another is not known well enough to judge by."""
 
 SMALLEST_SPREAD = np.float32(1e-4)
 """Of what is left of a change: below it, single precision is what is heard."""
@@ -222,12 +226,17 @@ def learn_association(
         updates, passes: over batches and over the N steps, at most.
         feedback: how errors come back to the hidden units; by the transposed weights where None.
     """
-    D = learn_linear(a, groups, changes)
+    few = len(a) < ROWS_PER_INPUT * a.shape[1]
+    D = learn_from_past(a, changes) if few else learn_linear(a, groups, changes)
     remainder = np.maximum(np.sqrt(np.mean((delta - a @ D.T) ** 2, axis=0)), SMALLEST_SPREAD)  # (X,)
+    exists = synapses(groups, changes, a.shape[1], size)
+    if few:
+        for _ in range(TICKS + PRECISION_EPOCHS):
+            tick()
+        return _linear_alone(D, remainder, _random(exists.V, rng))
     left = (delta - a @ D.T) / remainder
     fresh = len(tried_on(a))
     shown = max(len(a) - fresh, 1)
-    exists = synapses(groups, changes, a.shape[1], size)
     V, U = _learn_hidden(a[:shown], left[:shown], exists, rng, tick, updates, passes, feedback or Feedback())
     # How far it goes wrong in rows that it has learned says too little of how far it will.
     f, left = hidden_units(a[-fresh:], V), left[-fresh:]
@@ -235,6 +244,18 @@ def learn_association(
     W_S, b_S = np.zeros_like(U), np.zeros(len(U), np.float32)
     learn_precision(f, left - f @ U.T, W_S, b_S, rng, tick)
     return Association(V, U * remainder[:, None], D, W_S, b_S, remainder)
+
+
+def _linear_alone(D: Array, remainder: Array, V: Array) -> Association:
+    """With units that nothing is expected from: names may be read from them."""
+    nothing = np.zeros((len(D), len(V)), np.float32)
+    return Association(V, nothing, D, nothing.copy(), np.zeros_like(remainder), remainder)
+
+
+def _random(exists: Array, rng: np.random.Generator) -> Array:
+    """V (M, I) before anything is learned, 0 where there is no synapse."""
+    V: Array = rng.standard_normal(exists.shape).astype(np.float32) / np.float32(np.sqrt(exists.shape[1])) * exists
+    return V
 
 
 def trust(left: Array, expected: Array) -> Array:
@@ -256,7 +277,7 @@ def _learn_hidden(
 ) -> tuple[Array, Array]:
     """V and U from N rows (N, I) and what the linear part leaves of them (N, X), standardised."""
     updates = max(TICKS, min(updates, passes * len(a) // BATCH))
-    V = rng.standard_normal(exists.V.shape).astype(np.float32) / np.float32(np.sqrt(a.shape[1])) * exists.V
+    V = _random(exists.V, rng)
     U, nothing = np.zeros_like(exists.U), exists.D[:, :0]
     into, out_of = Synapse(V), Synapse(U)
     spread = np.ones(left.shape[1], np.float32)

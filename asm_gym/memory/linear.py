@@ -4,7 +4,8 @@
     Δ̂_g = m_g + D_g (a_t - m),     D_g = -P_gg⁻¹ P_g·      0 from g itself
 
 One inverse serves every group: D_g is the ridge regression of group g on everything else. λ is chosen for each sense by
-the error that it leaves in rows that C has not seen, and D then follows from all rows.
+the error that it leaves in rows that C has not seen, and D then follows from all rows. From few rows it is given, and
+D reads the past and the command alone.
 
 Sources: Besag 1975 (parts given the rest) and Lauritzen 1996 for conditionals of a Gaussian; Hoerl and Kennard 1970 for
 ridge regression.
@@ -29,6 +30,9 @@ EXACT = 1e-8
 
 MOST_INPUTS = 8192
 """C of these takes 0.5 GiB, and its eigenvectors minutes."""
+
+FEW_PENALTY = 1e-4
+"""λ where rows are too few to choose it by: the last of them may all be of one skill, and then ask for far too much."""
 
 HELD_OUT = 5
 """One in so many rows, the last ones, shows what was learned from the others is worth."""
@@ -93,6 +97,12 @@ def learn_linear(a: Array, groups: NDArray[np.intp], changes: slice) -> NDArray[
         if np.any(best == n):
             D[best == n] = conditional(everything, penalty, groups, changes)[best == n]
     return D.astype(np.float32)
+
+
+def learn_from_past(a: Array, changes: slice) -> NDArray[np.float32]:
+    """D (X, I) from few rows (N, I): no change reads what another sense does now, as if all were of one group."""
+    one_group = np.zeros(len(np.arange(a.shape[1])[changes]), np.intp)
+    return conditional(moments(a), FEW_PENALTY, one_group, changes).astype(np.float32)
 
 
 def tried_on(a: Array) -> Array:
