@@ -52,7 +52,7 @@ class Cell(NamedTuple):
         (r, z, n), (r_h, z_h, n_h) = (
             np.split(v, 3, axis=-1) for v in (x @ self.W_x.T + self.b_x, h @ self.W_h.T + self.b_h)
         )
-        reset, update = (1.0 / (1.0 + np.exp(-v)) for v in (r + r_h, z + z_h))
+        reset, update = (np.exp(-np.logaddexp(0.0, -v)) for v in (r + r_h, z + z_h))
         return np.asarray((1.0 - update) * np.tanh(n + reset * n_h) + update * h, np.float32)
 
     @classmethod

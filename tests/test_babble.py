@@ -203,9 +203,9 @@ def undisturbed(**about):
     return replace(lesson_of([5, 9, 0] * 20, [1, 2, 3] * 20, number=2), **about)
 
 
-def test_a_threshold_is_set_on_solved_lessons_that_nothing_disturbed_and_that_press_as_usual():
+def test_a_threshold_is_set_on_solved_lessons_that_nothing_disturbed_but_where_they_crash():
     learned = [lesson_of([9, 0] * 30, [3] * 60, number=n) for n in (0, 1, 3)]
-    hard = lesson_of([9] * 25 + [9.1] + [0] * 34, [3] * 60, number=5)
+    hard = lesson_of([9] * 10 + [18] * 15 + [18.1] + [0] * 34, [3] * 60, number=5)
     noisy = lesson_of([9] * 60, [3] * 60, noise=0.1, number=8)
     found = healthy([*learned, undisturbed(), hard, noisy, undisturbed(success=False)])
     assert [len(e) for e in found.calibration] == [60, 21, 30]

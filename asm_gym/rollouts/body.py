@@ -50,7 +50,7 @@ def healthy(recordings: Sequence[Episode]) -> Lessons:
     Noise drives arms into tables and joints into their stops, and so do agents that are half trained. That is no fault
     of the body, but a memory that takes it for usual would be blind to every collision. So learning goes up to twice
     what the expert usually feels at most in that task, and up to once that where a guide was disturbed. The threshold
-    is set on what stays below once that.
+    is set on what stays below twice that: beyond is a crash.
 
     Raises:
         ValueError: a task has no undisturbed lesson that was solved, to measure by, or too little is left.
@@ -72,7 +72,7 @@ def healthy(recordings: Sequence[Episode]) -> Lessons:
             share = DISTURBED_UP_TO if _lesson(episode)["noise"] else LEARNED_UP_TO
             found.fit.extend(gentle_pieces(episode, Gentle(*(share * usual))))
         elif _undisturbed(episode):
-            found.calibration.extend(gentle_pieces(episode, Gentle(*usual)))
+            found.calibration.extend(gentle_pieces(episode, Gentle(*(LEARNED_UP_TO * usual))))
     if not all(found):
         raise ValueError(f"{len(recordings)} lessons leave too little that is healthy: record more")
     return found
