@@ -183,7 +183,8 @@ def check(args: Args) -> None:
             )
         make_policy(guide, environment(home, args.config.settings))
     for exam in args.exams:
-        make_policy(exam.policy, environment(task_spec(exam.task).id, args.config.settings))
+        if exam.policy.endswith(".npz"):
+            make_policy(exam.policy, environment(task_spec(exam.task).id, args.config.settings))
 
 
 def learn(args: Args, console: Console) -> NeuralASM:
