@@ -51,6 +51,16 @@ class Actions:
         found: NDArray[np.float64] = self._low + self._half * (action.astype(np.float64) + 1.0)
         return found
 
+    def slowed(self, simulation: Simulation, action: NDArray[np.float32], most: float) -> NDArray[np.float32]:
+        """(A,) the action at which no hand is commanded to go faster than ``most`` [m/s]; the same where none is."""
+        shares = [(part, s) for part, s in simulation.slowed(self.scaled(action), most) if s < 1.0]
+        if not shares:
+            return action
+        slow, rest = action.copy(), self.resting(simulation, action)
+        for part, share in shares:
+            slow[part] = rest[part] + np.float32(share) * (action[part] - rest[part])
+        return slow
+
     def turning(self, simulation: Simulation, turns: NDArray[np.float64]) -> NDArray[np.float32]:
         """(A,) the action that turns the arms' joints by ``turns`` (J,) [rad], as nearly as one step can.
 
