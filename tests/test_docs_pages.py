@@ -64,7 +64,7 @@ def test_printing_replaces_what_was_printed_and_keeps_the_text_around_it(page):
     assert "After." in again.text
     assert "```text\n42\n```" in again.text
     assert "41" not in again.text
-    assert again.meta["code"] == pages.digest(["stream.py"])
+    assert again.meta["code"] == pages.digest(["spec.py"])
     assert again.meta["date"] == datetime.date.today()
     assert not again.is_old
     assert not again.says_so
@@ -87,7 +87,7 @@ def test_a_command_that_fails_leaves_the_page_as_it_was(page):
 
 def test_a_mark_comes_and_goes_with_the_code(page):
     assert page.marked().says_so
-    page.meta.update(code=pages.digest(["stream.py"]), stale=True)
+    page.meta.update(code=pages.digest(["spec.py"]), stale=True)
     assert not page.marked().says_so
 
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.scripts.cli import main as cli
 from asm_gym.scripts.reproduce import (
     INDEPENDENT,
@@ -37,6 +37,7 @@ from asm_gym.scripts.reproduce.expression import (
     mean_demonstrations,
     recalled,
 )
+from asm_gym.scripts.reproduce.fault_sets import written_trial
 from asm_gym.scripts.reproduce.handwriting import (
     NOISE,
     STEPS,
@@ -45,8 +46,7 @@ from asm_gym.scripts.reproduce.handwriting import (
     repertoire,
 )
 from asm_gym.scripts.reproduce.laws import LAWS, fit
-from asm_gym.scripts.reproduce.trials import written_trial
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 
 def letters_of(count: int, each: int = 6, seed: int = 0) -> tuple[list, list]:

@@ -11,8 +11,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import as_float32, check_flag, check_number, check_numbers, check_text, shown
-from asm_gym.choices import check_choice
 from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.cameras import RENDER_MODES, Pictures
@@ -21,8 +19,9 @@ from asm_gym.envs.layout import Layout
 from asm_gym.envs.rewards import Rewards, RewardTerms
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Corruption, SensorErrors
 from asm_gym.envs.simulation import Simulation
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import as_float32, check_choice, check_flag, check_number, check_numbers, check_text, shown
 
 _BAD = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
