@@ -101,11 +101,11 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
         if header.get("kind") != kind:
             raise _OtherCheckpointError(f"{path} is a checkpoint of {header.get('kind')!r}, not of {kind!r}")
         names = {n.removesuffix(".npy") for n in file.namelist() if n != HEADER}
-        declared = header.pop("arrays")
-        if set(declared) != names:
+        declared = header.pop("arrays", None)  # the shipped agents declare none
+        if declared is not None and set(declared) != names:
             raise ValueError(f"its header declares other arrays: {', '.join(sorted(set(declared) ^ names))}")
         arrays = {name: _read(file, f"{name}.npy") for name in sorted(names)}
-        for name, as_declared in declared.items():
+        for name, as_declared in (declared or {}).items():
             if [arrays[name].dtype.str, *arrays[name].shape] != as_declared:
                 raise ValueError(f"{name} is {arrays[name].dtype} {arrays[name].shape}, and declared otherwise")
     return Checkpoint(header, arrays)
