@@ -14,7 +14,7 @@ printed = documents.tool("printed")
 
 TEXT = """---
 command: echo 42
-rooms: [stream.py]
+rooms: [spec.py]
 version: 0.0.1
 date: 2026-01-01
 code: unrecorded
@@ -50,7 +50,7 @@ def test_a_page_older_than_the_code_it_measures_says_so():
 def test_a_stale_page_carries_a_banner_and_a_fresh_one_only_its_command(page):
     old, fresh = printed.banner(page), printed.banner(page.printed_anew("42"))
     assert "**Stale.**" in old
-    assert "`stream.py`" in old
+    assert "`spec.py`" in old
     assert "Stale" not in fresh
     assert "echo 42" in old
     assert "echo 42" in fresh
