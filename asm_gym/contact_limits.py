@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_flag, check_number
-from asm_gym.stream import Channel
+from asm_gym.spec import Channel
+from asm_gym.validation import check_flag, check_number
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,9 @@ class ContactLimits:
         fixed = [self.wrist_force if c.name.endswith("wrist_force") else self.external_torque for c in felt]
         most = np.repeat(fixed, [c.size for c in felt]).astype(np.float64)
         if self.healthy and len(self.healthy) != len(most):
-            raise ValueError(f"healthy must say {len(most)} numbers, one for each that is felt, got {len(self.healthy)}")
+            raise ValueError(
+                f"healthy must say {len(most)} numbers, one for each that is felt, got {len(self.healthy)}"
+            )
         return np.maximum(most, self.healthy) if self.healthy else most
 
     @property

@@ -8,8 +8,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.checks import as_float32
 from asm_gym.envs.simulation import Simulation
+from asm_gym.validation import as_float32
 
 _CHANGES = ("OSC_POSE", "JOINT_POSITION")
 """Controllers whose actions are changes of where the arm is."""

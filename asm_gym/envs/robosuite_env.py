@@ -11,8 +11,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import as_float32, check_flag, check_number, check_numbers, check_text, shown
-from asm_gym.choices import check_choice
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
@@ -22,8 +20,9 @@ from asm_gym.envs.layout import Layout
 from asm_gym.envs.rewards import Rewards, RewardTerms
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Corruption, SensorErrors
 from asm_gym.envs.simulation import Expected, Simulation
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import as_float32, check_choice, check_flag, check_number, check_numbers, check_text, shown
 
 _BAD = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
@@ -437,7 +436,10 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         forces = dict(zip(names, (np.nan,) * 3 if unstable else felt, strict=True))
         if self.contact_limits is not None:
             left = self.left_band_s
-            forces |= {"contact_load": np.inf if unstable else sim.load, "contact_left_s": np.nan if left is None else left}
+            forces |= {
+                "contact_load": np.inf if unstable else sim.load,
+                "contact_left_s": np.nan if left is None else left,
+            }
         return info | {"success": success, **forces, "unstable": unstable}
 
     def _bad_count(self) -> int:

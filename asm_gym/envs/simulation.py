@@ -18,6 +18,7 @@ from asm_gym.envs.nominal import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
 from asm_gym.envs.views import ACTS, ARMED, FELT, JOINTS, LEFT, Band, Goals, Views
 
+
 class Expected(NamedTuple):
     """What the arms are to feel in the substeps of a control step, as ``Simulation.felt`` lays it out."""
 
@@ -83,9 +84,7 @@ class Simulation:
         # Where the numbers of ``felt`` stand in a band: arm, and place.
         self._felt_places = np.nonzero([[i >= JOINTS or i < n for i in range(FELT)] for n in self._arms.joints])
         joints = np.zeros((n, JOINTS))
-        self._goals = Goals(
-            np.zeros((n, 3)), np.zeros((n, 3, 3)), joints, joints.copy(), np.zeros(n, np.int64)
-        )
+        self._goals = Goals(np.zeros((n, 3)), np.zeros((n, 3, 3)), joints, joints.copy(), np.zeros(n, np.int64))
         self._deltas = np.zeros((n, JOINTS))
         self._turns = np.tile(np.eye(3), (n, 1, 1))
         self._samples[:] = 0.0
