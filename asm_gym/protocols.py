@@ -6,8 +6,10 @@ from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.contact_limits import ContactLimits
 from asm_gym.spec import Channel, StreamSpec
 
 
@@ -24,6 +26,9 @@ class HoldsItself(Protocol):
 
     holding: bool
     """Set, the arms stay in the next control step, and the grippers keep what they were told; the step unsets it."""
+
+    keeps_holding: bool
+    """Set, no step unsets ``holding``: for wrappers in between that make several steps of one."""
 
 
 @runtime_checkable
@@ -76,11 +81,27 @@ class FeelsWithinSteps(Protocol):
 
 
 @runtime_checkable
+class LimitsContact(Protocol):
+    """It compares what its arms feel with limits in every physics substep, and stays where one is passed."""
+
+    felt_channels: tuple[Channel, ...]
+    contact_limits: ContactLimits | None
+    """Of this episode; ``reset`` forgets them."""
+
+    def slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(A,) what is commanded in the place of ``action``, by the speed that the limits allow a hand."""
+        ...
+
+
+@runtime_checkable
 class LaysOutObservations(Protocol):
     """It says what its observations are made of."""
 
     observation_layout: dict[str, int]
     """Their parts in order, by the names of channels, and how many numbers each has."""
+
+    laid_out_space: spaces.Space[Any]
+    """Of these observations, before any wrapper changes them."""
 
 
 @runtime_checkable

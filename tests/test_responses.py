@@ -10,8 +10,8 @@ from asm_gym.policies.reflexes import Graded
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.arbitration import Arbiter
-from asm_gym.wrappers.arguments import make_fallback
+from asm_gym.wrappers.arbiter import Arbiter
+from asm_gym.wrappers.factory import make_fallback
 from asm_gym.wrappers.patience import Patience
 from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, Responder, responses_from
 from tests.fakes import CueMonitor, FakeEnv

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from asm_gym.policies.reflexes import Graded
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.arguments import REFLEXES, make_patience
+from asm_gym.wrappers.factory import REFLEXES, make_patience
 from tests.fakes import SPEC, CueMonitor, FakeEnv
 
 ACT = np.array([0.3, -0.2, 1.0], np.float32)
@@ -205,12 +205,12 @@ def test_a_monitor_learns_on_the_job_only_when_asked_and_never_from_an_override(
     learned: list[tuple[int, float]] = []
     run(NeuralASMSafety(FakeEnv(), Learner([2]), on_alarm="hold", release_after=2), 7)
     assert not learned
-    run(NeuralASMSafety(FakeEnv(), Learner([2]), on_alarm="hold", release_after=2, learning_rate=0.25), 7)
+    run(NeuralASMSafety(FakeEnv(), Learner([2]), on_alarm="hold", release_after=2, online_learning_rate=0.25), 7)
     assert learned == [(t, 0.25) for t in (0, 1, 2, 5, 6)]  # steps 3 and 4 were held
     with pytest.raises(ValueError, match="CueMonitor cannot learn"):
-        NeuralASMSafety(FakeEnv(), CueMonitor(), learning_rate=0.1)
+        NeuralASMSafety(FakeEnv(), CueMonitor(), online_learning_rate=0.1)
     with pytest.raises(ValueError, match=r"learning_rate must be a number in \[0, 1\], got 3"):
-        NeuralASMSafety(FakeEnv(), Learner(), learning_rate=3)
+        NeuralASMSafety(FakeEnv(), Learner(), online_learning_rate=3)
 
 
 class Broken:

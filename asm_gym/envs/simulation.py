@@ -224,7 +224,7 @@ class Simulation:
     # ------------------------------------------------------------------ knowledge of the robot
 
     def slowed(self, action: NDArray[np.float64], most: float) -> list[tuple[slice, float]]:
-        """For each arm, its part of the action, and the share of it at which its hand goes no faster than ``most`` [m/s].
+        """For each arm, its part of the action, and what share of it keeps its hand below ``most`` [m/s].
 
         A controller that is asked for a change Δx of pose again and again, from where it is, comes to the velocity
         Kp/Kd Δx. Actions of controllers that take anything else are left as they are.
