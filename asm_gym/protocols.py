@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
@@ -99,9 +98,6 @@ class LaysOutObservations(Protocol):
 
     observation_layout: dict[str, int]
     """Their parts in order, by the names of channels, and how many numbers each has."""
-
-    laid_out_space: spaces.Space[Any]
-    """Of these observations, before any wrapper changes them."""
 
 
 @runtime_checkable

@@ -52,8 +52,9 @@ class Situation(NamedTuple):
         stops: the response ends the episode, and has been held for long enough.
         overdue: the reflex has acted for as long as it may.
         quiet: surprise has been low for long enough, and nothing touches.
-        free: what touched has been gone for long enough.
-        waited: the reflex has acted for long enough for a trial, and nobody knows whether something touches.
+        free: what touched has been gone for long enough, and nothing presses.
+        waited: the reflex has acted for long enough for a trial, nothing presses, and nobody knows whether something
+            touches.
         settled: the trial has gone well for long enough.
     """
 
@@ -86,9 +87,6 @@ TRANSITIONS = (
     Transition("*", _POLICY, None, lambda s: s.alarm and s.goes_on, "an alarm whose cause lets the policy go on"),
     Transition("override", _POLICY, State.REFLEX, lambda s: s.alarm, "any other alarm"),
     Transition("", (State.TRIAL,), State.POLICY, lambda s: s.settled, "no alarm for `release_after`"),
-    Transition("give_up", (State.REFLEX,), State.ENDED, lambda s: s.stops, "response `stop`, held for `try_after`"),
-    Transition("give_up", (State.REFLEX,), State.ENDED, lambda s: s.overdue, "acted for `max_override`"),
-    Transition("", (State.REFLEX,), None, lambda s: s.presses, "still presses"),
     Transition(
         "*", (State.REFLEX,), State.TRIAL, lambda s: s.alarm and s.goes_on, "the cause turns out to be a sensor"
     ),
@@ -96,8 +94,10 @@ TRANSITIONS = (
         "release", (State.REFLEX,), State.TRIAL, lambda s: s.quiet, "quiet for `release_after`, nothing touches"
     ),
     Transition("release", (State.REFLEX,), State.TRIAL, lambda s: s.free, "what touched has gone"),
+    Transition("give_up", (State.REFLEX,), State.ENDED, lambda s: s.stops, "response `stop`, held for `try_after`"),
+    Transition("give_up", (State.REFLEX,), State.ENDED, lambda s: s.overdue, "acted for `max_override`"),
     Transition(
-        "trial", (State.REFLEX,), State.TRIAL, lambda s: s.waited, "held for `try_after`, nothing is known to touch"
+        "trial", (State.REFLEX,), State.TRIAL, lambda s: s.waited, "held for `try_after`, nothing known to touch"
     ),
 )
 """What leads from one state to another: the first that holds. Where none does, nothing changes."""
@@ -401,8 +401,8 @@ class Arbiter:
             stops=stopping and c.held >= (rule.try_after or rule.release_after),
             overdue=c.acted >= (rule.max_override or math.inf),
             quiet=not stopping and c.quiet >= rule.release_after and not sensed.touched,
-            free=not stopping and c.free >= rule.free_after << min(c.returned, 16),
-            waited=not stopping and c.held >= c.wait and sensed.touched is None,
+            free=not (stopping or sensed.presses) and c.free >= rule.free_after << min(c.returned, 16),
+            waited=not (stopping or sensed.presses) and c.held >= c.wait and sensed.touched is None,
             settled=c.since > rule.release_after,
         )
 

@@ -35,7 +35,7 @@ TRUST_S = 1.0
 LONGEST_S = 20.0
 """No sense is completed for longer than this [s]."""
 
-MOST_MISSING = 1.0 / 3.0
+MOST_MISSING = 0.5
 """Where more than this share of the senses is missing, what is left tells too little of them."""
 
 FARTHEST = 6.0
@@ -220,8 +220,10 @@ class ObservationMap:
     def __init__(self, env: gym.Env[Any, Any], spec: StreamSpec) -> None:
         self._space, inner = env.observation_space, env.unwrapped
         if isinstance(inner, LaysOutObservations) and env.has_wrapper_attr("stream_spec"):
-            if self._space != inner.laid_out_space:
-                raise ValueError(f"a wrapper inside has changed the observation, which was {inner.laid_out_space}")
+            # One of many environments has the space of all, wrapped, and says what its own was.
+            own = getattr(inner, "laid_out_space", env.unwrapped.observation_space)
+            if self._space != own:
+                raise ValueError(f"a wrapper inside has changed the observation, which was {own}")
             self._places = _laid_out(inner.observation_layout, spec, self._space)
         elif not env.has_wrapper_attr("stream_spec") and isinstance(self._space, spaces.Box):
             self._places = [Place("", spec.sensory, np.arange(len(spec.sensory)))]

@@ -377,9 +377,8 @@ def watch_each(
 ) -> list[ScoredEpisode]:
     """The traces of one trial with each of ``actings``, of which those that must be the same run once.
 
-    The ideal reflex's is that of the policy alone, where nothing touches the body and no sense is at fault. Where nothing
-    but senses is
-    at fault, it is the one in which nothing goes wrong.
+    The ideal reflex's is that of the policy alone, where nothing touches the body and no sense is at fault. Where
+    nothing but senses is at fault, it is the one in which nothing goes wrong.
 
     Args:
         undisturbed: makes the trace of the policy alone in this trial when nothing goes wrong, where that is known.
