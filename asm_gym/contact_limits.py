@@ -26,8 +26,8 @@ class ContactLimits:
     Args:
         wrist_force: on each axis of the wrist, the hand's own weight included [N].
         external_torque: of each joint [N m].
-        hand_speed: a command that would move the hand faster is scaled down to it [m/s]; infinite for none. Controllers
-            whose actions are no motions, torques, are not scaled.
+        hand_speed: a command that would move the hand faster is scaled down to it [m/s]; infinite for none. Of
+            OSC_POSE and JOINT_POSITION, whose actions are changes of where the arm is; others are not scaled.
         healthy: the most that healthy motion of this body and task was seen to reach, (N,) in the order of
             ``RobosuiteEnv.felt_channels``; where that is more, it counts. Empty where nobody knows.
         stays: the arm stays from the physics substep on after a limit was passed; else it is only said.

@@ -171,6 +171,10 @@ class Guard:
         decision = arbiter.decide(sensed)
         if not decision.intervened:
             self.largest = max(self.largest or 0.0, value)
+            if severity.presses:
+                self.substeps.pressed()
+            elif beneath is not None:
+                self.substeps.acted()
         reasons = {CONTACT: severity.presses, FAILURE: bool(failure), SURPRISE: over, MISSING: bool(lost)}
         reason = next((name for name, holds in reasons.items() if holds), "")
         failure = joined(failure, decision.failure)

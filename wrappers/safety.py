@@ -90,17 +90,17 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             takes it for infinite surprise, and ``"ignore"`` is for simulations, which wait. The first row does not
             count.
         adaptive_threshold: how the threshold follows a policy that changes, from episode to episode; ``info["asm"]``
-            then holds the ``threshold`` of this episode, its ``ceiling``, and ``level``, the share of episodes so far with
-            a false alarm. Not counted are alarms above the ceiling, those that went on while the reflex acted, and those that
-            ``confirm_alarm`` was called for. None for a threshold that stays.
+            then holds the ``threshold`` of this episode, its ``ceiling``, and ``level``, the share of episodes so far
+            with a false alarm. Not counted are alarms above the ceiling, those that went on while the reflex acted, and
+            those that ``confirm_alarm`` was called for. None for a threshold that stays.
         responses: under ``"graded"``, what is done about which cause, where it is not what
             ``asm_gym.wrappers.responses.DEFAULT`` says: ``{"contact": "yield"}``. None may let a pressing arm go on.
         contact_limits: what an arm may feel and how fast its hand may go. ``"memory"`` for the usual ones, and more
             where the monitor's calibration episodes have shown that healthy motion here does. None for none: then
             nobody knows what presses, and ``"graded"`` holds at every alarm but a sensor's.
         band: a calibrated band on what the arm feels, made with ``monitor``, compared within the limits in every
-            physics substep of the policy's steps. What it promises comes beside what ``monitor`` does. Elsewhere than in
-            this package it is compared once a step, and a warning says so.
+            physics substep of the policy's steps. What it promises comes beside what ``monitor`` does. Elsewhere than
+            in this package it is compared once a step, and a warning says so.
 
     Raises:
         ValueError: an unknown ``on_alarm``, cause or response, a response that lets a pressing arm go on, a reflex

@@ -14,7 +14,14 @@ from asm_gym.monitors import Monitor, NeuralASM
 from asm_gym.monitors.contact_band import UNJUDGED, Band, ContactBand
 from asm_gym.monitors.monitor import MonitorState
 from asm_gym.protocols import FeelsWithinSteps, LimitsContact
+from asm_gym.spec import control_period
 from asm_gym.validation import shown
+
+CAREFUL = 1.0 / 3.0
+"""Share of the speed limit that a hand has after it has pressed too hard."""
+
+CAREFUL_S = 1.0
+"""For so long [s], counted while the policy acts."""
 
 
 class Beneath(NamedTuple):
@@ -70,6 +77,8 @@ class SubstepGuard:
         self._arm = inner if isinstance(inner, FeelsWithinSteps) else None
         if band is not None:
             self._check(band, monitor, inner)
+        self._careful_steps = max(1, round(CAREFUL_S / control_period(env)))
+        self._careful = 0  # steps of the policy for which its hand is slower still
         self._sent: Band | None = None
         self._unjudged = 0  # steps of the policy for which there is no band
 
@@ -86,9 +95,25 @@ class SubstepGuard:
 
     def begin(self) -> None:
         """A new episode has begun in the environment."""
-        self._sent, self._unjudged = None, 0
+        self._sent, self._unjudged, self._careful = None, 0, 0
+        self._limit(self._limits)
+
+    def pressed(self) -> None:
+        """The policy has pressed too hard: from now on its hand goes slower for a while."""
+        self._careful = self._careful_steps
+        if self._limits is not None:
+            self._limit(replace(self._limits, hand_speed=CAREFUL * self._limits.hand_speed))
+
+    def acted(self) -> None:
+        """The policy has acted in a step."""
+        if self._careful:
+            self._careful -= 1
+            if not self._careful:
+                self._limit(self._limits)
+
+    def _limit(self, limits: ContactLimits | None) -> None:
         if self._limited is not None:
-            self._limited.contact_limits = self._limits
+            self._limited.contact_limits = limits
 
     def send(self, state: MonitorState, action: NDArray[np.floating[Any]], overridden: bool) -> None:
         """Says what is expected of a step that is about to be made.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import zip_longest
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -102,6 +103,7 @@ class VectorNeuralASMSafety(VectorWrapper):
             )
         self._watch_with(body_memory(first, StreamSource(first).spec) if monitor is None else monitor)
         self._limits = any(isinstance(member, LimitsContact) for member in self._members)
+        self._told: list[ContactLimits | None] = []
         self._holding = np.zeros(env.num_envs, bool)
         if any(isinstance(member, HoldsItself) for member in self._members):
             # Who is held is held in all steps that wrappers in between make of one.
@@ -226,6 +228,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         observed = iterate(self.observation_space, self._observations)
         each = zip(self._guards, chosen, observed, begun, strict=True)
         commands = [rest if fresh else guard.arbiter.command(action, seen) for guard, action, seen, fresh in each]
+        self._limit()
         wanted = np.array([isinstance(m, HoldsItself) and m.holding for m in self._members])
         if (wanted | self._holding).any():
             set_attribute(self.env, "holding", wanted.tolist())
@@ -337,9 +340,15 @@ class VectorNeuralASMSafety(VectorWrapper):
         self._follow(begun)
         for i in np.flatnonzero(begun):
             self._guards[i].begin()
-        if begun.any() and self._limits:
-            limits = [m.contact_limits if isinstance(m, LimitsContact) else None for m in self._members]
+        if begun.any():
+            self._told = []  # a new episode has forgotten its limits
+
+    def _limit(self) -> None:
+        """Tells the environments their limits, where those have changed."""
+        limits = [m.contact_limits if isinstance(m, LimitsContact) else None for m in self._members]
+        if self._limits and any(a is not b for a, b in zip_longest(limits, self._told)):
             set_attribute(self.env, "contact_limits", limits)
+            self._told = limits
 
     def _restart(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Begins anew what this wrapper has ended, in the same step."""

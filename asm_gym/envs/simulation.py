@@ -42,7 +42,6 @@ class Simulation:
     def __init__(self, env: Any, substeps: int) -> None:
         self.env = env
         self.substeps = substeps
-        self._step_s = 1.0 / env.control_freq
         self.model: mujoco.MjModel = env.sim.model._model
         self.data: mujoco.MjData = env.sim.data._data
         self._rotations = importlib.import_module("robosuite.utils.transform_utils")
@@ -249,15 +248,14 @@ class Simulation:
             controller, part = self._controllers[a], slice(start + low, start + high)
             start += robot.action_dim
             kind, n = controller.name, int(self._arms.joints[a])
-            if kind not in ("OSC_POSE", "IK_POSE", "JOINT_POSITION") or controller.input_type != "delta":
+            if kind not in ("OSC_POSE", "JOINT_POSITION") or controller.input_type != "delta":
                 continue
             delta = np.asarray(controller.scale_action(action[part]), np.float64)
             if kind == "JOINT_POSITION":
                 jacobian = np.zeros((3, self.model.nv))
                 mujoco.mj_jacSite(self.model, self.data, jacobian, None, int(self._arms.site[a]))
                 delta = jacobian[:, self._arms.dofs[a, :n]] @ delta
-            # IK_POSE hands joint positions on to a controller with gains of its own; a change a step is its most.
-            gain = 1.0 / self._step_s if kind == "IK_POSE" else float(np.mean(controller.kp[:3] / controller.kd[:3]))
+            gain = float(np.mean(controller.kp[:3] / controller.kd[:3]))
             speed = gain * float(np.linalg.norm(delta[:3]))
             found.append((part, 1.0 if speed <= most else most / speed))
         return found

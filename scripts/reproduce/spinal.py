@@ -90,8 +90,8 @@ def run(trial: Trial, config: RolloutConfig, memory: NeuralASM, band: ContactBan
         guarded: Any = NeuralASMSafety(env, memory, on_alarm=act, band=band, on_overrun="ignore")
 
         def keep(info: dict[str, Any]) -> None:
-            if info["asm"]["spinal_s"] is not None:
-                left.append(len(felt) * band.spec.dt + info["asm"]["spinal_s"])
+            if not math.isnan(after := info["asm"]["severity"]["left_s"]):
+                left.append(len(felt) * band.spec.dt + after)
             felt.append(arm.felt)
             if len(felt) > onset:
                 forces.append(info["external_force"])
