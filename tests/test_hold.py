@@ -144,10 +144,10 @@ def pushed(controller, newtons, steps=30):
     env = guarded(inner)
     env.reset(seed=0)
     for _ in range(AT + 10):
-        env.step(np.zeros(7, np.float32))
+        env.step(np.zeros(env.action_space.shape, np.float32))
     start, moved = joints(env)[0], []
     for _ in range(steps):
-        env.step(np.zeros(7, np.float32))
+        env.step(np.zeros(env.action_space.shape, np.float32))
         moved.append(np.abs(joints(env)[0] - start).max())
     env.close()
     return max(moved), moved[-1]
