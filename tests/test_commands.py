@@ -78,12 +78,12 @@ def test_a_slip_of_the_finger_is_told_what_was_meant(typed, near, capsys):
 
 
 def test_all_studies_check_the_options_of_all_before_the_first_runs(capsys, monkeypatch):
-    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{reproduce.INDEPENDENT[i]}") for i in (0, -1))
+    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{name}") for name in ("retention", "failure"))
     ran: list[str] = []
     for module in (first, last):
-        monkeypatch.setattr(module, "main", lambda argv, name=module.__name__: ran.append(name) or 0)
-    monkeypatch.setattr(last, "Args", Options)  # which has no --seeds
-    monkeypatch.setattr(reproduce, "INDEPENDENT", (reproduce.INDEPENDENT[0], reproduce.INDEPENDENT[-1]))
+        monkeypatch.setattr(module, "run", lambda config, name=module.__name__: ran.append(name))
+    monkeypatch.setattr(last, "Config", Options)  # which has no --seeds
+    monkeypatch.setattr(reproduce, "INDEPENDENT", ("retention", "failure"))
     assert cli.main(["reproduce", "all", "--seeds", "2"]) == 2
     assert "--seeds" in capsys.readouterr().err
     assert not ran

@@ -84,7 +84,7 @@ class Args:
     """PPO that learns to stay out of alarm, by a Lagrange multiplier on the reward: an example to copy."""
 
     memory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MEMORY.asm")]
-    """A calibrated memory of harmless moving, such as asm-gym train-safely makes: exploration.asm."""
+    """A calibrated memory of harmless moving, such as asm-gym reproduce safe_training makes: exploration.asm."""
     task: str = "Lift"
     """Name of a task."""
     steps: int = 20_000

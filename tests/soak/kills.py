@@ -64,7 +64,8 @@ def commands(out: Path) -> list[Work]:
         --fit-episodes 2 --calibration-episodes 5 --nominal-episodes 1 --faulty-episodes 1 --harmless-episodes 1"""
     train = """train Lift --demonstrations 1 --cloning-updates 40 --steps 60 --checkpoint-every 20
         --evaluate-every 30 --evaluation-episodes 1 --final-episodes 1"""
-    react = "react --tasks Lift --reflexes hold --faults passing_push --episodes 1 --false-alarm-rate 0.2 --run"
+    react = """reproduce reflexes --tasks Lift --reflexes hold --faults passing_push --episodes 1
+        --false-alarm-rate 0.2 --run"""
     return [
         Work("save", save_for_ever, lambda folder: NeuralASM.load(folder / "x.asm").hidden_size in SIZES),
         Work("collect", command("collect Lift --episodes 3"), recorded),
