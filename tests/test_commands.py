@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from asm_gym.scripts import cli, command, reproduce
+from asm_gym.scripts.options import rows as options_of
 
 ROOT = Path(__file__).resolve().parents[1]
 STUDIES = [f"reproduce {study}" for study in ("all", *reproduce.STUDIES)]
@@ -61,6 +62,33 @@ def test_nonsense_is_refused_in_one_line(name, capsys):
     said = capsys.readouterr().err
     assert len(lines(said)) == 1
     assert said.startswith("asm-gym ")
+
+
+def test_a_person_can_hold_the_options_of_all_commands_that_are_used():
+    shared = {"--workers", "--seed", "--out", "--quick"}
+    own = {}
+    for name, what in cli.GROUPS["Use it"].items():
+        kind = importlib.import_module(what.module).Args
+        own[name] = [row.name for row in options_of(kind) if row.name.split()[0] not in shared]
+    assert sum(map(len, own.values())) + len(shared) <= 60, own
+
+
+@pytest.mark.parametrize("name", EVERY_COMMAND)
+def test_help_has_no_marks_of_the_parser(name, capsys):
+    assert cli.main([*name.split(), "--help"]) == 0
+    said = capsys.readouterr().out
+    assert "{None}" not in said
+    assert "(default" not in said
+
+
+def test_help_says_what_will_do_and_what_is_shortened(capsys):
+    assert cli.main(["train", "--help"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "--algorithm NAME How it learns" in said
+    assert "One of sac, td3, ppo, gru. Default: sac." in said
+    assert "Unless asked otherwise: steps 300, demonstrations 4" in said
+    assert cli.main(["demo", "--help"]) == 0
+    assert "--on-alarm {graded,hold,terminate}" in capsys.readouterr().out
 
 
 def test_the_commands_fit_a_terminal(capsys):

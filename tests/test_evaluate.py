@@ -18,8 +18,10 @@ from asm_gym.monitors import load_monitor, registry
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 from asm_gym.rollouts.seeds import draw_onset
 from asm_gym.rollouts.trial import RolloutConfig, record
+from asm_gym.scripts import command
 from asm_gym.scripts.cli import main as cli
 from asm_gym.scripts.evaluate import Args, labels, main
+from asm_gym.scripts.options import shortened
 from asm_gym.spec import Channel, StreamSpec
 
 MONITORS = ("neural_asm", "kalman+evidence", "autoregression", "force_limit")
@@ -105,8 +107,8 @@ def test_a_folder_of_other_settings_is_refused(run, capsys):
         ("--false-alarm-rate 0.001", "needs 999 calibration"),
         ("--faulty-episodes 5", "at most 4, got 5"),
         ("--fit-episodes 0", "fit_episodes.*0"),
-        ("--window -1", "window"),
-        ("--backend dask", "address"),
+        ("--workers dask", "address"),
+        ("--workers many", "workers must be a number"),
         ("--policy door_sac", "door_sac takes observations of 41"),
         ("--policy nobody.npz", "nobody.npz"),
         ("--settings gru.hidden_size=8", "monitor with settings 'gru'; known: "),
@@ -137,13 +139,25 @@ def test_a_monitor_of_the_table_is_set_otherwise_under_every_detection(run):
 
 
 def test_quick_is_less_of_everything():
-    quick = Args(quick=True).scaled()
+    quick = command.parse("evaluate", Args, ["--quick"])
     assert quick.tasks == ("Lift", "Stack", "Door")
     assert quick.severities == ("strong",)
-    assert Args().scaled() == Args()
+    assert quick.episodes("calibration") * 3 >= 19
+    with pytest.raises(ValueError, match="window"):
+        Args(window=-1.0)
     made = labels(Args(tasks=("Door",), faults=("push", "slip"), harmless=("touch",), false_alarm_rate=0.05))
     assert {label.kind for label in made} == {"", "push", "touch"}  # a door is nothing that could slip
     assert len({label.path for label in made}) == len(made)
+
+
+def test_quick_keeps_what_was_asked_for():
+    asked = ["--monitors", "neural_asm", "gru", "--tasks", "PickPlaceCan", "--fit-episodes", "60"]
+    args = command.parse("evaluate", Args, ["--quick", *asked])
+    assert args.monitors == ("neural_asm", "gru")
+    assert args.tasks == ("PickPlaceCan",)
+    assert (args.fit_episodes, args.nominal_episodes, args.episodes("calibration")) == (60, 8, 19)
+    assert "fit episodes" not in shortened(args)
+    assert "nominal episodes 8" in shortened(args)
 
 
 def test_onsets_leave_room_before_and_after():
