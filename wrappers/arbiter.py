@@ -290,6 +290,11 @@ class Arbiter:
         return self.state is State.REFLEX
 
     @property
+    def strikes(self) -> int:
+        """How often the policy has pressed too hard in this episode."""
+        return self._counts.strikes
+
+    @property
     def may_go_on(self) -> bool:
         """Whether the policy may go on in alarm, for all the time that it did."""
         return self._counts.went_on < self._rule.go_on

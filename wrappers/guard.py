@@ -27,7 +27,7 @@ from asm_gym.wrappers.factory import (
 from asm_gym.wrappers.observer import joined
 from asm_gym.wrappers.reports import CONTACT, FAILURE, MISSING, SURPRISE, RowReport
 from asm_gym.wrappers.responses import NO_RESPONSE, Responder, responses_from
-from asm_gym.wrappers.severity import Severity, SeverityEstimator
+from asm_gym.wrappers.severity import AGAIN, LEANS_S, Severity, SeverityEstimator
 from asm_gym.wrappers.substeps import Beneath, SubstepGuard
 
 
@@ -145,8 +145,7 @@ class Guard:
         if failure:
             arbiter.warn(failure, "which counts as an alarm")
         held = arbiter.overriding
-        load, left_s = Beneath() if beneath is None else beneath
-        severity = self._severity.of(row, load, left_s, held)
+        severity = self._severity.of(row, beneath, held, LEANS_S / (1 + AGAIN * arbiter.strikes))
         over, lost = not value <= arbiter.threshold, self.responder.lost
         alarm = over or bool(lost) or severity.presses
         if alarm and lost and not (over or severity.presses or failure or severity.fast):

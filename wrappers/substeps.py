@@ -16,6 +16,7 @@ from asm_gym.monitors.monitor import MonitorState
 from asm_gym.protocols import FeelsWithinSteps, LimitsContact
 from asm_gym.spec import control_period
 from asm_gym.validation import shown
+from asm_gym.wrappers.severity import ContactForce
 
 CAREFUL = 1.0 / 3.0
 """Share of the speed limit that a hand has after it has pressed too hard."""
@@ -30,10 +31,12 @@ class Beneath(NamedTuple):
     Attributes:
         load: the largest share of a contact limit that was felt; not a number where nobody feels within steps.
         left_s: when, after the step began, a limit was passed or a band left [s]; not a number where none was.
+        force: contact force on the arm that this comes to, the mean of the step [N]; not a number where nobody feels.
     """
 
     load: float = np.nan
     left_s: float = np.nan
+    force: float = np.nan
 
 
 def limits_for(limits: ContactLimits | None, acts: bool) -> ContactLimits | None:
@@ -77,6 +80,7 @@ class SubstepGuard:
         self._arm = inner if isinstance(inner, FeelsWithinSteps) else None
         if band is not None:
             self._check(band, monitor, inner)
+        self._felt = None if self._limited is None else ContactForce.felt_by(self._limited.felt_channels)
         self._careful_steps = max(1, round(CAREFUL_S / control_period(env)))
         self._careful = 0  # steps of the policy for which its hand is slower still
         self._sent: Band | None = None
@@ -139,9 +143,10 @@ class SubstepGuard:
     def came(self, row: NDArray[np.floating[Any]], info: dict[str, Any]) -> Beneath:
         """What came of the step that ended with ``row`` (D,), of which the environment said ``info``."""
         load, left = float(info.get("contact_load", np.nan)), float(info.get("contact_left_s", np.nan))
-        if self._sent is None or self._band is None:
-            return Beneath(load, left)
-        if self._arm is None:
-            outside = bool((self._sent.times(self._band.felt_in(row)) > 1.0).any())
-            return Beneath(load, self._band.spec.dt if outside else left)
-        return Beneath(load, np.nan if self._arm.left_band_s is None else self._arm.left_band_s)
+        force = np.nan if self._felt is None or "contact_felt" not in info else self._felt(info["contact_felt"])
+        if self._sent is not None and self._band is not None:
+            if self._arm is None:
+                left = self._band.spec.dt if (self._sent.times(self._band.felt_in(row)) > 1.0).any() else left
+            elif self._arm.left_band_s is not None:
+                left = self._arm.left_band_s
+        return Beneath(load, left, force)

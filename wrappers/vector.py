@@ -36,6 +36,9 @@ from asm_gym.wrappers.vector_utils import (
     set_attribute,
 )
 
+FELT = "contact_load", "contact_left_s", "contact_felt"
+"""What environments say of what their arms felt within a step."""
+
 
 class VectorNeuralASMSafety(VectorWrapper):
     """``NeuralASMSafety`` for n environments side by side, with one batched ``observe`` for all of them.
@@ -293,7 +296,9 @@ class VectorNeuralASMSafety(VectorWrapper):
             if begun[i]:
                 reports.append(nothing(own.silenced(np.ones(1, bool))))
                 continue
-            beneath = guard.substeps.came(rows[i], _said(infos, i, bool(last[i]), ("contact_load", "contact_left_s")))
+            beneath = guard.substeps.came(
+                rows[i], _said(infos, i, bool(last[i]), ("contact_load", "contact_left_s", "contact_felt"))
+            )
             said = None if expected is None else expected[i]
             heard = guard.heard(own, bool(failed[i]))
             report = guard.judge(heard, rows[i], executed[i], failed[i], beneath, said, latency)

@@ -137,8 +137,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """Set, ``holding`` lasts until both are unset, however many steps a wrapper in between makes of one."""
         self.contact_limits: ContactLimits | None = None
         """What the arms may feel and how fast they may go in this episode; ``reset`` forgets it. ``info`` then holds
-        ``contact_load``, the largest share of a limit that was felt within the step, and ``contact_left_s``, when in
-        it a limit was passed [s], not a number where none was."""
+        ``contact_load``, the largest share of a limit that was felt within the step, ``contact_left_s``, when in it a
+        limit was passed [s], not a number where none was, and ``contact_felt``, the step's mean of what was felt."""
         self._band: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._stays = False
         self.substeps = backend.PHYSICS_FREQ // control_freq
@@ -436,10 +436,9 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         forces = dict(zip(names, (np.nan,) * 3 if unstable else felt, strict=True))
         if self.contact_limits is not None:
             left = self.left_band_s
-            forces |= {
-                "contact_load": np.inf if unstable else sim.load,
-                "contact_left_s": np.nan if left is None else left,
-            }
+            info["contact_load"] = np.inf if unstable else sim.load
+            info["contact_left_s"] = np.nan if left is None else left
+            info["contact_felt"] = sim.felt.mean(axis=0)
         return info | {"success": success, **forces, "unstable": unstable}
 
     def _bad_count(self) -> int:
