@@ -159,7 +159,7 @@ def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
     """
     if type(values) is np.ndarray and values.dtype == np.float32:
         return values
-    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+    if isinstance(values, np.ma.MaskedArray) and bool(np.any(values.mask)):
         raise ValueError(f"{name} must be numbers, and some are masked: {shown(values)}")
     try:
         given: NDArray[Any] = np.asarray(values)
