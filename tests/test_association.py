@@ -13,8 +13,8 @@ from asm_gym.memory.association import (
     hidden_units,
     learn_association,
     synapses,
-    trust,
 )
+from asm_gym.memory.crossfit import trust
 from asm_gym.memory.energy import energy
 from asm_gym.memory.inference import direct_synapses
 from asm_gym.memory.learning import hebbian_change

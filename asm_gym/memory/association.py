@@ -10,8 +10,10 @@
 
 A joint that moves and a hand that does not, a torque commanded and none measured: each group is completed from the
 rest, so that what a body cannot do is an error, in whatever skill. What is linear is solved at once; the hidden units
-learn what is left of it, and are believed as far as rows that they have not learned bear them out. From very few rows
-neither the one nor the other is known: D then reads the past and the command alone, and U and W_S are 0.
+learn what is left of it from all rows, and are believed as far as rows that they have not learned bear them out. Such
+rows are found by cross-fitting: ``crossfit`` has what units that learned two thirds of the episodes expect of the other
+third. W_S is learned on the errors of those. From very few rows neither the one nor the other is known: D then reads
+the past and the command alone, and U and W_S are 0.
 
 The rule equals the gradient of a Huber loss, and Uᵀ is the transpose of the weights that predict (weight transport):
 this is backpropagation through one layer, at one moment, and only ΔU is local. Nor is D, from the inverse of what all
@@ -23,15 +25,16 @@ Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning by 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.memory.crossfit import SMALLEST_SPREAD, THIRDS, crossfit, thirds, trust
 from asm_gym.memory.energy import Array, activate, kernel, outward
 from asm_gym.memory.learning import Synapse, coincidence, cosine_decay, shuffled
-from asm_gym.memory.linear import learn_from_past, learn_linear, tried_on
+from asm_gym.memory.linear import learn_from_past, learn_linear
 from asm_gym.memory.precision import PRECISION_EPOCHS, learn_precision, log_variance
 
 UPDATES, PASSES = 6000, 40
@@ -43,16 +46,13 @@ WARM_UP = 0.1
 """Share of the updates in which the step size rises to ``RATE``; it falls along a cosine after."""
 
 TICKS = 20
-"""How often learning tells of its progress."""
+"""How often the learning of hidden units tells of its progress."""
+
+ALL_TICKS = (THIRDS + 1) * TICKS + PRECISION_EPOCHS
+"""How often all of it does."""
 
 ROWS_PER_INPUT = 12
 """With fewer rows than that for each input, what one sense tells of another is not known well enough to judge by."""
-
-SMALLEST_SPREAD = np.float32(1e-4)
-"""Of what is left of a change: below it, single precision is what is heard."""
-
-DOUBTED = 3.0
-"""Standard deviations that an error counts at most where the hidden units are tried."""
 
 TRACKING = np.float32(0.01)
 """Weight of the newest batch in the running spread σ of each error."""
@@ -214,35 +214,43 @@ def learn_association(
     updates: int = UPDATES,
     passes: int = PASSES,
     feedback: Feedback | None = None,
+    lengths: Sequence[int] = (),
 ) -> Association:
     """What is linear in closed form; what remains by the hidden units, in random order; how sure it is last.
 
     Args:
-        a: (N, I) inputs of whole episodes, one after another, the last input a constant 1. The last fifth of the rows
-            is not learned by the hidden units: it shows how far they are to be trusted, and how sure they may be.
+        a: (N, I) inputs of whole episodes, one after another, the last input a constant 1.
         delta: (N, X) changes, standardised.
         groups, changes, size: as in ``synapses``.
-        tick: called ``TICKS`` times on the way, and once after each of ``PRECISION_EPOCHS``.
-        updates, passes: over batches and over the N steps, at most.
+        tick: called ``ALL_TICKS`` times on the way.
+        updates, passes: over batches and over the rows that are learned from, at most.
         feedback: how errors come back to the hidden units; by the transposed weights where None.
+        lengths: how many rows each episode has; where none are told, thirds are of rows that follow each other.
     """
     few = len(a) < ROWS_PER_INPUT * a.shape[1]
     D = learn_from_past(a, changes) if few else learn_linear(a, groups, changes)
     remainder = np.maximum(np.sqrt(np.mean((delta - a @ D.T) ** 2, axis=0)), SMALLEST_SPREAD)  # (X,)
     exists = synapses(groups, changes, a.shape[1], size)
     if few:
-        for _ in range(TICKS + PRECISION_EPOCHS):
+        for _ in range(ALL_TICKS):
             tick()
         return _linear_alone(D, remainder, _random(exists.V, rng))
     left = (delta - a @ D.T) / remainder
-    fresh = len(tried_on(a))
-    shown = max(len(a) - fresh, 1)
-    V, U = _learn_hidden(a[:shown], left[:shown], exists, rng, tick, updates, passes, feedback or Feedback())
-    # How far it goes wrong in rows that it has learned says too little of how far it will.
-    f, left = hidden_units(a[-fresh:], V), left[-fresh:]
-    U *= trust(left, f @ U.T)[:, None]
+
+    def learned(rows: NDArray[np.bool_] | slice) -> tuple[Array, Array]:
+        return _learn_hidden(a[rows], left[rows], exists, rng, tick, updates, passes, feedback or Feedback())
+
+    def expect(learned_from: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Array:
+        V, U = learned(learned_from)
+        return hidden_units(a[asked], V) @ U.T
+
+    # How far units go wrong in rows that they have learned says too little of how far they will.
+    expected = crossfit(expect, thirds(len(a), lengths, rng), left.shape[1])
+    V, U = learned(slice(None))
+    share = trust(left, expected)
+    U *= share[:, None]
     W_S, b_S = np.zeros_like(U), np.zeros(len(U), np.float32)
-    learn_precision(f, left - f @ U.T, W_S, b_S, rng, tick)
+    learn_precision(hidden_units(a, V), left - share * expected, W_S, b_S, rng, tick)
     return Association(V, U * remainder[:, None], D, W_S, b_S, remainder)
 
 
@@ -256,13 +264,6 @@ def _random(exists: Array, rng: np.random.Generator) -> Array:
     """V (M, I) before anything is learned, 0 where there is no synapse."""
     V: Array = rng.standard_normal(exists.shape).astype(np.float32) / np.float32(np.sqrt(exists.shape[1])) * exists
     return V
-
-
-def trust(left: Array, expected: Array) -> Array:
-    """(X,) in [0, 1]: what share of the ``expected`` (N, X) leaves the least of what was ``left`` (N, X) to expect."""
-    known = np.sum(expected**2, axis=0)
-    share: Array = np.sum(np.clip(left, -DOUBTED, DOUBTED) * expected, axis=0) / np.maximum(known, SMALLEST_SPREAD)
-    return np.clip(share, 0.0, 1.0).astype(np.float32)
 
 
 def _learn_hidden(
