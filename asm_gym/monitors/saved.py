@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 
 from asm_gym.checkpoint import Checkpoint
 from asm_gym.checks import check_number
+from asm_gym.choices import check_choice
+from asm_gym.detection import Blocks
 from asm_gym.detection.base import Arrays
+from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.detection.detector import ANYTHING
 from asm_gym.stream import StreamSpec
 
-MAXIMA = "nominal_maxima"
-"""Under which name a checkpoint keeps what ``calibrate`` has found."""
+MAXIMA, BLOCKS, LEARNED_FROM = "nominal_maxima", "nominal_blocks", "learned_from"
+"""Under which names a checkpoint keeps what ``calibrate`` has found, by the episode and by the hour, and the marks of
+what ``fit`` was given."""
 
 RENAMED = {"habit": "context_quantile", "carry_prior": "free_running_probability"}
 """What older checkpoints keep under another name."""
@@ -28,6 +32,9 @@ class SavedMonitor(NamedTuple):
     Attributes:
         arrays: what its model and its detections have learned, by name.
         maxima: (n,) largest surprise in each episode of the calibration; None where it was not kept.
+        blocks: the same by the hour.
+        learned_from: marks of the episodes that were learned from, as ``fresh.sketch`` keeps them.
+        promised: what the threshold's promise counts by.
         threshold: as it was written.
         detection: which the threshold is of; None where there was but one.
         skills: names of those that the model knows.
@@ -36,6 +43,9 @@ class SavedMonitor(NamedTuple):
 
     arrays: Arrays
     maxima: NDArray[np.float64] | None
+    blocks: Blocks | None
+    learned_from: NDArray[np.float64] | None
+    promised: str
     threshold: object
     detection: str | None
     skills: tuple[str, ...]
@@ -50,11 +60,15 @@ class SavedMonitor(NamedTuple):
             raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
         names = {n: n if "detection" in header else RENAMED.get(n, n) for n in header["shapes"]}
         arrays = {now: saved.array(n, *header["shapes"][n]) for n, now in names.items()}
-        maxima = arrays.pop(MAXIMA, None)
+        maxima, blocks, learned_from = (arrays.pop(name, None) for name in (MAXIMA, BLOCKS, LEARNED_FROM))
+        promised = header.get("promised", EPISODE)
+        check_choice("promise", promised, (EPISODE, HOUR))
         if "context_quantile" in arrays:
             arrays.setdefault("context_range", ANYTHING)
         about = dict(header.get("about", {}))  # an older asm-gym kept nothing
-        return cls(arrays, maxima, header["threshold"], header.get("detection"), tuple(header["skills"]), about)
+        by_hour = None if blocks is None else Blocks.restored(blocks)
+        kept = maxima, by_hour, learned_from, promised, header["threshold"]
+        return cls(arrays, *kept, header.get("detection"), tuple(header["skills"]), about)
 
     def threshold_below(self, reach: float) -> float | None:
         """The threshold, once it is a number that surprise can exceed, which never comes to ``reach``."""
@@ -64,6 +78,15 @@ class SavedMonitor(NamedTuple):
         if number >= reach:
             raise ValueError(f"threshold must be below {reach:g}, all that errors can add up to, got {number:g}")
         return number
+
+
+def calibration_arrays(
+    maxima: NDArray[np.float64] | None, blocks: Blocks | None, learned_from: NDArray[np.float64] | None
+) -> Arrays:
+    """What a checkpoint keeps of them, by name; of what there is."""
+    by_hour = None if blocks is None else np.stack(blocks)
+    found = {MAXIMA: maxima, BLOCKS: by_hour, LEARNED_FROM: learned_from}
+    return {name: array for name, array in found.items() if array is not None}
 
 
 class Restorable(Protocol):
