@@ -42,12 +42,14 @@ def marks(episode: Episode) -> Marks:
     found = sum(row[n : steps - STRETCH + 1 + n] * m for n, m in enumerate(_odd(STRETCH)))
     still = np.concatenate([[0], np.cumsum(row[1:] == row[:-1])])  # (T,) repetitions so far
     moves = still[STRETCH - 1 :] == still[: steps - STRETCH + 1]
-    return (_mixed(np.asarray(found, np.uint64)) >> BITS)[moves].astype(np.float64)
+    kept: Marks = (_mixed(np.asarray(found, np.uint64)) >> BITS)[moves].astype(np.float64)
+    return kept
 
 
 def sketch(episodes: Sequence[Episode]) -> Marks:
     """What is kept of episodes that are learned from."""
-    return np.unique(np.concatenate([np.zeros(0), *(np.sort(marks(e))[:KEPT] for e in episodes)]))
+    kept: Marks = np.unique(np.concatenate([np.zeros(0), *(np.sort(marks(e))[:KEPT] for e in episodes)]))
+    return kept
 
 
 def check_fresh(episodes: Sequence[Episode], learned: Marks | None = None) -> None:

@@ -261,7 +261,7 @@ class CalibratedMonitor(Calibrated):
     def save(self, path: str | Path) -> None:
         """Writes everything learned to one file: arrays and JSON."""
         self._fitted()
-        arrays = self.learned_ | calibration_arrays(self.maxima_, self.blocks_, self._learned_from)
+        arrays = {**self.learned_, **calibration_arrays(self.maxima_, self.blocks_, self._learned_from)}
         header = {
             "spec": self.spec.to_json(),
             "hyperparameters": self.get_params(),
