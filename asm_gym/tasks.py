@@ -8,8 +8,8 @@ from importlib import import_module
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from asm_gym.checks import check_text
 from asm_gym.extras import needed_for
+from asm_gym.validation import check_text
 
 ROBOTS = ("Panda", "Sawyer", "UR5e", "Kinova3", "IIWA", "Jaco")
 """Arms that the tasks are tested with."""

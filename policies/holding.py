@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.abilities import HasGrippers, HoldsItself
 from asm_gym.policies.base import Policy
+from asm_gym.protocols import HasGrippers, HoldsItself
 
 
 class Begun(NamedTuple):

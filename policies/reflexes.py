@@ -9,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.abilities import TurnsJoints
-from asm_gym.checks import check_number
 from asm_gym.policies.holding import Begun, Hold, Reflex, nearest_to_rest, require_unchanged, resting_action
-from asm_gym.stream import StreamSpec, control_period
+from asm_gym.protocols import TurnsJoints
+from asm_gym.spec import StreamSpec, control_period
+from asm_gym.validation import check_number
 
 __all__ = [
     "Begun",

@@ -18,32 +18,32 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
-from asm_gym.episodes import EpisodeLabel, load_episode
+from asm_gym.episode import EpisodeLabel, load_episode
 from asm_gym.evaluation.tables import console_table, markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
-from asm_gym.rollouts.babbling import curriculum, record_lesson
-from asm_gym.rollouts.benchmark import code_digest
-from asm_gym.rollouts.body import healthy, held_out, learn_body
-from asm_gym.rollouts.examination import Exam, Marks, at_rates, card, examine, usual_force
-from asm_gym.rollouts.folder import claimed, labelled, make_missing, versions
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
+from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
+from asm_gym.rollouts.pretraining.healthy import healthy, held_out, learn_body
+from asm_gym.rollouts.pretraining.model_card import Exam, Marks, at_rates, card, examine, usual_force
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import claimed, labelled, make_missing, versions
+from asm_gym.rollouts.scoring import code_digest
 from asm_gym.rollouts.trial import RolloutConfig, environment, record
 from asm_gym.scripts.command import at_least, run
 from asm_gym.tasks import ROBOTS, TASKS
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import check_choice
 
 SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
 RATES = 0.01, 0.05
 """Rates at which an examination is also told."""
 LEARNING = (
-    *("memory", "detection", "scaling.py", "stream.py", "rollouts/body.py"),
+    *("memory", "detection", "scaling.py", "spec.py", "rollouts/pretraining/healthy.py"),
     *("monitors/memory_model.py", "monitors/monitor.py", "monitors/neural_asm.py"),
 )
 """What decides, in the package, over what a body learns of the same lessons."""
@@ -206,7 +206,7 @@ def learn(args: Args, console: Console) -> NeuralASM:
         **versions(),
     }
     about, path = json.loads(json.dumps(about)), args.out / f"{args.name}.asm"
-    with suppress(FileNotFoundError, ValueError):  # one that is damaged or of an older asm-gym is learned anew
+    with suppress(FileNotFoundError, ValueError):  # one that is damaged is learned anew
         memory = NeuralASM.load(path)
         if memory.about == about:
             return memory

@@ -7,9 +7,9 @@ from importlib import import_module
 from typing import NamedTuple
 
 from asm_gym import __version__
-from asm_gym.choices import check_choice
 from asm_gym.extras import needed_for
 from asm_gym.scripts.command import DONE, exit_code
+from asm_gym.validation import check_choice
 
 
 class Command(NamedTuple):

@@ -15,12 +15,12 @@ import gymnasium as gym
 import tyro
 from rich.console import Console
 
-from asm_gym.datasets import require_minari, write_dataset
-from asm_gym.episodes import Episode, load_episode
+from asm_gym.data.datasets import require_minari, write_dataset
+from asm_gym.episode import Episode, load_episode
 from asm_gym.rollouts.collect import check, collect, collect_to
-from asm_gym.rollouts.folder import claimed, versions
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import claimed, versions
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import at_least, run

@@ -26,6 +26,7 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, hourly_alarms, typical
 from asm_gym.evaluation.report import write_json, write_report
+from asm_gym.evaluation.scored import NOMINAL
 from asm_gym.evaluation.statistics import Share, binomial_interval
 from asm_gym.evaluation.tables import (
     BRIEF_CONDITION_COLUMNS,
@@ -35,7 +36,6 @@ from asm_gym.evaluation.tables import (
     outcome_table,
     tabulate,
 )
-from asm_gym.evaluation.trace import NOMINAL
 from asm_gym.faults import Collision, Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.collect import collect

@@ -21,29 +21,28 @@ import gymnasium as gym
 import tyro
 from rich.console import Console
 
-from asm_gym.checks import check_number
-from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
-from asm_gym.episodes import EpisodeLabel
+from asm_gym.episode import EpisodeLabel
 from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.report import publish
 from asm_gym.evaluation.tables import brief_monitors_table, console_table, harmless_table, kinds_table
 from asm_gym.faults import anywhere
+from asm_gym.faults.interface import FaultyInterface
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of, possible
 from asm_gym.monitors import MONITORS, PARTS, make_monitor, monitor_class
 from asm_gym.monitors.registry import model_of
 from asm_gym.policies import make_policy
-from asm_gym.rollouts.benchmark import benchmark, calibrated
-from asm_gym.rollouts.folder import claimed, make_missing
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import claimed, make_missing
+from asm_gym.rollouts.scoring import benchmark, calibrated
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, horizon_of, record
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
 from asm_gym.scripts.command import at_least, one_line, run
+from asm_gym.stream_source import StreamSource
 from asm_gym.tasks import env_id, is_task
-from asm_gym.wrappers.faults import FaultyInterface
-from asm_gym.wrappers.recording import StreamSource
+from asm_gym.validation import check_choice, check_number
 
 _HARMLESS = (*HARMLESS, *EXECUTIONS)
 SHOWN = 2

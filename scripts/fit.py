@@ -16,16 +16,15 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from asm_gym.checks import check_number
-from asm_gym.choices import check_choice
+from asm_gym.data.logs import Layout, read_logs
+from asm_gym.data.selection import divided, normal_episodes, pieces, unbroken
 from asm_gym.detection import conformal_episodes
-from asm_gym.episodes import Episode
-from asm_gym.logs import Layout, read_logs
+from asm_gym.episode import Episode
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
-from asm_gym.normal import divided, normal_episodes, pieces, unbroken
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
+from asm_gym.validation import check_choice, check_number
 
 _QUICK = {"episodes": 20, "epochs": 5}
 

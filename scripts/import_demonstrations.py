@@ -14,12 +14,12 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from asm_gym.datasets import write_dataset
+from asm_gym.data.datasets import write_dataset
 from asm_gym.envs.demonstrations import recorded_in, replay
-from asm_gym.episodes import Episode
-from asm_gym.rollouts.folder import versions
+from asm_gym.episode import Episode
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import versions
 from asm_gym.scripts.command import run
 
 

@@ -20,15 +20,14 @@ import torch
 import tyro
 from rich.console import Console
 
-from asm_gym.choices import check_choice
-from asm_gym.datasets import read_dataset
-from asm_gym.episodes import Episode, load_episode
+from asm_gym.data.datasets import read_dataset
+from asm_gym.episode import Episode, load_episode
 from asm_gym.policies.network import NetworkPolicy, describe
 from asm_gym.rollouts.collect import check as check_policy
 from asm_gym.rollouts.collect import collect_to
-from asm_gym.rollouts.folder import claimed
 from asm_gym.rollouts.parallel import THIS_PROCESS, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.learners import ALGORITHMS
 from asm_gym.rollouts.training.recurrent import RECURRENT, clone_recurrent
@@ -36,6 +35,7 @@ from asm_gym.rollouts.training.run import BEST, CLONE, Plan, TrainingRun, succes
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import at_least, run
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import check_choice
 
 KEPT = ("env_id", "algorithm", "robot", "demonstrations", "dataset", "cloning_updates", "seed")
 """What must not change while a run goes on."""

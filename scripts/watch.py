@@ -23,20 +23,20 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from asm_gym.checks import check_number
+from asm_gym.data.live import RowReader, SourceDied, is_live, lines_from
+from asm_gym.data.logs import Layout, Log, read_logs
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, traces_of
 from asm_gym.evaluation.report import write_report
+from asm_gym.evaluation.scored import ScoredEpisode
 from asm_gym.evaluation.tables import Table
-from asm_gym.evaluation.trace import Trace
 from asm_gym.extras import require
-from asm_gym.live import RowReader, SourceDied, is_live, lines_from
-from asm_gym.live_view import LiveView
-from asm_gym.logs import Layout, Log, read_logs
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number
+from asm_gym.view.rerun import LiveView
 
 AT_ONCE = 64
 """Episodes scored side by side."""
@@ -87,7 +87,7 @@ def in_groups(logs: Iterable[Log], size: int) -> Iterator[list[Log]]:
 def review(args: Args, monitor: Any, console: Console) -> int:
     """Scores a recording, writes what came of it, and prints the alarms."""
     alarms: list[Alarm] = []
-    worst: list[Trace] = []
+    worst: list[ScoredEpisode] = []
     episodes = 0
     with stage("watching", console, {}) as progress:
         for group in in_groups(read_logs(args.source, Layout(monitor.spec, args.rate)), AT_ONCE):
@@ -111,7 +111,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     return BAD_NEWS if alarms else DONE
 
 
-def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Trace]) -> None:
+def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[ScoredEpisode]) -> None:
     """Writes the table of all alarms, and a report with the most surprising episodes."""
     args.out.mkdir(parents=True, exist_ok=True)
     with (args.out / "alarms.csv").open("w", newline="", encoding="utf-8") as file:
@@ -141,7 +141,7 @@ def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Trac
     )
 
 
-def write_rerun(path: Path, traces: Sequence[Trace], monitor: Any) -> None:
+def write_rerun(path: Path, traces: Sequence[ScoredEpisode], monitor: Any) -> None:
     """Writes episodes for Rerun's viewer, one after another."""
     seconds = 0.0
     with LiveView(path, monitor.spec, getattr(monitor, "model", None)) as view:

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from asm_gym.episodes import Episode, EpisodeLabel, save_episode
+from asm_gym.episode import Episode, EpisodeLabel, save_episode
 from asm_gym.scripts.cli import main
-from asm_gym.stream import Channel, StreamSpec
+from asm_gym.spec import Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("external_torque_peak", 2, "N m", noise=0.1),), dt=0.05)
 COUNTS = {"fit": 10, "calibration": 40, "nominal": 20}

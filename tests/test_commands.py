@@ -16,8 +16,6 @@ from pathlib import Path
 
 import pytest
 
-import asm_gym.wrappers  # noqa: F401  (adds its own to what has moved)
-from asm_gym.moved import MOVED
 from asm_gym.scripts import cli, command, reproduce
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -199,28 +197,6 @@ def running(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:
         return False
-
-
-def test_every_package_of_which_modules_have_moved_says_so_when_it_is_imported():
-    assert {name.split(".")[1] for name in MOVED} == {"faults", "memory", "scripts", "wrappers"}
-
-
-@pytest.mark.parametrize("old", MOVED)
-def test_a_module_is_found_under_its_old_name_and_says_the_new_one(old):
-    new = importlib.import_module(MOVED[old])
-    spec = new.__spec__
-    sys.modules.pop(old, None)
-    with pytest.warns(DeprecationWarning, match=re.escape(f"{old} is {MOVED[old]} now")):
-        assert importlib.import_module(old) is new
-    assert new.__spec__ is spec
-
-
-def test_a_command_that_has_moved_runs_under_its_old_name_and_says_the_new_one():
-    old = [sys.executable, "-m", "asm_gym.scripts.demonstrations", "--help"]
-    env = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(old, capture_output=True, text=True, check=True, cwd=ROOT, env=env)
-    assert "asm_gym.scripts.demonstrations is asm_gym.scripts.import_demonstrations now" in done.stderr
-    assert done.stdout.startswith("usage: asm-gym import")
 
 
 def options() -> Iterator[tuple[str, str]]:

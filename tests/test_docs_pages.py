@@ -14,7 +14,7 @@ printed = documents.tool("printed")
 
 TEXT = """---
 command: echo 42
-rooms: [stream.py]
+rooms: [spec.py]
 version: 0.0.1
 date: 2026-01-01
 code: unrecorded
@@ -50,7 +50,7 @@ def test_a_page_older_than_the_code_it_measures_says_so():
 def test_a_stale_page_carries_a_banner_and_a_fresh_one_only_its_command(page):
     old, fresh = printed.banner(page), printed.banner(page.printed_anew("42"))
     assert "**Stale.**" in old
-    assert "`stream.py`" in old
+    assert "`spec.py`" in old
     assert "Stale" not in fresh
     assert "echo 42" in old
     assert "echo 42" in fresh
@@ -64,7 +64,7 @@ def test_printing_replaces_what_was_printed_and_keeps_the_text_around_it(page):
     assert "After." in again.text
     assert "```text\n42\n```" in again.text
     assert "41" not in again.text
-    assert again.meta["code"] == pages.digest(["stream.py"])
+    assert again.meta["code"] == pages.digest(["spec.py"])
     assert again.meta["date"] == datetime.date.today()
     assert not again.is_old
     assert not again.says_so
@@ -87,7 +87,7 @@ def test_a_command_that_fails_leaves_the_page_as_it_was(page):
 
 def test_a_mark_comes_and_goes_with_the_code(page):
     assert page.marked().says_so
-    page.meta.update(code=pages.digest(["stream.py"]), stale=True)
+    page.meta.update(code=pages.digest(["spec.py"]), stale=True)
     assert not page.marked().says_so
 
 

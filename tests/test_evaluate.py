@@ -13,13 +13,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from asm_gym.episodes import Episode, EpisodeLabel, load_episode
+from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.monitors import load_monitor, registry
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 from asm_gym.rollouts.seeds import draw_onset
 from asm_gym.rollouts.trial import RolloutConfig, record
 from asm_gym.scripts.evaluate import Args, labels, main
-from asm_gym.stream import Channel, StreamSpec
+from asm_gym.spec import Channel, StreamSpec
 
 MONITORS = ("neural_asm", "kalman+evidence", "autoregression", "force_limit")
 SMALL = [

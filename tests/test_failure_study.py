@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.statistics import Share
 from asm_gym.monitors import Surprise
 from asm_gym.policies.network import NetworkPolicy
@@ -14,7 +14,7 @@ from asm_gym.scripts.reproduce import failure_rivals
 from asm_gym.scripts.reproduce.failure import AGENTS, Args, Watched, early, in_order, labels, order, separated, ways
 from asm_gym.scripts.reproduce.failure_rivals import entropy, inconsistency, reversals, scored
 from asm_gym.scripts.reproduce.weakened import Weakened
-from asm_gym.stream import Channel, StreamSpec
+from asm_gym.spec import Channel, StreamSpec
 
 INF = float("inf")
 

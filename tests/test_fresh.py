@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors import CalibratedMonitor, load_monitor, make_monitor
 from asm_gym.monitors.fresh import KEPT, STRETCH, check_fresh, marks, sketch
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("sense", 3, group="a"), Channel("action", 2, group=MOTOR)), dt=0.05)
 
@@ -55,7 +55,7 @@ def test_what_was_learned_from_is_known_however_it_is_cut():
     assert len(kept) == 10 * KEPT
     joined = Episode.from_stream(np.concatenate([e.stream for e in lessons[3:5]]), SPEC)
     for again in (lessons[3], joined):
-        with pytest.raises(ValueError, match="^episode 1 was learned from"):
+        with pytest.raises(ValueError, match=r"^episode 1 was learned from"):
             check_fresh([episode(77), again], kept)
     check_fresh([episode(n) for n in range(20, 30)], kept)
 

@@ -91,7 +91,11 @@ def test_a_promise_says_by_what_it_counts():
 @pytest.mark.parametrize(
     ("rate", "hours", "message"),
     [
-        (1.0, 0.25, r"1 false alarms an hour need at least 1 hours .*, got 0.25: record 0.75 hours more, or promise 4$"),
+        (
+            1.0,
+            0.25,
+            r"1 false alarms an hour need at least 1 hours .*, got 0.25: record 0.75 hours more, or promise 4$",
+        ),
         (0.1, 3.7, r"0.1 false alarms an hour need at least 10 hours .*: record 6.3 hours more, or promise 0.271$"),
     ],
 )

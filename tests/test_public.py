@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from sklearn.model_selection import train_test_split
 
-from asm_gym.public import AURSAD_META, VORAUS_META, read_public
+from asm_gym.data.public import AURSAD_META, VORAUS_META, read_public
 from asm_gym.scripts.cli import main
 
 ROWS = 40

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from asm_gym.episodes import load_episode
+from asm_gym.episode import load_episode
 from asm_gym.scripts import evaluate
 from asm_gym.scripts.reproduce import repertoire
 from asm_gym.scripts.reproduce.skill_recognition import naming_figure, share_right

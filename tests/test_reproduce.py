@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.scripts.cli import main as cli
 from asm_gym.scripts.reproduce import (
     INDEPENDENT,
@@ -37,6 +37,7 @@ from asm_gym.scripts.reproduce.expression import (
     mean_demonstrations,
     recalled,
 )
+from asm_gym.scripts.reproduce.fault_sets import written_fault_set
 from asm_gym.scripts.reproduce.handwriting import (
     NOISE,
     STEPS,
@@ -45,8 +46,7 @@ from asm_gym.scripts.reproduce.handwriting import (
     repertoire,
 )
 from asm_gym.scripts.reproduce.laws import LAWS, fit
-from asm_gym.scripts.reproduce.trials import written_trial
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 
 def letters_of(count: int, each: int = 6, seed: int = 0) -> tuple[list, list]:
@@ -144,7 +144,7 @@ def test_the_state_tells_a_pair_apart_only_once_it_has_parted():
 
 def test_a_library_told_a_wrong_skill_is_always_in_alarm_and_the_memory_needs_none():
     args = fault_detection.Args(letters=3, writings=8, hidden=32, robot_episodes=0)
-    records, _ = fault_detection.judged(0, written_trial(0, 3, 8), args)
+    records, _ = fault_detection.judged(0, written_fault_set(0, 3, 8), args)
     alarms = {way: over_seeds(records, "alarm", way=way)[0] for way in fault_detection.WAYS}
     assert alarms["wrong"] == 1.0
     assert alarms["memory"] < 0.35

@@ -8,7 +8,7 @@ from asm_gym.memory.completion import Completion
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.policies.reflexes import Graded
 from asm_gym.scaling import StreamScaler
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.arbitration import Arbiter
 from asm_gym.wrappers.arguments import make_fallback

@@ -9,7 +9,7 @@ import pytest
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from asm_gym.episodes import Episode, save_episode
+from asm_gym.episode import Episode, save_episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.training.exploration import Explorer, Gentle, until_contact
 from asm_gym.rollouts.training.learners import NOVICE_LOG_STD, make_learner, make_novice
@@ -19,7 +19,7 @@ from asm_gym.rollouts.training.violations import TorqueWatch
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.reproduce import safe_training
 from asm_gym.scripts.reproduce.training_report import counts_table, learning_figure, worth, worth_table
-from asm_gym.stream import Channel, StreamSpec
+from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from tests.fakes import CueMonitor, FakeEnv
 from tests.streams import sine_episodes, sine_spec

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from asm_gym.envs.threads import ThreadVectorEnv
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.faults import Push
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.spinal import UNJUDGED, FeltEpisode, SpinalBand
-from asm_gym.rollouts.felt import felt_episodes
+from asm_gym.rollouts.substeps import felt_episodes
 from asm_gym.scripts.reproduce.spinal import main, table
-from asm_gym.stream import Channel, StreamSpec
+from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety
 
 SPEC = StreamSpec(

@@ -15,8 +15,8 @@ import torch
 from stable_baselines3.common.logger import configure
 from torch.utils._pytree import tree_leaves
 
-from asm_gym.datasets import write_dataset
-from asm_gym.episodes import Episode
+from asm_gym.data.datasets import write_dataset
+from asm_gym.episode import Episode
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
 from asm_gym.rollouts.training.learners import ALGORITHMS, RECIPES, export, make_learner, warm_critic
@@ -24,7 +24,7 @@ from asm_gym.rollouts.training.recurrent import clone_recurrent
 from asm_gym.rollouts.training.run import Plan, Standard, TrainingRun
 from asm_gym.rollouts.training.state import TrainingState, newest, resume, save
 from asm_gym.scripts.cli import main
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 
 PENDULUM = ["train", "Pendulum-v1", "--demonstrations", "0", "--evaluation-episodes", "1", "--final-episodes", "1"]
 

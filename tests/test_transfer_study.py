@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asm_gym.episodes import Episode, EpisodeLabel
-from asm_gym.scripts.cli import main as asm_gym
+from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.scripts.reproduce import transfer_judge
 from asm_gym.scripts.reproduce.transfer import Args
 from asm_gym.scripts.reproduce.transfer_judge import ADAPTIVE, Judge
 from asm_gym.scripts.reproduce.transfer_report import alarmed, detection, drawn, per_hour, tables
 from asm_gym.scripts.reproduce.transfer_watched import KNOWN, POLICIES, WATCHED, Watched
-from asm_gym.stream import Channel, StreamSpec
+from asm_gym.spec import Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("a", 2, group="a"), Channel("b", 1, group="b"), Channel("action", 1, group="action")), 0.05)
 LIFT, SAC = Watched("Lift"), Watched("Lift", "lift_sac", group=POLICIES)
@@ -167,9 +166,3 @@ def test_agents_of_ones_own_are_watched_besides(tmp_path):
 def test_settings_that_cannot_be_judged_are_refused(wrong, says):
     with pytest.raises(ValueError, match=says):
         Args(**wrong)
-
-
-def test_with_two_folders_it_is_what_it_was_before(tmp_path, capsys):
-    with pytest.warns(DeprecationWarning, match="adoption"):
-        assert asm_gym(["reproduce", "transfer", str(tmp_path), str(tmp_path), "--out", str(tmp_path / "out")]) == 2
-    assert "holds no recordings" in capsys.readouterr().err

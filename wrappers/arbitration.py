@@ -14,9 +14,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import as_float32, shown
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Graded, Hold, Recall, Reflex
+from asm_gym.validation import as_float32, shown
 from asm_gym.wrappers.patience import Patience
 
 _log = logging.getLogger("asm_gym.safety")

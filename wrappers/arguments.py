@@ -8,13 +8,13 @@ from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 
-from asm_gym.abilities import SensesWithinSteps
-from asm_gym.checks import check_number, shown
 from asm_gym.detection.adaptive import AdaptiveThreshold, RunningThreshold
 from asm_gym.monitors import ExpectsActions, ExplainsItself, Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract, nearest_to_rest
-from asm_gym.stream import StreamSpec, control_period
+from asm_gym.protocols import SensesWithinSteps
+from asm_gym.spec import StreamSpec, control_period
+from asm_gym.validation import check_number, shown
 from asm_gym.wrappers.patience import Patience
 
 LOG = logging.getLogger("asm_gym.safety")

@@ -11,15 +11,14 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.abilities import LaysOutObservations
-from asm_gym.checks import check_number, shown
 from asm_gym.memory.completion import Completion, Filling
 from asm_gym.monitors import ExplainsItself, Monitor
-from asm_gym.stream import StreamSpec
-from asm_gym.typed import typed
+from asm_gym.protocols import LaysOutObservations
+from asm_gym.spec import StreamSpec
+from asm_gym.stream_source import StreamSource
+from asm_gym.validation import check_number, shown, typed
 from asm_gym.wrappers.arguments import check_monitor
 from asm_gym.wrappers.observer import Observer
-from asm_gym.wrappers.recording import StreamSource
 
 WELL_AFTER_S = 1.0
 """A sense is well again once it has said what was expected for so long [s]."""

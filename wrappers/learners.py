@@ -10,9 +10,8 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_text
-from asm_gym.stream import control_period
-from asm_gym.typed import typed
+from asm_gym.spec import control_period
+from asm_gym.validation import check_text, typed
 
 FLAT = ("cost", "asm_surprise", "asm_alarm", "asm_intervened")
 """What the safety wrapper says in numbers, beside its dictionary."""

@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number, shown
-from asm_gym.evaluation.overlay import StripChart, arrow, compose, project
+from asm_gym.validation import check_number, shown
+from asm_gym.view.chart import StripChart, arrow, compose, project
 
 ARROW_M = 0.01
 """Length of a force's arrow [m/N]."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Self
 
-from asm_gym.checks import check_number
+from asm_gym.validation import check_number
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.monitors import Surprise
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 from asm_gym.wrappers.arbitration import Decision
 from asm_gym.wrappers.observer import joined
 from asm_gym.wrappers.responses import NO_RESPONSE, Response

@@ -10,10 +10,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import shown
-from asm_gym.choices import check_choice
 from asm_gym.monitors import ExplainsItself, Monitor
 from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, as_info, averaged
+from asm_gym.validation import check_choice, shown
 from asm_gym.wrappers.arbitration import GOING_ON
 from asm_gym.wrappers.completion import ObservationMap, Repair
 from asm_gym.wrappers.touch import Touch

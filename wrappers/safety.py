@@ -11,12 +11,12 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.checks import as_float32, check_flag, check_number, shown
-from asm_gym.choices import check_choice
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import LearnsOnTheJob, Monitor, Surprise
 from asm_gym.monitors.spinal import SpinalBand
 from asm_gym.policies.base import Policy
+from asm_gym.stream_source import StreamSource
+from asm_gym.validation import as_float32, check_choice, check_flag, check_number, shown
 from asm_gym.wrappers.arbitration import NOTHING, Arbiter
 from asm_gym.wrappers.arguments import (
     body_memory,
@@ -31,7 +31,6 @@ from asm_gym.wrappers.arguments import (
     running,
 )
 from asm_gym.wrappers.observer import Observer, joined
-from asm_gym.wrappers.recording import StreamSource
 from asm_gym.wrappers.reports import RowReport, report
 from asm_gym.wrappers.responses import Responder, responses_from
 from asm_gym.wrappers.spinal import Left, SpinalCord

@@ -8,11 +8,11 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.abilities import FeelsWithinSteps
-from asm_gym.checks import shown
 from asm_gym.monitors import Monitor, NeuralASM, Surprise
 from asm_gym.monitors.monitor import MonitorState
 from asm_gym.monitors.spinal import UNJUDGED, Band, SpinalBand
+from asm_gym.protocols import FeelsWithinSteps
+from asm_gym.validation import shown
 
 
 class Left(NamedTuple):

@@ -8,9 +8,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.abilities import LocatesForces
 from asm_gym.memory.completion import Completion
-from asm_gym.stream import StreamSpec
+from asm_gym.protocols import LocatesForces
+from asm_gym.spec import StreamSpec
 
 PRESSING = 2.5
 """Something presses where an external torque is so many of its completion's standard deviations off."""

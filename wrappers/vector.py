@@ -10,12 +10,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
-from asm_gym.abilities import HoldsItself
-from asm_gym.checks import as_float32, check_flag
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, Reflex, nearest_to_rest
+from asm_gym.protocols import HoldsItself
+from asm_gym.stream_source import StreamSource
+from asm_gym.validation import as_float32, check_flag
 from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Command, Decision
 from asm_gym.wrappers.arguments import (
     body_memory,
@@ -29,7 +30,6 @@ from asm_gym.wrappers.arguments import (
 )
 from asm_gym.wrappers.batches import Mask, Member, final, members, refuse_changes, replace, set_attribute
 from asm_gym.wrappers.observer import Observer, joined
-from asm_gym.wrappers.recording import StreamSource
 
 
 class VectorNeuralASMSafety(VectorWrapper):

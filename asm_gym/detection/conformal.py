@@ -13,8 +13,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.special import betaincinv
 
-from asm_gym.checks import check_number, shown
 from asm_gym.detection.base import Array
+from asm_gym.validation import check_number, shown
 
 EPISODE, HOUR = "episode", "hour"
 """What a rate of false alarms may be counted by."""

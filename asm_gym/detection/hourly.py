@@ -21,9 +21,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number, shown
 from asm_gym.detection.base import Array
 from asm_gym.detection.conformal import HOUR, Promise, surely_below
+from asm_gym.validation import check_number, shown
 
 MINUTE = 60.0
 """Longest block, and how long the value must have stayed below the threshold for another alarm [s]."""

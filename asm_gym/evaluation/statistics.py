@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammainccinv, gammaincinv
 
-from asm_gym.checks import check_number, shown
+from asm_gym.validation import check_number, shown
 
 Floats = NDArray[np.floating[Any]]
 

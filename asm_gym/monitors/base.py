@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors.diagnosis import Diagnosis
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 
 Progress = Callable[[int, int], object]
 """Called as ``progress(done, total)``."""

@@ -11,8 +11,8 @@ from asm_gym.detection import Blocks, Promise, hourly_promise
 from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.monitors.asked import Asked
 from asm_gym.monitors.base import Surprise
-from asm_gym.stream import StreamSpec
-from asm_gym.typed import typed
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import typed
 
 
 class Calibrated:

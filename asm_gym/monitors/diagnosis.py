@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.memory.completion import PENALTY, Completion
-from asm_gym.stream import MOTOR
+from asm_gym.spec import MOTOR
 
 FAMILIES = ("sensor", "contact", "actuator", "action", "object", "unknown")
 """Of causes: a sensor; something that touches the body; a joint or gripper; what becomes of an action on its way; a

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 
 STRETCH = 20
 """L, rows. Episodes that are shorter cannot be told."""

@@ -1,4 +1,4 @@
-"""What a monitor's file holds, in whichever words an older asm-gym wrote it."""
+"""What a monitor's file holds."""
 
 from __future__ import annotations
 
@@ -10,20 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import Checkpoint
-from asm_gym.checks import check_number
-from asm_gym.choices import check_choice
 from asm_gym.detection import Blocks
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.conformal import EPISODE, HOUR
-from asm_gym.detection.detector import ANYTHING
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_choice, check_number
 
 MAXIMA, BLOCKS, LEARNED_FROM = "nominal_maxima", "nominal_blocks", "learned_from"
 """Under which names a checkpoint keeps what ``calibrate`` has found, by the episode and by the hour, and the marks of
 what ``fit`` was given."""
-
-RENAMED = {"habit": "context_quantile", "carry_prior": "free_running_probability"}
-"""What older checkpoints keep under another name."""
 
 
 class SavedMonitor(NamedTuple):
@@ -31,12 +26,12 @@ class SavedMonitor(NamedTuple):
 
     Attributes:
         arrays: what its model and its detections have learned, by name.
-        maxima: (n,) largest surprise in each episode of the calibration; None where it was not kept.
-        blocks: the same by the hour.
-        learned_from: marks of the episodes that were learned from, as ``fresh.sketch`` keeps them.
+        maxima: (n,) largest surprise in each episode of the calibration; None before it.
+        blocks: the same by the hour; None before it, and in files that were written before it was kept.
+        learned_from: marks of the episodes that were learned from, as ``fresh.sketch`` keeps them; None in such files.
         promised: what the threshold's promise counts by.
         threshold: as it was written.
-        detection: which the threshold is of; None where there was but one.
+        detection: which the threshold is of.
         skills: names of those that the model knows.
         about: whatever else was worth knowing.
     """
@@ -47,7 +42,7 @@ class SavedMonitor(NamedTuple):
     learned_from: NDArray[np.float64] | None
     promised: str
     threshold: object
-    detection: str | None
+    detection: str
     skills: tuple[str, ...]
     about: dict[str, Any]
 
@@ -58,17 +53,13 @@ class SavedMonitor(NamedTuple):
         undeclared = sorted(set(saved.arrays) - set(header["shapes"]))
         if undeclared:
             raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
-        names = {n: n if "detection" in header else RENAMED.get(n, n) for n in header["shapes"]}
-        arrays = {now: saved.array(n, *header["shapes"][n]) for n, now in names.items()}
+        arrays = {name: saved.array(name, *shape) for name, shape in header["shapes"].items()}
         maxima, blocks, learned_from = (arrays.pop(name, None) for name in (MAXIMA, BLOCKS, LEARNED_FROM))
         promised = header.get("promised", EPISODE)
         check_choice("promise", promised, (EPISODE, HOUR))
-        if "context_quantile" in arrays:
-            arrays.setdefault("context_range", ANYTHING)
-        about = dict(header.get("about", {}))  # an older asm-gym kept nothing
         by_hour = None if blocks is None else Blocks.restored(blocks)
         kept = maxima, by_hour, learned_from, promised, header["threshold"]
-        return cls(arrays, *kept, header.get("detection"), tuple(header["skills"]), about)
+        return cls(arrays, *kept, header["detection"], tuple(header["skills"]), dict(header["about"]))
 
     def threshold_below(self, reach: float) -> float | None:
         """The threshold, once it is a number that surprise can exceed, which never comes to ``reach``."""
@@ -105,7 +96,6 @@ def restored(path: str | Path, saved: Checkpoint, make: Callable[..., R]) -> R:
         ValueError: the file is damaged.
     """
     try:
-        hyperparameters = {RENAMED.get(n, n): value for n, value in saved.header["hyperparameters"].items()}
-        return make(StreamSpec.from_json(saved.header["spec"]), **hyperparameters).restore(saved)
+        return make(StreamSpec.from_json(saved.header["spec"]), **saved.header["hyperparameters"]).restore(saved)
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error

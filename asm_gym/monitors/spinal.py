@@ -32,7 +32,7 @@ from asm_gym.memory.state import MemoryState
 from asm_gym.memory.traces import advance
 from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.scaling import FARTHEST
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 
 KIND = "spinal_band"
 UNJUDGED = 2

@@ -21,10 +21,8 @@ import cloudpickle
 from loky import get_reusable_executor
 from threadpoolctl import threadpool_limits
 
-from asm_gym.checks import check_number
-from asm_gym.choices import check_choice
 from asm_gym.extras import require
-from asm_gym.typed import typed
+from asm_gym.validation import check_choice, check_number, typed
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

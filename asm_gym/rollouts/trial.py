@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 import asm_gym  # noqa: F401  (registers the environments in every worker)
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.episodes import Episode, EpisodeLabel, save_episode
+from asm_gym.episode import Episode, EpisodeLabel, save_episode
 from asm_gym.evaluation.contact import contact_force
-from asm_gym.evaluation.trace import IDEAL, NOMINAL, POLICY_ALONE, InterventionOutcome, Trace, TraceDetail
+from asm_gym.evaluation.scored import IDEAL, NOMINAL, POLICY_ALONE, InterventionOutcome, ScoredEpisode, TraceDetail
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.anywhere import faults_anywhere, sigmas
 from asm_gym.faults.body import touches_body
+from asm_gym.faults.interface import FaultyInterface
 from asm_gym.faults.sensor import corrupts_senses
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
 from asm_gym.monitors import Monitor, NeuralASM
@@ -30,10 +31,9 @@ from asm_gym.monitors.spinal import SpinalBand
 from asm_gym.policies import Policy, Seeded, make_policy, rollout
 from asm_gym.policies.scripted.base import Style
 from asm_gym.rollouts.seeds import draw_onset, episode_seeds
-from asm_gym.stream import control_period
+from asm_gym.spec import control_period
 from asm_gym.tasks import env_id
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder
-from asm_gym.wrappers.faults import FaultyInterface
 from asm_gym.wrappers.ideal import IdealReflex
 
 Settings = tuple[tuple[str, Any], ...]
@@ -307,7 +307,7 @@ def goal_in(env: gym.Env[Any, Any], recorded: Episode) -> dict[str, list[float]]
     return {"goal": [float(number) for name, part in parts if name in objects for number in part]}
 
 
-def watch(trial: Trial, config: RolloutConfig, memory: Path) -> Trace:
+def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
     """The trace of one trial, in this process's environment.
 
     Args:
@@ -330,7 +330,7 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> Trace:
     lasted = max((t + 1 for t, info in enumerate(infos) if info.get("fault")), default=None)
 
     named = next((a["cause"] for a in asm[began:] if a["cause"]["family"]), asm[0]["cause"])
-    trace = Trace(
+    trace = ScoredEpisode(
         kind=trial.kind,
         severity=trial.severity,
         task=trial.task,
@@ -356,7 +356,7 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> Trace:
     return trace.attributed(attribution, monitor.spec.labels)
 
 
-def watch_pair(trial: Trial, config: RolloutConfig, memory: Path) -> list[Trace]:
+def watch_pair(trial: Trial, config: RolloutConfig, memory: Path) -> list[ScoredEpisode]:
     """The traces of one trial with the policy alone, and as it says."""
     return watch_each(replace(trial, acting=POLICY_ALONE), (POLICY_ALONE, trial.acting), config, memory)
 
@@ -373,8 +373,8 @@ def watch_each(
     actings: Sequence[str],
     config: RolloutConfig,
     memory: Path,
-    undisturbed: Callable[[], Trace] | None = None,
-) -> list[Trace]:
+    undisturbed: Callable[[], ScoredEpisode] | None = None,
+) -> list[ScoredEpisode]:
     """The traces of one trial with each of ``actings``, of which those that must be the same run once.
 
     Without a band the wrapper acts only after an alarm, so without one any reflex's episode is that of the policy
@@ -390,7 +390,7 @@ def watch_each(
         alone = watch(replace(trial, acting=POLICY_ALONE), config, memory)
     of_senses = undisturbed is not None and concerns_senses_alone(trial, config)
 
-    def found(acting: str) -> Trace:
+    def found(acting: str) -> ScoredEpisode:
         if acting == IDEAL and of_senses and undisturbed is not None:
             return replace(undisturbed(), kind=trial.kind, severity=trial.severity, acting=IDEAL)
         told = acting == IDEAL and concerns_ideal(trial, config)

@@ -19,7 +19,6 @@ from rich.console import Console
 from rich.progress import track
 
 import asm_gym  # noqa: F401  (registers the environments)
-from asm_gym.checks import check_number
 from asm_gym.envs.backend import import_robosuite
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.scripts.benchmark.coverage import Coverage
@@ -31,6 +30,7 @@ from asm_gym.scripts.benchmark.vector import vector_table
 from asm_gym.scripts.benchmark.watch import Watch
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import check_number
 
 
 @dataclass

@@ -17,15 +17,15 @@ from torch import Tensor
 from asm_gym.detection.evidence import CONTEXT_GAIN, POWER
 from asm_gym.detection.repetition import evidence_steps
 from asm_gym.detection.tails import TAIL_INDEX
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.memory.traces import DECAYS
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.spinal import SpinalBand
 from asm_gym.rollouts.collect import collect
-from asm_gym.rollouts.felt import felt_episodes
+from asm_gym.rollouts.substeps import felt_episodes
 from asm_gym.scripts.benchmark.turns import take_turns
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 
 ACTIONS = 7

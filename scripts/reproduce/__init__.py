@@ -6,8 +6,8 @@ import sys
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from asm_gym.choices import check_choice
 from asm_gym.scripts.command import DONE, REFUSED, exit_code, parse
+from asm_gym.validation import check_choice
 
 
 class Study(NamedTuple):

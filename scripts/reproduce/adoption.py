@@ -16,17 +16,17 @@ from typing import Annotated, NamedTuple
 import tyro
 from rich.console import Console
 
-from asm_gym.choices import check_choice
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.comparison import monitor_metrics, visible_kinds
 from asm_gym.evaluation.metrics import DetectionMetrics, Kind, false_alarms
 from asm_gym.evaluation.tables import Column, Table, console_table, count, markdown, percent_within, tabulate
 from asm_gym.monitors import MONITORS
-from asm_gym.rollouts.benchmark import detectability_of, result_of
-from asm_gym.rollouts.folder import recorded
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import recorded
+from asm_gym.rollouts.scoring import detectability_of, result_of
 from asm_gym.scripts.command import run
 from asm_gym.scripts.reproduce.common import tasks_recorded
+from asm_gym.validation import check_choice
 
 Roles = Mapping[str, Sequence[Episode]]
 

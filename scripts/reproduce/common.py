@@ -19,12 +19,12 @@ from rich.console import Console
 from threadpoolctl import threadpool_limits
 
 import asm_gym
-from asm_gym.episodes import Episode, EpisodeLabel, load_episode
+from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.figures import save
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table, console_table, markdown
-from asm_gym.rollouts.folder import make_missing, tasks_in
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import make_missing, tasks_in
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, record
 from asm_gym.scripts.command import at_least, run

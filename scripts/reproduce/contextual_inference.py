@@ -20,8 +20,7 @@ from rich.console import Console
 from scipy.cluster.vq import kmeans2
 from scipy.optimize import linear_sum_assignment
 
-from asm_gym.choices import check_choice
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.readout import certainty, learn_readout
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
@@ -48,6 +47,7 @@ from asm_gym.scripts.reproduce.handwriting import (
     detoured,
     repertoire,
 )
+from asm_gym.validation import check_choice
 
 SHARED = 2
 """Strokes that the letters of a pair have in common."""

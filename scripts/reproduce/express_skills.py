@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.statistics import wilson_interval
 from asm_gym.evaluation.tables import Table

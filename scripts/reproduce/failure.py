@@ -20,17 +20,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
-from asm_gym.episodes import Episode, EpisodeLabel, load_episode, save_episode
+from asm_gym.episode import Episode, EpisodeLabel, load_episode, save_episode
 from asm_gym.evaluation.figures import figure, look
+from asm_gym.evaluation.scored import NOMINAL
 from asm_gym.evaluation.statistics import RESAMPLES, Estimate, Share, auroc
 from asm_gym.evaluation.tables import Table, count
-from asm_gym.evaluation.trace import NOMINAL
 from asm_gym.monitors import MONITORS
-from asm_gym.rollouts.folder import make_missing
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce
@@ -38,6 +37,7 @@ from asm_gym.scripts.reproduce.failure_rivals import NAMES, scored
 from asm_gym.scripts.reproduce.weakened import weakened
 from asm_gym.tasks import env_id
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import check_choice
 from asm_gym.wrappers import StreamRecorder
 
 AGENTS = {"Lift": "lift_sac", "Stack": "stack_sac", "Door": "door_sac"}

@@ -20,14 +20,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 
-from asm_gym.checks import check_number
-from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes, conformal_threshold
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.metrics import detected, false_alarms, time_matched_auroc
+from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.tables import Table
-from asm_gym.evaluation.trace import NOMINAL, Trace
 from asm_gym.faults.suite import KINDS, SEVERITIES
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.rollouts.parallel import parallel_map
@@ -44,9 +42,10 @@ from asm_gym.scripts.reproduce.common import (
     shown,
     wide_enough,
 )
+from asm_gym.scripts.reproduce.fault_sets import FaultSet, robot_fault_set, written_fault_set
 from asm_gym.scripts.reproduce.handwriting import check_letters
-from asm_gym.scripts.reproduce.trials import Trial, robot_trial, written_trial
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import check_choice, check_number
 
 WAYS = {
     "memory": "Neural ASM, told nothing",
@@ -146,7 +145,7 @@ def _skill(episode: Episode) -> str:
     return str(episode.info["skill"])
 
 
-def judged(seed: int, trial: Trial, args: Args) -> tuple[list[Record], dict[str, Any]]:
+def judged(seed: int, trial: FaultSet, args: Args) -> tuple[list[Record], dict[str, Any]]:
     """Every way of telling faults, on one domain; and the surprise in one faulty episode, for the figure."""
     skills = sorted({_skill(e) for e in trial.fit})
     spec = trial.fit[0].spec
@@ -181,11 +180,11 @@ def judged(seed: int, trial: Trial, args: Args) -> tuple[list[Record], dict[str,
 
 def _trace(
     episode: Episode, values: NDArray[np.float64], threshold: float, kind: str = NOMINAL, onset: int | None = None
-) -> Trace:
-    return Trace(kind, episode.seed or 0, episode.spec.dt, threshold, values, onset, task=_skill(episode))
+) -> ScoredEpisode:
+    return ScoredEpisode(kind, episode.seed or 0, episode.spec.dt, threshold, values, onset, task=_skill(episode))
 
 
-def _found(fault: Trace, nominal: Sequence[Trace]) -> Record:
+def _found(fault: ScoredEpisode, nominal: Sequence[ScoredEpisode]) -> Record:
     """AUROC against nominal episodes of the same skill in the same steps, and whether an alarm was raised in time."""
     window_s = WINDOW * fault.dt
     score = time_matched_auroc([fault], nominal, window_s)
@@ -249,7 +248,7 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
         found = parallel_map(partial(_letters, args=args), list(args.repetitions), args.workers, progress)
     if args.robot_episodes:
         faults = args.faults, args.severity, args.faulty_episodes
-        trial = robot_trial(args, args.tasks, args.robot_episodes, *faults, console, seconds)
+        trial = robot_fault_set(args, args.tasks, args.robot_episodes, *faults, console, seconds)
         with stage("robosuite", console, seconds) as progress:
             one = partial(judged, trial=trial, args=args)
             found += parallel_map(one, list(args.repetitions), args.workers, progress)
@@ -260,7 +259,7 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
 
 
 def _letters(seed: int, args: Args) -> tuple[list[Record], dict[str, Any]]:
-    return judged(seed, written_trial(seed, args.letters, args.writings), args)
+    return judged(seed, written_fault_set(seed, args.letters, args.writings), args)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -19,10 +19,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 
-from asm_gym.choices import check_choice
 from asm_gym.detection import EvidenceDetection, ModelOutput, conformal_episodes
 from asm_gym.detection.base import Arrays
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.comparison import BenchmarkResult, MonitorResult
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.resampling import interval
@@ -34,14 +33,15 @@ from asm_gym.monitors import CalibratedMonitor, make_monitor
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
 from asm_gym.monitors.model import StreamModel
-from asm_gym.rollouts.benchmark import detectability_of, judged
-from asm_gym.rollouts.folder import recorded
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import recorded
+from asm_gym.rollouts.scoring import detectability_of, judged
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce, tasks_recorded
 from asm_gym.scripts.reproduce.learning_curve import in_turn
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_choice
 
 UNITS = 960
 """Of association, shared out among the groups, as in the memory."""

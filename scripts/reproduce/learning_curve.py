@@ -19,20 +19,20 @@ import tyro
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.comparison import Detectability, MonitorResult, monitor_metrics, visible_kinds
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.metrics import false_alarms
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import MONITORS
-from asm_gym.rollouts.benchmark import detectability_of, result_of
-from asm_gym.rollouts.folder import recorded
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import recorded
+from asm_gym.rollouts.scoring import detectability_of, result_of
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce, tasks_recorded
+from asm_gym.validation import check_choice
 
 QUICK = 40
 """With ``--quick``, nothing learns from more episodes than these."""

@@ -23,7 +23,6 @@ import torch
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from asm_gym.checks import check_number
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
 from asm_gym.memory.inference import Weights
@@ -48,6 +47,7 @@ from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import trajectories
 from asm_gym.scripts.reproduce.gradients import COMPARED, CUE, Changes, cosine, exact, local
 from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire
+from asm_gym.validation import check_number
 
 TARGETS = {
     "energy": "gradient of the energy",

@@ -18,17 +18,16 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from asm_gym.checks import check_number
-from asm_gym.choices import check_choice
+from asm_gym.data.public import Recorded, read_public
+from asm_gym.data.selection import divided
 from asm_gym.detection import conformal_episodes
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.statistics import auroc
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
-from asm_gym.normal import divided
-from asm_gym.public import Recorded, read_public
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
+from asm_gym.validation import check_choice, check_number
 
 AT_ONCE = 64
 """Episodes scored side by side."""

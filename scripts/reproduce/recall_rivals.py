@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.scripts.reproduce import splines
 from asm_gym.scripts.reproduce.common import Record
 from asm_gym.scripts.reproduce.expression import (

@@ -16,7 +16,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from asm_gym.choices import check_choice
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
 from asm_gym.rollouts.parallel import parallel_map
@@ -36,6 +35,7 @@ from asm_gym.scripts.reproduce.recall_rivals import (
     learned,
     writings,
 )
+from asm_gym.validation import check_choice
 
 
 def grid(**values: Sequence[float]) -> tuple[Setting, ...]:

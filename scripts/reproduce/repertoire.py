@@ -17,7 +17,6 @@ from typing import Annotated, Any, NamedTuple
 import tyro
 from rich.console import Console
 
-from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation.comparison import monitor_metrics, visible_kinds
 from asm_gym.evaluation.figures import save
@@ -25,10 +24,10 @@ from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table, console_table, markdown, milliseconds
 from asm_gym.monitors import MONITORS
-from asm_gym.rollouts.benchmark import detectability_of, result_of
-from asm_gym.rollouts.folder import files_in, recorded, tasks_in
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import files_in, recorded, tasks_in
+from asm_gym.rollouts.scoring import detectability_of, result_of
 from asm_gym.scripts.command import at_least, run
 from asm_gym.scripts.reproduce.skill_recognition import (
     alarms_table,
@@ -38,6 +37,7 @@ from asm_gym.scripts.reproduce.skill_recognition import (
     naming_table,
 )
 from asm_gym.scripts.reproduce.skill_switch import NAMES, record_switch
+from asm_gym.validation import check_choice
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
 from asm_gym.rollouts.parallel import parallel_map

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.scripts.reproduce.common import Record
 from asm_gym.scripts.reproduce.expression import Backpropagated, Expresser, Hopfield, Library, Memory, Rows
 

@@ -19,19 +19,19 @@ import tyro
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation.comparison import monitor_metrics, visible_kinds
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table
-from asm_gym.rollouts.benchmark import detectability_of, fitted, judged
-from asm_gym.rollouts.folder import recorded
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import recorded
+from asm_gym.rollouts.scoring import detectability_of, fitted, judged
 from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce, tasks_recorded
 from asm_gym.scripts.reproduce.learning_curve import in_turn
+from asm_gym.validation import check_choice
 
 Setting = dict[str, Any]
 """Hyperparameters that differ from those that a monitor has by itself."""

@@ -21,13 +21,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
-from asm_gym.rollouts.folder import CRASH
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import CRASH
 from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, demonstrations, reproduce
 from asm_gym.scripts.reproduce.skill_names import (

@@ -10,11 +10,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episodes import Episode, load_episode, save_episode
+from asm_gym.episode import Episode, load_episode, save_episode
 from asm_gym.monitors.model import running
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
 from asm_gym.rollouts.trial import environment
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 from asm_gym.wrappers import StreamRecorder
 
 NAMES = {"Can": "PickPlaceCan", "Milk": "PickPlaceMilk"}
@@ -42,7 +42,7 @@ class Switch:
     @classmethod
     def read(cls, path: Path, spec: StreamSpec) -> Self:
         """What ``record_switch`` wrote."""
-        episode = load_episode(path, spec)
+        episode = load_episode(path)
         spec.require(episode.spec, str(path))
         return cls(episode, running(episode), int(episode.info["changed"]))
 

@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from asm_gym.envs.backend import PHYSICS_FREQ
+from asm_gym.evaluation.scored import IDEAL, POLICY_ALONE
 from asm_gym.evaluation.tables import Table
-from asm_gym.evaluation.trace import IDEAL, POLICY_ALONE
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.spinal import SpinalBand
 from asm_gym.policies import rollout
-from asm_gym.rollouts.felt import band_of_task
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
+from asm_gym.rollouts.substeps import band_of_task
 from asm_gym.rollouts.trial import AFTER_S, PASSING, RolloutConfig, Trial, environment, policy_for, staged
 from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import sys
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,24 +16,23 @@ from pathlib import Path
 
 from rich.console import Console
 
-from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
-from asm_gym.episodes import Episode, EpisodeLabel, load_episode
+from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.faults.suite import kinds_of
 from asm_gym.monitors import EVIDENCE, MONITORS, CalibratedMonitor, NeuralASM
-from asm_gym.rollouts.babbling import curriculum, record_lesson
-from asm_gym.rollouts.benchmark import fitted
-from asm_gym.rollouts.body import harmless, healthy, held_out, learn_body
-from asm_gym.rollouts.folder import make_missing
+from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
+from asm_gym.rollouts.pretraining.healthy import harmless, healthy, held_out, learn_body
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import make_missing
+from asm_gym.rollouts.scoring import fitted
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import at_least
-from asm_gym.scripts.reproduce import adoption
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, demonstrations, reproduce
 from asm_gym.scripts.reproduce.transfer_judge import Judge, Own, fewer_senses, role
 from asm_gym.scripts.reproduce.transfer_report import drawn, tables
 from asm_gym.scripts.reproduce.transfer_watched import KNOWN, POLICIES, WATCHED, Watched, record_watched
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import check_choice
 
 SHIPPED = "panda"
 """The memory of this body that comes with the package, at the rate that it was shipped with."""
@@ -224,12 +222,8 @@ def judged(
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the study, and returns the exit code; with two folders it is ``adoption``, as it was before."""
-    given = sys.argv[1:] if argv is None else argv
-    if given and not given[0].startswith("-"):
-        warnings.warn("reproduce transfer KNOWN WATCHED is now reproduce adoption", DeprecationWarning, stacklevel=2)
-        return adoption.main(given)
-    return reproduce("transfer", study, Args, __doc__, given)
+    """Runs the study, and returns the exit code."""
+    return reproduce("transfer", study, Args, __doc__, argv)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.tables import Table
 from asm_gym.rollouts.parallel import parallel_map

@@ -22,7 +22,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 
-from asm_gym import datasets, episodes, logs
+from asm_gym import episode as one_episode
+from asm_gym.data import datasets, logs
 from asm_gym.monitors import load_monitor
 from asm_gym.policies import make_policy
 from asm_gym.policies.network import NetworkPolicy
@@ -129,7 +130,7 @@ class Files:
         layout, env = logs.Layout(spec=good.spec), FakeEnv()
         self.formats = {
             "memory": Format(good.memory_file, lambda p: _arrays(load_monitor(p).learned_)),
-            "episode": Format(good.episode_file, lambda p: _content(episodes.load_episode(p))),
+            "episode": Format(good.episode_file, lambda p: _content(one_episode.load_episode(p))),
             "agent": Format(good.agent_file, lambda p: _acts(NetworkPolicy.load(p), 37)),
             "agent of SB3": Format(Path("good.zip").resolve(), lambda p: _acts(make_policy(str(p), env), 2)),
             "dataset": Format(next(good.dataset.rglob("*.hdf5")), _dataset),
@@ -187,7 +188,7 @@ def _dataset(file: Path) -> list[tuple[Any, ...]]:
     return [_content(episode) for episode in datasets.read_dataset(file.parents[1])]
 
 
-def _content(episode: episodes.Episode) -> tuple[Any, ...]:
+def _content(episode: one_episode.Episode) -> tuple[Any, ...]:
     return episode.stream.tobytes(), episode.spec, episode.success, episode.seed, episode.actions.tobytes()
 
 

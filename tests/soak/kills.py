@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from asm_gym.checkpoint import kind_of, read_checkpoint
-from asm_gym.datasets import read_dataset
-from asm_gym.episodes import load_episode
+from asm_gym.data.datasets import read_dataset
+from asm_gym.episode import load_episode
 from asm_gym.files import UNFINISHED
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts import cli

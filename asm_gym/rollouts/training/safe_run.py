@@ -20,7 +20,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor as EpisodeMonitor
 
-from asm_gym.episodes import Episode, load_episode
+from asm_gym.episode import Episode, load_episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
