@@ -224,7 +224,7 @@ class SkillSurprise:
         weight = check_number("the weight of skill surprise", float(arrays["weight"]), above=0.0)
         learned = {n: a for n, a in arrays.items() if n not in ("maxima", "blocks", "weight")}
         shapes = {name: array.shape for name, array in learned.items()}
-        header = {"shapes": shapes, "skills": (), "threshold": None, "detection": EvidenceDetection.name}
+        header = {"shapes": shapes, "skills": (), "threshold": None, "detection": EvidenceDetection.name, "about": {}}
         return cls(
             _monitor(spec, seed).restore(Checkpoint(header, learned)),
             weight,
