@@ -1,8 +1,9 @@
 """How hard an arm may press and how fast its hand may go before it stays, whatever the cause is taken for.
 
 ISO/TS 15066:2016 (Annex A) lets a robot press a hand, the least tolerant part that it is likely to meet, with 140 N for
-long and 280 N for a moment. Healthy motion of the tasks of this package reaches 10 to 71 N at the wrist on one axis and 8 to 34 N m in
-a joint; what is peculiar to a set-up is learned from its calibration episodes, and the larger of the two counts.
+long and 280 N for a moment. Healthy motion of the tasks of this package reaches 10 to 71 N at the wrist on one axis and
+8 to 34 N m in a joint; what is peculiar to a set-up is learned from its calibration episodes, and the larger of the two
+counts.
 """
 
 from __future__ import annotations

@@ -184,6 +184,20 @@ class Simulation:
         parts = [[s[:count, :n], s[:count, wrist]] for s, n in zip(self._samples, self._arms.joints, strict=True)]
         return np.hstack([part for arm in parts for part in arm])
 
+    @property
+    def contact_forces(self) -> NDArray[np.float64]:
+        """(K,) the largest net contact force on an arm in each substep since the row began [N]; no sensor tells it."""
+        forces = self._samples[:, : self._done - self._row_began, kernels.CONTACT]
+        found: NDArray[np.float64] = np.linalg.norm(forces, axis=2).max(axis=0)
+        return found
+
+    @property
+    def strain(self) -> NDArray[np.float64]:
+        """(K,) the largest external torque in a joint in each substep since the row began [N m]."""
+        torques = self._samples[:, : self._done - self._row_began, kernels.EXTERNAL]
+        found: NDArray[np.float64] = np.abs(torques).max(axis=(0, 2))
+        return found
+
     def sense(self) -> NDArray[np.float64]:
         """What the arms' sensors read now, summarised over the substeps since the row began; noiseless."""
         if self._done > self._row_began:
@@ -224,7 +238,7 @@ class Simulation:
     # ------------------------------------------------------------------ knowledge of the robot
 
     def slowed(self, action: NDArray[np.float64], most: float) -> list[tuple[slice, float]]:
-        """For each arm, its part of the action, and the share of it at which its hand goes no faster than ``most`` [m/s].
+        """For each arm, its part of the action, and what share of it keeps its hand below ``most`` [m/s].
 
         A controller that is asked for a change Δx of pose again and again, from where it is, comes to the velocity
         Kp/Kd Δx. Actions of controllers that take anything else are left as they are.
