@@ -82,7 +82,7 @@ class NeuralASM(CalibratedMonitor):
         self,
         spec: StreamSpec,
         hidden_size: int = 256,
-        association_size: int = 960,
+        association_size: int = 240,
         iterations: int = 5,
         learning_rate: float = 3e-3,
         epochs: int = 40,

@@ -151,7 +151,7 @@ def judged(seed: int, trial: FaultSet, args: Args) -> tuple[list[Record], dict[s
     spec = trial.fit[0].spec
     hidden = args.hidden if trial.domain == "letters" else 2 * args.hidden
     # With few rows a wide association would learn them by heart.
-    size = 960 if trial.domain == "robosuite" else 64
+    size = 240 if trial.domain == "robosuite" else 64
     memory = NeuralASM(spec, hidden, size, iterations=10, seed=seed).fit(trial.fit)
     library = make_monitor("skill_library", spec, seed=seed).fit(trial.fit)
     evident = make_monitor("skill_library+evidence", spec, seed=seed).fit(trial.fit)

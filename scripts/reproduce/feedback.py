@@ -43,7 +43,7 @@ from asm_gym.scripts.reproduce.learning_curve import in_turn
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice
 
-UNITS = 960
+UNITS = 240
 """Of association, shared out among the groups, as in the memory."""
 
 LINEAR = "linear"

@@ -40,7 +40,7 @@ SETTINGS: dict[str, tuple[Setting, ...]] = {
     "neural_asm": (
         {},
         {"association_size": 480},
-        {"association_size": 1920},
+        {"association_size": 960},
         {"learning_rate": 1e-3},
         {"hidden_size": 128},
     ),
