@@ -12,21 +12,24 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import tyro
 from rich.console import Console
 
 from asm_gym.data.logs import Layout, read_logs
 from asm_gym.data.selection import divided, normal_episodes, pieces, unbroken
-from asm_gym.detection import conformal_episodes
+from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.episode import Episode
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
+from asm_gym.monitors.asked import Asked
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
 from asm_gym.validation import check_choice, check_number
 
 _QUICK = {"episodes": 20, "epochs": 5}
+
+ANY_EPISODE = 0.5
+"""A rate that one episode can promise: by the hour it is hours that count."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,8 @@ class Args:
     """Name of the monitor."""
     false_alarm_rate: float = 0.05
     """Share of normal episodes that may raise an alarm."""
+    false_alarms_per_hour: float | None = None
+    """Alarms in an hour of normal episodes; promised in place of a share of them."""
     calibration_share: float = 0.5
     """Share of the episodes that set the threshold, and are not learned from."""
     action: tuple[str, ...] = ()
@@ -59,13 +64,19 @@ class Args:
 
     def __post_init__(self) -> None:
         check_choice("monitor", self.monitor, MONITORS)
-        conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
+        _ = self.asked  # refuses a rate that is none
         check_number("calibration_share", self.calibration_share, above=0, below=1)
         for name in ("rate", "split"):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), above=0)
         if self.out.is_dir():
             raise ValueError(f"out must be a file, and {self.out} is a folder")
+
+    @property
+    def asked(self) -> Asked:
+        """The promise of the threshold."""
+        hourly = self.false_alarms_per_hour
+        return Asked.of(self.false_alarm_rate if hourly is None else None, hourly)
 
 
 def learned(args: Args, fitting: list[Episode], calibration: list[Episode], progress: Progress) -> Any:
@@ -74,7 +85,30 @@ def learned(args: Args, fitting: list[Episode], calibration: list[Episode], prog
     if args.quick and "epochs" in monitor_class(args.monitor).hyperparameters:
         settings["epochs"] = _QUICK["epochs"]
     monitor: Any = make_monitor(args.monitor, fitting[0].spec, **settings)
-    return monitor.fit(fitting, progress).calibrate(calibration, args.false_alarm_rate)
+    return monitor.fit(fitting, progress).calibrate(calibration, **args.asked.named)
+
+
+def parted(args: Args, episodes: list[Episode]) -> tuple[list[Episode], list[Episode]]:
+    """Those to learn from, and those to calibrate on. Raises ValueError where they are too few for the promise."""
+    if args.asked.per == EPISODE:
+        return divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
+    fitting, calibration = divided(episodes, ANY_EPISODE, args.calibration_share, args.seed)
+    args.asked.check_hours(hours_of(calibration))
+    return fitting, calibration
+
+
+def promised(args: Args, calibration: list[Episode]) -> str:
+    """How often the threshold lets normal operation alarm, in words."""
+    if args.asked.per == HOUR:
+        return f"at most {args.asked.rate:g} alarms an hour of normal ones, from {hours_of(calibration):.3g} of them"
+    hourly = args.false_alarm_rate * len(calibration) / hours_of(calibration)
+    at_their_length = f"{hourly:.{0 if hourly >= 10 else 1}f} an hour at their length"
+    return f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones, {at_their_length}"
+
+
+def hours_of(episodes: list[Episode]) -> float:
+    """How long they are together [h]."""
+    return sum(len(e) * e.spec.dt for e in episodes) / 3600
 
 
 def fit(args: Args, console: Console) -> None:
@@ -90,24 +124,20 @@ def fit(args: Args, console: Console) -> None:
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
     whole = [part for episode in kept.episodes for part in unbroken(episode)]
     episodes = whole if args.split is None else [p for e in whole for p in pieces(e, args.split)]
-    fitting, calibration = divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
+    fitting, calibration = parted(args, episodes)
     fitting = fitting[: _QUICK["episodes"]] if args.quick else fitting
     with stage("learning", console, {}) as progress:
         monitor = learned(args, fitting, calibration, progress)
     monitor.save(args.out)
     spec = fitting[0].spec
     rows = sum(map(len, fitting))
-    hourly = args.false_alarm_rate * 3600 / (spec.dt * float(np.mean([len(e) for e in calibration])))
     say = partial(console.print, soft_wrap=True, highlight=False)
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
     if left_out:
         say(f"Left out: {left_out}.")
     if len(whole) != len(kept.episodes):
         say(f"Rows were lost: {len(kept.episodes)} episodes were cut there, into {len(whole)} parts.")
-    say(
-        f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: an alarm in at most "
-        f"{args.false_alarm_rate:.1%} of normal ones, {hourly:.{0 if hourly >= 10 else 1}f} an hour at their length."
-    )
+    say(f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: {promised(args, calibration)}.")
     seconds = time.perf_counter() - start
     say(f"Wrote {args.out} after {seconds:.0f} s. Watch with it: asm-gym watch LOG --monitor {args.out}")
 

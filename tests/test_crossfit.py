@@ -67,7 +67,7 @@ def test_precision_is_that_of_rows_that_were_never_learned():
     def squared(inputs, delta):
         f = hidden_units(inputs, w.V)
         error = (delta - complete(f, inputs, w.U, w.D)) / w.remainder
-        return np.mean(error**2 * np.exp(-log_variance(f, w.W_S, w.b_S)))
+        return np.mean(error**2 * np.exp(-log_variance(f, w.W_S, w.b_S, w.span_S)))
 
     fresh = squared(*lesson(rng, 100, 50))
     assert 0.6 < fresh < 1.7  # 1: errors are as large as was said

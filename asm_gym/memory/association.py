@@ -3,7 +3,7 @@
     a_t = [v_{t-1}, Δ_t, Δ_{t-1}, u_t, 1]          values before, changes now and before, the action as commanded
     h_t = V a_t                                    units of group g have no synapse from its own Δ_t
     Δ̂_t = D a_t + U f(h_t)                         what predicts g has synapses from units of g alone
-    log σ²_t = W_S f(h_t) + b_S                    how large an error is to be expected, in s: see ``precision``
+    log σ²_t = W_S f(h_t) + b_S, within span_S     how large an error is to be expected, in s: see ``precision``
     D: in closed form, see ``linear``              s: the spread of what it leaves, r_t = (Δ_t - D a_t)/s
     ε_t = ψ((r_t - U f(h_t)/s)/σ),  ψ(ε) = min(max(ε, -1), 1)
     ΔU ∝ ε_t f(h_t)ᵀ    ΔV ∝ ε_h a_tᵀ,  ε_h = f'(h_t) ⊙ Uᵀ ε_t
@@ -35,7 +35,7 @@ from asm_gym.memory.crossfit import SMALLEST_SPREAD, THIRDS, crossfit, thirds, t
 from asm_gym.memory.energy import Array, activate, kernel, outward
 from asm_gym.memory.learning import Synapse, coincidence, cosine_decay, shuffled
 from asm_gym.memory.linear import learn_from_past, learn_linear
-from asm_gym.memory.precision import PRECISION_EPOCHS, learn_precision, log_variance
+from asm_gym.memory.precision import PRECISION_EPOCHS, learn_precision, log_variance, unbounded, usual_span
 
 UPDATES, PASSES = 6000, 40
 """Batches learned from at most, and passes over the steps at most: with more, few steps would be learned by heart."""
@@ -66,13 +66,15 @@ class Association(NamedTuple):
     D: Array  # (X, I)
     W_S: Array  # (X, M)
     b_S: Array  # noqa: N815 (X,)
+    span_S: Array  # noqa: N815 (2, X) what log σ² stays within
     remainder: Array  # (X,) s, the spread that the linear part leaves; 1 in memories that learned both parts at once
 
 
 def association_shapes(inputs: int, units: int, changes: int) -> dict[str, tuple[int, ...]]:
     """The shape of each array in ``Association``, by name."""
     M, X = units, changes
-    return {"V": (M, inputs), "U": (X, M), "D": (X, inputs), "W_S": (X, M), "b_S": (X,), "remainder": (X,)}
+    precision = {"W_S": (X, M), "b_S": (X,), "span_S": (2, X)}
+    return {"V": (M, inputs), "U": (X, M), "D": (X, inputs), **precision, "remainder": (X,)}
 
 
 class Change(NamedTuple):
@@ -154,6 +156,7 @@ def normalised_errors(
     D: Array,
     W_S: Array,
     b_S: Array,
+    span_S: Array,
     remainder: Array,
     spans: NDArray[np.intp],
 ) -> tuple[Array, Array]:
@@ -172,7 +175,7 @@ def normalised_errors(
             for j in range(spans[i, 0], spans[i, 1]):
                 total += f[0, j] * U[i, j]
             out[0, i] += total
-    spread = log_variance(f, W_S, b_S)
+    spread = log_variance(f, W_S, b_S, span_S)
     for n in range(out.shape[0]):
         for i in range(out.shape[1]):
             error = (changes[n, i] - out[n, i]) / remainder[i]
@@ -250,14 +253,15 @@ def learn_association(
     share = trust(left, expected)
     U *= share[:, None]
     W_S, b_S = np.zeros_like(U), np.zeros(len(U), np.float32)
-    learn_precision(hidden_units(a, V), left - share * expected, W_S, b_S, rng, tick)
-    return Association(V, U * remainder[:, None], D, W_S, b_S, remainder)
+    f = hidden_units(a, V)
+    learn_precision(f, left - share * expected, W_S, b_S, rng, tick)
+    return Association(V, U * remainder[:, None], D, W_S, b_S, usual_span(f, W_S, b_S), remainder)
 
 
 def _linear_alone(D: Array, remainder: Array, V: Array) -> Association:
     """With units that nothing is expected from: names may be read from them."""
     nothing = np.zeros((len(D), len(V)), np.float32)
-    return Association(V, nothing, D, nothing.copy(), np.zeros_like(remainder), remainder)
+    return Association(V, nothing, D, nothing.copy(), np.zeros_like(remainder), unbounded(len(D)), remainder)
 
 
 def _random(exists: Array, rng: np.random.Generator) -> Array:

@@ -30,6 +30,11 @@ class Asked(NamedTuple):
         conformal_episodes(false_alarm_rate)
         return cls(false_alarm_rate, EPISODE)
 
+    @property
+    def named(self) -> dict[str, float]:
+        """As ``calibrate`` takes it."""
+        return {"false_alarms_per_hour" if self.per == HOUR else "false_alarm_rate": self.rate}
+
     def check_hours(self, hours: float) -> None:
         """Raises ValueError where there are too few for a rate by the hour."""
         if self.per == HOUR:
