@@ -104,7 +104,7 @@ def test_too_few_hours_are_refused_with_how_many_more_it_takes(rate, hours, mess
         hourly_threshold(Blocks(np.ones(10), np.full(10, hours / 10)), rate)
 
 
-@pytest.mark.parametrize("rate", [0.0, -1.0, np.nan, np.inf, "1", None, True])
+@pytest.mark.parametrize("rate", [0.0, -1.0, np.nan, np.inf, 1e308, "1", None, True])
 def test_a_rate_that_is_none_is_refused(rate):
     with pytest.raises(ValueError, match="false_alarms_per_hour must be"):
         hourly_threshold(Blocks(np.ones(3), np.ones(3)), rate)

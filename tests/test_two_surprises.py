@@ -108,6 +108,8 @@ def test_each_choice_keeps_a_promise_by_the_hour(tmp_path):
     """40 episodes of 4 s: 160 s, of which three may alarm at 90 an hour, whichever surprise is asked."""
     asm = both().with_alarm_on("body").calibrate([carried(100 + s) for s in range(40)], false_alarms_per_hour=90.0)
     asm.save(tmp_path / "by_hour.asm")
+    with pytest.raises(ValueError, match="episode 1 was learned from"):  # by what listens for skills
+        asm.calibrate([carried(100), carried(3)] * 40, false_alarms_per_hour=90.0)
     for known in (asm, load_monitor(tmp_path / "by_hour.asm")):
         for which in ("body", "skill", "either", "both"):
             chosen = known.with_alarm_on(which)

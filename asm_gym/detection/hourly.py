@@ -28,8 +28,8 @@ from asm_gym.validation import check_number, shown
 MINUTE = 60.0
 """Longest block, and how long the value must have stayed below the threshold for another alarm [s]."""
 
-LEAST_PER_HOUR = 1e-6
-"""A hundred years of operation: what nobody records."""
+LEAST_PER_HOUR, MOST_PER_HOUR = 1e-6, 1e6
+"""One in a hundred years of operation, which nobody records, and more than there are rows."""
 
 ROUNDING = 1e-9
 
@@ -71,7 +71,7 @@ def alarms_in(value: Array, threshold: float, dt: float) -> int:
 
 def check_per_hour(rate: float) -> float:
     """Raises ValueError or TypeError unless it is a number of alarms an hour that can be promised."""
-    return check_number("false_alarms_per_hour", rate, low=LEAST_PER_HOUR)
+    return check_number("false_alarms_per_hour", rate, low=LEAST_PER_HOUR, high=MOST_PER_HOUR)
 
 
 def check_hours(rate: float, hours: float) -> None:

@@ -140,8 +140,9 @@ class CalibratedMonitor(Calibrated):
         kept = len(episodes) // one_in if one_in else 0
         held_out, learned = ([episodes[i] for i in part] for part in (order[:kept], order[kept:]))
         self._uncalibrate()
-        before = self._learned_from if warm_start and self._learned_from is not None else np.zeros(0)
-        self._learned_from = np.union1d(before, sketch(episodes))
+        if not warm_start:
+            self._learned_from = None
+        self._remember(episodes)
         # One thread: products this small are slowed down by several, and ruined by several that share a core.
         with threadpool_limits(1):
             if warm_start and isinstance(self.model, Specialises):
@@ -301,6 +302,11 @@ class CalibratedMonitor(Calibrated):
         other.detections = {name: copy.copy(d) for name, d in self.detections.items()}
         other.detection = other.detections[self.detection.name]
         return other
+
+    def _remember(self, episodes: Sequence[Episode]) -> None:
+        """That these were learned from, so that no promise by the hour is made of them."""
+        before = np.zeros(0) if self._learned_from is None else self._learned_from
+        self._learned_from = np.union1d(before, sketch(episodes))
 
     def _fitted(self) -> None:
         if not self.model.learned_ or (self.detection.arrays and not self.detection.learned_):

@@ -259,6 +259,7 @@ class NeuralASM(CalibratedMonitor):
         self.skill_ = SkillSurprise.learned(episodes, body.score_episodes(episodes), self.seed)
         self.threshold_, self.maxima_, self.about = body.threshold_, body.maxima_, body.about
         self.blocks_, self.promised_ = body.blocks_, body.promised_
+        self._remember(episodes)
         return self
 
     def with_alarm_on(self, which: str) -> Self:
