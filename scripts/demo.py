@@ -24,7 +24,7 @@ from rich.console import Console
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
-from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, false_alarms_per_hour, typical
+from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, hourly_alarms, typical
 from asm_gym.evaluation.report import write_json, write_report
 from asm_gym.evaluation.scored import NOMINAL
 from asm_gym.evaluation.statistics import Share, binomial_interval
@@ -211,7 +211,7 @@ def as_json(m: DetectionMetrics) -> dict[str, Any]:
         "condition": m.name,
         "episodes": len(m.watched),
         "false_alarm_episodes": false_alarms(m.watched),
-        "false_alarms_per_hour": false_alarms_per_hour(m.watched),
+        "false_alarms_per_hour": hourly_alarms(m.watched).value,
         "detected": m.detected,
         "delays": m.delays,
         "auroc": m.auroc,

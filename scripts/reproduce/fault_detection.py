@@ -128,7 +128,7 @@ def judged(seed: int, trial: FaultSet, config: Config) -> tuple[list[Record], di
     spec = trial.fit[0].spec
     hidden = config.hidden if trial.domain == "letters" else 2 * config.hidden
     # With few rows a wide association would learn them by heart.
-    size = 960 if trial.domain == "robosuite" else 64
+    size = 240 if trial.domain == "robosuite" else 64
     memory = NeuralASM(spec, hidden, size, iterations=10, seed=seed).fit(trial.fit)
     library = make_monitor("skill_library", spec, seed=seed).fit(trial.fit)
     evident = make_monitor("skill_library+evidence", spec, seed=seed).fit(trial.fit)
