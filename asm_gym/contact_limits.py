@@ -39,6 +39,8 @@ class ContactLimits:
         external_torque: of each joint [N m].
         hand_speed: a command that would move the hand faster is scaled down to it [m/s]; infinite for none. Of
             OSC_POSE and JOINT_POSITION, whose actions are changes of where the arm is; others are not scaled.
+        by_place: the hand goes no faster than healthy episodes of this body and task did near where it is, and slowly
+            where they never were; ``hand_speed`` is the most. That needs a monitor that was calibrated since.
         healthy: the most that healthy motion of this body and task was seen to reach, (N,) in the order of
             ``RobosuiteEnv.felt_channels``; where that is more, it counts. Empty where nobody knows.
         stays: the arm stays from the physics substep on after a limit was passed; else it is only said.
@@ -50,6 +52,7 @@ class ContactLimits:
     wrist_force: float = 80.0
     external_torque: float = 40.0
     hand_speed: float = 0.15
+    by_place: bool = False
     healthy: tuple[float, ...] = ()
     stays: bool = True
 
@@ -59,6 +62,7 @@ class ContactLimits:
         check_number("hand_speed", self.hand_speed, above=0, infinite=True)
         for value in self.healthy:
             check_number("healthy", value, low=0)
+        check_flag("by_place", self.by_place)
         check_flag("stays", self.stays)
 
     def most(self, felt: Sequence[Channel]) -> NDArray[np.float64]:

@@ -1,6 +1,7 @@
 """Who acts next: one table of transitions, searched by a machine that tries whatever rows there may be."""
 
 import math
+import warnings
 from itertools import product
 from pathlib import Path
 
@@ -130,7 +131,9 @@ class Episodes(RuleBasedStateMachine):
         if self.arbiter.state is State.ENDED:
             return
         acts = self.arbiter.state in ACTING and np.isfinite(action).all()
-        done = self.arbiter.command(action, np.zeros(2, np.float32))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that such an action is none is said, which other tests ask for
+            done = self.arbiter.command(action, np.zeros(2, np.float32))
         assert self.env.action_space.contains(done.action)
         np.testing.assert_array_equal(done.action, np.clip(action, -1, 1) if acts else [0, 0, done.action[2]])
 

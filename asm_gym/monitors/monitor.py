@@ -16,6 +16,7 @@ from asm_gym.contact_limits import healthy_forces
 from asm_gym.detection import Detection, ModelOutput, Nominal
 from asm_gym.detection.conformal import HOUR
 from asm_gym.episode import Episode
+from asm_gym.familiar_speed import FamiliarSpeed
 from asm_gym.monitors.asked import Asked
 from asm_gym.monitors.base import Model, Progress, Specialises, State, Surprise, Told
 from asm_gym.monitors.calibrated import Calibrated
@@ -46,6 +47,7 @@ class CalibratedMonitor(Calibrated):
         threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
         healthy_: (N,) the most that an arm felt in the calibration episodes, in the order of ``felt_channels`` [N m],
             [N]; contact limits are no less. Empty before, and where the stream senses no such forces.
+        familiar_: how fast the hand went at each place in them; None before, and where the stream tells of no hand.
         maxima_: (n,) largest surprise in each episode that ``calibrate`` was given; None before.
         blocks_: the same by the hour, as ``detection.hourly`` counts it; None before, and where it was not kept.
         promised_: ``"episode"`` or ``"hour"``, what the threshold's promise counts by.
@@ -192,7 +194,9 @@ class CalibratedMonitor(Calibrated):
             asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
             check_fresh(episodes, self._learned_from)
         self._set_threshold(self.score_episodes(episodes), asked)
-        self.healthy_ = healthy_forces([e.stream for e in episodes], self.spec)
+        streams = [episode.stream for episode in episodes]
+        self.healthy_ = healthy_forces(streams, self.spec)
+        self.familiar_ = FamiliarSpeed.learned(streams, self.spec)
         return self
 
     @typed
@@ -268,6 +272,7 @@ class CalibratedMonitor(Calibrated):
             "skills": list(self.skills_),
             "about": self.about,
             "healthy": list(self.healthy_),
+            "familiar": [] if self.familiar_ is None else self.familiar_.rows,
             "shapes": {name: list(array.shape) for name, array in arrays.items()},
         }
         write_checkpoint(path, self.model.kind, header, arrays)
@@ -291,6 +296,7 @@ class CalibratedMonitor(Calibrated):
             if found.arrays.keys() >= set(detection.arrays):
                 detection.restore({n: found.arrays[n] for n in detection.arrays})
         self.about, self._learned_from = found.about, found.learned_from
+        self.familiar_ = FamiliarSpeed.restored(saved.header.get("familiar", []))
         self.healthy_ = tuple(check_number("healthy", value, low=0.0) for value in saved.header.get("healthy", ()))
         if found.detection == self.detection.name:
             self.threshold_, self.promised_ = found.threshold_below(self.detection.reach), found.promised
