@@ -1,8 +1,8 @@
 """How fast a hand has healthily gone at each place: where nothing is known, it goes slowly.
 
-A place is a cube of ``CELL`` metres. It knows the 95 % quantile of the speeds that healthy episodes had there; asked for
-a place, the greatest of those within ``NEAR`` counts, and a little more. Elsewhere the hand goes at ``UNKNOWN``, at which
-the first blow on a stiff table stays below 100 N.
+A place is a cube of ``CELL`` metres. It knows the 95 % quantile of the speeds that healthy episodes had there. Asked
+for a place, the greatest of those within ``NEAR`` counts, and a little more. Elsewhere a hand goes at ``UNKNOWN``, and
+its first blow on a stiff table stays below 100 N.
 """
 
 from __future__ import annotations

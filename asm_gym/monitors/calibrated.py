@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import Blocks, Promise, hourly_promise
 from asm_gym.detection.conformal import EPISODE, HOUR
+from asm_gym.familiar_speed import FamiliarSpeed
 from asm_gym.monitors.asked import Asked
 from asm_gym.monitors.base import Surprise
 from asm_gym.spec import StreamSpec
@@ -82,6 +83,8 @@ class Calibrated:
     def _uncalibrate(self) -> None:
         self.threshold_ = self.maxima_ = self.blocks_ = None
         self.promised_ = EPISODE
+        self.healthy_: tuple[float, ...] = ()
+        self.familiar_: FamiliarSpeed | None = None
 
     @property
     def _name(self) -> str:
