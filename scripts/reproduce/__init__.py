@@ -32,6 +32,7 @@ STUDIES = {
     "transfer": Study("one memory of a body, for policies and tasks never met"),
     "failure": Study("does surprise tell that a policy will fail"),
     "harm": Study("harm avoided against success kept, under any policy"),
+    "attack": Study("what can be hidden from the memory by who writes to the senses"),
     "spinal": Study("how soon an arm feels what it should not, in substeps"),
     "reflexes": Study("what acting on alarms is worth, reflex by fault", needs_a_run=True),
     "learning_curve": Study("detection by the number of episodes learned from", needs_a_run=True),
