@@ -89,6 +89,16 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
         ValueError: an unknown name, a task without an expert, or an agent that was trained in another environment; the
             message lists what exists, or what differs.
         FileNotFoundError: there is no such agent.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from asm_gym import make_policy
+        >>> env = gym.make("asm_gym/SyntheticArm-v0")
+        >>> policy = make_policy("sway", env, seed=0)
+        >>> observation, info = env.reset(seed=0)
+        >>> action, state = policy.predict(observation)
+        >>> env.action_space.contains(action)
+        True
     """
     if name == "scripted":
         task, elsewhere = getattr(env.unwrapped, "task", None), env.spec.id if env.spec else ""

@@ -192,6 +192,16 @@ def make_monitor(
 
     Raises:
         ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists.
+
+    Example:
+        >>> import numpy as np
+        >>> from asm_gym import Channel, Episode, StreamSpec, make_monitor
+        >>> spec, rng = StreamSpec((Channel("position", 3, "m"),), dt=0.05), np.random.default_rng(0)
+        >>> healthy = [Episode.from_stream(rng.normal(size=(60, 3)), spec) for _ in range(30)]
+        >>> monitor = make_monitor("kalman+evidence", spec, ridge=1e-3).fit(healthy[:10])
+        >>> monitor = monitor.calibrate(healthy[10:], false_alarm_rate=0.05)
+        >>> monitor.detection.name
+        'evidence'
     """
     kind = monitor_class(name if not isinstance(detection, str) else f"{model_of(name)}+{detection}")
     for parameter in hyperparameters:

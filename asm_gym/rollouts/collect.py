@@ -52,6 +52,12 @@ def collect(
     Raises:
         ValueError: fewer than one episode or worker; whatever the environment and the policy refuse.
         TypeError: spaces that are no numbers, or a policy that cannot be sent to another process.
+
+    Example:
+        >>> from asm_gym import collect
+        >>> episodes = collect("asm_gym/SyntheticArm-v0", "sway", episodes=2, seed=0, workers=1)
+        >>> len(episodes), episodes[0].stream.shape == (len(episodes[0]), episodes[0].spec.size)
+        (2, True)
     """
     check_number("episodes", episodes, low=1, whole=True)
     config = RolloutConfig(policy, env_kwargs=tuple(sorted(env_kwargs.items())))

@@ -137,6 +137,7 @@ def main(study: ModuleType, argv: Sequence[str] | None = None) -> int:
 
 def conduct(name: str, study: Callable[[Any], Findings], config: Any, console: Console) -> None:
     """Runs a study, writes what it found into its folder, and prints it."""
+    _ = getattr(config, "tasks", ())  # of a run: refused where there is none, before anything is written
     config.out.mkdir(parents=True, exist_ok=True)  # refused before the study, not after it
     sitting = Sitting(console)
     token = _NOW.set(sitting)
