@@ -30,9 +30,11 @@ from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
 from asm_gym.rollouts.pretraining.healthy import healthy, held_out, learn_body
 from asm_gym.rollouts.pretraining.model_card import Exam, Marks, at_rates, card, examine, usual_force
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.record import record
 from asm_gym.rollouts.run_folder import claimed, labelled, make_missing, versions
 from asm_gym.rollouts.scoring import code_digest
-from asm_gym.rollouts.trial import RolloutConfig, environment, record
+from asm_gym.rollouts.staging import environment
+from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.tasks import ROBOTS, TASKS

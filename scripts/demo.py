@@ -42,8 +42,10 @@ from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged, watch_pair
+from asm_gym.rollouts.staging import play, staged
+from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
+from asm_gym.rollouts.watch import watch_pair
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.tasks import env_id

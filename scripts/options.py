@@ -99,17 +99,19 @@ def read(kind: type[Any], argv: Sequence[str], prog: str) -> dict[str, Any]:
     hurried = "--quick" in argv
     hints = get_type_hints(kind, include_extras=True)
     defaults = {each.name: _default(each, hurried) for each in fields(kind)}
+    positional: Any = tyro.conf.Positional
     made: list[Any] = []
     for each in fields(kind):
         if not each.metadata.get("typed", True):
             continue
         hint = hints[each.name]
-        hint = tyro.conf.Positional[hint] if each.metadata.get("positional") else hint
+        hint = positional[hint] if each.metadata.get("positional") else hint
         default = defaults[each.name]
         made.append((each.name, hint, field(default=tyro.MISSING if default is MISSING else default)))
     flat = make_dataclass(kind.__name__, made, frozen=True)
-    typed = tyro.cli(flat, args=list(argv), prog=prog)
-    return {name: value for name, value in defaults.items() if value is not MISSING} | vars(typed)
+    typed: Any = tyro.cli(flat, args=list(argv), prog=prog)
+    values: dict[str, Any] = {name: value for name, value in defaults.items() if value is not MISSING} | vars(typed)
+    return values
 
 
 def shortened(options: Any) -> str:
@@ -145,11 +147,12 @@ def _rows(kind: type[Any]) -> Iterator[Row]:
         about = each.metadata
         if not about.get("typed", True):
             continue
-        hint, extras = hints[each.name], ()
+        hint: Any = hints[each.name]
+        extras: Sequence[Any] = ()
         if get_origin(hint) is Annotated:
-            hint, *extras = get_args(hint)  # type: ignore[assignment]
+            hint, *extras = get_args(hint)
         if is_dataclass(hint):
-            yield from _rows(hint)  # type: ignore[arg-type]
+            yield from _rows(hint)
             continue
         metavar = about.get("metavar") or next((m for e in extras if (m := getattr(e, "metavar", ""))), "")
         positional = bool(about.get("positional")) or any("POSITIONAL" in str(e).upper() for e in extras)
@@ -209,7 +212,7 @@ def _laid_out(paragraph: str) -> bool:
 
 
 @cache
-def docstrings(kind: type[Any]) -> dict[str, str]:
+def docstrings(kind: Any) -> dict[str, str]:
     """What is said under each field, or under ``Args:``, in the source of a class and of those it comes from."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__):

@@ -8,9 +8,23 @@ import inspect
 import pytest
 
 import asm_gym
+from asm_gym.faults.suite import KINDS
+from asm_gym.monitors import MONITORS
+from asm_gym.policies.registry import REGISTERED
+from asm_gym.tasks import OWN
 
 ELSEWHERE = {"FaultInjection", "NeuralASMSafety", "StreamRecorder", "VectorNeuralASMSafety"}
 """Names whose example is to come with the rewriting of the wrappers."""
+
+
+@pytest.fixture(autouse=True)
+def registries():
+    """What an example registers is forgotten."""
+    kept = [(rows, dict(rows)) for rows in (KINDS, MONITORS, OWN, REGISTERED)]
+    yield
+    for rows, before in kept:
+        rows.clear()
+        rows.update(before)
 
 
 @pytest.mark.parametrize("name", sorted(set(asm_gym.__all__) - ELSEWHERE))

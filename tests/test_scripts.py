@@ -11,7 +11,8 @@ from asm_gym.evaluation.report import write_json
 from asm_gym.evaluation.statistics import Share
 from asm_gym.faults import FrozenEncoder, Push
 from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.trial import RolloutConfig, Trial, watch
+from asm_gym.rollouts.trial import RolloutConfig, Trial
+from asm_gym.rollouts.watch import watch
 from asm_gym.scripts import command, demo
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.collect import collect, episode_seeds

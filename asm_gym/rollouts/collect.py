@@ -14,7 +14,8 @@ from asm_gym.episode import Episode, save_episode
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.trial import PolicySource, RolloutConfig, Trial, environment, play, policy_for, staged
+from asm_gym.rollouts.staging import environment, play, policy_for, staged
+from asm_gym.rollouts.trial import PolicySource, RolloutConfig, Trial
 from asm_gym.tasks import env_spec
 from asm_gym.validation import check_number, typed
 from asm_gym.wrappers import StreamRecorder
