@@ -110,7 +110,7 @@ def register_task(name: str, make: Callable[..., gym.Env[Any, Any]] | str, horiz
     check_number("horizon", horizon, low=1, whole=True)
     spec = EnvSpec(f"asm_gym/{name}-v0", entry_point=make, max_episode_steps=horizon)
     add("task", OWN, name, spec)
-    gym.registry.setdefault(spec.id, spec)
+    gym.registry[spec.id] = spec
 
 
 def task(name: str) -> TaskSpec:
@@ -132,7 +132,7 @@ def env_id(name: str) -> str:
         ImportError: the module of ``module:id`` is not installed; the message says what brings it.
     """
     if name in OWN:
-        gym.registry.setdefault(OWN[name].id, OWN[name])  # which a worker has not done yet
+        gym.registry[OWN[name].id] = OWN[name]  # which a worker has not done yet
         return OWN[name].id
     try:
         env_spec(check_text("task", name))

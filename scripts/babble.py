@@ -19,7 +19,7 @@ from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import EpisodeLabel, load_episode
-from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
+from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_S
 from asm_gym.evaluation.tables import console_table, markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
@@ -43,7 +43,7 @@ from asm_gym.validation import check_choice, check_number
 
 SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
-RATES = 0.01, 0.05
+RATES = REPORTED_RATE, FALSE_ALARM_RATE
 """Rates at which an examination is also told."""
 LEARNING = (
     *("memory", "detection", "scaling.py", "spec.py", "rollouts/pretraining/healthy.py"),

@@ -99,12 +99,15 @@ def read(kind: type[Any], argv: Sequence[str], prog: str) -> dict[str, Any]:
     hurried = "--quick" in argv
     hints = get_type_hints(kind, include_extras=True)
     defaults = {each.name: _default(each, hurried) for each in fields(kind)}
+    annotated: Any = Annotated
     positional: Any = tyro.conf.Positional
     made: list[Any] = []
     for each in fields(kind):
         if not each.metadata.get("typed", True):
             continue
         hint = hints[each.name]
+        if metavar := each.metadata.get("metavar"):
+            hint = annotated[hint, tyro.conf.arg(metavar=metavar)]
         hint = positional[hint] if each.metadata.get("positional") else hint
         default = defaults[each.name]
         made.append((each.name, hint, field(default=tyro.MISSING if default is MISSING else default)))
@@ -141,7 +144,7 @@ def rows(kind: type[Any]) -> Iterator[Row]:
     yield from sorted(found, key=lambda row: not row.positional)
 
 
-def _rows(kind: type[Any]) -> Iterator[Row]:
+def _rows(kind: Any) -> Iterator[Row]:
     hints, said = get_type_hints(kind, include_extras=True), docstrings(kind)
     for each in fields(kind):
         about = each.metadata
@@ -152,7 +155,8 @@ def _rows(kind: type[Any]) -> Iterator[Row]:
         if get_origin(hint) is Annotated:
             hint, *extras = get_args(hint)
         if is_dataclass(hint):
-            yield from _rows(hint)
+            nested: Any = hint
+            yield from _rows(nested)
             continue
         metavar = about.get("metavar") or next((m for e in extras if (m := getattr(e, "metavar", ""))), "")
         positional = bool(about.get("positional")) or any("POSITIONAL" in str(e).upper() for e in extras)
