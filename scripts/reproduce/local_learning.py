@@ -179,7 +179,8 @@ def tables(records: Sequence[Record], config: Config) -> list[Table]:
     """Angles over learning, by array, by iterations; errors; costs."""
     epochs = checkpoints(config.epochs)
 
-    epochs_of, usually = kit.by("epoch", epochs), {"array": "all", "iterations": usual(config)}
+    epochs_of = kit.by("epoch", epochs)
+    usually: Record = {"array": "all", "iterations": usual(config)}
     targets = {label: {"target": t} for t, label in TARGETS.items()}
     angles_of = partial(kit.grid, records=records, value="degrees", digits=0)
     caption = (
