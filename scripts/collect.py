@@ -23,7 +23,7 @@ from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, option
-from asm_gym.tasks import ROBOTS, env_id
+from asm_gym.tasks import ROBOTS, TASKS, env_id
 
 __all__ = ["collect", "episode_seeds"]  # which were here before there was a room for them
 
@@ -32,7 +32,7 @@ __all__ = ["collect", "episode_seeds"]  # which were here before there was a roo
 class Args:
     """Episodes of a policy, as a Minari dataset."""
 
-    task: str = option("Lift", positional=True, check=env_id, metavar="TASK")
+    task: str = option("Lift", positional=True, check=env_id, listed=TASKS, metavar="TASK")
     """Name of a task, or any Gymnasium id whose spaces are numbers, such as Pusher-v5."""
     policy: str = "scripted"
     """What acts: scripted, hold, sway, a shipped agent, or the path of one."""

@@ -81,7 +81,7 @@ class Args:
     """Names of monitors; any model goes under any detection, as in external_torque_limit+evidence."""
     settings: tuple[str, ...] = option((), metavar="MONITOR.NAME=VALUE")
     """Hyperparameters of these monitors that are not their own, as in gru.learning_rate=0.0003."""
-    faults: tuple[str, ...] = option((), metavar="KIND")
+    faults: tuple[str, ...] = option((), listed=KINDS, metavar="KIND")
     """Kinds of fault, by default all that there are; development or test for robosuite's to choose by, or to report."""
     severities: tuple[str, ...] = option(SEVERITIES, quick=("strong",), least=1, known=SEVERITIES)
     """How bad each is."""

@@ -39,6 +39,7 @@ def option(
     quick: T = _SAME,
     least: float | None = None,
     known: Iterable[str] | Callable[[], Iterable[str]] = (),
+    listed: Iterable[str] | Callable[[], Iterable[str]] = (),
     check: Callable[[Any], object] | None = None,
     metavar: str = "",
     positional: bool = False,
@@ -50,11 +51,12 @@ def option(
         quick: with ``--quick``, where nothing else was asked for.
         least: of a number; of a tuple, of how many there are.
         known: names that will do, or what tells them.
+        listed: names that the help lists, beside which others may do.
         check: is called with the value, or with each of a tuple's, and raises where it will not do.
         metavar: what stands for the value in the help.
         positional: given without its name.
     """
-    about = {"quick": quick, "least": least, "known": known, "check": check, "metavar": metavar}
+    about = {"quick": quick, "least": least, "known": known, "listed": listed, "check": check, "metavar": metavar}
     made: T = field(default=default, metadata={**about, "positional": positional, "typed": True})
     return made
 
@@ -136,6 +138,7 @@ class Row(NamedTuple):
     name: str  # as typed
     said: str
     positional: bool
+    required: bool
 
 
 def rows(kind: type[Any]) -> Iterator[Row]:
@@ -160,7 +163,9 @@ def _rows(kind: Any) -> Iterator[Row]:
             continue
         metavar = about.get("metavar") or next((m for e in extras if (m := getattr(e, "metavar", ""))), "")
         positional = bool(about.get("positional")) or any("POSITIONAL" in str(e).upper() for e in extras)
-        yield Row(_typed(each, hint, metavar, positional), _said(each, kind, said.get(each.name, "")), positional)
+        required = each.default is MISSING and each.default_factory is MISSING
+        told = _said(each, kind, said.get(each.name, ""))
+        yield Row(_typed(each, hint, metavar, positional), told, positional, required)
 
 
 def _typed(each: Field[Any], hint: Any, metavar: str, positional: bool) -> str:
@@ -178,8 +183,9 @@ def _typed(each: Field[Any], hint: Any, metavar: str, positional: bool) -> str:
 
 def _said(each: Field[Any], kind: type[Any], text: str) -> str:
     about, parts = each.metadata, [" ".join(text.split())]
-    if known := about.get("known"):
-        parts.append(f"One of {', '.join(known() if callable(known) else known)}.")
+    for how, said in (("known", "One of"), ("listed", "There are")):
+        if names := about.get(how):
+            parts.append(f"{said} {', '.join(names() if callable(names) else names)}.")
     if each.name == "quick":
         changed = [
             f"{other.name.replace('_', ' ')} {_words(value) or 'none'}"
@@ -198,7 +204,8 @@ def help_text(prog: str, kind: type[Any], about: str) -> str:
     """Usage, what the command does, and a paragraph an option, as wide as the terminal."""
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     every = list(rows(kind))
-    usage = " ".join(["usage:", prog, *(row.name for row in every if row.positional)])
+    given = (row.name if row.required else f"[{row.name}]" for row in every if row.positional)
+    usage = " ".join(["usage:", prog, *given])
     named = any(not row.positional for row in every)
     lines = [f"{usage} [OPTIONS]" if named else usage]
     for paragraph in about.split("\n\n"):
