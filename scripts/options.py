@@ -22,8 +22,6 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import tyro
-
 from asm_gym.validation import check_choice
 
 T = TypeVar("T")
@@ -98,6 +96,8 @@ def read(kind: type[Any], argv: Sequence[str], prog: str) -> dict[str, Any]:
     Raises:
         SystemExit: they make no sense; standard error says what.
     """
+    import tyro
+
     hurried = "--quick" in argv
     hints = get_type_hints(kind, include_extras=True)
     defaults = {each.name: _default(each, hurried) for each in fields(kind)}
