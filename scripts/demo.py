@@ -42,11 +42,13 @@ from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged, watch_pair
+from asm_gym.rollouts.staging import play, staged
+from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
+from asm_gym.rollouts.watch import watch_pair
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, fixed, option
-from asm_gym.tasks import env_id
+from asm_gym.tasks import TASKS, env_id
 from asm_gym.validation import check_choice
 from asm_gym.wrappers import NeuralASMSafety
 
@@ -55,7 +57,7 @@ from asm_gym.wrappers import NeuralASMSafety
 class Args:
     """Collect, fit, calibrate, break things, and see who notices."""
 
-    task: str = option("Lift", positional=True, check=env_id, metavar="TASK")
+    task: str = option("Lift", positional=True, check=env_id, listed=TASKS, metavar="TASK")
     """Name of a task."""
     on_alarm: Literal["graded", "hold", "terminate"] = option("graded")
     """What the wrapper does on an alarm: graded does what the cause asks for."""

@@ -20,7 +20,7 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.episode import Episode
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
-from asm_gym.monitors import make_monitor, monitor_class
+from asm_gym.monitors import MONITORS, make_monitor, monitor_class
 from asm_gym.monitors.asked import Asked
 from asm_gym.monitors.registry import check_monitor
 from asm_gym.rollouts.parallel import Progress
@@ -42,7 +42,7 @@ class Args:
     .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS."""
     out: Path = option(Path("runs/fit/memory.asm"), metavar="FILE")
     """File to write the memory to."""
-    monitor: str = option("neural_asm", check=check_monitor)
+    monitor: str = option("neural_asm", check=check_monitor, listed=MONITORS)
     """Name of the monitor."""
     false_alarm_rate: float = option(FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of normal episodes that may raise an alarm."""

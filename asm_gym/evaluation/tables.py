@@ -15,7 +15,8 @@ from rich.table import Table as ConsoleTable
 
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import metrics
-from asm_gym.evaluation.comparison import RATES, BenchmarkResult
+from asm_gym.evaluation.comparison import BenchmarkResult
+from asm_gym.evaluation.defaults import RATES
 from asm_gym.evaluation.metrics import ActingMetrics, Delays, DetectionMetrics, KindMetrics, in_words
 from asm_gym.evaluation.resampling import interval
 from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE

@@ -72,6 +72,17 @@ class NeuralASM(CalibratedMonitor):
         maxima_: largest surprise in each episode that ``calibrate`` was given; None before.
         blocks_: the same by the hour; None before, and in memories that were saved before it was kept.
         skill_: what listens for skills; None before ``learn_skills``.
+
+    Example:
+        >>> import numpy as np
+        >>> from asm_gym import Channel, Episode, NeuralASM, StreamSpec
+        >>> spec, rng = StreamSpec((Channel("position", 2, "m"),), dt=0.05), np.random.default_rng(0)
+        >>> healthy = [Episode.from_stream(rng.normal(size=(60, 2)).cumsum(0), spec) for _ in range(40)]
+        >>> memory = NeuralASM(spec, hidden_size=16, association_size=16, epochs=2).fit(healthy[:20])
+        >>> memory = memory.calibrate(healthy[20:], false_alarm_rate=0.05)
+        >>> knocked = Episode.from_stream(healthy[0].stream + 50.0 * (np.arange(60)[:, None] > 30), spec)
+        >>> bool((memory.score(knocked).value > memory.threshold).any())
+        True
     """
 
     kind = MemoryModel.kind

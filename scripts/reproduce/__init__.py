@@ -83,7 +83,7 @@ def everything(argv: list[str]) -> int:
     if command.parse("reproduce all", Config, argv, f"Runs {', '.join(INDEPENDENT)}.") is None:
         return DONE
     for name in INDEPENDENT:
-        command.parse(f"reproduce {name}", _options(_module(name)), argv)
+        command.parse(f"reproduce {name}", options_of(name), argv)
     code = DONE
     for name in INDEPENDENT:
         code = max(code, _run(name, argv))
@@ -101,7 +101,9 @@ def _run(name: str, argv: list[str]) -> int:
     return code
 
 
-def _options(module: Any) -> Any:
+def options_of(study: str) -> Any:
+    """The dataclass of a study's options."""
+    module = _module(study)
     return module.Config if hasattr(module, "Config") else module.Args
 
 

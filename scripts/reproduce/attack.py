@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from asm_gym.evaluation.tables import Column, tabulate
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy, rollout
-from asm_gym.rollouts.trial import environment
+from asm_gym.rollouts.staging import environment
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.spec import StreamSpec

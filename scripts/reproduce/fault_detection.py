@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.episode import Episode
+from asm_gym.evaluation import defaults
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.metrics import detected, false_alarms, time_matched_auroc
 from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
@@ -46,7 +47,7 @@ WAYS = {
 WINDOW = 20
 """Steps after its onset within which a fault is to be seen: 1 s in robosuite."""
 
-RATE = 0.05
+RATE = defaults.FALSE_ALARM_RATE
 """Share of nominal episodes that may raise an alarm."""
 
 
@@ -179,12 +180,9 @@ def tables(records: Sequence[Record], config: Config) -> list[Table]:
         caption = f"{domain}: thresholds for {100 * RATE:g} % of nominal episodes; mean ± SD over seeds"
         made.append(Table(caption, ("", "AUROC", "found within 20 steps", "nominal episodes in alarm"), rows))
     if config.robot_episodes:
-        rows = [
-            (label, *(shown(records, "auroc", domain="robosuite", way=w, kind=k) for k in config.faults))
-            for w, label in WAYS.items()
-        ]
-        heads = ("", *(k.replace("_", " ") for k in config.faults))
-        made.append(Table(f"AUROC by kind of fault, {config.severity}", heads, rows))
+        ways = {label: {"way": way, "domain": "robosuite"} for way, label in WAYS.items()}
+        kinds = {kind.replace("_", " "): {"kind": kind} for kind in config.faults}
+        made.append(kit.grid(f"AUROC by kind of fault, {config.severity}", records, "auroc", ways, kinds))
     return made
 
 
