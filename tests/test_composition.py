@@ -17,7 +17,7 @@ import asm_gym.detection
 from asm_gym.detection import EvidenceDetection, ModelOutput, conformal_threshold
 from asm_gym.detection.scores import WINDOW, Largest, Mahalanobis, MovingMean, Squares
 from asm_gym.episodes import Episode
-from asm_gym.memory.recurrent import RecurrentWeights
+from asm_gym.memory.settling import SettlingWeights
 from asm_gym.monitors import (
     DETECTIONS,
     MONITORS,
@@ -327,7 +327,7 @@ def test_a_memory_of_an_older_version_goes_on_learning_with_the_temporal_network
     noise = np.random.default_rng(0).normal(0.0, 0.01, (10, *episode.stream.shape))
     asm.fit([Episode.from_stream(episode.stream + n, asm.spec) for n in noise], warm_start=True)
     before = old("neural_asm")[0].learned_
-    for name in RecurrentWeights._fields:
+    for name in SettlingWeights._fields:
         np.testing.assert_array_equal(asm.learned_[name], before[name])
     assert not np.array_equal(asm.learned_["D"], before["D"])
     with pytest.raises(RuntimeError, match="no skill has a name yet"):
