@@ -28,7 +28,7 @@ from asm_gym.memory.temporal import unassociated
 from asm_gym.monitors import NeuralASM, load_monitor
 from asm_gym.monitors.spinal import SpinalBand
 from asm_gym.policies import NeuralASMPolicy
-from asm_gym.stream import StreamSpec
+from asm_gym.stream import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from tests.streams import frozen, sine_episodes, sine_spec
 
@@ -248,6 +248,30 @@ def test_more_inference_a_row_makes_it_expect_the_next_better(asm):
     assert errors[50] < 1.1 * errors[5]
 
 
+def test_a_memory_of_fewer_senses_settles_where_it_would_had_it_never_seen_them():
+    joint, wrist = Channel("joint", 3, "rad", group="joint"), Channel("wrist", 2, "N", group="wrench")
+    other, command = Channel("command_z", 1, group="action"), Channel("command", 2, group="action")
+    spec, rng = StreamSpec((joint, wrist, other, command), dt=0.05), np.random.default_rng(0)
+    mixing, episodes = rng.normal(size=(2, 5)), []
+    for _ in range(40):
+        commands = np.hstack([np.zeros((40, 1)), rng.normal(size=(40, 2))])
+        senses = np.cumsum(commands[:, 1:], axis=0) @ mixing + 0.05 * rng.normal(size=(40, 5))
+        episodes.append(Episode.from_stream(np.hstack([senses, commands]).astype(np.float32), spec))
+    whole = NeuralASM(spec, 8, 24, iterations=1000, epochs=5, dynamics="settling").fit(episodes)
+    fewer = whole.for_stream(StreamSpec((command, joint), dt=0.05))
+    assert fewer.dynamics == "settling"
+    left = episodes[0].stream[:, [6, 7, 0, 1, 2]]
+    full, part = whole.senses_.read_episode(episodes[0].stream), fewer.senses_.read_episode(left)
+    seen = np.array([[c not in (3, 4) for c in (*spec.sensory, *whole.senses_.slow)]], np.float32)
+    assert 0 < seen.sum() < seen.size
+    z, small = whole.model.network.at_rest(1), fewer.model.network.at_rest(1)
+    for x, u, y, v in zip(full.senses, full.commands, part.senses, part.commands, strict=True):
+        z = whole.model.network.follow(z, u[None], x[None], seen).traces
+        small = fewer.model.network.follow(small, v[None], y[None], np.ones((1, len(y)), np.float32)).traces
+        np.testing.assert_allclose(small, z, atol=2e-4)
+    assert np.isfinite(fewer.score(Episode.from_stream(left, fewer.spec)).value).all()
+
+
 class Sliding(gym.Env[Any, Any]):
     """A point that a command moves."""
 
@@ -310,7 +334,5 @@ def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):
     traces.save(tmp_path / "traces.asm")
     with pytest.raises(ValueError, match=r"^this is a memory of dynamics='traces', .* cannot be loaded as 'settling'$"):
         NeuralASM(sine_spec(), 8, 8, dynamics="settling").restore(read_checkpoint(tmp_path / "traces.asm", traces.kind))
-    with pytest.raises(ValueError, match="of dynamics='settling' cannot leave senses out: fit one of fewer senses"):
-        asm.for_stream(sine_spec(motor=0))
     with pytest.raises(ValueError, match="a band needs a fitted memory of traces, got one of dynamics='settling'"):
         SpinalBand(asm)

@@ -19,7 +19,7 @@ from asm_gym.memory.association import Association, association_shapes, existing
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of
 from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
-from asm_gym.memory.fewer import MOST_INPUTS, Kept, fewer_changes, fewer_traces, moments
+from asm_gym.memory.fewer import MOST_INPUTS, Kept, fewer_changes, fewer_settled, fewer_traces, moments
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs
 from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
@@ -96,12 +96,9 @@ class MemoryModel(StreamModel):
 
         Raises:
             ValueError: the stream has senses that this memory never met, or the memory does not know what its own have
-                in common; or it is not one of traces.
+                in common.
         """
         columns = spec.columns_in(self.spec)
-        network = self.network
-        if not isinstance(network, Network):
-            raise ValueError(f"a memory of dynamics={self.dynamics!r} cannot leave senses out: fit one of fewer senses")
         if "moments" not in self.learned_:
             raise ValueError(
                 "this memory does not keep what its senses have in common (it was saved by an older asm-gym, has lost "
@@ -113,11 +110,13 @@ class MemoryModel(StreamModel):
             for name, nothing in (("mean", 0.0), ("spread", 1.0), ("change", 1.0))
         }
         new = StreamScaler(spec, **standard, lag=self.lag)
-        kept = fewer_changes(network.association, C, old, new, columns)
-        weights = fewer_traces(network.weights, C, old, new, columns)
+        network, left = self.network, (old, new, columns)
+        kept = fewer_changes(network.association, C, *left)
+        traces = isinstance(network, Network)
+        weights = fewer_traces(network.weights, C, *left) if traces else fewer_settled(network.weights, *left)
         skills = {name: self.learned_[name] for name in ("W_K", "b_K") if self.skills_}
         learned = {**standard, **skills, "energy": self.learned_["energy"]}
-        model = MemoryModel(spec, self.hidden_size, self.association_size, self.schedule, self.feedback)
+        model = MemoryModel(spec, self.hidden_size, self.association_size, self.schedule, self.feedback, self.dynamics)
         return model.restore({**learned, **weights._asdict(), **kept.association._asdict()}, self.skills_), kept
 
     def specialise(self, episodes: Sequence[Episode]) -> Self:
