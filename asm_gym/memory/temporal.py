@@ -73,7 +73,7 @@ class TemporalNetwork(ABC):
         return self.prior_precision, self.sensory_precision, self.curvature, self.iterations
 
     weights: Any
-    """The synapses through time, a NamedTuple of arrays."""
+    """The synapses through time, a NamedTuple of arrays whose fields each kind of network has of its own."""
 
     @property
     @abstractmethod
