@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import math
 import re
@@ -105,7 +106,7 @@ def test_the_memory_recalls_each_letter_from_its_cue():
 
 @pytest.mark.parametrize(
     ("law", "true"),
-    [("exponential", (0.4, 1.5, 6.0)), ("power", (0.2, 2.0, 0.7)), ("linear", (0.5, 0.3))],
+    [("exponential", (0.4, 1.5, 6.0)), ("fitts", (1.5, 6.0)), ("power", (0.2, 2.0, 0.7)), ("linear", (0.5, 0.3))],
 )
 def test_a_law_is_found_again_within_its_intervals(law, true):
     x = np.repeat([1.0, 2, 4, 8, 16, 32, 64, 128], 4)
@@ -115,17 +116,26 @@ def test_a_law_is_found_again_within_its_intervals(law, true):
     # Within twice the 95 % interval, which chance leaves once in ten thousand times.
     assert all(abs(v - t) <= hi - lo for v, t, lo, hi in zip(found.values, true, found.low, found.high, strict=True))
     if law != "linear":
-        other = fit({"exponential": "power", "power": "exponential"}[law], x, y)
+        other = fit({"exponential": "power", "fitts": "power", "power": "exponential"}[law], x, y)
         assert found.aic < other.aic
 
 
-def test_an_unseen_axis_is_completed_to_about_the_noise_with_however_little_inference():
-    args = speed_accuracy.Args(skills=2, hidden=32, writings=4, steps=2000, iterations=(1, 5, 30, 200))
-    rng = np.random.default_rng(0)
-    records = speed_accuracy.by_iterations(0, repertoire(2, 2, rng), args, rng)
-    errors = [r["completed_cm"] for r in records]
-    assert max(errors) < 3 * NOISE  # the traces lead there; the state adds little
-    assert max(errors) < 1.1 * min(errors)
+def test_traces_need_no_inference_and_a_state_that_settles_trades_it_for_accuracy():
+    args = speed_accuracy.Args(skills=2, hidden=32, writings=4, steps=2000, iterations=(1, 5, 30, 100))
+    found = {}
+    for dynamics in ("traces", "settling"):
+        rng = np.random.default_rng(0)
+        letters = repertoire(2, 2, rng)
+        records = speed_accuracy.by_iterations(0, letters, args, rng, dynamics)
+        found[dynamics] = {(r["iterations"], r["shorter"]): r for r in records}
+    completed = [r["completed_cm"] for r in found["traces"].values()]
+    assert max(completed) < 3 * NOISE  # the traces lead there; the state adds little
+    assert max(completed) < 1.1 * min(completed)
+    assert len({r["next_cm"] for r in found["traces"].values()}) == 1  # to the bit: nothing is inferred
+    settling = [found["settling"][at]["next_cm"] for at in ((1, 20), (5, 20), (30, 20), (100, 1))]
+    assert all(later < sooner for sooner, later in itertools.pairwise(settling))
+    assert settling[0] > 1.3 * settling[-1]
+    assert found["settling"][100, 1]["auroc"] > 0.6
 
 
 def test_a_slip_is_one_of_so_many_centimetres_from_its_onset_on():

@@ -8,7 +8,7 @@ Before anything is read z is μ. The bracket bounds the largest curvature of F, 
 F, however W_F grows.
 
 Source: Millidge et al. 2024 (PLOS Comput Biol); Tang et al. 2023 (NeurIPS). Theirs carry the state itself on, through
-learned synapses; here the traces are carried on, for which no gradient through time is needed.
+learned synapses, as ``settling`` does; here traces are carried on, for which no gradient through time is needed.
 """
 
 from __future__ import annotations

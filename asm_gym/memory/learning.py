@@ -223,6 +223,6 @@ def passes(trajectories: Sequence[Trajectory], schedule: Schedule) -> int:
     return max(1, min(schedule.epochs, round(most / updates)))
 
 
-def largest_rate(weights: Weights, schedule: Schedule) -> float:
-    """The learning rate to begin with."""
-    return schedule.learning_rate * min(1.0, REFERENCE_WIDTH / weights.W_C.shape[0])
+def largest_rate(hidden: int, schedule: Schedule) -> float:
+    """The learning rate to begin with, of H hidden units."""
+    return schedule.learning_rate * min(1.0, REFERENCE_WIDTH / hidden)

@@ -25,6 +25,7 @@ from asm_gym.memory.association import Association, hidden_units
 from asm_gym.memory.energy import Array
 from asm_gym.memory.inference import Weights
 from asm_gym.memory.precision import log_variance
+from asm_gym.memory.settling import SettlingWeights
 from asm_gym.memory.traces import DECAYS
 from asm_gym.scaling import StreamScaler
 
@@ -150,6 +151,24 @@ def fewer_traces(memory: Weights, C: Array, old: StreamScaler, new: StreamScaler
     W_F, W_D = (np.where(known[:, None], W[left], 0.0) for W in (memory.W_F, direct))
     found = memory.W_C @ every, W_F, W_D, memory.gains
     return Weights(*(np.ascontiguousarray(a, np.float32) for a in found))
+
+
+def fewer_settled(memory: SettlingWeights, old: StreamScaler, new: StreamScaler, columns: Columns) -> SettlingWeights:
+    """The synapses of a state that settles, of the senses that are left; arguments as in ``fewer_changes``.
+
+    A sense that is never seen has no precision, so that it has no term in the energy: its synapses are not needed, and
+    nothing stands in for it. A command that is not known is at its mean.
+    """
+    before, after = traced_inputs(old), traced_inputs(new, columns)
+    S, A = len(after) - 1 - len(new.spec.motor), len(old.spec.motor)
+    at = {name: n for n, name in enumerate(before)}
+    senses = [at[name] for name in after[:S]]
+    taken = np.array([at.get(name, -1) for name in after[S:]]) - (len(before) - 1 - A)  # the constant 1 is the last
+    known, place = taken >= 0, np.maximum(taken, 0)
+    W_U = np.where(known, memory.W_U[:, place], 0.0)
+    W_A = np.where(known[:-1, None], memory.W_A[place[:-1]], 0.0)
+    found = memory.W_H, W_U, memory.W_F[senses], memory.b_F[senses], W_A
+    return SettlingWeights(*(np.ascontiguousarray(a, np.float32) for a in found))
 
 
 def _unit_groups(memory: Association, senses: StreamScaler) -> NDArray[np.intp]:

@@ -6,7 +6,7 @@
 
 Offline the predictions stand in for what is not sensed. An x̂_t that is fed back is what μ_t predicts, so that its error
 is 0 and inference leaves the state where it is: z_t = μ_t is the fixed point, not a short cut. (W_S, W_A are rows of
-W_F, and D_S, D_A of W_D: see ``inference``.)
+W_F, and D_S, D_A of W_D: see ``inference``.) The same holds of the network that settles, which carries on z_t.
 
 Sources: Tang, Barron and Bogacz 2023 (NeurIPS) for online and offline recall by temporal predictive coding; Mahajan et
 al. 2025 (Neural Computation 38(1)) for skills.
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.memory.energy import Array
-from asm_gym.memory.network import Network, Step
+from asm_gym.memory.temporal import Step, TemporalNetwork
 from asm_gym.scaling import StreamScaler
 from asm_gym.validation import check_number
 
@@ -38,7 +38,7 @@ class Recalled(NamedTuple):
     traces: Array  # (B, I) c_T, to carry on with
 
 
-def follow(network: Network, c: Array, senses: Array, commands: Array) -> Recalled:
+def follow(network: TemporalNetwork, c: Array, senses: Array, commands: Array) -> Recalled:
     """Online recall: every row is expected, then sensed.
 
     Args:
@@ -54,7 +54,7 @@ def follow(network: Network, c: Array, senses: Array, commands: Array) -> Recall
     return _stacked(steps, network)
 
 
-def run_on(network: Network, c: Array, steps: int) -> Recalled:
+def run_on(network: TemporalNetwork, c: Array, steps: int) -> Recalled:
     """Offline recall: ``steps`` rows from the traces ``c`` (B, I) on, each from what was expected of those before."""
     made = []
     for _ in range(steps):
@@ -75,7 +75,7 @@ def to_rows(reader: StreamScaler, recalled: Recalled) -> NDArray[np.float64]:
 
 
 def continued(
-    network: Network, reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int
+    network: TemporalNetwork, reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int
 ) -> NDArray[np.float64]:
     """(steps, D) rows that come after a cue (T, D), in the units of the stream. Raises as ``check_cue`` does."""
     rows, lag = check_cue(reader, cue, steps), reader.lag
@@ -103,7 +103,7 @@ def check_cue(reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int) 
     return rows
 
 
-def _stacked(steps: Sequence[Step], network: Network) -> Recalled:
+def _stacked(steps: Sequence[Step], network: TemporalNetwork) -> Recalled:
     expected = np.stack([s.expected for s in steps])
     S = expected.shape[2] - network.motor
     return Recalled(expected[:, :, :S], expected[:, :, S:], np.stack([s.z for s in steps]), steps[-1].traces)

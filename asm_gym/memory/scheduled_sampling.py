@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +100,13 @@ class ScheduledSampling:
         return total
 
 
+class Streams(Protocol):
+    """Streams of episodes that something learns from."""
+
+    def run(self, moments: Iterable[Moment], rate: float, free: float) -> float:
+        """Learns from the moments that come next, as ``ScheduledSampling`` does; the sum of all energies."""
+
+
 def learn(
     weights: Weights,
     trajectories: Sequence[Trajectory],
@@ -108,8 +115,25 @@ def learn(
     tick: Callable[[], None],
 ) -> NDArray[np.float64]:
     """Learns in place; the mean energy of each epoch. Calls ``tick`` after each, of which many data need fewer."""
-    epochs, widest = passes(trajectories, schedule), largest_rate(weights, schedule)
     streams = ScheduledSampling(Learner(weights, schedule, rng), schedule.batch_size)
+    return practise(streams, weights.W_C.shape[0], trajectories, schedule, rng, tick)
+
+
+def practise(
+    streams: Streams,
+    hidden: int,
+    trajectories: Sequence[Trajectory],
+    schedule: Schedule,
+    rng: np.random.Generator,
+    tick: Callable[[], None],
+) -> NDArray[np.float64]:
+    """Passes over the episodes, at a rate that decays and more and more alone; the mean energy of each.
+
+    Args:
+        hidden: H, of what learns.
+        tick: called after each.
+    """
+    epochs, widest = passes(trajectories, schedule), largest_rate(hidden, schedule)
     moments = one_after_another(trajectories, schedule.batch_size, rng)
     steps = -(-sum(len(t.senses) for t in trajectories) // schedule.batch_size)
     curve = np.zeros(epochs)

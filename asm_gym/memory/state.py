@@ -1,7 +1,7 @@
 """What the memory carries from row to row.
 
-Association compares each row with that of l rows before, so that l rows and those before them are kept; the traces
-of the temporal network take up every l-th row. l is 1 at a control rate (``senses``).
+Association compares each row with that of l rows before, so that l rows and those before them are kept; the temporal
+network takes up every l-th row. l is 1 at a control rate (``senses``).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.network import Network
+from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.scaling import ScaledRows
 
 Rows = NDArray[np.float64]
@@ -20,7 +20,7 @@ Rows = NDArray[np.float64]
 class MemoryState(NamedTuple):
     """Where the memory is, one entry a stream; a value, never changed in place."""
 
-    traces: NDArray[np.float32]  # (B, I) c, of what was sensed and done
+    traces: NDArray[np.float32]  # (B, I) c, of what was sensed and done; or the state z that settled on it
     expected: NDArray[np.float32]  # (B, H) f(μ), of the state that was expected then
     before: Rows  # (B, l, D) the rows seen last, the oldest first
     earlier: Rows  # (B, l, D) those before
@@ -28,7 +28,7 @@ class MemoryState(NamedTuple):
     skill: NDArray[np.float32]  # (B, K) L, what speaks for each skill; K is 0 where none has a name
 
 
-def at_start(batch: int, network: Network, lag: int, size: int, skills: int) -> MemoryState:
+def at_start(batch: int, network: TemporalNetwork, lag: int, size: int, skills: int) -> MemoryState:
     """Before the first row, of ``size`` numbers."""
     state, rows = np.zeros((batch, network.hidden_size), np.float32), np.zeros((batch, lag, size))
     named = np.zeros((batch, skills), np.float32)
@@ -60,7 +60,9 @@ def past(state: Remembers, rows: Rows) -> tuple[Rows, Rows]:
     return before, earlier
 
 
-def carry_on(network: Network, state: MemoryState, row: ScaledRows) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def carry_on(
+    network: TemporalNetwork, state: MemoryState, row: ScaledRows
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """c and f(μ) after a row, which are as they were in streams whose turn it is not."""
     due = state.steps % state.before.shape[1] == 0
     if not due.any():

@@ -105,13 +105,14 @@ class ContactBand:
 
     Raises:
         ValueError: the memory expects no external torque or no force at the wrist, its rows come faster than that a
-            change is taken from one to the next, or it was saved before there were traces.
+            change is taken from one to the next, or it is not a fitted one of traces.
     """
 
     def __init__(self, memory: NeuralASM) -> None:
         spec, model = memory.spec, memory.model
-        if type(memory.network_) is not Network:
-            raise ValueError("a band needs a fitted memory that was not saved by an older asm-gym: fit it anew")
+        if not isinstance(memory.network_, Network):
+            one = "that is not fitted" if memory.network_ is None else f"of dynamics={memory.dynamics!r}"
+            raise ValueError(f"a band needs a fitted memory of traces, got one {one}")
         if model.lag != 1:
             raise ValueError(
                 f"a band is sent down once a control step, and this memory has {1 / spec.dt:g} rows a second"

@@ -40,7 +40,7 @@ class CompiledRow:
     """``observe`` of a memory under the detection of evidence.
 
     Args:
-        model: fitted, and not of a memory that was saved before there were traces.
+        model: fitted, and one of traces.
         detection: fitted.
     """
 
@@ -63,7 +63,7 @@ class CompiledRow:
     @classmethod
     def of(cls, model: MemoryModel, detection: Detection) -> CompiledRow | None:
         """That of a model and a detection; None where there is none for them."""
-        fits = type(model.network) is Network and isinstance(detection, EvidenceDetection)
+        fits = isinstance(model.network, Network) and isinstance(detection, EvidenceDetection)
         return cls(model, detection) if fits and isinstance(detection, EvidenceDetection) else None
 
     def __call__(self, state: MonitorState, rows: NDArray[np.float64]) -> tuple[MonitorState, Surprise]:

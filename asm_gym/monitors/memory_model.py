@@ -16,20 +16,20 @@ from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.association import Association, association_shapes, existing, hidden_units
 from asm_gym.memory.completion import Completion
+from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of
 from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
-from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs
-from asm_gym.memory.marginalise import MOST_INPUTS, Kept, fewer_changes, fewer_traces, moments
+from asm_gym.memory.marginalise import MOST_INPUTS, Kept, fewer_changes, fewer_settled, fewer_traces, moments
 from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
 from asm_gym.memory.network import Network, train
 from asm_gym.memory.online import followed
 from asm_gym.memory.precision import unbounded
 from asm_gym.memory.readout import add_up, learn_readout
 from asm_gym.memory.recall import continued
-from asm_gym.memory.recurrent import RecurrentNetwork, RecurrentWeights, recurrent_shapes
 from asm_gym.memory.specialise import specialise
 from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past
+from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.model import StreamModel, model_outputs, running
 from asm_gym.scaling import StreamScaler, rows_apart
@@ -45,6 +45,7 @@ class MemoryModel(StreamModel):
         association_size: hidden units of association, shared out among the groups of senses.
         schedule: how to learn and to infer.
         feedback: how errors come back to the hidden units of association, one of ``memory.feedback.FEEDBACK``.
+        dynamics: how what was is carried on, one of ``memory.dynamics.DYNAMICS``.
 
     Attributes:
         senses_: how it reads a row.
@@ -62,13 +63,14 @@ class MemoryModel(StreamModel):
         association_size: int,
         schedule: Schedule,
         feedback: str = TRANSPORTED,
+        dynamics: str = TRACES,
     ) -> None:
         super().__init__(spec)
-        self.feedback = feedback
+        self.feedback, self.dynamics = feedback, dynamics
         self.hidden_size, self.association_size, self.schedule = hidden_size, association_size, schedule
         self.lag = rows_apart(spec.dt)
         self.shortest = 1 + self.lag
-        self.network_: Network | None = None
+        self.network_: TemporalNetwork | None = None
         self.motor_: Motor | None = None
         self.completion_: Completion | None = None
 
@@ -80,8 +82,10 @@ class MemoryModel(StreamModel):
         # Nothing came before the first ``lag`` rows, so that no change in them is known.
         trajectories = [Trajectory(r.senses[::lag], r.commands[::lag], r.inputs[lag:]) for r in readings]
         layout = senses.groups, senses.changes, self.hidden_size, self._units_each(senses)
-        trained = train(trajectories, *layout, self.schedule, rng, progress, FEEDBACK[self.feedback]())
-        standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change, "energy": trained.energy}
+        how = FEEDBACK[self.feedback](), DYNAMICS[self.dynamics].learn
+        trained = train(trajectories, *layout, self.schedule, rng, progress, *how)
+        standard: dict[str, NDArray[Any]] = {"mean": senses.mean, "spread": senses.spread, "change": senses.change}
+        standard["energy"] = trained.energy
         if senses.inputs <= MOST_INPUTS:
             standard["moments"] = moments(np.concatenate([t.inputs for t in trajectories]))
         network, completion = trained.network, Completion.fit(senses, streams)
@@ -96,7 +100,7 @@ class MemoryModel(StreamModel):
                 in common.
         """
         columns = spec.columns_in(self.spec)
-        if "moments" not in self.learned_ or isinstance(self.network, RecurrentNetwork):
+        if "moments" not in self.learned_:
             raise ValueError(
                 "this memory does not keep what its senses have in common (it has lost "
                 f"senses before, or has more than {MOST_INPUTS} inputs), so that none of them can be left out"
@@ -107,11 +111,13 @@ class MemoryModel(StreamModel):
             for name, nothing in (("mean", 0.0), ("spread", 1.0), ("change", 1.0))
         }
         new = StreamScaler(spec, **standard, lag=self.lag)
-        kept = fewer_changes(self.network.association, C, old, new, columns)
-        weights = fewer_traces(self.network.weights, C, old, new, columns)
+        network, left = self.network, (old, new, columns)
+        kept = fewer_changes(network.association, C, *left)
+        traces = isinstance(network, Network)
+        weights = fewer_traces(network.weights, C, *left) if traces else fewer_settled(network.weights, *left)
         skills = {name: self.learned_[name] for name in ("W_K", "b_K") if self.skills_}
         learned = {**standard, **skills, "energy": self.learned_["energy"]}
-        model = MemoryModel(spec, self.hidden_size, self.association_size, self.schedule, self.feedback)
+        model = MemoryModel(spec, self.hidden_size, self.association_size, self.schedule, self.feedback, self.dynamics)
         return model.restore({**learned, **weights._asdict(), **kept.association._asdict()}, self.skills_), kept
 
     def specialise(self, episodes: Sequence[Episode]) -> Self:
@@ -124,8 +130,7 @@ class MemoryModel(StreamModel):
         changes = np.ascontiguousarray(inputs[:, senses.changes])
         layout = senses.groups, senses.changes, self._units_each(senses)
         now = specialise(self.network.association, inputs, changes, *layout)
-        temporal = RecurrentWeights._fields if isinstance(self.network, RecurrentNetwork) else Weights._fields
-        kept = {"mean", "spread", "change", "energy", "moments", *temporal}
+        kept = {"mean", "spread", "change", "energy", "moments", *self.network.weights._fields}
         return self.restore({**{n: a for n, a in self.learned_.items() if n in kept}, **now._asdict()})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
@@ -136,8 +141,10 @@ class MemoryModel(StreamModel):
         if "span_S" not in learned:  # saved before what it had shown bounded it
             learned = {**learned, "span_S": unbounded(X)}
         units = len(learned["V"])
-        older = "W_H" in learned  # saved before there were traces
-        temporal = (recurrent_shapes if older else weight_shapes)(self.hidden_size, senses.size, A)
+        if (found := dynamics_of(learned)) != self.dynamics:
+            raise ValueError(f"this is a memory of dynamics={found!r}, which cannot be loaded as {self.dynamics!r}")
+        dynamics = DYNAMICS[self.dynamics]
+        temporal = dynamics.shapes(self.hidden_size, senses.size, A)
         shapes = temporal | association_shapes(senses.inputs, units, X)
         if skills:
             both = units + self.hidden_size
@@ -149,10 +156,7 @@ class MemoryModel(StreamModel):
         arrays = {name: np.ascontiguousarray(learned[name], np.float32) for name in shapes}
         association = Association(**{n: arrays[n] for n in Association._fields})
         how = self.schedule.iterations, self.schedule.prior_precision, self.schedule.sensory_precision
-        if older:
-            self.network_ = RecurrentNetwork(RecurrentWeights(**{n: arrays[n] for n in temporal}), association, *how)
-        else:
-            self.network_ = Network(Weights(**{n: arrays[n] for n in temporal}), association, *how)
+        self.network_ = dynamics.network(dynamics.weights(**{n: arrays[n] for n in temporal}), association, *how)
         self.senses_, self.motor_ = senses, Motor.found(learned, senses)
         self.completion_ = Completion.found(learned, senses)
         return super().restore(learned, skills)
@@ -174,7 +178,7 @@ class MemoryModel(StreamModel):
         return MemoryState(traces, expected, *seen, skill), ModelOutput(error, expected)
 
     @property
-    def network(self) -> Network:
+    def network(self) -> TemporalNetwork:
         """The weights, which are there once it is fitted."""
         assert self.network_ is not None
         return self.network_

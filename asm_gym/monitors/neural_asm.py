@@ -17,10 +17,11 @@ from asm_gym.checkpoint import Checkpoint, read_checkpoint
 from asm_gym.detection import Detector, EvidenceDetection
 from asm_gym.detection.detector import BOUND, GAINS
 from asm_gym.episode import Episode
+from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of
 from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
-from asm_gym.memory.network import Network
+from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.asked import Asked
 from asm_gym.monitors.base import Progress, Surprise, Told
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
@@ -47,12 +48,14 @@ class NeuralASM(CalibratedMonitor):
         spec: the stream it watches.
         hidden_size: H, hidden units of the temporal network.
         association_size: hidden units of association, shared out among the groups of senses.
-        iterations: inference steps while learning, and where a sense is missing; a row that is seen needs none.
+        iterations: inference steps at most, which end sooner where nothing moves any more; 5 by traces, while learning
+            and where a sense is missing, for a row that is seen needs none; 20 by settling, on every row.
         learning_rate: largest change of a synapse in one step, decaying to 0 along a cosine; scaled by 256 / H where H
             is larger, so that a unit's input does not change more for having more synapses.
         epochs: passes of the temporal network over the training episodes; fewer where they are very many.
         batch_size: episodes it learns from side by side.
-        prior_precision: Π_z, trust in what was expected; the firmer, the closer local learning is to the gradient.
+        prior_precision: Π_z, trust in what was expected; 30 by traces, for the firmer, the closer local learning is to
+            the gradient; 1 by settling, where the senses are to move the state.
         sensory_precision: Π_x, trust in what is sensed.
         free_running_probability: reached half-way through training; with it, after a random cue, a stream runs on
             alone for a step: the action is the memory's own, and it goes on from what it expected. Above 0 the memory
@@ -66,6 +69,8 @@ class NeuralASM(CalibratedMonitor):
             that is to watch any policy leaves it out.
         seed: of the initial weights and of the order of the episodes.
         feedback: how errors come back to the hidden units of association, one of ``memory.feedback.FEEDBACK``.
+        dynamics: how the temporal network carries on what was: ``"traces"`` of what was sensed and done, or
+            ``"settling"``, the temporal predictive coding network of the papers, whose state is inferred on every row.
 
     Attributes:
         threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
@@ -94,11 +99,11 @@ class NeuralASM(CalibratedMonitor):
         spec: StreamSpec,
         hidden_size: int = 256,
         association_size: int = 240,
-        iterations: int = 5,
+        iterations: int | None = None,
         learning_rate: float = 3e-3,
         epochs: int = 40,
         batch_size: int = 64,
-        prior_precision: float = 30.0,
+        prior_precision: float | None = None,
         sensory_precision: float = 1.0,
         free_running_probability: float = 0.0,
         gains: Sequence[float] = GAINS,
@@ -107,7 +112,12 @@ class NeuralASM(CalibratedMonitor):
         habituates: bool = True,
         seed: int = 0,
         feedback: str = TRANSPORTED,
+        dynamics: str = TRACES,
     ) -> None:
+        check_choice("dynamics", dynamics, DYNAMICS)
+        self.dynamics, usual = dynamics, DYNAMICS[dynamics]
+        iterations = usual.iterations if iterations is None else iterations
+        prior_precision = usual.prior_precision if prior_precision is None else prior_precision
         self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
         self.association_size = check_number("association_size", association_size, low=1, whole=True)
         self.epochs = check_number("epochs", epochs, low=1, whole=True)
@@ -122,7 +132,7 @@ class NeuralASM(CalibratedMonitor):
         check_choice("feedback", feedback, FEEDBACK)
         self.feedback = feedback
         schedule = Schedule(**{name: getattr(self, name) for name in Schedule._fields})
-        model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, feedback)
+        model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, feedback, dynamics)
         super().__init__(model, EvidenceDetection(spec, gains, bound, shrinkage, habituates), seed=seed)
         self._diagnosis: Diagnosis | None = None
         self._row: CompiledRow | None = None
@@ -130,7 +140,7 @@ class NeuralASM(CalibratedMonitor):
         self.skill_: SkillSurprise | None = None
 
     @property
-    def network_(self) -> Network | None:
+    def network_(self) -> TemporalNetwork | None:
         """The memory with its weights; None before ``fit``."""
         return self.model.network_
 
@@ -170,7 +180,8 @@ class NeuralASM(CalibratedMonitor):
         schedule = {name: getattr(self, name) for name in Schedule._fields}
         sizes = {"hidden_size": self.hidden_size, "association_size": self.association_size}
         detections = {n: getattr(d, n) for d in self.detections.values() for n in parameter_names(type(d))}
-        return schedule | sizes | detections | {"seed": self.seed, "feedback": self.feedback}
+        how = {"seed": self.seed, "feedback": self.feedback, "dynamics": self.dynamics}
+        return schedule | sizes | detections | how
 
     @classmethod
     @typed
@@ -231,6 +242,8 @@ class NeuralASM(CalibratedMonitor):
 
     def restore(self, saved: Checkpoint) -> Self:
         own, skill = apart(saved)
+        if "dynamics" not in saved.header["hyperparameters"]:  # saved before there was a choice
+            self.dynamics = self.model.dynamics = dynamics_of(saved.header["shapes"])
         super().restore(own)
         self.skill_ = SkillSurprise.found(self.spec, skill, self.seed) if skill else None
         if self.alarm_on != "body" and self.skill_ is None:

@@ -24,6 +24,8 @@ STUDIES = {
     "unnamed_skills": Study("how many skills a stream holds, and where each begins"),
     "skill_change": Study("a change of skill is followed, and raises no alarm"),
     "express_skills": Study("one memory's own motor prediction drives the arm"),
+    "tracking": Study("the settling network against the Kalman filter"),
+    "sequences": Study("sequences of patterns, some of which come twice"),
     "local_learning": Study("local updates against backpropagation through time"),
     "retention": Study("skills learned one after another, with replay"),
     "speed_accuracy": Study("more inference, or slower movements, for more accuracy"),

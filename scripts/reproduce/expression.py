@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.episode import Episode
-from asm_gym.memory.association import Association, association_shapes
+from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.inference import Weights
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, initial_weights
 from asm_gym.memory.recall import Recalled, follow, run_on, to_rows
 from asm_gym.memory.scheduled_sampling import learn
+from asm_gym.memory.temporal import TemporalNetwork, unassociated
 from asm_gym.memory.traces import fit_gains
 from asm_gym.monitors import CalibratedMonitor, make_monitor
 from asm_gym.scaling import StreamScaler
@@ -53,7 +54,7 @@ class Memory:
     """The temporal predictive coding network alone: nothing is judged here, so there is no association."""
 
     reader: StreamScaler
-    network: Network
+    network: TemporalNetwork
 
     @classmethod
     def learned(
@@ -67,6 +68,7 @@ class Memory:
         rate: float = 3e-3,
         prior_precision: float = 30.0,
         gain: float = 1.0,
+        dynamics: str = TRACES,
     ) -> Memory:
         """From whole episodes, no labels.
 
@@ -74,10 +76,30 @@ class Memory:
             steps: in which its synapses change, with 64 episodes side by side.
             free: ``free_running_probability`` of ``NeuralASM``, which explains the others too.
             gain: of the synapses onto the state before it learns; large ones make units that tell beginnings apart.
+            dynamics: traces alone have a ``gain``, and others infer and learn as they usually do.
         """
+        if dynamics != TRACES:
+            return cls.by(dynamics, episodes, hidden, rng, steps, free, rate)
         blank = cls.untaught(episodes, hidden, rng, iterations, prior_precision)
         blank.network.weights.W_C[:] *= np.float32(gain)
         return blank.taught(episodes, rng, steps, free, rate)
+
+    @classmethod
+    def by(
+        cls,
+        dynamics: str,
+        episodes: Sequence[Episode],
+        hidden: int,
+        rng: np.random.Generator,
+        steps: int,
+        free: float,
+        rate: float,
+    ) -> Memory:
+        """One of ``DYNAMICS``, with its usual inference; arguments as in ``learned``."""
+        reader, how, size = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes]), DYNAMICS[dynamics], 64
+        epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
+        schedule = Schedule(epochs, size, rate, how.iterations, how.prior_precision, 1.0, free)
+        return cls(reader, how.learn(trajectories(reader, episodes), hidden, schedule, rng, lambda: None).network)
 
     @classmethod
     def untaught(
@@ -112,11 +134,6 @@ class Memory:
         if cue == len(streams):
             return rows
         return np.concatenate([rows, to_rows(self.reader, run_on(self.network, cued.traces, len(streams) - cue))])
-
-
-def unassociated() -> Association:
-    """An association without units."""
-    return Association(*(np.zeros(shape, np.float32) for shape in association_shapes(1, 0, 0).values()))
 
 
 @dataclass(frozen=True)

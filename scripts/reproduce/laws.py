@@ -1,6 +1,7 @@
 """Laws of speed and accuracy, fitted by least squares.
 
-    exponential   e = limit + gain exp(-n/τ)        n the time of inference; Fitts' law, n = a + b log2 1/(e - limit)
+    exponential   e = limit + gain exp(-n/τ)        n the time of inference
+    fitts         e = gain exp(-n/τ)                Fitts' law, n = a + b log2 1/e
     power         e = limit + gain n^-exponent
     linear        e = start + slope v                     v the speed
 
@@ -39,6 +40,7 @@ class Fit(NamedTuple):
 
 LAWS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
     "exponential": (lambda n, limit, gain, tau: limit + gain * np.exp(-n / tau), ("limit", "gain", "τ")),
+    "fitts": (lambda n, gain, tau: gain * np.exp(-n / tau), ("gain", "τ")),
     "power": (lambda n, limit, gain, slope: limit + gain * n**-slope, ("limit", "gain", "exponent")),
     "linear": (lambda v, start, slope: start + slope * v, ("start", "slope")),
 }
@@ -47,16 +49,21 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
 def fit(law: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> Fit | None:
     """The law that is nearest to the points, with intervals from the curvature of the fit; None where there is none."""
     function, names = LAWS[law]
-    guess = (
-        [y[0], 0.0] if law == "linear" else [float(y[-1]), float(y[0] - y[-1]), 5.0 if law == "exponential" else 1.0]
-    )
-    bounds = (-np.inf, np.inf) if law == "linear" else ([-np.inf, -np.inf, 1e-2], [np.inf, np.inf, 1e3])
+    first, last = float(y[0]), float(y[-1])
+    guess = {
+        "exponential": [last, first - last, 5.0],
+        "fitts": [first, 5.0],
+        "power": [last, first - last, 1.0],
+        "linear": [first, 0.0],
+    }[law]
+    free, ends = [np.inf] * (len(names) - 1), (-np.inf, np.inf) if law == "linear" else (1e-2, 1e3)
+    bounds = [*(-x for x in free), ends[0]], [*free, ends[1]]
     try:
         values, covariance = curve_fit(function, x, y, p0=guess, bounds=bounds, maxfev=20_000)
     except RuntimeError:
         return None
-    count, free = len(x), len(names)
+    count, parameters = len(x), len(names)
     residual = max(float(np.sum((y - function(x, *values)) ** 2)), 1e-300)
-    half = student.ppf(0.975, max(1, count - free)) * np.sqrt(np.diag(covariance))
-    aic = count * math.log(residual / count) + 2 * (free + 1)
+    half = student.ppf(0.975, max(1, count - parameters)) * np.sqrt(np.diag(covariance))
+    aic = count * math.log(residual / count) + 2 * (parameters + 1)
     return Fit(law, names, tuple(values), tuple(values - half), tuple(values + half), aic)

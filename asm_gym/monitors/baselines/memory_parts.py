@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
-from asm_gym.memory.inference import direct, expect, sense
 from asm_gym.memory.state import MemoryState, past
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
@@ -80,9 +79,8 @@ class TemporalPart(_Part):
         return StreamModel.restore(self, learned, skills)
 
     def predict(self, state: MemoryState, rows: NDArray[np.float64]) -> tuple[MemoryState, ModelOutput]:
-        w = self.memory.network.weights
         reading = self.memory.senses_.read(rows, *past(state, rows))
-        expected = direct(state.traces, reading.commands, w.W_D) + sense(expect(state.traces, w.W_C), w.W_F)
+        expected = self.memory.network.predict(state.traces, reading.commands)
         error = (reading.senses - expected[:, : self.memory.senses_.size]) * reading.seen
         # Nothing is expected of the first row, nor of rows in between, which the traces do not take up.
         error[(state.steps == 0) | (state.steps % self.memory.lag != 0)] = 0.0

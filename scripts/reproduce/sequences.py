@@ -1,0 +1,201 @@
+"""Memory of sequences: the network that settles, as the paper on sequential memory asks it.
+
+A sequence of patterns of ±1 is learned, and recalled from its first pattern alone. Patterns are drawn at random; or all
+like one template (b = 0.5: three bits of four agree with it); or some come twice, as in A B C B A, so that a pattern
+does not say what comes next, and only what came before does. Beside the network are what the paper compares with:
+
+    asymmetric Hopfield    x_{t+1} = sign(Σ_i x_{i+1} x_iᵀ x_t)
+    one layer              x_{t+1} = sign(W x_t),  W = argmin Σ_i ‖x_{i+1} - W x_i‖²    where its learning ends
+
+and the network by traces, which the paper does not have.
+
+Source: Tang, Barron and Bogacz 2023 (NeurIPS 36), and the scripts that they name, for the patterns and A B C B A, of
+digits there. Sompolinsky and Kanter 1986 (PRL 57(22)) for the asymmetric Hopfield network.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.console import Console
+
+from asm_gym.evaluation.figures import figure
+from asm_gym.evaluation.tables import Table
+from asm_gym.memory.dynamics import DYNAMICS
+from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.recall import follow, run_on
+from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.progress import stage
+from asm_gym.scripts.command import at_least
+from asm_gym.scripts.reproduce.common import Common, Findings, Record, over_seeds, reproduce, shown
+from asm_gym.scripts.reproduce.curves import points
+from asm_gym.validation import check_number
+
+Patterns = NDArray[np.float64]
+
+ALIKE = 0.5
+"""b, of patterns like one template: each bit agrees with it with a probability of (1 + b)/2."""
+
+RIGHT = 0.95
+"""Share of the bits of a pattern that is recalled rightly."""
+
+ALIASED = {"A B C B A": (0, 1, 2, 1, 0), "A B C B A D B C": (0, 1, 2, 1, 0, 3, 1, 2)}
+"""Sequences in which patterns come again."""
+
+MODELS = {
+    "hopfield": "asymmetric Hopfield",
+    "single": "one layer",
+    "settling": "settling",
+    "traces": "traces",
+}
+
+
+@dataclass(frozen=True)
+class Args(Common):
+    """Which sequences are recalled from their first pattern."""
+
+    lengths: tuple[int, ...] = (4, 8, 16, 32, 64)
+    """Patterns in a sequence."""
+    walks: tuple[int, ...] = (8, 16)
+    """Patterns in a sequence drawn from four."""
+    size: int = 100
+    """Bits of a pattern."""
+    hidden: int = 64
+    """Hidden units."""
+    updates: int = 3000
+    """Steps in which the synapses change, with 16 streams side by side."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(1, self, "lengths", "size", "hidden", "updates")
+        for count in (*self.lengths, *self.walks):
+            check_number("the length of a sequence", count, low=2, whole=True)
+
+    def scaled(self) -> Args:
+        """With ``quick``, little of everything."""
+        if not self.quick:
+            return self
+        return replace(self, seeds=min(self.seeds, 2), lengths=(4, 8), walks=(8,), hidden=16, updates=300)
+
+
+def patterns(count: int, size: int, alike: float, rng: np.random.Generator) -> Patterns:
+    """(count, size) of ±1, each bit as in one template with a probability of (1 + alike)/2."""
+    template = rng.choice([-1.0, 1.0], size)
+    return np.where(rng.random((count, size)) < (1 + alike) / 2, template, -template)
+
+
+def tasks(args: Args, rng: np.random.Generator) -> dict[tuple[str, int], Patterns]:
+    """Every sequence (P, N), by kind and length."""
+    made = {}
+    for (kind, alike), count in product((("random", 0.0), ("alike", ALIKE)), args.lengths):
+        made[kind, count] = patterns(count, args.size, alike, rng)
+    for name, order in ALIASED.items():
+        made[name, len(order)] = patterns(4, args.size, 0.0, rng)[list(order)]
+    for count in args.walks:
+        made["of four", count] = patterns(4, args.size, 0.0, rng)[rng.integers(0, 4, count)]
+    return made
+
+
+def by_correlation(sequence: Patterns) -> Patterns:
+    """What an asymmetric Hopfield network recalls from the first pattern."""
+    return _stepped(sequence, sequence[:-1].T @ sequence[1:])
+
+
+def by_one_layer(sequence: Patterns) -> Patterns:
+    """What predictive coding without hidden units recalls, once it has settled on its weights."""
+    return _stepped(sequence, np.linalg.lstsq(sequence[:-1], sequence[1:], rcond=None)[0])
+
+
+def _stepped(sequence: Patterns, W: Patterns) -> Patterns:
+    found = [sequence[0]]
+    for _ in sequence[1:]:
+        found.append(np.sign(found[-1] @ W))
+    return np.array(found)
+
+
+def by_network(sequence: Patterns, dynamics: str, args: Args, rng: np.random.Generator) -> Patterns:
+    """What a temporal network recalls, once it has learned by its local rules."""
+    how, one = DYNAMICS[dynamics], np.ones((len(sequence), 1), np.float32)
+    x = sequence.astype(np.float32)
+    epochs = max(1, round(16 * args.updates / len(x)))
+    schedule = Schedule(epochs, 16, 3e-3, how.iterations, how.prior_precision, 1.0, 0.0)
+    network = how.learn([Trajectory(x, one, x)], args.hidden, schedule, rng, lambda: None).network
+    cued = follow(network, network.at_rest(1), x[:1, None], one[:1, None])
+    alone = run_on(network, cued.traces, len(x) - 1).senses[:, 0]
+    return np.vstack([sequence[:1], alone])
+
+
+def recalled(found: Patterns, sequence: Patterns) -> tuple[float, float]:
+    """Share of the patterns after the first that are right, and the mean squared error of a bit."""
+    agree = np.mean(np.sign(found[1:]) == sequence[1:], axis=1)
+    return float(np.mean(agree >= RIGHT)), float(np.mean((found[1:] - sequence[1:]) ** 2))
+
+
+def one_seed(seed: int, args: Args) -> list[Record]:
+    """Every sequence by every model."""
+    rng, records = np.random.default_rng(seed), []
+    for (kind, count), sequence in tasks(args, rng).items():
+        models = {"hopfield": by_correlation(sequence), "single": by_one_layer(sequence)}
+        models |= {name: by_network(sequence, name, args, rng) for name in DYNAMICS}
+        for model, found in models.items():
+            right, mse = recalled(found, sequence)
+            records.append({"seed": seed, "kind": kind, "length": count, "model": model, "right": right, "mse": mse})
+    return records
+
+
+def tables(records: Sequence[Record], args: Args) -> list[Table]:
+    """Patterns recalled rightly, and errors."""
+    asked = list(dict.fromkeys((r["kind"], r["length"]) for r in records))
+    return [
+        Table(
+            f"{title}, from the first alone; {args.size} bits, {args.hidden} units; mean ± SD over seeds",
+            ("sequence", "patterns", *MODELS.values()),
+            [
+                (kind, str(count), *(shown(records, value, kind=kind, length=count, model=m) for m in MODELS))
+                for kind, count in asked
+            ],
+        )
+        for value, title in (("right", "Share of the patterns that are right"), ("mse", "Mean squared error of a bit"))
+    ]
+
+
+def drawn(records: Sequence[Record], args: Args) -> Figure:
+    """Patterns recalled rightly, by length, of both kinds."""
+    with figure(height=3.0, width=8) as fig:
+        for ax, (kind, title) in zip(
+            fig.subplots(1, 2, sharey=True),
+            (("random", "patterns at random"), ("alike", "patterns like one template")),
+            strict=True,
+        ):
+            for i, (model, label) in enumerate(MODELS.items()):
+                found = [over_seeds(records, "right", kind=kind, length=n, model=model) for n in args.lengths]
+                points(ax, args.lengths, found, i, label)
+            ax.set(xlabel="patterns in a sequence", xscale="log", title=title)
+        fig.axes[0].set(ylabel="share recalled rightly")
+        fig.axes[1].legend(fontsize=7)
+    return fig
+
+
+def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+    """Every seed."""
+    args = args.scaled()
+    with stage("learning sequences", console, seconds) as progress:
+        found = parallel_map(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
+    records = [r for own in found for r in own]
+    return Findings(records, tables(records, args), drawn(records, args), {})
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the study, and returns the exit code."""
+    return reproduce("sequences", study, Args, __doc__, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,338 @@
+"""The network that settles: its energy against finite differences, a linear observer, and what a user may ask of it."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from asm_gym.monitors.spinal import SpinalBand
+from gymnasium import spaces
+
+from asm_gym.checkpoint import read_checkpoint
+from asm_gym.episode import Episode
+from asm_gym.memory.inference import infer
+from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.recall import follow, run_on
+from asm_gym.memory.scheduled_sampling import LONGEST_CUE, one_after_another
+from asm_gym.memory.settling import SettlingNetwork, SettlingWeights
+from asm_gym.memory.settling_learning import (
+    SettlingLearner,
+    SettlingStreams,
+    initial_settling_weights,
+    learn_settling,
+    settling_change,
+)
+from asm_gym.memory.temporal import unassociated
+from asm_gym.monitors import NeuralASM, load_monitor
+from asm_gym.policies import NeuralASMPolicy
+from asm_gym.spec import Channel, StreamSpec
+from asm_gym.wrappers import NeuralASMSafety
+from tests.streams import frozen, sine_episodes, sine_spec
+
+H, S, A = 7, 4, 2
+SCHEDULE = Schedule(8, 4, 3e-3, 20, 1.0, 1.0, 0.0)
+
+
+def network(iterations: int = 20) -> SettlingNetwork:
+    return SettlingNetwork(
+        initial_settling_weights(H, S, A, np.random.default_rng(0)), unassociated(), iterations, 1, 1
+    )
+
+
+def rows(steps: int, batch: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(1)
+    commands = rng.normal(size=(steps, batch, A + 1))
+    commands[:, :, -1] = 1.0
+    return rng.normal(size=(steps, batch, S)).astype(np.float32), commands.astype(np.float32)
+
+
+def total_energy(w: SettlingWeights, before, u, x, z, pi_z, pi_x) -> float:
+    """F of a step, written out; a mean over the batch."""
+    carried = np.tanh(before) @ w.W_H.T
+    state, senses = z - carried - u @ w.W_U.T, x - np.tanh(z) @ w.W_F.T - w.b_F
+    action = u[:, :-1] - np.tanh(carried + w.W_U[:, -1]) @ w.W_A.T
+    return 0.5 * float(pi_z * np.sum(state**2) + pi_x * np.sum(senses**2) + np.sum(action**2)) / len(z)
+
+
+def problem(settled: bool):
+    """Weights, what a step reads, and z: anywhere, or where inference settles; of double precision."""
+    rng = np.random.default_rng(3)
+    w = SettlingWeights(*(np.asarray(W, np.float64) for W in initial_settling_weights(H, S, A, rng)))
+    w.b_F[:] = rng.normal(size=S)
+    before, u, x = (
+        rng.normal(size=(3, H)),
+        np.hstack([rng.normal(size=(3, A)), np.ones((3, 1))]),
+        rng.normal(size=(3, S)),
+    )
+    return w, before, u, x, settle_in_double(w, before, u, x) if settled else rng.normal(size=(3, H))
+
+
+def settle_in_double(w: SettlingWeights, before, u, x, pi_z=2.0, pi_x=1.5):
+    mu, curvature = np.tanh(before) @ w.W_H.T + u @ w.W_U.T, pi_z + pi_x * np.linalg.norm(w.W_F, 2) ** 2
+    return infer(mu, x - w.b_F, w.W_F, pi_z, np.full_like(x, pi_x), curvature, 3000)
+
+
+def changes(w: SettlingWeights, before, u, x, z, pi_z=2.0, pi_x=1.5) -> SettlingWeights:
+    carried = np.tanh(before) @ w.W_H.T
+    mu, h = carried + u @ w.W_U.T, carried + w.W_U[:, -1]
+    errors = pi_z * (z - mu), pi_x * (x - w.b_F - np.tanh(z) @ w.W_F.T), u[:, :-1] - np.tanh(h) @ w.W_A.T
+    return settling_change(before, u, h, errors, z)
+
+
+@pytest.mark.parametrize("settled", [False, True])
+def test_every_rule_is_the_slope_of_the_energy(settled):
+    w, before, u, x, z = problem(settled)
+    delta = changes(w, before, u, x, z)
+    for name in SettlingWeights._fields:
+        rng = np.random.default_rng(0)
+        way = rng.normal(size=getattr(w, name).shape)
+
+        def energy(step, name=name, way=way):
+            moved = w._replace(**{name: getattr(w, name) + step * way})
+            # Where z has settled F is flat in it, so that letting it settle anew changes nothing: a total derivative.
+            at = settle_in_double(moved, before, u, x) if settled else z
+            if name in ("W_H", "W_U"):  # the motor error teaches W_A alone
+                motor = total_energy(moved, before, u, x, at, 0.0, 0.0) - total_energy(w, before, u, x, at, 0.0, 0.0)
+                return total_energy(moved, before, u, x, at, 2.0, 1.5) - motor
+            return total_energy(moved, before, u, x, at, 2.0, 1.5)
+
+        slope = (energy(1e-4) - energy(-1e-4)) / 2e-4
+        assert slope == pytest.approx(-np.sum(getattr(delta, name) * way), rel=2e-3, abs=1e-5), name
+
+
+def test_more_inference_never_has_more_energy_and_ends_where_it_is_flat():
+    w, before, u, x, end = problem(settled=True)
+    mu, curvature = np.tanh(before) @ w.W_H.T + u @ w.W_U.T, 2.0 + 1.5 * np.linalg.norm(w.W_F, 2) ** 2
+    steps = [infer(mu, x - w.b_F, w.W_F, 2.0, np.full_like(x, 1.5), curvature, n) for n in (0, 1, 2, 5, 20, 100)]
+    energies = [total_energy(w, before, u, x, z, 2.0, 1.5) for z in (*steps, end)]
+    assert all(b <= a + 1e-9 for a, b in itertools.pairwise(energies))
+    assert energies[0] > 1.1 * energies[-1]
+    for way in np.random.default_rng(1).normal(size=(5, *end.shape)):
+        up, down = (total_energy(w, before, u, x, end + step * way, 2.0, 1.5) for step in (1e-3, -1e-3))
+        assert abs(up - down) / 2e-3 < 1e-3
+
+
+def test_where_it_is_linear_it_is_the_observer_of_a_constant_gain():
+    # Small states, for which tanh is linear: z = μ + K (x - C μ),  K = Cᵀ (C Cᵀ + Π_z/Π_x)⁻¹
+    rng, small = np.random.default_rng(0), 1e-3
+    w = initial_settling_weights(3, 3, 1, rng)
+    net = SettlingNetwork(w, unassociated(), 500, 0.5, 2.0)
+    C = w.W_F.astype(float)
+    K = C.T @ np.linalg.inv(C @ C.T + 0.25 * np.eye(3))
+    z, state = net.at_rest(1), np.zeros((1, 3))
+    for _ in range(30):
+        x = small * rng.normal(size=(1, 3))
+        u = np.append(small * rng.normal(size=1), 0.0)[None]
+        z = net.follow(z, u.astype(np.float32), x.astype(np.float32), np.ones((1, 3), np.float32)).traces
+        mu = state @ w.W_H.T + u @ w.W_U.T
+        state = mu + (x - mu @ C.T) @ K.T
+        np.testing.assert_allclose(z, state, atol=1e-3 * small)
+
+
+def test_watching_and_following_agree_where_all_is_seen_and_where_something_is_not():
+    net, (senses, commands) = network(), rows(3)
+    for seen in (np.ones((3, S), np.float32), np.array([[1, 0, 1, 1]] * 3, np.float32)):
+        step = net.follow(net.at_rest(3), commands[0], senses[0], seen)
+        expected, state = net.carry_on(net.at_rest(3), commands[0], senses[0], seen)
+        np.testing.assert_allclose(expected, np.tanh(step.mu), atol=1e-6)
+        np.testing.assert_allclose(state, step.z, atol=1e-6)
+        np.testing.assert_allclose(net.predict(net.at_rest(3), commands[0]), step.expected, atol=1e-6)
+    other = senses[0].copy()
+    other[:, 1] += 10.0
+    unseen = net.follow(net.at_rest(3), commands[0], other, seen)
+    np.testing.assert_array_equal(unseen.z, step.z)
+
+
+def test_running_on_is_following_the_own_predictions():
+    net, (senses, commands) = network(iterations=200), rows(5)
+    z = follow(net, net.at_rest(3), senses, commands).traces
+    alone = run_on(net, z, 8)
+    fed_back = np.concatenate([alone.commands, np.ones((8, 3, 1), np.float32)], axis=2)
+    along = follow(net, z, alone.senses, fed_back)
+    np.testing.assert_allclose(along.senses, alone.senses, atol=1e-3)
+    np.testing.assert_allclose(along.commands, alone.commands, atol=1e-3)
+
+
+def some_trajectories(count: int) -> list[Trajectory]:
+    senses, commands = rows(40, count)
+    return [Trajectory(senses[: 30 + n, n], commands[: 30 + n, n], senses[: 30 + n, n]) for n in range(count)]
+
+
+def test_learning_sees_the_energy_that_the_network_has():
+    net, (senses, commands) = network(), rows(1)
+    step = net.follow(net.at_rest(3), commands[0], senses[0], np.ones_like(senses[0]))
+    learned = SettlingLearner(net.weights, SCHEDULE, np.random.default_rng(0)).step(
+        net.at_rest(3), commands[0], senses[0], rate=0.0
+    )
+    total = 3 * total_energy(net.weights, net.at_rest(3), commands[0], senses[0], step.z, 1.0, 1.0)
+    assert learned.energy == pytest.approx(total, rel=1e-4)
+    np.testing.assert_allclose(learned.z, step.z, atol=1e-3)  # the norm is that of twenty power iterations
+
+
+def test_learning_lowers_the_energy_and_is_reproducible():
+    time = np.arange(30)[:, None] * np.array([0.1, 0.17, 0.23, 0.3])
+    episodes = [
+        Trajectory(np.sin(time + n).astype(np.float32), np.ones((30, 1), np.float32), time.astype(np.float32))
+        for n in range(8)
+    ]
+    how = SCHEDULE._replace(epochs=40)
+    first, again = (learn_settling(episodes, 16, how, np.random.default_rng(7), lambda: None) for _ in range(2))
+    assert first.energy[-1] < 0.2 * first.energy[0]
+    for a, b in zip(first.network.weights, again.network.weights, strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+@pytest.mark.parametrize("free", [0.0, 1.0])
+def test_after_the_cue_the_state_that_was_expected_is_carried_on(free):
+    episode, net = some_trajectories(1)[0], network()
+    streams = SettlingStreams(SettlingLearner(net.weights, SCHEDULE, np.random.default_rng(0)), 1)
+    moments = one_after_another([episode], 1, np.random.default_rng(0))
+    first = next(m for m in moments if m.begins.all())
+    streams.run([first], 0.0, free)
+    length = int(streams.cue[0, 0])
+    assert 1 <= length < LONGEST_CUE
+    streams.run(itertools.islice(moments, len(episode.senses) - 1), 0.0, free)
+    T = len(episode.senses)
+    if free == 0.0:
+        z = follow(net, net.at_rest(1), episode.senses[:, None], episode.commands[:, None]).traces
+    else:  # the last row of the cue is inferred, and what is handed on is what was expected of it
+        z = follow(net, net.at_rest(1), episode.senses[: length - 1, None], episode.commands[: length - 1, None]).traces
+        z = net.follow(z, episode.commands[length - 1 : length], np.zeros((1, S), np.float32), np.zeros((1, S))).mu
+        z = run_on(net, z, T - length).traces if length < T else z
+    np.testing.assert_allclose(streams.z, z, rtol=1e-3, atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def asm() -> NeuralASM:
+    memory = NeuralASM(sine_spec(), 32, 48, epochs=30, free_running_probability=0.6, dynamics="settling")
+    return memory.fit(sine_episodes(40)).calibrate(sine_episodes(60, 1), 0.05)
+
+
+def test_a_memory_that_settles_is_used_by_the_same_names(asm, tmp_path):
+    asm.save(tmp_path / "settling.asm")
+    loaded, episode = load_monitor(tmp_path / "settling.asm"), sine_episodes(1, 5)[0]
+    assert isinstance(loaded, NeuralASM)
+    assert loaded.get_params() == asm.get_params()
+    assert (loaded.dynamics, loaded.iterations, loaded.prior_precision) == ("settling", 20, 1.0)
+    assert loaded.score(episode).value.tobytes() == asm.score(episode).value.tobytes()
+    cue, after = episode.stream[:20].astype(float), episode.stream[20:30]
+    np.testing.assert_array_equal(loaded.recall(cue, 10), asm.recall(cue, 10))
+    apart = np.abs(asm.recall(cue, 10) - after)[:, :12].mean(), np.abs(cue[-1] - after)[:, :12].mean()
+    assert apart[0] < 0.7 * apart[1]
+    alarms = [asm.score(frozen(e, 3, 15)).value.max() > asm.threshold for e in sine_episodes(20, 7)]
+    assert np.mean(alarms) > 0.9
+    named = [Episode.from_stream(e.stream, e.spec, info={"skill": str(n % 2)}) for n, e in enumerate(sine_episodes(8))]
+    copy = load_monitor(tmp_path / "settling.asm")
+    assert set(copy.name_skills(named).skills(episode.stream)) <= {"0", "1"}
+    state = asm.initial_state()
+    for row in episode.stream:
+        state, _ = asm.observe(state, row[None])
+    assert asm.expected_action(state).shape == (1, 2)
+
+
+def test_more_inference_a_row_makes_it_expect_the_next_better(asm):
+    # The speed-accuracy trade-off in small: without inference the state never hears of the senses.
+    reader, network = asm.senses_, asm.model.network
+    errors = {}
+    for count in (0, 1, 5, 50):
+        net, wrong = network.with_iterations(count), []
+        for e in sine_episodes(10, 9):
+            reading = reader.read_episode(e.stream)
+            found = follow(net, net.at_rest(1), reading.senses[:, None], reading.commands[:, None])
+            wrong.append(np.mean((found.senses[10:, 0] - reading.senses[10:]) ** 2))
+        errors[count] = np.mean(wrong)
+    assert errors[0] > 1.5 * errors[1] > 1.5 * errors[5]
+    assert errors[50] < 1.1 * errors[5]
+
+
+def test_a_memory_of_fewer_senses_settles_where_it_would_had_it_never_seen_them():
+    joint, wrist = Channel("joint", 3, "rad", group="joint"), Channel("wrist", 2, "N", group="wrench")
+    other, command = Channel("command_z", 1, group="action"), Channel("command", 2, group="action")
+    spec, rng = StreamSpec((joint, wrist, other, command), dt=0.05), np.random.default_rng(0)
+    mixing, episodes = rng.normal(size=(2, 5)), []
+    for _ in range(40):
+        commands = np.hstack([np.zeros((40, 1)), rng.normal(size=(40, 2))])
+        senses = np.cumsum(commands[:, 1:], axis=0) @ mixing + 0.05 * rng.normal(size=(40, 5))
+        episodes.append(Episode.from_stream(np.hstack([senses, commands]).astype(np.float32), spec))
+    whole = NeuralASM(spec, 8, 24, iterations=1000, epochs=5, dynamics="settling").fit(episodes)
+    fewer = whole.for_stream(StreamSpec((command, joint), dt=0.05))
+    assert fewer.dynamics == "settling"
+    left = episodes[0].stream[:, [6, 7, 0, 1, 2]]
+    full, part = whole.senses_.read_episode(episodes[0].stream), fewer.senses_.read_episode(left)
+    seen = np.array([[c not in (3, 4) for c in (*spec.sensory, *whole.senses_.slow)]], np.float32)
+    assert 0 < seen.sum() < seen.size
+    z, small = whole.model.network.at_rest(1), fewer.model.network.at_rest(1)
+    for x, u, y, v in zip(full.senses, full.commands, part.senses, part.commands, strict=True):
+        z = whole.model.network.follow(z, u[None], x[None], seen).traces
+        small = fewer.model.network.follow(small, v[None], y[None], np.ones((1, len(y)), np.float32)).traces
+        np.testing.assert_allclose(small, z, atol=2e-4)
+    assert np.isfinite(fewer.score(Episode.from_stream(left, fewer.spec)).value).all()
+
+
+class Sliding(gym.Env[Any, Any]):
+    """A point that a command moves."""
+
+    metadata = {"render_fps": 20}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Box(-9.0, 9.0, (3,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.at, self.t = self.np_random.normal(size=3), 0
+        return self.at.astype(np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.t += 1
+        self.at = self.at + 0.1 * np.asarray(action) + 0.01 * self.np_random.normal(size=3)
+        return self.at.astype(np.float32), 0.0, False, self.t >= 40, {}
+
+
+def test_it_guards_and_acts_as_any_memory_does():
+    env, rng, episodes = Sliding(), np.random.default_rng(0), []
+    spec = StreamSpec.from_spaces(env.observation_space, env.action_space, 0.05)
+    for seed in range(40):
+        at, _ = env.reset(seed=seed)
+        made, action = [np.concatenate([at, np.zeros(3)])], np.zeros(3)
+        for _ in range(39):
+            action = np.clip(-at + 0.1 * rng.normal(size=3), -1, 1)
+            at, *_ = env.step(action)
+            made.append(np.concatenate([at, action]))
+        episodes.append(Episode.from_stream(np.array(made, np.float32), spec))
+    asm = NeuralASM(spec, 16, 24, epochs=200, dynamics="settling").fit(episodes[:20]).calibrate(episodes[20:], 0.1)
+    guarded = NeuralASMSafety(Sliding(), asm, on_alarm="hold")
+    _, info = guarded.reset(seed=1)
+    for _ in range(10):
+        *_, info = guarded.step(np.zeros(3, np.float32))
+    assert np.isfinite(info["asm"]["surprise"])
+    policy = NeuralASMPolicy(asm, Sliding())
+    left = []
+    for seed in range(5):
+        at, _ = env.reset(seed=100 + seed)
+        away, state = np.linalg.norm(at), None
+        for t in range(30):
+            action, state = policy.predict(at, state, np.array([t == 0]))
+            at, *_ = env.step(action)
+        left.append(np.linalg.norm(at) / away)
+    assert np.mean(left) < 0.3
+
+
+def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):
+    with pytest.raises(ValueError, match=r"^unknown dynamics 'setling'; known: traces, settling; did you mean"):
+        NeuralASM(sine_spec(), dynamics="setling")
+    with pytest.raises(ValueError, match=r"^iterations must be a whole number in \[1, 1000\], got 0$"):
+        NeuralASM(sine_spec(), dynamics="settling", iterations=0)
+    asm.save(tmp_path / "settling.asm")
+    saved = read_checkpoint(tmp_path / "settling.asm", NeuralASM.kind)
+    with pytest.raises(ValueError, match=r"^this is a memory of dynamics='settling', .* cannot be loaded as 'traces'$"):
+        NeuralASM(sine_spec(), 32, 48).restore(saved)
+    traces = NeuralASM(sine_spec(), 8, 8, epochs=1).fit(sine_episodes(5))
+    traces.save(tmp_path / "traces.asm")
+    with pytest.raises(ValueError, match=r"^this is a memory of dynamics='traces', .* cannot be loaded as 'settling'$"):
+        NeuralASM(sine_spec(), 8, 8, dynamics="settling").restore(read_checkpoint(tmp_path / "traces.asm", traces.kind))
+    with pytest.raises(ValueError, match="a band needs a fitted memory of traces, got one of dynamics='settling'"):
+        SpinalBand(asm)
