@@ -12,7 +12,7 @@ pytest = $(one_thread) $(bin)/python -m pytest -n $(JOBS) --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo reproduce doctor test test-all extras soak check format docs page stale clean
+.PHONY: help demo reproduce doctor test test-all extras soak check format docs page pages verify clean
 
 help: ## list the commands
 	@sed -nE 's/^([a-z-]+):.* ## (.*)/  make \1\t\2/p' Makefile | expand -t 20
@@ -56,8 +56,11 @@ docs: $(stamp) ## this documentation as a site, in docs/_build/html
 page: $(stamp) ## runs the command of a page of results, and keeps what it prints: PAGE=docs/results/demo.md
 	$(bin)/python docs/pages.py print $(PAGE)
 
-stale: $(stamp) ## marks the pages of results whose code has changed
-	$(bin)/python docs/pages.py mark
+pages: $(stamp) ## prints every page for which something has changed, and goes on where it was interrupted; hours
+	$(bin)/python docs/pages.py all $(ARGS)
+
+verify: $(stamp) ## runs the checks of the pages of results, and says which print something else
+	$(one_thread) $(bin)/python docs/pages.py verify $(ARGS)
 
 clean: ## removes .venv, builds and caches; runs/ stays
 	rm -rf .venv build dist docs/_build docs/reference/api *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
