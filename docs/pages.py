@@ -7,7 +7,7 @@ The front matter of a page in ``docs/results`` says so:
     printed: runs/quick/results.md   what the command leaves; without it, what the command prints
     figures: {runs/quick/roc.png: docs/img/roc.png}
     reads: {runs/evaluate: detection}   what the command reads, and the page whose command makes that
-    check: asm-gym evaluate …        at most 30 s, its output tells whether the page still holds
+    check: asm-gym evaluate … --out $CHECK   at most 30 s; says whether the page still holds; CHECK: an empty folder
     tolerance: 0.05                  of the check's numbers, relative
     version: 0.1.0
     date: 2026-11-22
@@ -161,7 +161,7 @@ def _said(command: str) -> tuple[str, dict[str, str]]:
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
     with tempfile.TemporaryDirectory() as folder:
         notes = Path(folder) / "ran.txt"
-        there = os.environ | {"PATH": path, "COLUMNS": "120"} | ran.noting(notes)
+        there = os.environ | {"PATH": path, "COLUMNS": "120", "CHECK": folder} | ran.noting(notes)
         done = subprocess.run(
             ["bash", "-e", "-c", command], cwd=ROOT, env=there, stdout=subprocess.PIPE, text=True, check=True
         )
