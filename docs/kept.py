@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 TOLERANCE = 0.05
@@ -18,13 +19,11 @@ def rounded(text: str) -> str:
 
 
 def _rounded(number: str) -> str:
-    value = float(number)
-    whole, _, decimals = number.lstrip("-+").partition(".")
-    if len(whole.lstrip("0")) + len(decimals.lstrip("0") if not whole.strip("0") else decimals) <= DIGITS or not value:
+    value, decimals = float(number), len(number.partition(".")[2])
+    if not value:
         return number
-    if abs(value) >= 10 ** (DIGITS - 1):
-        return f"{float(f'{value:.{DIGITS - 1}e}'):.0f}"
-    return f"{value:.{DIGITS}g}"
+    places = min(decimals, DIGITS - 1 - math.floor(math.log10(abs(value))))
+    return f"{round(value, places):.{max(places, 0)}f}" if decimals or places < 0 else number
 
 
 def different(was: str, now: str, tolerance: float = TOLERANCE) -> list[str]:
@@ -43,7 +42,8 @@ def _agree(old: str, new: str, tolerance: float) -> bool:
         return False
     pairs = zip(_NUMBER.findall(old), _NUMBER.findall(new), strict=True)
     return all(
-        abs(float(a) - float(b)) <= max(_unit(a), _unit(b), tolerance * _larger(a, b)) * (1 + 1e-9) for a, b in pairs
+        abs(float(a) - float(b)) <= max(min(_unit(a), _unit(b)), tolerance * _larger(a, b)) * (1 + 1e-9)
+        for a, b in pairs
     )
 
 

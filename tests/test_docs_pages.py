@@ -197,6 +197,8 @@ def test_a_page_without_a_check_is_passed_over_and_said(page, capsys):
         ("12.3456 kg", "12.3 kg"),
         ("98765 rows", "98800 rows"),
         ("154 of 1.5", "154 of 1.5"),
+        ("1.000 and 12.0", "1.00 and 12.0"),
+        ("1234.5", "1230"),
         ("0.0", "0.0"),
         ("panda-v0 at e1s", "panda-v0 at e1s"),
         ("┃ a ┃ 1.0 ┃\n━━━━\n  b", "a 1.0\nb"),
@@ -218,6 +220,7 @@ def test_numbers_are_rounded_and_frames_left_out(text, short):
         ("a 1.0", "a 1.0\nb", False),
         ("a", "a 1.0", False),
         ("0.02", "0.03", True),
+        ("1.00", "0.50", False),
         ("1.0", "-1.0", False),
     ],
 )
