@@ -1,11 +1,53 @@
-"""Neural associative skill memories that watch robots: importing this registers the environments with Gymnasium."""
+"""Neural associative skill memories that watch robots.
+
+Importing this registers the environments with Gymnasium, and little else: each name is imported when it is asked for.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-from asm_gym.moved import install
+from asm_gym.extras import needed_for
 from asm_gym.tasks import TASKS
 
+if TYPE_CHECKING:
+    from asm_gym.episode import Episode
+    from asm_gym.monitors import NeuralASM, make_monitor
+    from asm_gym.policies import make_policy
+    from asm_gym.rollouts.collect import collect
+    from asm_gym.rollouts.pretraining.healthy import harmless
+    from asm_gym.spec import Channel, StreamSpec
+    from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
+
+__all__ = [
+    "Channel",
+    "Episode",
+    "FaultInjection",
+    "NeuralASM",
+    "NeuralASMSafety",
+    "StreamRecorder",
+    "StreamSpec",
+    "VectorNeuralASMSafety",
+    "collect",
+    "harmless",
+    "make_monitor",
+    "make_policy",
+]
+
 __version__ = "0.1.0"
+
+_HOME = {
+    **dict.fromkeys(("NeuralASM", "make_monitor"), "monitors"),
+    **dict.fromkeys(("FaultInjection", "NeuralASMSafety", "StreamRecorder", "VectorNeuralASMSafety"), "wrappers"),
+    **dict.fromkeys(("collect", "harmless"), "rollouts"),
+    **dict.fromkeys(("Channel", "StreamSpec"), "spec"),
+    "Episode": "episode",
+    "make_policy": "policies",
+}
+"""Which room a name comes from."""
 
 for _task in TASKS.values():
     gymnasium.register(
@@ -17,4 +59,15 @@ for _task in TASKS.values():
 
 gymnasium.register(id="asm_gym/SyntheticArm-v0", entry_point="asm_gym.synthetic_arm:SyntheticArm")
 
-install()
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    with needed_for(name):
+        value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value  # not asked for again
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

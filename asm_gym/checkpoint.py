@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.files import regular_file, written_whole
-from asm_gym.typed import typed
+from asm_gym.validation import typed
 
 FORMAT = "asm-gym"
 VERSION = 1
@@ -101,7 +101,7 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
         if header.get("kind") != kind:
             raise _OtherCheckpointError(f"{path} is a checkpoint of {header.get('kind')!r}, not of {kind!r}")
         names = {n.removesuffix(".npy") for n in file.namelist() if n != HEADER}
-        declared = header.pop("arrays", None)  # an older asm-gym declared none
+        declared = header.pop("arrays", None)  # the shipped agents declare none
         if declared is not None and set(declared) != names:
             raise ValueError(f"its header declares other arrays: {', '.join(sorted(set(declared) ^ names))}")
         arrays = {name: _read(file, f"{name}.npy") for name in sorted(names)}

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from asm_gym.checks import shown
+from asm_gym.validation import shown
 
 UNFINISHED = ".unfinished"
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]

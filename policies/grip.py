@@ -23,7 +23,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.stream import control_period
+from asm_gym.spec import control_period
 
 FORGETS = 1.6
 """τ [s]."""

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import State
 from asm_gym.policies.grip import Grip, Readout
-from asm_gym.stream import MOTOR, StreamSpec, control_period
-from asm_gym.typed import typed
+from asm_gym.spec import MOTOR, StreamSpec, control_period
+from asm_gym.validation import typed
 
 OBJECT = "object"
 """The group of what lies about; the objects of other tasks are out of play, and read 0."""

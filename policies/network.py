@@ -20,7 +20,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
-from asm_gym.choices import check_choice
+from asm_gym.validation import check_choice
 
 Array = NDArray[np.float32]
 

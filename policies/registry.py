@@ -26,7 +26,7 @@ from asm_gym.policies.scripted.transport import TransportExpert
 from asm_gym.policies.scripted.two_arm_lift import TwoArmLiftExpert
 from asm_gym.policies.scripted.wipe import WipeExpert
 from asm_gym.tasks import TaskSpec
-from asm_gym.typed import typed
+from asm_gym.validation import typed
 
 EXPERTS: dict[str, Callable[..., Policy]] = {
     "Lift": LiftExpert,

@@ -8,9 +8,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from asm_gym.checks import check_number
 from asm_gym.policies.base import Policy
-from asm_gym.typed import typed
+from asm_gym.validation import check_number, typed
 
 
 @typed

@@ -17,26 +17,26 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 from rich.console import Console
 
-from asm_gym.checks import check_number
+from asm_gym.data.live import RowReader, SourceDied, is_live, lines_from
+from asm_gym.data.logs import Layout, Log, read_logs
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, traces_of
 from asm_gym.evaluation.report import write_report
+from asm_gym.evaluation.scored import ScoredEpisode
 from asm_gym.evaluation.tables import Table
-from asm_gym.evaluation.trace import Trace
 from asm_gym.extras import require
-from asm_gym.live import RowReader, SourceDied, is_live, lines_from
-from asm_gym.live_view import LiveView
-from asm_gym.logs import Layout, Log, read_logs
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
-from asm_gym.stream import StreamSpec
+from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number
+from asm_gym.view.rerun import LiveView
 
 AT_ONCE = 64
 """Episodes scored side by side."""
@@ -55,26 +55,23 @@ LATENCIES = 10_000
 class Args:
     """Watches a recording, or rows as they come."""
 
-    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    source: str = option(positional=True, metavar="SOURCE")
     """What asm-gym fit reads; or what is live: -, tail:FILE or udp:PORT."""
-    monitor: Annotated[Path, tyro.conf.arg(metavar="FILE.asm")]
+    monitor: Path = option(metavar="FILE.asm")
     """A calibrated monitor, such as asm-gym fit writes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/watch")
+    out: Path = option(Path("runs/watch"), metavar="FOLDER")
     """Folder of the table, the figures and the report of a recording."""
-    rate: float | None = None
-    """Rows of logs a second [Hz]; by default their column called time says it, or else the memory."""
-    silence: float = 2.0
-    """Seconds without a row after which a live source has died, which is an alarm."""
-    rerun: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
+    rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
+    """Rows of logs a second; by default their column called time says it, or else the memory."""
+    silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
+    """Without a row for so long a live source has died, which is an alarm."""
+    rerun: Path | None = option(None, metavar="FILE.rrd")
     """Where to write the most surprising episodes of a recording for Rerun's viewer."""
-    figures: int = 4
+    figures: int = fixed(4, check=partial(check_number, "figures", low=1, whole=True))
     """How many of the most surprising episodes are drawn."""
 
     def __post_init__(self) -> None:
-        check_number("figures", self.figures, low=1, whole=True)
-        check_number("silence", self.silence, above=0)
-        if self.rate is not None:
-            check_number("rate", self.rate, above=0)
+        check_options(self)
 
 
 def in_groups(logs: Iterable[Log], size: int) -> Iterator[list[Log]]:
@@ -87,7 +84,7 @@ def in_groups(logs: Iterable[Log], size: int) -> Iterator[list[Log]]:
 def review(args: Args, monitor: Any, console: Console) -> int:
     """Scores a recording, writes what came of it, and prints the alarms."""
     alarms: list[Alarm] = []
-    worst: list[Trace] = []
+    worst: list[ScoredEpisode] = []
     episodes = 0
     with stage("watching", console, {}) as progress:
         for group in in_groups(read_logs(args.source, Layout(monitor.spec, args.rate)), AT_ONCE):
@@ -111,7 +108,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     return BAD_NEWS if alarms else DONE
 
 
-def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Trace]) -> None:
+def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[ScoredEpisode]) -> None:
     """Writes the table of all alarms, and a report with the most surprising episodes."""
     args.out.mkdir(parents=True, exist_ok=True)
     with (args.out / "alarms.csv").open("w", newline="", encoding="utf-8") as file:
@@ -141,7 +138,7 @@ def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Trac
     )
 
 
-def write_rerun(path: Path, traces: Sequence[Trace], monitor: Any) -> None:
+def write_rerun(path: Path, traces: Sequence[ScoredEpisode], monitor: Any) -> None:
     """Writes episodes for Rerun's viewer, one after another."""
     seconds = 0.0
     with LiveView(path, monitor.spec, getattr(monitor, "model", None)) as view:

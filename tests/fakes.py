@@ -11,9 +11,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors import Surprise
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("position", 2, "m"), Channel("action", 3, group=MOTOR)), dt=0.05)
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from asm_gym.episodes import Episode
-from asm_gym.stream import Channel, StreamSpec
+from asm_gym.episode import Episode
+from asm_gym.spec import Channel, StreamSpec
 
 
 def sine_spec(sensory: int = 12, motor: int = 2) -> StreamSpec:

@@ -8,9 +8,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors import CalibratedMonitor, make_monitor
-from asm_gym.stream import StreamSpec, control_period
+from asm_gym.spec import StreamSpec, control_period
 from tests.needs import needs
 
 needs("mujoco")

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM, make_monitor
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.streams import sine_episodes
 
 NAMES = ("neural_asm", "memory_skill", "association_linear+evidence", "window_pca+evidence", "kalman+evidence")

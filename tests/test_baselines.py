@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from asm_gym.checkpoint import read_checkpoint
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors import MONITORS, load_monitor, make_monitor, monitor_class
 from asm_gym.monitors.baselines import association_mlp, gru, lstm_vae
 from asm_gym.monitors.saved import restored
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.needs import needs
 from tests.streams import sine_episodes, sine_spec
 
@@ -176,7 +176,7 @@ def test_what_a_baseline_was_set_to_is_in_its_file_and_a_file_from_before_has_it
     for made in (monitor, own):
         made.save(tmp_path / "m.asm")
         np.testing.assert_array_equal(load_monitor(tmp_path / "m.asm").score(one).value, made.score(one).value)
-    # An older asm-gym wrote nothing of these.
+    # What a file says nothing of is as it is by default.
     saved = read_checkpoint(tmp_path / "m.asm", name)
     before = {n: v for n, v in saved.header["hyperparameters"].items() if n not in setting}
     older = restored("m.asm", saved._replace(header={**saved.header, "hyperparameters": before}), monitor_class(name))

@@ -8,14 +8,16 @@ import pytest
 
 from asm_gym.evaluation import comparison, metrics
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
+from asm_gym.evaluation.scored import ScoredEpisode
 from asm_gym.evaluation.tables import harmless_table, kinds_table, monitors_table
-from asm_gym.evaluation.trace import Trace
 
 
 def a_trace(peak, kind="nominal", severity="", onset=None):
     surprise = np.zeros(10)
     surprise[5] = peak
-    trace = Trace(kind, 0, 0.05, 3.5, surprise, onset, severity, "Lift", "asm", affected_channels=frozenset("a"))
+    trace = ScoredEpisode(
+        kind, 0, 0.05, 3.5, surprise, onset, severity, "Lift", "asm", affected_channels=frozenset("a")
+    )
     return trace.attributed(np.ones((10, 1)), ("a",))
 
 

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.completion import Completion, sensors_of
 from asm_gym.monitors import NeuralASM, Surprise
 from asm_gym.monitors.diagnosis import CLASSES, Diagnosis, Readout
 from asm_gym.scaling import StreamScaler
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import CompletedObservation, NeuralASMSafety
-from asm_gym.wrappers.completion import ObservationMap, Repair
+from asm_gym.wrappers.repair import ObservationMap, Repair
 from tests.fakes import CueMonitor
 
 SPEC = StreamSpec(

@@ -4,7 +4,7 @@ import numpy as np
 
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce.completion import _worse_from, by_kalman, by_last_value, by_memory, main
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.test_completion import MEMORY, SENSES, SPEC, STREAMS, arm
 
 

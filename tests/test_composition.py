@@ -7,17 +7,14 @@ import subprocess
 import sys
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-import asm_gym.detection
 from asm_gym.detection import EvidenceDetection, ModelOutput, conformal_threshold
 from asm_gym.detection.scores import WINDOW, Largest, Mahalanobis, MovingMean, Squares
-from asm_gym.episodes import Episode
-from asm_gym.memory.recurrent import RecurrentWeights
+from asm_gym.episode import Episode
 from asm_gym.monitors import (
     DETECTIONS,
     MONITORS,
@@ -33,10 +30,9 @@ from asm_gym.monitors import (
     register_monitor,
 )
 from asm_gym.monitors.model import StreamModel
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.streams import frozen, sine_episodes, sine_spec
 
-DATA = Path(__file__).parent / "data"
 """Files that asm-gym saved before models and detections were parts, and what it made of a stream."""
 
 
@@ -286,70 +282,6 @@ def test_optional_abilities_are_protocols():
     for ability in (ForgetsEvidence, ExpectsActions, LearnsOnTheJob, NamesSkills):
         assert isinstance(asm, ability)
         assert isinstance(limit, ability) == (ability is ForgetsEvidence)
-
-
-def old(name):
-    monitor = monitor_class(name).load(DATA / f"{name.partition('+')[0]}.asm")
-    return monitor, Episode.from_stream(np.load(DATA / "surprise.npz")["stream"], monitor.spec)
-
-
-@pytest.mark.parametrize("name", ["neural_asm", "kalman", "kalman+evidence"])
-def test_a_file_of_an_older_version_gives_the_same_surprise(name, tmp_path):
-    monitor, episode = old(name)
-    said = np.load(DATA / "surprise.npz")
-    value, before = monitor.score(episode).value, said[name.replace("+", "_")]
-    # A sense that sticks from row 20 on counts for more than it did, with evidence, once it repeats itself twice.
-    same = slice(None, None if name == "kalman" else 22)
-    # Processors round the memory's single precision differently; on the one that saved it, every bit is the same.
-    np.testing.assert_allclose(value[same], before[same], rtol=1e-3)
-    assert ((value > monitor.threshold) >= (before > monitor.threshold)).all()
-    assert monitor.threshold in said["thresholds"]
-    monitor.save(tmp_path / "now.asm")
-    now = load_monitor(tmp_path / "now.asm")
-    np.testing.assert_array_equal(now.score(episode).value, monitor.score(episode).value)
-    assert now.threshold == monitor.threshold
-
-
-def test_a_file_of_an_older_version_keeps_its_abilities_and_says_what_it_lacks():
-    asm, episode = old("neural_asm")
-    assert asm.get_params()["free_running_probability"] == 0.5
-    assert asm.skills_ == ("far", "near")
-    assert asm.motor_ is not None
-    np.testing.assert_allclose(
-        asm.recall(episode.stream[:10], 5), np.load(DATA / "surprise.npz")["recalled"], rtol=1e-3
-    )
-    with pytest.raises(RuntimeError, match=r"older asm-gym did not save it.*calibrate\(nominal_episodes\) again"):
-        asm.threshold_at(0.05)
-
-
-def test_a_memory_of_an_older_version_goes_on_learning_with_the_temporal_network_it_has():
-    asm, episode = old("neural_asm")
-    noise = np.random.default_rng(0).normal(0.0, 0.01, (10, *episode.stream.shape))
-    asm.fit([Episode.from_stream(episode.stream + n, asm.spec) for n in noise], warm_start=True)
-    before = old("neural_asm")[0].learned_
-    for name in RecurrentWeights._fields:
-        np.testing.assert_array_equal(asm.learned_[name], before[name])
-    assert not np.array_equal(asm.learned_["D"], before["D"])
-    with pytest.raises(RuntimeError, match="no skill has a name yet"):
-        asm.skills(episode.stream)
-
-
-def test_old_names_go_on_working_and_say_the_new_ones(kalman):
-    with pytest.warns(DeprecationWarning, match="carry_prior is now free_running_probability"):
-        assert NeuralASM(sine_spec(), carry_prior=0.5).free_running_probability == 0.5
-    with pytest.warns(DeprecationWarning, match="free_running_probability"):
-        made = make_monitor("neural_asm", sine_spec(), carry_prior=0.5)
-    assert made.get_params()["free_running_probability"] == 0.5
-    with pytest.raises(TypeError, match="no hyperparameter depth"):
-        NeuralASM(sine_spec(), depth=3)
-    with pytest.warns(DeprecationWarning, match="resynchronise is now reset_evidence"):
-        kalman.resynchronise(kalman.initial_state())
-    with pytest.warns(DeprecationWarning, match="Run is now .*ModelOutput"):
-        assert asm_gym.detection.Run is ModelOutput
-    with pytest.warns(DeprecationWarning, match="TAIL_INDEX"):
-        assert asm_gym.detection.LIGHT == 0.3
-    with pytest.raises(AttributeError, match="Ran"):
-        _ = asm_gym.detection.Ran
 
 
 def test_a_file_keeps_the_maxima_beside_what_was_learned(kalman, tmp_path):

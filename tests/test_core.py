@@ -25,9 +25,9 @@ LARGEST = 500e6
 WATCH = """
 import gymnasium, numpy as np
 import asm_gym, asm_gym.monitors, asm_gym.wrappers
-from asm_gym.episodes import Episode, load_episode, save_episode
+from asm_gym.episode import Episode, load_episode, save_episode
 from asm_gym.monitors import NeuralASM
-from asm_gym.stream import Channel, StreamSpec
+from asm_gym.spec import Channel, StreamSpec
 
 spec = StreamSpec((Channel("x", 3, group="joint"), Channel("u", 1, group="action")), dt=0.05)
 rng = np.random.default_rng(0)
@@ -69,8 +69,9 @@ print(json.dumps([
     said(lambda: asm_gym.wrappers.FaultInjection),
     said(lambda: asm_gym.wrappers.SurpriseOverlay),
     said(lambda: asm_gym.monitors.make_monitor("gru", spec)),
-    said(lambda: __import__("asm_gym.datasets").datasets.require_minari()),
+    said(lambda: __import__("asm_gym.data.datasets").data.datasets.require_minari()),
     said(lambda: __import__("asm_gym.tasks").tasks.env_id("gymnasium_robotics:FetchReach-v4")),
+    {name: said(lambda: getattr(asm_gym, name)) for name in asm_gym.__all__},
 ]))
 """
 
@@ -82,6 +83,14 @@ SAID = [
     "a dataset needs h5py: pip install 'asm-gym[data]'",
     "gymnasium_robotics:FetchReach-v4 needs gymnasium_robotics: pip install 'asm-gym[environments]'",
 ]
+
+ONE_IMPORT = {
+    **dict.fromkeys(("NeuralASM", "NeuralASMSafety", "VectorNeuralASMSafety", "StreamRecorder"), None),
+    **dict.fromkeys(("Channel", "Episode", "StreamSpec", "make_monitor", "make_policy"), None),
+    "FaultInjection": SAID[0],
+    **dict.fromkeys(("collect", "harmless"), "running episodes needs loky: pip install 'asm-gym[report]'"),
+}
+"""What a core install answers for each name of the package."""
 
 NOTHING_ELSE = """
 import sys
@@ -99,7 +108,7 @@ def test_the_core_watches_a_stream_and_names_what_the_rest_needs(tmp_path):
     code = NOTHING_ELSE.replace("ABSENT", repr(set(BROUGHT_BY))) + WATCH
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == SAID
+    assert json.loads(done.stdout) == [*SAID, ONE_IMPORT]
 
 
 def test_a_command_says_which_extra_it_lacks(tmp_path):
@@ -172,7 +181,7 @@ def test_a_core_install_is_small_and_works(tmp_path):
     assert grown < LARGEST
     done = subprocess.run([python, "-c", WATCH], capture_output=True, text=True, check=False, **alone)
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == SAID
+    assert json.loads(done.stdout) == [*SAID, ONE_IMPORT]
 
 
 def _size(folder: Path) -> int:

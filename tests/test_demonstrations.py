@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from asm_gym.datasets import read_dataset
+from asm_gym.data.datasets import read_dataset
 from asm_gym.envs.demonstrations import recorded_in, replay
 from asm_gym.policies import make_policy, rollout
 from asm_gym.scripts.cli import main

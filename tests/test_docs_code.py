@@ -13,10 +13,10 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-import tyro
 
 from asm_gym.faults import FAULTS
 from asm_gym.monitors import MONITORS
+from asm_gym.scripts import command as command_of
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.command import run
 from tests import documents
@@ -96,13 +96,13 @@ def check(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
         called: Callable[[], int] = partial(run, "soak", soak.Args, soak.soak, argv[2:])
     else:
         called = partial(main, argv)
-    parse = tyro.cli
+    parse = command_of.parse
 
     def dry(*args: Any, **kwargs: Any) -> Any:
         parse(*args, **kwargs)
         raise Parsed
 
-    monkeypatch.setattr(tyro, "cli", dry)
+    monkeypatch.setattr(command_of, "parse", dry)
     try:
         code = called()
     except Parsed:
@@ -110,7 +110,7 @@ def check(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     except SystemExit as stopped:
         code = stopped.code
     finally:
-        monkeypatch.setattr(tyro, "cli", parse)
+        monkeypatch.setattr(command_of, "parse", parse)
     assert code == 0, command
 
 
@@ -150,3 +150,10 @@ def test_a_comment_that_makes_a_block_small_must_match_it():
     assert documents.small("collect(episodes=60)", "<!-- small: 60 -> 6 -->\n") == "collect(episodes=6)"
     with pytest.raises(AssertionError, match="does not occur"):
         documents.small("collect(episodes=60)", "<!-- small: 50 -> 6 -->\n")
+
+
+@pytest.mark.parametrize("page", RESULTS, ids=documents.name)
+def test_the_check_of_a_page_of_results_can_be_given(page: Path, monkeypatch: pytest.MonkeyPatch):
+    script = documents.tool("pages").Page.read(page).meta.get("check", "").replace("\\\n", " ")
+    for command in re.findall(r"^(asm-gym [^|>\n]*)", script, re.M):
+        check(command.replace("$CHECK", "runs/check"), monkeypatch)

@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import FlattenObservation, NormalizeObservation
 
 import asm_gym  # noqa: F401
-from asm_gym.datasets import read_dataset
+from asm_gym.data.datasets import read_dataset
 from asm_gym.faults import (
     ActionDelay,
     ActionScale,
@@ -23,13 +23,13 @@ from asm_gym.faults import (
     Scale,
 )
 from asm_gym.faults.anywhere import KINDS, faults_anywhere, sigmas
+from asm_gym.faults.interface import FaultyInterface
 from asm_gym.faults.suite import SEVERITIES
 from asm_gym.policies import make_policy
 from asm_gym.rollouts import collect
 from asm_gym.scripts.cli import main
-from asm_gym.stream import MOTOR, Channel, StreamSpec, flat, flat_rows
+from asm_gym.spec import MOTOR, Channel, StreamSpec, flat, flat_rows
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
-from asm_gym.wrappers.faults import FaultyInterface
 from tests.fakes import CueMonitor, FakeEnv
 from tests.needs import needs
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.statistics import auroc
 from asm_gym.monitors import NeuralASM, make_monitor
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 SKILLS, STEPS, ONSET, WINDOW = 10, 60, 30, 20
 GROUPS, EACH, HIDDEN, MOTORS = 4, 6, 8, 3

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from asm_gym.episodes import EpisodeLabel
-from asm_gym.rollouts import benchmark
-from asm_gym.rollouts.benchmark import LEARNING, code_digest, fitted
+from asm_gym.episode import EpisodeLabel
+from asm_gym.rollouts import scoring
+from asm_gym.rollouts.scoring import LEARNING, code_digest, fitted
 from tests.streams import sine_episodes
 
 
@@ -34,7 +34,7 @@ def test_a_monitor_is_kept_and_one_that_cannot_be_read_is_made_anew(tmp_path):
 def test_what_other_code_has_learned_is_learned_anew_and_that_is_said(tmp_path, monkeypatch):
     recordings = some_recordings()
     fitted(tmp_path, "kalman", recordings, 0)
-    monkeypatch.setattr(benchmark, "code_digest", lambda: "01234567")
+    monkeypatch.setattr(scoring, "code_digest", lambda: "01234567")
     with pytest.warns(UserWarning, match="kalman was fitted by other code"):
         fitted(tmp_path, "kalman", recordings, 0)
     assert len(list((tmp_path / "monitors").glob("kalman-*.asm"))) == 2

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
-from asm_gym.checks import as_float32
 from asm_gym.faults import FAULTS
 from asm_gym.monitors import NeuralASM
+from asm_gym.validation import as_float32
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety
 from tests.fakes import CueMonitor, FakeEnv
 from tests.streams import sine_episodes, sine_spec

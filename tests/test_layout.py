@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import os
 import subprocess
 import sys
@@ -12,10 +13,13 @@ from pathlib import Path
 
 import pytest
 
+import asm_gym
 from asm_gym.monitors import pretrained
 from tests.wheel import LINKS, ROOT, build_wheel
 
 LAYERS = ("core", "policies", "wrappers", "rollouts", "scripts")  # each may import itself and what stands before it
+FACADE = "asm_gym.__init__"
+"""Hands out names of every layer, each when it is asked for: see ``test_importing_the_package_is_cheap``."""
 AUTOGRAD = ("torch", "jax", "autograd", "tensorflow", "theano")
 
 
@@ -63,13 +67,13 @@ def offences(within: str, *roots: str) -> list[str]:
 
 def test_every_layer_is_looked_at() -> None:
     assert {layer(name) for name in MODULES} == set(LAYERS)
-    assert "asm_gym.stream" in MODULES
+    assert "asm_gym.spec" in MODULES
 
 
 @pytest.mark.parametrize(
     ("name", "line", "what"),
     [
-        ("asm_gym.envs.a", "from ..stream import Channel", "asm_gym.stream.Channel"),
+        ("asm_gym.envs.a", "from ..spec import Channel", "asm_gym.spec.Channel"),
         ("asm_gym.envs.__init__", "from . import b", "asm_gym.envs.b"),
         ("asm_gym.memory.a", "from asm_gym import wrappers", "asm_gym.wrappers"),
         ("asm_gym.a", "def f():\n  import asm_gym.scripts.cli as c", "asm_gym.scripts.cli"),
@@ -79,7 +83,7 @@ def test_an_import_is_resolved_to_its_long_name(name: str, line: str, what: str)
     assert list(imports(name, ast.parse(line))) == [what]
 
 
-@pytest.mark.parametrize("name", sorted(MODULES))
+@pytest.mark.parametrize("name", sorted(MODULES.keys() - {FACADE}))
 def test_imports_point_one_way(name: str) -> None:
     allowed = LAYERS[: LAYERS.index(layer(name)) + 1]
     upstream = [what for what in IMPORTS[name] if what.split(".")[0] == "asm_gym" and layer(what) not in allowed]
@@ -106,17 +110,30 @@ def test_only_envs_imports_robosuite() -> None:
 def test_no_module_speaks_to_a_network() -> None:
     # Clusters are dask's and ray's to speak to, where an address is named. Live rows are heard on the loopback alone.
     names = "socket", "ssl", "urllib", "http", "ftplib", "smtplib", "requests", "httpx", "aiohttp"
-    assert offences("asm_gym", *names) == ["asm_gym.live imports socket"]
-    assert 'bind(("127.0.0.1", port))' in (ROOT / "asm_gym" / "live.py").read_text(encoding="utf-8")
+    assert offences("asm_gym", *names) == ["asm_gym.data.live imports socket"]
+    assert 'bind(("127.0.0.1", port))' in (ROOT / "asm_gym" / "data/live.py").read_text(encoding="utf-8")
 
 
 def test_importing_the_package_is_cheap() -> None:
     code = (
         "import sys, asm_gym;"
-        "sys.exit(' '.join({'robosuite', 'mujoco', 'torch', 'stable_baselines3'} & set(sys.modules)))"
+        "print(*sorted({m.partition('.')[0] for m in sys.modules}), *(m for m in sys.modules if 'asm_gym.' in m))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stderr.strip() == ""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert not loaded & {"robosuite", "mujoco", "torch", "stable_baselines3", "numba", "scipy"}
+    assert {name for name in loaded if "." in name} <= {
+        f"asm_gym.{m}" for m in ("extras", "tasks", "files", "validation")
+    }
+
+
+def test_every_name_of_the_package_is_what_its_room_calls_so():
+    for name in asm_gym.__all__:
+        room = importlib.import_module(f"asm_gym.{asm_gym._HOME[name]}")
+        assert getattr(asm_gym, name) is getattr(room, name)
+    assert set(asm_gym.__all__) == set(asm_gym._HOME) <= set(dir(asm_gym))
+    with pytest.raises(AttributeError, match=r"module 'asm_gym' has no attribute 'Tracer'"):
+        asm_gym.Tracer  # noqa: B018 (looked up)
 
 
 @pytest.mark.parametrize("link", LINKS)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.linear import FEW_PENALTY, PENALTIES, conditional, learn_from_past, learn_linear, moments
 from asm_gym.monitors import make_monitor
-from asm_gym.stream import Channel, StreamSpec
+from asm_gym.spec import Channel, StreamSpec
 
 GROUPS = np.array([0, 0, 1, 2, 2])
 CHANGES = slice(5, 10)

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from asm_gym.live import RowReader, SourceDied, is_live, lines_from
+from asm_gym.data.live import RowReader, SourceDied, is_live, lines_from
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.watch import follow
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.streams import swing
 
 SPEC = StreamSpec((Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02)

@@ -11,13 +11,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from asm_gym.columns import as_array, read_parquet, read_table
-from asm_gym.episodes import Episode
-from asm_gym.lerobot import write_lerobot
-from asm_gym.logs import Layout, read_logs
+from asm_gym.data.lerobot import write_lerobot
+from asm_gym.data.logs import Layout, read_logs
+from asm_gym.data.tabular import as_array, read_parquet, read_table
+from asm_gym.data.timing import noise_of, regular
+from asm_gym.episode import Episode
 from asm_gym.scripts.cli import main
-from asm_gym.stream import MOTOR
-from asm_gym.timing import noise_of, regular
+from asm_gym.spec import MOTOR
 from tests.needs import needs
 
 RATE, ROWS = 50.0, 80

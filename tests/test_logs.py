@@ -12,15 +12,15 @@ import pyarrow as pa
 import pytest
 from rich.console import Console
 
-from asm_gym.episodes import Episode, EpisodeLabel, save_episode
+from asm_gym.data.channels import read_table, stream_of
+from asm_gym.data.logs import READERS, Layout, Log, read_logs
+from asm_gym.data.selection import divided, normal_episodes, pieces
+from asm_gym.episode import Episode, EpisodeLabel, save_episode
 from asm_gym.evaluation.alarms import traces_of
-from asm_gym.logs import READERS, Layout, Log, read_logs
 from asm_gym.monitors import load_monitor, make_monitor
-from asm_gym.normal import divided, normal_episodes, pieces
 from asm_gym.scripts import watch
 from asm_gym.scripts.cli import main
-from asm_gym.stream import MOTOR
-from asm_gym.tables import read_table, stream_of
+from asm_gym.spec import MOTOR
 
 RATE = 50.0
 ROWS = 80
@@ -357,12 +357,12 @@ def test_standard_input_is_watched_as_a_command(memory, monkeypatch, capsys):
         (["fit"], "DATA"),
         (["fit", "nowhere"], "there is no nowhere"),
         (["fit", "nowhere", "--monitor", "asm"], "unknown monitor 'asm'"),
-        (["fit", "nowhere", "--calibration-share", "1"], "calibration_share must be"),
+        (["fit", "nowhere", "--split", "0"], "split must be"),
         (["fit", "nowhere", "--rate", "-1"], "rate must be"),
         (["fit", "nowhere", "--out", "."], "is a folder"),
         (["watch", "nowhere"], "--monitor"),
         (["watch", "nowhere", "--monitor", "none.asm"], "none.asm"),
-        (["watch", "nowhere", "--monitor", "x.asm", "--figures", "0"], "figures must be"),
+        (["watch", "nowhere", "--monitor", "x.asm", "--silence", "0"], "silence must be"),
         (["watch", "-", "--monitor", "x.asm", "--rerun", "x.rrd"], "--rerun is for a recording, and - is live"),
     ],
 )

@@ -12,14 +12,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, situation
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.grip import ENOUGH, FORGETS, Readout
 from asm_gym.policies.memory_policy import StreamReader, common_spec
 from asm_gym.scaling import StreamScaler
-from asm_gym.stream import Channel, StreamSpec
+from asm_gym.spec import Channel, StreamSpec
 
 SMALL: dict[str, Any] = {"hidden_size": 8, "association_size": 8, "epochs": 1}
 

@@ -21,18 +21,18 @@ from asm_gym.evaluation.metrics import (
     time_matched_auroc,
     typical,
 )
+from asm_gym.evaluation.scored import InterventionOutcome, ScoredEpisode, TraceDetail, spans, window_steps
 from asm_gym.evaluation.statistics import Share, auroc, wilson_interval
-from asm_gym.evaluation.trace import InterventionOutcome, Trace, TraceDetail, spans, window_steps
 
 
 def a_trace(
     surprise: Any, onset: int | None = None, kind: str | None = None, contact_force: float = 0.0, **fields: Any
-) -> Trace:
+) -> ScoredEpisode:
     """A trace of 0.1 s steps and the threshold 10."""
     kind = kind or ("nominal" if onset is None else "push")
     values: dict[str, Any] = {"dt": 0.1, "threshold": 10.0, "seed": 0, "onset": onset, **fields}
     outcome = InterventionOutcome(values.pop("success", True), values.pop("ended_by_alarm", False), contact_force)
-    return Trace(kind=kind, surprise=np.asarray(surprise, np.float64), outcome=outcome, **values)
+    return ScoredEpisode(kind=kind, surprise=np.asarray(surprise, np.float64), outcome=outcome, **values)
 
 
 def detail(fault: Any) -> TraceDetail:

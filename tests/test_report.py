@@ -20,13 +20,13 @@ from matplotlib.figure import Figure
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.metrics import by_condition, false_alarms, time_matched_auroc
 from asm_gym.evaluation.report import write_json, write_report
+from asm_gym.evaluation.scored import InterventionOutcome, ScoredEpisode, TraceDetail
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Column, Table, detection_table, headline, outcome_table, tabulate
-from asm_gym.evaluation.trace import InterventionOutcome, Trace, TraceDetail
-from asm_gym.evaluation.video import write_video
+from asm_gym.view.film import write_video
 
 
-def a_trace(condition: str, seed: int, acting: str = "policy alone") -> Trace:
+def a_trace(condition: str, seed: int, acting: str = "policy alone") -> ScoredEpisode:
     """60 steps of 0.05 s; faults begin at step 20 and are seen, or not, as chance has it."""
     rng = np.random.default_rng([seed, len(condition)])
     surprise = rng.gamma(3.0, 2.0, 60)
@@ -36,19 +36,19 @@ def a_trace(condition: str, seed: int, acting: str = "policy alone") -> Trace:
         surprise[20 + rng.integers(8) : 40] += 30 * rng.random()
     attribution = rng.dirichlet(np.ones(20), 60) * surprise[:, None]
     channels = tuple(f"joint_position[{i}]" for i in range(20))
-    return Trace(
+    return ScoredEpisode(
         condition, seed, 0.05, 20.0, surprise, 20 if fault.any() else None, acting=acting,
         outcome=InterventionOutcome(True, False, 10 * rng.random()), detail=TraceDetail(attribution, channels, fault),
     ).attributed(attribution, channels)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def traces() -> list[Trace]:
+def traces() -> list[ScoredEpisode]:
     names = ("nominal", "push", "weak joint")
     return [a_trace(c, s, a) for c in names for s in range(8) for a in ("policy alone", "hold")]
 
 
-def figures_of(traces: list[Trace]) -> dict[str, Figure]:
+def figures_of(traces: list[ScoredEpisode]) -> dict[str, Figure]:
     faulty = next(t for t in traces if t.delay is not None)
     return {
         "surprise": figures.surprise_figure([traces[0], faulty]),
@@ -59,7 +59,7 @@ def figures_of(traces: list[Trace]) -> dict[str, Figure]:
     }
 
 
-def test_figures_are_the_same_bytes_each_time_whatever_the_users_style(traces: list[Trace], tmp_path: Path):
+def test_figures_are_the_same_bytes_each_time_whatever_the_users_style(traces: list[ScoredEpisode], tmp_path: Path):
     before = {name: figures.save(f, tmp_path / f"{name}.png").read_bytes() for name, f in figures_of(traces).items()}
     with mpl.rc_context({"axes.facecolor": "red", "font.size": 30, "axes.labelsize": 30, "ytick.direction": "in"}):
         again = figures_of(traces)
@@ -67,14 +67,14 @@ def test_figures_are_the_same_bytes_each_time_whatever_the_users_style(traces: l
         assert figures.save(figure, tmp_path / "again.png").read_bytes() == before[name], name
 
 
-def test_figures_leave_pyplot_and_the_users_style_alone(traces: list[Trace]):
+def test_figures_leave_pyplot_and_the_users_style_alone(traces: list[ScoredEpisode]):
     with mpl.rc_context({"font.size": 17.0}):
         figures_of(traces)
         assert mpl.rcParams["font.size"] == 17.0
     assert plt.get_fignums() == []
 
 
-def test_the_roc_curve_encloses_the_auroc_it_names(traces: list[Trace]):
+def test_the_roc_curve_encloses_the_auroc_it_names(traces: list[ScoredEpisode]):
     ax = figures.roc_figure(by_condition(traces, 1.0)).axes[0]
     alone = [t for t in traces if t.watched_only]
     nominal = [t for t in alone if t.condition == "nominal"]
@@ -86,7 +86,7 @@ def test_the_roc_curve_encloses_the_auroc_it_names(traces: list[Trace]):
         assert line.get_label() == f"{condition}: {auroc:.3f}"
 
 
-def test_the_delay_curve_ends_at_the_share_detected_in_the_window(traces: list[Trace]):
+def test_the_delay_curve_ends_at_the_share_detected_in_the_window(traces: list[ScoredEpisode]):
     ax = figures.delay_figure(by_condition(traces, 0.5)).axes[0]
     rows = [r for r in by_condition(traces, 0.5) if r.name != "nominal"]
     assert any(0 < r.detected.value < 1 for r in rows)
@@ -96,13 +96,13 @@ def test_the_delay_curve_ends_at_the_share_detected_in_the_window(traces: list[T
         assert y[-1] == pytest.approx(100 * row.detected.value)
 
 
-def test_curves_differ_in_colour_and_in_line(traces: list[Trace]):
+def test_curves_differ_in_colour_and_in_line(traces: list[ScoredEpisode]):
     lines = figures.delay_figure(by_condition(traces, 1.0)).axes[0].lines
     assert len({line.get_color() for line in lines}) == 2
     assert len({str(line._dash_pattern) for line in lines}) == 2
 
 
-def test_infinite_and_zero_surprise_can_be_drawn(traces: list[Trace], tmp_path: Path):
+def test_infinite_and_zero_surprise_can_be_drawn(traces: list[ScoredEpisode], tmp_path: Path):
     good = next(t for t in traces if t.delay is not None)
     surprise = good.surprise.copy()
     surprise[:5], surprise[30:] = 0.0, np.inf
@@ -114,7 +114,7 @@ def test_infinite_and_zero_surprise_can_be_drawn(traces: list[Trace], tmp_path: 
         assert figures.save(figure, tmp_path / f"{name}.png").stat().st_size > 5000
 
 
-def test_attribution_shows_the_channels_with_the_greatest_share_first(traces: list[Trace]):
+def test_attribution_shows_the_channels_with_the_greatest_share_first(traces: list[ScoredEpisode]):
     trace = next(t for t in traces if t.delay is not None)
     labels = [text.get_text() for text in figures.attribution_figure(trace, top=3).axes[0].get_yticklabels()]
     peaks = trace.detail.attribution[20:].max(axis=0)
@@ -127,7 +127,7 @@ def test_a_strip_shows_how_each_alarm_began_and_the_channel_that_raised_it():
     attribution[20], attribution[21] = (10.0, 20.0), (40.0, 10.0)  # the other one follows, and surprises more
     stream = np.arange(200.0).reshape(100, 2)
     detail = TraceDetail(attribution, ("q", "torque"), np.zeros(100, np.bool_), stream)
-    trace = Trace("log.csv", 0, 0.01, 20.0, surprise, detail=detail)
+    trace = ScoredEpisode("log.csv", 0, 0.01, 20.0, surprise, detail=detail)
     moments = figures.moments_of(trace)
     assert [(m.start, m.stop, m.channel, m.excess) for m in moments] == [(20, 22, 1, 2.5), (60, 61, 0, np.inf)]
     first, second, third = figures.moments_figure(moments).axes
@@ -140,7 +140,7 @@ def test_a_strip_shows_how_each_alarm_began_and_the_channel_that_raised_it():
         figures.moments_of(dataclasses.replace(trace, detail=None))
 
 
-def test_the_stream_is_shown_beside_its_twin_and_the_most_surprising_channel_first(traces: list[Trace]):
+def test_the_stream_is_shown_beside_its_twin_and_the_most_surprising_channel_first(traces: list[ScoredEpisode]):
     trace = next(t for t in traces if t.delay is not None)
     rng = np.random.default_rng(0)
     stream, twin = rng.normal(size=(2, len(trace), len(trace.detail.channels)))
@@ -159,7 +159,7 @@ def test_the_stream_is_shown_beside_its_twin_and_the_most_surprising_channel_fir
         figures.stream_figure(dataclasses.replace(trace, detail=None))
 
 
-def test_nothing_to_draw_is_an_error(traces: list[Trace]):
+def test_nothing_to_draw_is_an_error(traces: list[ScoredEpisode]):
     with pytest.raises(ValueError, match="no traces to draw"):
         figures.surprise_figure([])
     with pytest.raises(ValueError, match="needs nominal traces"):
@@ -185,7 +185,7 @@ class _Page(HTMLParser):
         return [attributes for name, attributes in self.tags if name == tag]
 
 
-def test_a_report_holds_everything_and_fetches_nothing(traces: list[Trace], tmp_path: Path):
+def test_a_report_holds_everything_and_fetches_nothing(traces: list[ScoredEpisode], tmp_path: Path):
     rows = by_condition(traces, 1.0)
     drawn = figures_of(traces)
     saved = figures.save(drawn["roc"], tmp_path / "roc.png")
@@ -241,7 +241,7 @@ def test_a_new_column_is_a_heading_and_a_function():
     assert (table.headings, table.rows) == (["n", "squared"], [("2", "4"), ("3", "9")])
 
 
-def test_tables_say_what_the_summary_says(traces: list[Trace]):
+def test_tables_say_what_the_summary_says(traces: list[ScoredEpisode]):
     rows = by_condition(traces, 0.5)
     push = rows[1]
     cells = dict(zip(*((t := detection_table(rows)).headings, t.rows[1]), strict=True))

@@ -6,17 +6,17 @@ import pytest
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.resampling import drawn_anew, interval
+from asm_gym.evaluation.scored import ScoredEpisode
 from asm_gym.evaluation.tables import lead_table
-from asm_gym.evaluation.trace import Trace
 
 
-def a_trace(peak: float, seed: int, onset: int | None = None, before: float = 0.0) -> Trace:
+def a_trace(peak: float, seed: int, onset: int | None = None, before: float = 0.0) -> ScoredEpisode:
     surprise = np.zeros(10)
     surprise[5], surprise[4] = peak, before
-    return Trace("nominal" if onset is None else "push", seed, 0.1, 1.0, surprise, onset, task="Lift")
+    return ScoredEpisode("nominal" if onset is None else "push", seed, 0.1, 1.0, surprise, onset, task="Lift")
 
 
-def scenes(rng: np.random.Generator, faults: int, n: int = 60) -> tuple[list[Trace], list[Trace]]:
+def scenes(rng: np.random.Generator, faults: int, n: int = 60) -> tuple[list[ScoredEpisode], list[ScoredEpisode]]:
     """``n`` nominal episodes, and ``faults`` faulty twins of each, which share what their scene adds."""
     height = rng.standard_normal(n)
     nominal = [a_trace(float(np.exp(0.2 * h)), s) for s, h in enumerate(height)]

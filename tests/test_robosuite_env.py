@@ -15,7 +15,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from asm_gym.graphics import rendering_backend
 from asm_gym.policies import make_policy
-from asm_gym.stream import MOTOR
+from asm_gym.spec import MOTOR
 from asm_gym.tasks import ROBOTS, TASKS, task
 
 

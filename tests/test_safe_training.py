@@ -9,7 +9,7 @@ import pytest
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from asm_gym.episodes import Episode, save_episode
+from asm_gym.episode import Episode, save_episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.training.exploration import Explorer, Gentle, until_contact
 from asm_gym.rollouts.training.learners import NOVICE_LOG_STD, make_learner, make_novice
@@ -19,7 +19,7 @@ from asm_gym.rollouts.training.violations import TorqueWatch
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.reproduce import safe_training
 from asm_gym.scripts.reproduce.training_report import counts_table, learning_figure, worth, worth_table
-from asm_gym.stream import Channel, StreamSpec
+from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from tests.fakes import CueMonitor, FakeEnv
 from tests.streams import sine_episodes, sine_spec
@@ -179,7 +179,7 @@ def test_a_novice_is_untrained_and_hesitant():
     ],
 )
 def test_what_makes_no_sense_is_refused(arguments, message, tmp_path, capsys):
-    assert main(["train-safely", *arguments, "--out", str(tmp_path / "out")]) == 2
+    assert main(["reproduce", "safe_training", *arguments, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -199,7 +199,7 @@ def test_a_memory_that_is_there_already_watches_and_nothing_is_explored_for_it(t
 
 @pytest.mark.slow
 def test_a_comparison_runs_end_to_end_and_goes_on(tmp_path):
-    how = ["train-safely", "--quick", "--workers", "2", "--out", str(tmp_path)]
+    how = ["reproduce", "safe_training", "--quick", "--workers", "2", "--out", str(tmp_path)]
     assert main(how) == 0
     written = {p.name for p in tmp_path.iterdir() if p.is_file()}
     tables = {f"training.{kind}" for kind in ("md", "csv", "json", "png")}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asm_gym.scaling import FARTHEST, StreamScaler
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("slow", 1), Channel("fast", 2), Channel("action", 1, group=MOTOR)), dt=0.05)
 

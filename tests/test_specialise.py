@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from asm_gym.detection import Promise, conformal_threshold
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.association import complete, hidden_units, synapses
 from asm_gym.memory.specialise import specialise
 from asm_gym.monitors import NeuralASM, make_monitor

@@ -12,11 +12,11 @@ import pytest
 from numpy.typing import NDArray
 from PIL import ImageColor
 
-from asm_gym.evaluation import overlay
-from asm_gym.evaluation.overlay import StripChart, arrow, compose, project
+from asm_gym.view import chart as drawing
+from asm_gym.view.chart import StripChart, arrow, compose, project
 from asm_gym.wrappers.overlay import SurpriseOverlay
 
-RED, ORANGE, CURVE = (np.array(ImageColor.getrgb(c)) for c in (overlay._ALARM, overlay._FAULT, overlay._CURVE))
+RED, ORANGE, CURVE = (np.array(ImageColor.getrgb(c)) for c in (drawing._ALARM, drawing._FAULT, drawing._CURVE))
 GREY = np.full((120, 200, 3), 128, np.uint8)
 
 
@@ -41,7 +41,7 @@ def test_equal_ratios_of_surprise_are_equal_distances():
 def test_the_curve_at_the_threshold_lies_on_the_dashes():
     chart = StripChart(200, 120, steps=10, threshold=7.0)
     empty = chart.draw([], [], [])
-    dashes = np.nonzero(has(empty[:, 150:], np.array(ImageColor.getrgb(overlay._INK))).any(axis=1))[0]
+    dashes = np.nonzero(has(empty[:, 150:], np.array(ImageColor.getrgb(drawing._INK))).any(axis=1))[0]
     curve = height_of_curve(chart.draw([7.0] * 10, [False] * 10, [False] * 10))
     assert curve == pytest.approx(dashes.mean(), abs=1.0)
 

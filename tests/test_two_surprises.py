@@ -6,9 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM, load_monitor
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
 

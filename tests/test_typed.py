@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 import pytest
 
-from asm_gym.typed import ArgumentTypeError, typed
+from asm_gym.validation import ArgumentTypeError, typed
 
 
 @typed

@@ -4,10 +4,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from asm_gym.extras import needed_for
-from asm_gym.moved import MOVED
-from asm_gym.wrappers.completion import CompletedObservation
-from asm_gym.wrappers.learners import FlatInfo, SafetyLog, SixValues
+from asm_gym.wrappers.logging import FlatInfo, SafetyLog, SixValues
 from asm_gym.wrappers.recording import StreamRecorder
+from asm_gym.wrappers.repair import CompletedObservation
 from asm_gym.wrappers.safety import NeuralASMSafety
 from asm_gym.wrappers.vector import VectorNeuralASMSafety
 
@@ -31,15 +30,6 @@ __all__ = [
 
 _NEED_MORE = {"FaultInjection": "faults", "RerunView": "live_view", "SurpriseOverlay": "overlay"}
 """Those that need more than watching a stream does, and are imported when they are asked for."""
-
-MOVED.update(
-    {
-        "asm_gym.wrappers.fault_injection": "asm_gym.wrappers.faults",
-        "asm_gym.wrappers.stream_recorder": "asm_gym.wrappers.recording",
-        "asm_gym.wrappers.surprise_overlay": "asm_gym.wrappers.overlay",
-        "asm_gym.wrappers.vector_safety": "asm_gym.wrappers.vector",
-    }
-)
 
 
 def __getattr__(name: str) -> Any:

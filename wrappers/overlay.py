@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number, shown
-from asm_gym.evaluation.overlay import StripChart, arrow, compose, project
+from asm_gym.validation import check_number, shown
+from asm_gym.view.chart import StripChart, arrow, compose, project
 
 ARROW_M = 0.01
 """Length of a force's arrow [m/N]."""
@@ -94,7 +94,7 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if cause.get("family"):
             self._cause = " ".join(filter(None, (cause["family"], cause["part"])))
         self._since_force += 1
-        if cause.get("force"):
+        if cause.get("force", {}).get("link"):
             self._force, self._since_force = cause["force"], 0
         completed = asm.get("completed") or ()
         self._completed = f"{', '.join(completed)} completed" if completed else ""

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from asm_gym.checks import check_number
+from asm_gym.validation import check_number
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.special import betaincinv
 
-from asm_gym.checks import check_number, shown
 from asm_gym.detection.base import Array
+from asm_gym.validation import check_number, shown
 
 LEAST_RATE = 1e-15
 """What needs more episodes than anybody records; of the smallest numbers there are, the inverse is infinite."""

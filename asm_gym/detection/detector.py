@@ -17,7 +17,6 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_flag, check_number, shown
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Array, Arrays, ModelOutput, Nominal, Place
 from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, accumulate, no_evidence, pool, strength
@@ -34,8 +33,8 @@ from asm_gym.detection.repetition import (
 )
 from asm_gym.detection.tails import worst_case
 from asm_gym.detection.whitening import bounded, whitening
-from asm_gym.stream import StreamSpec
-from asm_gym.typed import typed
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_flag, check_number, shown, typed
 
 GAINS = (0.8, 0.2, 0.05)
 BOUND = 100.0

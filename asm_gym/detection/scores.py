@@ -16,10 +16,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number
 from asm_gym.detection.base import Arrays, ModelOutput, Nominal, Place, State
 from asm_gym.detection.whitening import whitening
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number
 
 WINDOW = 5
 """Rows that the moving mean is taken over."""

@@ -8,8 +8,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.checks import as_float32
 from asm_gym.envs.simulation import Simulation
+from asm_gym.validation import as_float32
 
 _CHANGES = ("OSC_POSE", "JOINT_POSITION")
 """Controllers whose actions are changes of where the arm is."""
@@ -50,6 +50,16 @@ class Actions:
         """(A,) in the units robosuite's controllers take, which for most are the same."""
         found: NDArray[np.float64] = self._low + self._half * (action.astype(np.float64) + 1.0)
         return found
+
+    def slowed(self, simulation: Simulation, action: NDArray[np.float32], most: float) -> NDArray[np.float32]:
+        """(A,) the action at which no hand is commanded to go faster than ``most`` [m/s]; the same where none is."""
+        shares = [(part, s) for part, s in simulation.slowed(self.scaled(action), most) if s < 1.0]
+        if not shares:
+            return action
+        slow, rest = action.copy(), self.resting(simulation, action)
+        for part, share in shares:
+            slow[part] = rest[part] + np.float32(share) * (action[part] - rest[part])
+        return slow
 
     def turning(self, simulation: Simulation, turns: NDArray[np.float64]) -> NDArray[np.float32]:
         """(A,) the action that turns the arms' joints by ``turns`` (J,) [rad], as nearly as one step can.

@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_text, shown
-from asm_gym.choices import check_choice
 from asm_gym.extras import require
-from asm_gym.stream import Channel
+from asm_gym.spec import Channel
 from asm_gym.tasks import ROBOTS, TaskSpec
+from asm_gym.validation import check_choice, check_text, shown
 
 PHYSICS_FREQ = 500
 """Robosuite's physics rate [Hz]."""

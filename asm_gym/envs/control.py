@@ -5,8 +5,14 @@ Operational space control (Khatib 1987), as robosuite computes it, with J the ha
     Λ = (J M⁻¹ Jᵀ)⁻¹,   F = Kp e - Kd v,   p = M (10 (q₀ - q) - 2√10 q̇),
     τ = Jᵀ [Λx Fx; Λr Fr] + h + (I - Jᵀ Λ J M⁻¹) p
 
-Joint position control is τ = M (Kp (q* - q) - Kd q̇) + h. Everything is solved through Cholesky factors instead of
-robosuite's pseudo-inverses: the same numbers to rounding, and most of the speed.
+Joint position control is τ = M (Kp (q* - q) - Kd q̇) + h. An arm that is held is braked beneath its controller,
+
+    τ = s - M Kd q̇ + h,   s = M Kp (q₀ - q),   |sᵢ| <= Y (rᵢ + r₀),
+
+critically damped about the place q₀ where the hold began: it goes q̇/(e √Kp) further where its motors have the torque,
+and comes back without overshoot. Once it has come to rest it yields: where the spring of a joint would take more than
+the force Y gives at the hand, which is rᵢ from the joint's axis, q₀ follows. Everything is solved through Cholesky
+factors instead of robosuite's pseudo-inverses: the same numbers to rounding, and most of the speed.
 """
 
 from __future__ import annotations
@@ -89,6 +95,22 @@ def jacobian(views: Views, dofs: Ints, n: int, point: Floats, com: Floats, J: Fl
         J[3, i], J[4, i], J[5, i] = a[0], a[1], a[2]
 
 
+HOLD_STIFFNESS = 400.0
+"""Kp of an arm that is held [1/s²]; Kd is 2 √Kp."""
+
+YIELDS_AT = 60.0
+"""Y: an arm that is held gives way to more force at the hand than this [N], once it has come to rest."""
+
+BRAKING, YIELDING = 1, 2
+"""Of ``Goals.held``: on its way to rest, and since then."""
+
+RESTING = 0.1
+"""An arm none of whose joints is faster than this has come to rest [rad/s]."""
+
+YIELD_LEVER = 0.15
+"""r₀: what a joint has at least for a lever [m]."""
+
+
 @compiled
 def _base(views: Views, site: int) -> tuple[Floats, Floats]:
     """Position and orientation of the frame that actions are relative to."""
@@ -168,18 +190,86 @@ def osc_torques(M: Floats, J: Floats, n: int, wrench: Floats, posture: Floats, b
 
 
 @compiled
+def hold_at(views: Views, arms: Arms, goals: Goals, a: int) -> None:
+    """From now on arm ``a`` is held where it is; where it is held already, where it was."""
+    if not goals.held[a]:
+        for i in range(arms.joints[a]):
+            goals.anchor[a, i] = views.qpos[arms.qpos[a, i]]
+        goals.held[a] = BRAKING
+
+
+@compiled
+def _believed(views: Views, nominal: Nominal, arms: Arms, a: int, M: Floats, h: Floats) -> None:
+    """Writes mass matrix (n, n) and bias (n,) of arm ``a``, as the robot knows itself, into M and h."""
+    n, dofs = arms.joints[a], arms.dofs[a]
+    edited = nominal.model != 0
+    mass_matrix(nominal.mass if edited else views.mass, views, dofs, n, M)
+    for i in range(n):
+        h[i] = nominal.bias[dofs[i]] if edited else views.bias[dofs[i]]
+
+
+@compiled
+def _command(views: Views, arms: Arms, a: int, tau: Floats) -> None:
+    """Gives the motors of arm ``a`` torques (n,), as far as they go."""
+    for i in range(arms.joints[a]):
+        m = arms.motors[a, i]
+        views.ctrl[m] = min(max(tau[i], views.ctrlrange[m, 0]), views.ctrlrange[m, 1])
+
+
+@compiled
+def brake(views: Views, nominal: Nominal, arms: Arms, goals: Goals, a: int) -> None:
+    """Commands the motors of arm ``a`` so that it is held at its anchor, which follows what presses too hard."""
+    n, dofs = arms.joints[a], arms.dofs[a]
+    M, h, J = np.empty((n, n)), np.empty(n), np.empty((6, n))
+    off, spring, tau = np.empty(n), np.empty(n), np.empty(n)
+    _believed(views, nominal, arms, a, M, h)
+    jacobian(views, dofs, n, views.site_xpos[arms.site[a]], views.subtree_com[arms.root[a]], J)
+    fastest = 0.0
+    for i in range(n):
+        off[i] = goals.anchor[a, i] - views.qpos[arms.qpos[a, i]]
+        fastest = max(fastest, abs(views.qvel[dofs[i]]))
+    if fastest < RESTING:
+        goals.held[a] = YIELDING
+    for again in range(2):
+        for i in range(n):
+            spring[i] = 0.0
+            for j in range(n):
+                spring[i] += M[i, j] * off[j]
+            spring[i] *= HOLD_STIFFNESS
+        if again or goals.held[a] != YIELDING:
+            break
+        slips = False
+        for i in range(n):
+            lever = np.sqrt(J[0, i] ** 2 + J[1, i] ** 2 + J[2, i] ** 2) + YIELD_LEVER
+            most = YIELDS_AT * lever
+            if abs(spring[i]) > most:
+                off[i] *= most / abs(spring[i])
+                goals.anchor[a, i] = views.qpos[arms.qpos[a, i]] + off[i]
+                slips = True
+        if not slips:
+            break
+    damping = 2.0 * np.sqrt(HOLD_STIFFNESS)
+    for i in range(n):
+        braked = 0.0
+        for j in range(n):
+            braked += M[i, j] * views.qvel[dofs[j]]
+        tau[i] = spring[i] - damping * braked + h[i]
+    _command(views, arms, a, tau)
+
+
+@compiled
 def control(views: Views, nominal: Nominal, arms: Arms, goals: Goals, a: int) -> None:
     """Commands the motors of arm ``a``."""
+    if goals.held[a]:
+        brake(views, nominal, arms, goals, a)
+        return
     n = arms.joints[a]
     dofs = arms.dofs[a]
     M = np.empty((n, n))
     h = np.empty(n)
     p = np.empty(n)
     tau = np.empty(n)
-    edited = nominal.model != 0
-    mass_matrix(nominal.mass if edited else views.mass, views, dofs, n, M)
-    for i in range(n):
-        h[i] = nominal.bias[dofs[i]] if edited else views.bias[dofs[i]]
+    _believed(views, nominal, arms, a, M, h)
     if arms.kind[a] == JOINT_POSITION:
         for i in range(n):
             error = goals.joints[a, i] - views.qpos[arms.qpos[a, i]]
@@ -212,6 +302,4 @@ def control(views: Views, nominal: Nominal, arms: Arms, goals: Goals, a: int) ->
         J = np.empty((6, n))
         jacobian(views, dofs, n, views.site_xpos[site], com, J)
         osc_torques(M, J, n, wrench, M @ p, h, tau)
-    for i in range(n):
-        m = arms.motors[a, i]
-        views.ctrl[m] = min(max(tau[i], views.ctrlrange[m, 0]), views.ctrlrange[m, 1])
+    _command(views, arms, a, tau)

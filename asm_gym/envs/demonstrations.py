@@ -19,13 +19,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number
+from asm_gym.data.hdf5 import opened_hdf5
 from asm_gym.envs.layout import Layout
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.episodes import Episode
-from asm_gym.hdf5 import opened_hdf5
-from asm_gym.stream import MOTOR
+from asm_gym.episode import Episode
+from asm_gym.spec import MOTOR
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import check_number
 
 GROUPS = ("joint", "hand", MOTOR)
 """Channel groups that a state determines. What motors and contacts do within a step is in no such file."""

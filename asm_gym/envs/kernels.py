@@ -19,7 +19,7 @@ from llvmlite import binding
 from numba import types
 
 from asm_gym.compilation import compiled
-from asm_gym.envs.control import control, hand_velocity, set_goal
+from asm_gym.envs.control import brake, control, hand_velocity, hold_at, set_goal
 from asm_gym.envs.views import (
     ACTS,
     ARMED,
@@ -118,14 +118,29 @@ def sample(views: Views, nominal: Nominal, arms: Arms, k: int, samples: Floats) 
 def feel(arms: Arms, band: Band, k: int, samples: Floats) -> None:
     """Compares what the arms felt in substep ``k`` with what they were to feel; what is not a number is outside."""
     state = band.state
-    if state[ARMED] and state[LEFT] < 0:
+    if state[ARMED]:
         for a in range(len(arms.joints)):
             for i in range(FELT):
+                if i < JOINTS and i >= arms.joints[a]:
+                    continue
                 value = samples[a, k, i if i < JOINTS else i - JOINTS + WRENCH.start]
-                used = i >= JOINTS or i < arms.joints[a]
-                if used and not (band.low[a, i] <= value <= band.high[a, i]):
+                load = abs(value) / band.most[a, i]
+                if not load <= band.load[0]:
+                    band.load[0] = load if load == load else np.inf
+                if state[LEFT] < 0 and not (band.low[a, i] <= value <= band.high[a, i]):
                     state[LEFT] = state[PASSED]
     state[PASSED] += 1
+
+
+@compiled
+def brake_held(views: Views, nominal: Nominal, arms: Arms, goals: Goals) -> None:
+    """Brakes the arms that are held, beneath controllers that are not compiled."""
+    if goals.held.any():
+        if nominal.model != 0:
+            _believe(views, nominal)
+        for a in range(len(arms.joints)):
+            if goals.held[a]:
+                brake(views, nominal, arms, goals, a)
 
 
 @compiled
@@ -169,7 +184,7 @@ def run(
         stay = must_stay(band)
         for a in range(len(arms.joints)):
             if stay:
-                set_goal(views, arms, goals, a, np.zeros(JOINTS), np.eye(3))
+                hold_at(views, arms, goals, a)
             elif fresh and k == first:
                 set_goal(views, arms, goals, a, deltas[a], turns[a])
             control(views, nominal, arms, goals, a)

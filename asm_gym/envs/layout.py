@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.checks import as_float32
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import as_float32
 
 # What of the robot a policy sees: its configuration and motion, not its torques.
 _OBSERVED = (

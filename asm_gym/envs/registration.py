@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from asm_gym.checks import shown
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.tasks import TASKS
+from asm_gym.validation import shown
 
 
 class Maker:

@@ -11,8 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import as_float32, check_flag, check_number, check_numbers, check_text, shown
-from asm_gym.choices import check_choice
+from asm_gym.contact_limits import ContactLimits
 from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.cameras import RENDER_MODES, Pictures
@@ -20,9 +19,10 @@ from asm_gym.envs.edits import SimulatorEdits
 from asm_gym.envs.layout import Layout
 from asm_gym.envs.rewards import Rewards, RewardTerms
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Corruption, SensorErrors
-from asm_gym.envs.simulation import Simulation
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.envs.simulation import Expected, Simulation
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import as_float32, check_choice, check_flag, check_number, check_numbers, check_text, shown
 
 _BAD = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
@@ -133,7 +133,13 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.holding = False
         """Set, the arms stay in the next control step, and the grippers keep what they were told, whatever action
         arrives; from within a hook, in the rest of the step that runs. The step unsets it."""
-        self._expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self.keeps_holding = False
+        """Set, ``holding`` lasts until both are unset, however many steps a wrapper in between makes of one."""
+        self.contact_limits: ContactLimits | None = None
+        """What the arms may feel and how fast they may go in this episode; ``reset`` forgets it. ``info`` then holds
+        ``contact_load``, the largest share of a limit that was felt within the step, ``contact_left_s``, when in it a
+        limit was passed [s], not a number where none was, and ``contact_felt``, the step's mean of what was felt."""
+        self._band: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._stays = False
         self.substeps = backend.PHYSICS_FREQ // control_freq
         self._groups = tuple(stream)
@@ -192,7 +198,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._layout = Layout(self.measured_spec, self._groups, self._flat)
         self.observation_layout = self._layout.sizes
         """The observation's parts in order, and how many numbers each has."""
-        self.observation_space = self._layout.space(self._pictures.spaces)
+        self.observation_space = self.laid_out_space = self._layout.space(self._pictures.spaces)
 
     @property
     def stream_freq(self) -> int:
@@ -257,6 +263,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             self.simulation.begin_episode()
         self._warnings = self._bad_count()
         self._steps, self.holding = 0, False
+        self.contact_limits = self._band = None
         self._action = np.zeros(self._actions.size, np.float32)
         self._row = self.measure()
         self._ended = False
@@ -284,15 +291,14 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
         env = self.robosuite_env
         env.timestep += 1
-        self.simulation.begin(self._expected, self._stays)
-        self._expected = None
+        expected = self._expected()
+        self.simulation.begin(expected)
         self.command(action)
         self._rows: list[NDArray[np.float32]] = []
         self._advance()
-        if self._stays and self.simulation.left_band is not None:
-            self._action = self._actions.resting(
-                self.simulation, self._action
-            )  # what was done last is what the stream says was commanded
+        if expected is not None and expected.stays and self.simulation.left_band is not None:
+            # What was done last is what the stream says was commanded.
+            self._action = self._actions.resting(self.simulation, self._action)
         env.cur_time += env.control_timestep
         self._steps += 1
         reward = self._rewards(self._action)
@@ -335,9 +341,27 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             ValueError: a wrong shape, or an action that is not finite.
         """
         action = self._actions.checked(action)
-        held, self.holding = self.holding, False
-        self._action = self._actions.resting(self.simulation, self._action) if held else action
+        held, self.holding = self.holding, self.holding and self.keeps_holding
+        self._action = self._actions.resting(self.simulation, self._action) if held else self.slowed(action)
         self.simulation.command(self._delivered(self._action), held)
+
+    def slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(A,) what is commanded in the place of ``action``, by the speed that the limits allow a hand."""
+        limits = self.contact_limits
+        if limits is None or not limits.limits_speed:
+            return action
+        return self._actions.slowed(self.simulation, action, limits.hand_speed)
+
+    def _expected(self) -> Expected | None:
+        """What the arms are to feel in the step that begins: a band that was sent down for it, within the limits."""
+        band, self._band, limits = self._band, None, self.contact_limits
+        if band is None and limits is None:
+            return None
+        N = sum(c.size for c in self.felt_channels)
+        most = np.full(N, np.inf) if limits is None else limits.most(self.felt_channels)
+        low, high = (-most, most) if band is None else (np.maximum(band[0], -most), np.minimum(band[1], most))
+        stays = (band is not None and self._stays) or (limits is not None and limits.stays)
+        return Expected(low, high, most, stays)
 
     def expect(self, low: NDArray[np.float64], high: NDArray[np.float64], stays: bool = True) -> None:
         """Says what the arms are to feel in every physics substep of the next control step, and of that alone.
@@ -353,7 +377,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         size = sum(c.size for c in self.felt_channels)
         if any(b.shape != (size,) for b in bounds) or not (bounds[0] <= bounds[1]).all():
             raise ValueError(f"a band needs a least and a most for each of {size} numbers, got {shown(bounds)}")
-        self._expected, self._stays = bounds, stays
+        self._band, self._stays = bounds, stays
 
     @property
     def felt(self) -> NDArray[np.float64]:
@@ -410,6 +434,11 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         felt = sim.contact_force, sim.external_force, sim.mean_external_force / self.metadata["render_fps"]
         names = "contact_force", "external_force", "external_impulse"
         forces = dict(zip(names, (np.nan,) * 3 if unstable else felt, strict=True))
+        if self.contact_limits is not None:
+            left = self.left_band_s
+            info["contact_load"] = np.inf if unstable else sim.load
+            info["contact_left_s"] = np.nan if left is None else left
+            info["contact_felt"] = sim.felt.mean(axis=0)
         return info | {"success": success, **forces, "unstable": unstable}
 
     def _bad_count(self) -> int:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from asm_gym.envs import kernels
 from asm_gym.envs.views import Views
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 Corruption = Callable[[NDArray[np.float64]], None]
 """A sensor fault: edits a measured row in place."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -13,12 +13,19 @@ from numpy.typing import NDArray
 from asm_gym.compilation import must_compile
 from asm_gym.envs import kernels
 from asm_gym.envs.arms import bodies, compilable, describe
+from asm_gym.envs.control import hold_at
 from asm_gym.envs.nominal import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
 from asm_gym.envs.views import ACTS, ARMED, FELT, JOINTS, LEFT, Band, Goals, Views
 
-STIFFNESS, DAMPING = 150.0, 2 * 150.0**0.5
-"""Of arms that are held beneath their controllers [1/s², 1/s]: those of robosuite's own controllers of the hand."""
+
+class Expected(NamedTuple):
+    """What the arms are to feel in the substeps of a control step, as ``Simulation.felt`` lays it out."""
+
+    low: NDArray[np.float64]  # (N,) [N m], [N]
+    high: NDArray[np.float64]  # (N,)
+    most: NDArray[np.float64]  # (N,) contact limits, infinite where there are none
+    stays: bool  # the arms stay from the substep after that in which they felt anything else
 
 
 class Simulation:
@@ -45,7 +52,9 @@ class Simulation:
         """What the robot believes of itself."""
         self._samples = np.zeros((len(self._parts), substeps, kernels.SAMPLE))
         n = len(self._parts)
-        self._band = Band(np.zeros((n, FELT)), np.zeros((n, FELT)), np.zeros(5, np.int64))
+        self._band = Band(
+            *(np.zeros((n, FELT)), np.zeros((n, FELT)), np.full((n, FELT), np.inf)), np.zeros(1), np.zeros(5, np.int64)
+        )
         self.proprioception = Proprioception(self._parts, self._views, self.data)
         self.contact_force = self.external_force = self.mean_external_force = 0.0
         """The largest net contact force on an arm within the control step [N]: the norm of the summed contact forces on
@@ -65,7 +74,6 @@ class Simulation:
         self.compiled = all(compilable(robot, arm) for robot, arm in self._parts)
         """Whether control runs compiled."""
         self._arms = describe(self._parts, self.model)
-        self._anchor: NDArray[np.float64] | None = None
         self._joints, self._dofs = (
             np.concatenate([getattr(robot, name) for robot, _ in self._parts])
             for name in ("_ref_joint_pos_indexes", "_ref_joint_vel_indexes")
@@ -74,7 +82,8 @@ class Simulation:
         self._band.state[:] = 0, 0, 0, -1, 0
         # Where the numbers of ``felt`` stand in a band: arm, and place.
         self._felt_places = np.nonzero([[i >= JOINTS or i < n for i in range(FELT)] for n in self._arms.joints])
-        self._goals = Goals(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, JOINTS)))
+        joints = np.zeros((n, JOINTS))
+        self._goals = Goals(np.zeros((n, 3)), np.zeros((n, 3, 3)), joints, joints.copy(), np.zeros(n, np.int64))
         self._deltas = np.zeros((n, JOINTS))
         self._turns = np.tile(np.eye(3), (n, 1, 1))
         self._samples[:] = 0.0
@@ -86,30 +95,30 @@ class Simulation:
 
     # ------------------------------------------------------------------ control steps
 
-    def begin(self, expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None, acts: bool = True) -> None:
-        """Begins a control step.
-
-        Args:
-            expected: the least and the most (N,) that the arms are to feel in its substeps, as ``felt`` lays it out.
-            acts: the arms stay from the substep after that in which they felt anything else.
-        """
+    def begin(self, expected: Expected | None = None) -> None:
+        """Begins a control step, in which the arms are to feel what is ``expected``."""
         self._done = self._row_began = 0
         self._band.state[:] = 0, 0, 0, -1, 0
+        self._band.load[0] = 0.0
         if expected is not None:
-            for bound, values in zip(self._band[:2], expected, strict=True):
+            for bound, values in zip(self._band[:3], expected, strict=False):
                 bound[self._felt_places] = values
-            self._band.state[[ARMED, ACTS]] = 1, acts
+            self._band.state[[ARMED, ACTS]] = 1, expected.stays
         self._felt = (0.0, 0.0, 0.0)
 
     def command(self, action: NDArray[np.float64], hold: bool = False) -> None:
         """Gives the controllers a new set-point, which they take up in the next substep.
 
         Args:
-            hold: the arms are to stay. Compiled controllers do so by an action of no change. Some of the others never
-                do: a pose is kept by turning joints, and a torque of zero brakes nothing. So the arms are braked
-                beneath them, and held where they were when they were first told to.
+            hold: the arms are to stay. No action says that: one of no change follows where the arm drifts or is pushed
+                to, a pose is kept by turning joints, a torque of zero brakes nothing. So the arms are braked beneath
+                their controllers, and held where they were when they were first told to (``control.brake``).
         """
-        self._anchor = (self.data.qpos[self._joints] if self._anchor is None else self._anchor) if hold else None
+        for a in range(len(self._parts)):
+            if hold:
+                hold_at(self._views, self._arms, self._goals, a)
+            else:
+                self._goals.held[a] = 0
         self._action = action
         self._fresh = True
         if self.compiled:
@@ -134,25 +143,16 @@ class Simulation:
             for k in range(self._done, self._done + count):
                 self.env.sim.step1()
                 self.env._pre_action(self._action, self._fresh)
-                if self._anchor is not None:
-                    self._brake(self._anchor)
+                kernels.brake_held(self._views, self.nominal.now(), self._arms, self._goals)
                 self.env.sim.step2()
                 kernels.sample(self._views, self.nominal.now(), self._arms, k - self._row_began, self._samples)
                 kernels.feel(self._arms, self._band, k - self._row_began, self._samples)
                 if kernels.must_stay(self._band):
-                    self._anchor = self.data.qpos[self._joints]
+                    for a in range(len(self._parts)):
+                        hold_at(self._views, self._arms, self._goals, a)
                 self._fresh = False
         self._fresh = False
         self._done += count
-
-    def _brake(self, anchor: NDArray[np.float64]) -> None:
-        """τ = M (Kp (q₀ - q) - Kd q̇) + h, with q₀ the joints' ``anchor`` (J,) [rad]."""
-        M = np.zeros((self.model.nv, self.model.nv))
-        mujoco.mj_fullM(self.model, M, self.data.qM)
-        dofs, motors = self._dofs, self.motors
-        wanted = STIFFNESS * (anchor - self.data.qpos[self._joints]) - DAMPING * self.data.qvel[dofs]
-        torque = M[np.ix_(dofs, dofs)] @ wanted + self.data.qfrc_bias[dofs]
-        self.data.ctrl[motors] = np.clip(torque, *self.model.actuator_ctrlrange[motors].T)
 
     def begin_row(self) -> None:
         """What comes now is summarised by itself; the forces go on to be those of the whole control step."""
@@ -171,12 +171,31 @@ class Simulation:
         return None if left < 0 else left
 
     @property
+    def load(self) -> float:
+        """The largest share of a contact limit that was felt in the control step; infinite for what is no number."""
+        return float(self._band.load[0])
+
+    @property
     def felt(self) -> NDArray[np.float64]:
         """(K, N) what the arms felt in each substep since the row began, noiseless: of each arm the external torque of
         its joints [N m], then the force at its wrist [N]."""
         count, wrist = self._done - self._row_began, slice(kernels.WRENCH.start, kernels.WRENCH.start + 3)
         parts = [[s[:count, :n], s[:count, wrist]] for s, n in zip(self._samples, self._arms.joints, strict=True)]
         return np.hstack([part for arm in parts for part in arm])
+
+    @property
+    def contact_forces(self) -> NDArray[np.float64]:
+        """(K,) the largest net contact force on an arm in each substep since the row began [N]; no sensor tells it."""
+        forces = self._samples[:, : self._done - self._row_began, kernels.CONTACT]
+        found: NDArray[np.float64] = np.linalg.norm(forces, axis=2).max(axis=0)
+        return found
+
+    @property
+    def strain(self) -> NDArray[np.float64]:
+        """(K,) the largest external torque in a joint in each substep since the row began [N m]."""
+        torques = self._samples[:, : self._done - self._row_began, kernels.EXTERNAL]
+        found: NDArray[np.float64] = np.abs(torques).max(axis=(0, 2))
+        return found
 
     def sense(self) -> NDArray[np.float64]:
         """What the arms' sensors read now, summarised over the substeps since the row began; noiseless."""
@@ -216,6 +235,30 @@ class Simulation:
         self.data.ctrl[motors] = np.clip(controller.run_controller(), limits[:, 0], limits[:, 1])
 
     # ------------------------------------------------------------------ knowledge of the robot
+
+    def slowed(self, action: NDArray[np.float64], most: float) -> list[tuple[slice, float]]:
+        """For each arm, its part of the action, and what share of it keeps its hand below ``most`` [m/s].
+
+        A controller that is asked for a change Δx of pose again and again, from where it is, comes to the velocity
+        Kp/Kd Δx. Actions of controllers that take anything else are left as they are.
+        """
+        found, start = [], 0
+        for a, (robot, arm) in enumerate(self._parts):
+            low, high = robot._action_split_indexes[arm]
+            controller, part = self._controllers[a], slice(start + low, start + high)
+            start += robot.action_dim
+            kind, n = controller.name, int(self._arms.joints[a])
+            if kind not in ("OSC_POSE", "JOINT_POSITION") or controller.input_type != "delta":
+                continue
+            delta = np.asarray(controller.scale_action(action[part]), np.float64)
+            if kind == "JOINT_POSITION":
+                jacobian = np.zeros((3, self.model.nv))
+                mujoco.mj_jacSite(self.model, self.data, jacobian, None, int(self._arms.site[a]))
+                delta = jacobian[:, self._arms.dofs[a, :n]] @ delta
+            gain = float(np.mean(controller.kp[:3] / controller.kd[:3]))
+            speed = gain * float(np.linalg.norm(delta[:3]))
+            found.append((part, 1.0 if speed <= most else most / speed))
+        return found
 
     def motions(self, turns: NDArray[np.float64]) -> list[tuple[slice, NDArray[np.float64]]]:
         """For each arm, its part of the action, and that part's values for a change of its joints [rad]."""

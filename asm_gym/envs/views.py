@@ -115,6 +115,8 @@ class Goals(NamedTuple):
     position: Floats  # (A, 3) relative to the base
     orientation: Floats  # (A, 3, 3) relative to the base
     joints: Floats  # (A, JOINTS)
+    anchor: Floats  # (A, JOINTS) where an arm that is held is to stay [rad]
+    held: Ints  # (A,) whether it is: 0, ``control.BRAKING`` or ``control.YIELDING``
 
 
 class Band(NamedTuple):
@@ -122,6 +124,8 @@ class Band(NamedTuple):
 
     low: Floats  # (A, FELT) [N m], [N]
     high: Floats  # (A, FELT)
+    most: Floats  # (A, FELT) contact limits, which ``load`` is counted in; infinite where there are none
+    load: Floats  # (1,) the largest share of them that was felt since the control step began
     state: Ints  # (5,) see below
 
 

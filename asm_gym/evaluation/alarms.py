@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from asm_gym.data.logs import Log
 from asm_gym.evaluation import figures
-from asm_gym.evaluation.trace import Trace, TraceDetail
-from asm_gym.logs import Log
-from asm_gym.stream import StreamSpec
+from asm_gym.evaluation.scored import ScoredEpisode, TraceDetail
+from asm_gym.spec import StreamSpec
 
 
 class Alarm(NamedTuple):
@@ -38,7 +38,7 @@ HEADINGS = ("log", "from [s]", "to [s]", "channel", "thresholds")
 """The last: how surprising the worst row was, in multiples of the threshold."""
 
 
-def alarms_of(trace: Trace) -> list[Alarm]:
+def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
     """Every alarm of an episode, in order."""
     detail = trace.detail
     assert detail is not None
@@ -48,12 +48,12 @@ def alarms_of(trace: Trace) -> list[Alarm]:
     ]
 
 
-def traces_of(logs: Sequence[Log], monitor: Any) -> list[Trace]:
+def traces_of(logs: Sequence[Log], monitor: Any) -> list[ScoredEpisode]:
     """What the monitor says of each."""
     spec: StreamSpec = monitor.spec
     traces = []
     for (name, episode), surprise in zip(logs, monitor.score_episodes([log.episode for log in logs]), strict=True):
         fault = episode.faults if len(episode.faults) == len(episode) else np.zeros(len(episode), np.bool_)
         detail = TraceDetail(surprise.attribution, spec.labels, fault, episode.stream)
-        traces.append(Trace(name, 0, spec.dt, monitor.threshold, surprise.value, detail=detail))
+        traces.append(ScoredEpisode(name, 0, spec.dt, monitor.threshold, surprise.value, detail=detail))
     return traces

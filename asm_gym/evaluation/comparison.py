@@ -12,8 +12,8 @@ import numpy as np
 
 from asm_gym.evaluation.ideal import auroc_bound, power_bound
 from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Kind, KindMetrics, false_alarms, in_words
+from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.statistics import Floats, Share
-from asm_gym.evaluation.trace import NOMINAL, Trace
 
 IDEAL = "ideal observer"
 
@@ -61,10 +61,10 @@ class MonitorResult:
         maxima: (n,) the greatest surprise in each calibration episode.
     """
 
-    traces: Sequence[Trace]
-    harmless: Sequence[Trace]
+    traces: Sequence[ScoredEpisode]
+    harmless: Sequence[ScoredEpisode]
     thresholds: Mapping[float, float]
-    examples: Sequence[Trace] = ()
+    examples: Sequence[ScoredEpisode] = ()
     maxima: Floats = field(default_factory=lambda: np.zeros(0))
 
 

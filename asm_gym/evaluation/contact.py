@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asm_gym.choices import check_choice
 from asm_gym.evaluation.statistics import Floats, Share
+from asm_gym.validation import check_choice
 
 QUASI_STATIC = {
     "skull": 130.0,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from asm_gym.evaluation.scored import InterventionOutcome, ScoredEpisode
 from asm_gym.evaluation.statistics import Estimate, Floats, Share, bootstrap, gain, reduction
-from asm_gym.evaluation.trace import InterventionOutcome, Trace
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Comparison:
     median_delay_ms: float
 
 
-def compare(alone: Sequence[Trace], acted: Sequence[Trace], seed: int = 0) -> Comparison:
+def compare(alone: Sequence[ScoredEpisode], acted: Sequence[ScoredEpisode], seed: int = 0) -> Comparison:
     """One reflex under one fault.
 
     Args:
@@ -83,7 +83,9 @@ class IdealShare:
     impulse: float
 
 
-def share_of_ideal(alone: Sequence[Trace], acted: Sequence[Trace], ideal: Sequence[Trace]) -> IdealShare:
+def share_of_ideal(
+    alone: Sequence[ScoredEpisode], acted: Sequence[ScoredEpisode], ideal: Sequence[ScoredEpisode]
+) -> IdealShare:
     """Of sums over all episodes, within [0, 1].
 
     Raises:

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.evaluation.resampling import Draws, drawn_anew
+from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE, ScoredEpisode, window_steps
 from asm_gym.evaluation.statistics import Floats, Share, auroc
-from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE, Trace, window_steps
 
 Kind = tuple[str, str]
 """Of a fault, and its severity."""
@@ -35,12 +35,14 @@ def in_words(kind: Kind) -> str:
     return " ".join(part.replace("_", " ") for part in kind if part)
 
 
-def placements(faulty: Sequence[Trace], nominal: Sequence[Trace], window_s: float) -> NDArray[np.float64]:
+def placements(
+    faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float
+) -> NDArray[np.float64]:
     """(F,) for each fault, the share of nominal episodes of its task at least as surprising in the same steps.
 
     Ties count half. Episodes without a fault are left out, and faults that no nominal episode of their task reaches.
     """
-    by_task: dict[str, list[Trace]] = {}
+    by_task: dict[str, list[ScoredEpisode]] = {}
     for trace in nominal:
         by_task.setdefault(trace.task, []).append(trace)
     values = []
@@ -54,7 +56,7 @@ def placements(faulty: Sequence[Trace], nominal: Sequence[Trace], window_s: floa
     return np.array(values)
 
 
-def time_matched_auroc(faulty: Sequence[Trace], nominal: Sequence[Trace], window_s: float) -> float:
+def time_matched_auroc(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float) -> float:
     """AUROC of the greatest surprise within the window, each fault against the same steps of nominal episodes.
 
     Equal to :func:`auroc` where all onsets are; NaN where nothing can be compared.
@@ -100,7 +102,7 @@ class Delays(NamedTuple):
         return cls(median, p95, detected, len(late) - detected)
 
 
-def delays_ms(traces: Sequence[Trace], window_s: float) -> NDArray[np.float64]:
+def delays_ms(traces: Sequence[ScoredEpisode], window_s: float) -> NDArray[np.float64]:
     """(F,) sorted times from the fault to its alarm [ms], ``inf`` where that took longer than the window.
 
     Only the traces with a fault. The time runs from the beginning of the control step the fault began in to the end
@@ -110,28 +112,28 @@ def delays_ms(traces: Sequence[Trace], window_s: float) -> NDArray[np.float64]:
     return np.sort([math.inf if k is None or d is None or k >= window else 1e3 * d for k, window, d in found])
 
 
-def detected(traces: Sequence[Trace], window_s: float) -> Share:
+def detected(traces: Sequence[ScoredEpisode], window_s: float) -> Share:
     """Faults with an alarm raised within the window."""
     return Share.of([math.isfinite(d) for d in delays_ms(traces, window_s)])
 
 
-def false_alarms(traces: Sequence[Trace]) -> Share:
+def false_alarms(traces: Sequence[ScoredEpisode]) -> Share:
     """Episodes with an alarm before the fault, or with any where there is none."""
     return Share.of([bool(t.false_alarms) for t in traces])
 
 
-def false_alarms_per_hour(traces: Sequence[Trace]) -> float:
+def false_alarms_per_hour(traces: Sequence[ScoredEpisode]) -> float:
     """Alarms raised before any fault, per hour of operation before any fault [1/h]; NaN where there was none."""
     hours = sum((len(t) if t.onset is None else t.onset) * t.dt for t in traces) / 3600
     return sum(len(t.false_alarms) for t in traces) / hours if hours else math.nan
 
 
-def balanced_accuracy(faulty: Sequence[Trace], nominal: Sequence[Trace], window_s: float) -> float:
+def balanced_accuracy(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float) -> float:
     """Mean of the share of faults detected and the share of nominal episodes without an alarm."""
     return 0.5 * (detected(faulty, window_s).value + 1.0 - false_alarms(nominal).value)
 
 
-def timestep_weighted_accuracy(faulty: Sequence[Trace], nominal: Sequence[Trace]) -> float:
+def timestep_weighted_accuracy(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode]) -> float:
     """Balanced accuracy in which a detection counts the less the later it comes (FIPER; Römer et al. 2025).
 
     ½ (share of nominal episodes without an alarm + mean over faults of 1 - t/T), where t of the T steps left at the
@@ -141,12 +143,12 @@ def timestep_weighted_accuracy(faulty: Sequence[Trace], nominal: Sequence[Trace]
     return 0.5 * (float(np.mean(early)) + 1.0 - false_alarms(nominal).value) if early else math.nan
 
 
-def attribution_accuracy(faulty: Sequence[Trace]) -> Share:
+def attribution_accuracy(faulty: Sequence[ScoredEpisode]) -> Share:
     """Of the faults that raised an alarm, those whose most surprising channel belonged to the fault."""
     return Share.of([t.top_channel in t.affected_channels for t in faulty if t.top_channel and t.affected_channels])
 
 
-def typical(traces: Sequence[Trace]) -> Trace:
+def typical(traces: Sequence[ScoredEpisode]) -> ScoredEpisode:
     """The episode whose greatest surprise since the onset is the median one."""
     return sorted(traces, key=lambda t: float(t.surprise[t.onset or 0 :].max(initial=0.0)))[len(traces) // 2]
 
@@ -199,8 +201,8 @@ class DetectionMetrics:
     """
 
     name: str
-    traces: Sequence[Trace]
-    nominal: Sequence[Trace]
+    traces: Sequence[ScoredEpisode]
+    nominal: Sequence[ScoredEpisode]
     window_s: float
     thresholds: Mapping[float, float] = field(default_factory=dict)
     maxima: Floats = field(default_factory=lambda: np.zeros(0))
@@ -211,23 +213,23 @@ class DetectionMetrics:
         return drawn_anew(self.faulty, self.nominal, self.maxima, list(self.thresholds), self.window_s)
 
     @cached_property
-    def watched(self) -> list[Trace]:
+    def watched(self) -> list[ScoredEpisode]:
         """Those in which the policy acted alone: detection is measured on them."""
         return [t for t in self.traces if t.watched_only]
 
     @cached_property
-    def faulty(self) -> list[Trace]:
+    def faulty(self) -> list[ScoredEpisode]:
         return [t for t in self.watched if t.onset is not None]
 
     @cached_property
     def kinds(self) -> dict[Kind, KindMetrics]:
         """By kind and severity, in order of appearance."""
-        groups: dict[Kind, list[Trace]] = {}
+        groups: dict[Kind, list[ScoredEpisode]] = {}
         for trace in self.faulty:
             groups.setdefault((trace.kind, trace.severity), []).append(trace)
         return {kind: self._of(kind, group) for kind, group in groups.items()}
 
-    def _of(self, kind: Kind, faulty: Sequence[Trace]) -> KindMetrics:
+    def _of(self, kind: Kind, faulty: Sequence[ScoredEpisode]) -> KindMetrics:
         placed = placements(faulty, self.nominal, self.window_s)
         return KindMetrics(
             name=in_words(kind),
@@ -283,7 +285,7 @@ class DetectionMetrics:
         return [_ended(a, [t for t in self.traces if t.acting == a]) for a in actings]
 
 
-def _ended(acting: str, traces: Sequence[Trace]) -> ActingMetrics:
+def _ended(acting: str, traces: Sequence[ScoredEpisode]) -> ActingMetrics:
     ends = [t.outcome for t in traces]
     return ActingMetrics(
         acting=acting,
@@ -293,7 +295,7 @@ def _ended(acting: str, traces: Sequence[Trace]) -> ActingMetrics:
     )
 
 
-def by_condition(traces: Sequence[Trace], window_s: float) -> list[DetectionMetrics]:
+def by_condition(traces: Sequence[ScoredEpisode], window_s: float) -> list[DetectionMetrics]:
     """One for each condition, the nominal one first, then in order of appearance."""
     nominal = [t for t in traces if t.kind == NOMINAL and t.watched_only]
     conditions = sorted(dict.fromkeys(t.condition for t in traces), key=lambda c: c != NOMINAL)

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability
+from asm_gym.evaluation.scored import ScoredEpisode, window_steps
 from asm_gym.evaluation.tables import Table, harmless_table, kinds_table, lead_table, markdown, monitors_table
-from asm_gym.evaluation.trace import Trace, window_steps
 from asm_gym.extras import needed_for
 from asm_gym.files import written_whole
 
@@ -238,7 +238,7 @@ def _write_parquet(path: Path, result: BenchmarkResult) -> None:
     unfinished.replace(path)
 
 
-def _row(trace: Trace, possible: Detectability | None, window_s: float) -> dict[str, Any]:
+def _row(trace: ScoredEpisode, possible: Detectability | None, window_s: float) -> dict[str, Any]:
     after, affected = trace.detected_after, trace.affected_channels
     blamed = trace.top_channel if after is not None else ""
     return {

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection import conformal_episodes, conformal_threshold
+from asm_gym.evaluation.scored import ScoredEpisode, window_steps
 from asm_gym.evaluation.statistics import Estimate, Floats
-from asm_gym.evaluation.trace import Trace, window_steps
 
 DRAWS = 400
 """How often everything is drawn anew."""
@@ -44,8 +44,8 @@ def interval(value: float, draws: Floats) -> Estimate:
 
 
 def drawn_anew(
-    faulty: Sequence[Trace],
-    nominal: Sequence[Trace],
+    faulty: Sequence[ScoredEpisode],
+    nominal: Sequence[ScoredEpisode],
     maxima: Floats,
     rates: Sequence[float],
     window_s: float,
@@ -88,11 +88,14 @@ def drawn_anew(
 
 
 def _beaten(
-    faulty: Sequence[Trace], nominal: Sequence[Trace], place: Mapping[tuple[str, int], int], window_s: float
+    faulty: Sequence[ScoredEpisode],
+    nominal: Sequence[ScoredEpisode],
+    place: Mapping[tuple[str, int], int],
+    window_s: float,
 ) -> NDArray[np.float32]:
     """(F, scenes) 1 where a fault surprised more than the nominal episode in the same steps, ½ in ties, else NaN."""
     won = np.full((len(faulty), len(place)), np.nan, np.float32)
-    by_task: dict[str, list[Trace]] = {}
+    by_task: dict[str, list[ScoredEpisode]] = {}
     for trace in nominal:
         by_task.setdefault(trace.task, []).append(trace)
     for row, trace in zip(won, faulty, strict=True):
@@ -125,7 +128,7 @@ def _mean(values: Floats, weights: Floats) -> float:
 class _Alarms:
     """Which faults are detected at a threshold, without going through all traces again."""
 
-    def __init__(self, faulty: Sequence[Trace], window_s: float) -> None:
+    def __init__(self, faulty: Sequence[ScoredEpisode], window_s: float) -> None:
         self._faulty, self._window_s = faulty, window_s
         before = [t.surprise[o - 1] if (o := t.onset or 0) and o <= len(t) else -math.inf for t in faulty]
         self._before = np.array(before, float)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from asm_gym.checks import check_number, shown
+from asm_gym.validation import check_number, shown
 
 Floats = NDArray[np.floating[Any]]
 

@@ -18,8 +18,8 @@ from asm_gym.evaluation import metrics
 from asm_gym.evaluation.comparison import RATES, BenchmarkResult
 from asm_gym.evaluation.metrics import ActingMetrics, Delays, DetectionMetrics, KindMetrics, in_words
 from asm_gym.evaluation.resampling import interval
+from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE
 from asm_gym.evaluation.statistics import Estimate, Share
-from asm_gym.evaluation.trace import NOMINAL, POLICY_ALONE
 
 Subject = TypeVar("Subject")
 Compared = DetectionMetrics | KindMetrics

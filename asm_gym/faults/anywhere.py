@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.choices import check_choice
 from asm_gym.faults import action, sensor
 from asm_gym.faults.base import Fault, Interface
 from asm_gym.faults.suite import SEVERITIES
+from asm_gym.validation import check_choice
 
 
 class Struck(NamedTuple):

@@ -15,10 +15,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number, check_numbers, check_text, shown
-from asm_gym.choices import check_choice
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_choice, check_number, check_numbers, check_text, shown
 
 SHAPES = ("constant", "pulse", "ramp", "periodic", "random_walk")
 

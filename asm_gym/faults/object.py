@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_numbers
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults.base import Apply, Fault, Vector3, along, data_of, edited, group_labels, model_of, within
+from asm_gym.validation import check_numbers
 
 _AWAY = np.array([8.0, 8.0, 0.5])  # where a missing object lies [m]
 

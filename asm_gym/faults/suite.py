@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from asm_gym.choices import check_choice
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import action, actuator, body, harmless, object, sensor
 from asm_gym.faults.base import Fault
+from asm_gym.validation import check_choice
 
 SEVERITIES = ("mild", "medium", "strong")
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.scaling import StreamScaler
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

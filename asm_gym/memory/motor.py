@@ -25,12 +25,12 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.association import association_change, complete, hidden_units
 from asm_gym.memory.energy import Array
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 from asm_gym.scaling import StreamScaler
-from asm_gym.stream import MOTOR, StreamSpec
+from asm_gym.spec import MOTOR, StreamSpec
 
 UPDATES, PASSES = 12_000, 100
 """Batches learned from at most, and passes over the steps at most."""

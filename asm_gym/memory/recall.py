@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number
 from asm_gym.memory.energy import Array
 from asm_gym.memory.network import Network, Step
 from asm_gym.scaling import StreamScaler
+from asm_gym.validation import check_number
 
 MOST_STEPS = 1_000_000
 """Rows that are recalled at once."""

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors.diagnosis import Diagnosis
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 
 Progress = Callable[[int, int], object]
 """Called as ``progress(done, total)``."""
@@ -47,6 +47,12 @@ class Surprise(NamedTuple):
         """(B,) at the body, and (B,) at the skill, not a number where nobody listens for that."""
         body = self.value if self.of_body is None else self.of_body
         return body, np.full(len(body), np.nan) if self.of_skill is None else self.of_skill
+
+    def of(self, stream: int) -> Surprise:
+        """That of one stream, in a batch of one."""
+        at = slice(stream, stream + 1)
+        skill, body, of_skill = (None if p is None else p[at] for p in (self.skill, self.of_body, self.of_skill))
+        return Surprise(self.value[at], self.attribution[at], skill, body, of_skill)  # type: ignore[arg-type]
 
     def silenced(self, where: NDArray[np.bool_]) -> Surprise:
         """No surprise ``where`` (B,) nothing is judged."""

@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.episodes import Episode
-from asm_gym.memory.adaptation import followed
+from asm_gym.episode import Episode
 from asm_gym.memory.association import Association, association_shapes, existing, hidden_units
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
-from asm_gym.memory.fewer import MOST_INPUTS, Kept, fewer_changes, fewer_traces, moments
 from asm_gym.memory.inference import Weights, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs
+from asm_gym.memory.marginalise import MOST_INPUTS, Kept, fewer_changes, fewer_traces, moments
 from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
 from asm_gym.memory.network import Network, train
+from asm_gym.memory.online import followed
 from asm_gym.memory.readout import add_up, learn_readout
 from asm_gym.memory.recall import continued
 from asm_gym.memory.recurrent import RecurrentNetwork, RecurrentWeights, recurrent_shapes
@@ -32,7 +32,7 @@ from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.model import StreamModel, model_outputs, running
 from asm_gym.scaling import StreamScaler, rows_apart
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 
 
 class MemoryModel(StreamModel):
@@ -97,7 +97,7 @@ class MemoryModel(StreamModel):
         columns = spec.columns_in(self.spec)
         if "moments" not in self.learned_ or isinstance(self.network, RecurrentNetwork):
             raise ValueError(
-                "this memory does not keep what its senses have in common (it was saved by an older asm-gym, has lost "
+                "this memory does not keep what its senses have in common (it has lost "
                 f"senses before, or has more than {MOST_INPUTS} inputs), so that none of them can be left out"
             )
         C, old, known = self.learned_["moments"], self.senses_, columns >= 0

@@ -9,12 +9,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number, shown
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors.base import Model, State, Told
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number, shown
 
 HELD_OUT = 5
 """One in so many training episodes is not learned by the model, but shows how surprised it usually is."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -13,15 +12,13 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint, write_checkpoint
-from asm_gym.checks import check_flag, check_number, shown
-from asm_gym.choices import check_choice
 from asm_gym.detection import Detection, ModelOutput, Nominal, Promise, conformal_episodes, conformal_threshold
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors.base import Model, Progress, Specialises, State, Surprise, Told
 from asm_gym.monitors.model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.nominal import check_nominal
 from asm_gym.monitors.saved import MAXIMA, SavedMonitor
-from asm_gym.typed import typed
+from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
 
 
 class MonitorState(NamedTuple):
@@ -90,12 +87,12 @@ class CalibratedMonitor:
 
         Raises:
             ValueError: there were too few of them for this rate; the message says how many it takes.
-            RuntimeError: it is not calibrated, or was so by a version that did not keep what this takes.
+            RuntimeError: it is not calibrated, or does not keep what this takes.
         """
         if self.maxima_ is None and self.threshold_ is not None:
             raise RuntimeError(
-                f"this {self._name} keeps a threshold, but not the surprise of the nominal episodes that it was set by "
-                "(an older asm-gym did not save it): call calibrate(nominal_episodes) again"
+                f"this {self._name} keeps a threshold, but not the surprise of the nominal episodes that it was set "
+                "by: call calibrate(nominal_episodes) again"
             )
         if self.maxima_ is None:
             raise RuntimeError(f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first")
@@ -247,11 +244,6 @@ class CalibratedMonitor:
         """The state with the evidence so far forgotten, after an alarm that was acted on; the model goes on."""
         return state._replace(detection=self.detection.reset(state.detection))
 
-    def resynchronise(self, state: MonitorState) -> MonitorState:
-        """``reset_evidence``, as it was called before."""
-        warnings.warn("resynchronise is now reset_evidence", DeprecationWarning, stacklevel=2)
-        return self.reset_evidence(state)
-
     @typed
     def score(self, episode: Episode) -> Surprise:
         """The surprise of each step of an episode: value (T,), attribution (T, D); no names of skills."""
@@ -302,14 +294,14 @@ class CalibratedMonitor:
         theirs = {n for d in self.detections.values() for n in d.arrays}
         missing = [n for n in self.detection.arrays if n not in found.arrays]
         if missing:
-            raise ValueError(f"the checkpoint has no {', '.join(missing)}: an older asm-gym wrote it, so fit it anew")
+            raise ValueError(f"the checkpoint has no {', '.join(missing)}, so fit it anew")
         self.model.restore({n: a for n, a in found.arrays.items() if n not in theirs}, found.skills)
         self._prepare()
         for detection in self.detections.values():
             if found.arrays.keys() >= set(detection.arrays):
                 detection.restore({n: found.arrays[n] for n in detection.arrays})
         self.about = found.about
-        if found.detection in (None, self.detection.name):
+        if found.detection == self.detection.name:
             self.threshold_, self.maxima_ = found.threshold_below(self.detection.reach), found.maxima
         return self
 

@@ -5,7 +5,6 @@ row → memory: errors, context → whiten → accumulate → value, attribution
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -15,28 +14,26 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint, read_checkpoint
-from asm_gym.checks import check_number, shown
-from asm_gym.choices import check_choice
 from asm_gym.detection import Detector, EvidenceDetection
 from asm_gym.detection.detector import BOUND, GAINS
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
 from asm_gym.memory.network import Network
 from asm_gym.monitors.base import Progress, Surprise, Told
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
+from asm_gym.monitors.fused import CompiledRow
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState
 from asm_gym.monitors.nominal import check_nominal
-from asm_gym.monitors.row import CompiledRow
 from asm_gym.monitors.saved import restored
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise, apart
 from asm_gym.scaling import StreamScaler
-from asm_gym.stream import StreamSpec
-from asm_gym.typed import typed
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_choice, check_number, shown, typed
 
 MOST_ITERATIONS = 1000
 """Of inference in a row: twenty are enough, and a file that asks for a thousand million would never answer."""
@@ -97,13 +94,7 @@ class NeuralASM(CalibratedMonitor):
         habituates: bool = True,
         seed: int = 0,
         feedback: str = TRANSPORTED,
-        **renamed: float,
     ) -> None:
-        if "carry_prior" in renamed:
-            warnings.warn("carry_prior is now free_running_probability", DeprecationWarning, stacklevel=2)
-            free_running_probability = renamed.pop("carry_prior")
-        if renamed:
-            raise TypeError(f"NeuralASM has no hyperparameter {', '.join(renamed)}")
         self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
         self.association_size = check_number("association_size", association_size, low=1, whole=True)
         self.epochs = check_number("epochs", epochs, low=1, whole=True)
@@ -299,7 +290,7 @@ class NeuralASM(CalibratedMonitor):
 
         Raises:
             ValueError: it has senses that this memory never met (the message names them), or another rate; the memory
-                was saved by an older asm-gym, or has lost channels before.
+                has lost channels before.
             RuntimeError: the memory has not learned anything yet, or alarms on skills, which takes all senses.
         """
         self._fitted()

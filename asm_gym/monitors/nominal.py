@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from asm_gym.episodes import Episode
-from asm_gym.stream import StreamSpec
+from asm_gym.episode import Episode
+from asm_gym.spec import StreamSpec
 
 WILD = 1e6
 """How many times the range of its channel a number may be away from the median."""

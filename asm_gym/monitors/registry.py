@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from asm_gym.checkpoint import kind_of, read_checkpoint
-from asm_gym.checks import check_text
-from asm_gym.choices import check_choice
 from asm_gym.detection import Detection, EvidenceDetection
 from asm_gym.extras import needed_for
 from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import CalibratedMonitor
-from asm_gym.monitors.saved import RENAMED, restored
-from asm_gym.stream import StreamSpec
-from asm_gym.typed import typed
+from asm_gym.monitors.saved import restored
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_choice, check_text, typed
 
 EVIDENCE = "+evidence"
 """What the name of a monitor ends in where its errors are judged by the detection of the Neural ASM."""
@@ -27,7 +25,7 @@ DETECTIONS: dict[str, Any] = {
     "mahalanobis": "asm_gym.detection.scores:Mahalanobis",
     "moving_mean": "asm_gym.detection.scores:MovingMean",
     "largest": "asm_gym.detection.scores:Largest",
-    "band": "asm_gym.detection.band:Band",
+    "band": "asm_gym.detection.functional_band:FunctionalBand",
     "latent_threshold": "asm_gym.monitors.baselines.lstm_vae:LatentThreshold",
 }
 """The class of each detection, or where it stands."""
@@ -155,6 +153,15 @@ def model_of(name: str) -> str:
     return name.partition("+")[0]
 
 
+def check_monitor(name: str) -> None:
+    """Raises ValueError unless there is such a monitor, or such a model and detection; nothing is imported."""
+    model, plus, detection = name.partition("+")
+    if plus and name not in MONITORS and model in MONITORS:
+        check_choice("detection", detection, DETECTIONS)
+    else:
+        check_choice("monitor", name, MONITORS)
+
+
 @typed
 def monitor_class(name: str) -> MonitorKind:
     """What makes and loads the monitors of that name; torch is imported only for those that need it.
@@ -163,12 +170,9 @@ def monitor_class(name: str) -> MonitorKind:
         ValueError: there is no monitor of that name, or no such detection; the message lists what exists.
         ImportError: a package that it needs is not installed; the message says what to install.
     """
-    model, plus, detection = name.partition("+")
-    if name in MONITORS or not plus or model not in MONITORS:
-        check_choice("monitor", name, MONITORS)
-        kind = MONITORS[name]
-    else:
-        kind = MONITORS[model].under(detection)
+    check_monitor(name)
+    model, _, detection = name.partition("+")
+    kind = MONITORS[name] if name in MONITORS else MONITORS[model].under(detection)
     with needed_for(f"monitor {name}"):
         _ = kind.model_class, kind.detection_classes
     return kind
@@ -190,7 +194,7 @@ def make_monitor(
         ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists.
     """
     kind = monitor_class(name if not isinstance(detection, str) else f"{model_of(name)}+{detection}")
-    for parameter in hyperparameters.keys() - RENAMED.keys():
+    for parameter in hyperparameters:
         check_choice(f"hyperparameter of {name}", parameter, kind.hyperparameters)
     made = kind(spec, **hyperparameters)
     return made if detection is None or isinstance(detection, str) else made.with_detection(detection)

@@ -1,4 +1,4 @@
-"""What a monitor's file holds, in whichever words an older asm-gym wrote it."""
+"""What a monitor's file holds."""
 
 from __future__ import annotations
 
@@ -10,16 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import Checkpoint
-from asm_gym.checks import check_number
 from asm_gym.detection.base import Arrays
-from asm_gym.detection.detector import ANYTHING
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number
 
 MAXIMA = "nominal_maxima"
 """Under which name a checkpoint keeps what ``calibrate`` has found."""
-
-RENAMED = {"habit": "context_quantile", "carry_prior": "free_running_probability"}
-"""What older checkpoints keep under another name."""
 
 
 class SavedMonitor(NamedTuple):
@@ -27,9 +23,9 @@ class SavedMonitor(NamedTuple):
 
     Attributes:
         arrays: what its model and its detections have learned, by name.
-        maxima: (n,) largest surprise in each episode of the calibration; None where it was not kept.
+        maxima: (n,) largest surprise in each episode of the calibration; None before it.
         threshold: as it was written.
-        detection: which the threshold is of; None where there was but one.
+        detection: which the threshold is of.
         skills: names of those that the model knows.
         about: whatever else was worth knowing.
     """
@@ -37,7 +33,7 @@ class SavedMonitor(NamedTuple):
     arrays: Arrays
     maxima: NDArray[np.float64] | None
     threshold: object
-    detection: str | None
+    detection: str
     skills: tuple[str, ...]
     about: dict[str, Any]
 
@@ -48,13 +44,10 @@ class SavedMonitor(NamedTuple):
         undeclared = sorted(set(saved.arrays) - set(header["shapes"]))
         if undeclared:
             raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
-        names = {n: n if "detection" in header else RENAMED.get(n, n) for n in header["shapes"]}
-        arrays = {now: saved.array(n, *header["shapes"][n]) for n, now in names.items()}
+        arrays = {name: saved.array(name, *shape) for name, shape in header["shapes"].items()}
         maxima = arrays.pop(MAXIMA, None)
-        if "context_quantile" in arrays:
-            arrays.setdefault("context_range", ANYTHING)
-        about = dict(header.get("about", {}))  # an older asm-gym kept nothing
-        return cls(arrays, maxima, header["threshold"], header.get("detection"), tuple(header["skills"]), about)
+        about, skills = dict(header["about"]), tuple(header["skills"])
+        return cls(arrays, maxima, header["threshold"], header["detection"], skills, about)
 
     def threshold_below(self, reach: float) -> float | None:
         """The threshold, once it is a number that surprise can exceed, which never comes to ``reach``."""
@@ -82,7 +75,6 @@ def restored(path: str | Path, saved: Checkpoint, make: Callable[..., R]) -> R:
         ValueError: the file is damaged.
     """
     try:
-        hyperparameters = {RENAMED.get(n, n): value for n, value in saved.header["hyperparameters"].items()}
-        return make(StreamSpec.from_json(saved.header["spec"]), **hyperparameters).restore(saved)
+        return make(StreamSpec.from_json(saved.header["spec"]), **saved.header["hyperparameters"]).restore(saved)
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error

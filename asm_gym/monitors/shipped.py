@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from asm_gym.checkpoint import read_header
-from asm_gym.choices import check_choice
-from asm_gym.stream import StreamSpec
-from asm_gym.typed import typed
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_choice, typed
 
 SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
 """Where they lie."""

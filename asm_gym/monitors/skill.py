@@ -19,10 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import Checkpoint
-from asm_gym.checks import check_number
 from asm_gym.detection import EvidenceDetection, ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.memory.state import newest, past
 from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
@@ -30,7 +29,8 @@ from asm_gym.monitors.base import Progress, Surprise, Told
 from asm_gym.monitors.model import StreamModel
 from asm_gym.monitors.monitor import CalibratedMonitor
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number
 
 FAINTEST = 1e-4
 """Smallest spread of an error, in standard deviations of what is expected."""

@@ -8,8 +8,8 @@ with needed_for("running episodes"):
     from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 try:
     with needed_for("a robosuite environment or a fault in one"):
-        from asm_gym.rollouts.body import harmless
         from asm_gym.rollouts.collect import collect
+        from asm_gym.rollouts.pretraining.healthy import harmless
         from asm_gym.rollouts.trial import RolloutConfig, Trial
 except ImportError as error:
     # Who watches logs has no simulator, and who asks for one of these is told what is missing. They are not looked up

@@ -10,14 +10,13 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from asm_gym.checks import check_number
-from asm_gym.episodes import Episode, save_episode
-from asm_gym.rollouts.folder import make_missing
+from asm_gym.episode import Episode, save_episode
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
+from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import PolicySource, RolloutConfig, Trial, environment, play, policy_for, staged
 from asm_gym.tasks import env_spec
-from asm_gym.typed import typed
+from asm_gym.validation import check_number, typed
 from asm_gym.wrappers import StreamRecorder
 
 

@@ -21,10 +21,8 @@ import cloudpickle
 from loky import get_reusable_executor
 from threadpoolctl import threadpool_limits
 
-from asm_gym.checks import check_number
-from asm_gym.choices import check_choice
 from asm_gym.extras import require
-from asm_gym.typed import typed
+from asm_gym.validation import check_choice, check_number, typed
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -69,6 +67,20 @@ class ParallelConfig:
             raise ValueError("backend='dask' needs the address of its scheduler, such as tcp://host:8786")
         if self.backend == "loky" and self.address is not None:
             raise ValueError(f"an address is for a cluster: backend must be dask or ray, got loky with {self.address}")
+
+    @classmethod
+    def named(cls, workers: str) -> ParallelConfig:
+        """From one word: how many processes here, or ``dask:ADDRESS``, ``ray`` or ``ray:ADDRESS`` for a cluster.
+
+        Raises:
+            ValueError: it is none of these.
+        """
+        if workers.lstrip("-").isdecimal():
+            return cls(int(workers))
+        backend, _, address = workers.partition(":")
+        if backend not in BACKENDS or backend == "loky":
+            raise ValueError(f"workers must be a number, dask:ADDRESS or ray:ADDRESS, got {workers!r}")
+        return cls(backend=backend, address=address or None)
 
 
 @typed

@@ -6,7 +6,7 @@ import zlib
 
 import numpy as np
 
-from asm_gym.checks import check_number
+from asm_gym.validation import check_number
 
 MOST_EPISODES = 10**6
 """At ten seconds each, four months."""

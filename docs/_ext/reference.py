@@ -8,7 +8,19 @@ from pathlib import Path
 
 from sphinx.application import Sphinx
 
-ROOMS = ("envs", "faults", "memory", "detection", "monitors", "evaluation", "policies", "wrappers", "rollouts")
+ROOMS = (
+    "data",
+    "envs",
+    "faults",
+    "memory",
+    "detection",
+    "monitors",
+    "evaluation",
+    "policies",
+    "wrappers",
+    "rollouts",
+    "view",
+)
 
 
 def modules(package: Path, room: str = "") -> Iterator[str]:

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number
+from asm_gym.validation import check_number
 
 Vector = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.policies.base import Policy, PolicyState
-from asm_gym.stream import control_period
+from asm_gym.spec import control_period
 
 Floats = NDArray[np.float64]
 

@@ -20,20 +20,19 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.stats import betabinom
 
-from asm_gym.checks import check_number
-from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes, conformal_threshold
-from asm_gym.episodes import Episode, load_episode
+from asm_gym.episode import Episode, load_episode
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.rollouts.collect import collect_to
-from asm_gym.rollouts.folder import claimed
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import BAD_NEWS, DONE
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import check_choice, check_number
 
 CONFIDENCE = 0.99
 """That the law's interval holds the count, where the promise is kept."""

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.console import Console
 
-from asm_gym.choices import check_choice
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.policies import make_policy, rollout
@@ -19,6 +18,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import environment
 from asm_gym.tasks import ROBOTS
+from asm_gym.validation import check_choice
 
 _QUICK = 5
 

@@ -13,8 +13,7 @@ import torch
 from numpy.typing import NDArray
 from rich.console import Console
 
-from asm_gym.checks import check_number
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.memory.association import complete, hidden_units
 from asm_gym.monitors import NeuralASM, make_monitor
@@ -23,6 +22,7 @@ from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.benchmark.turns import check_quiet, machine
+from asm_gym.validation import check_number
 
 HELD_OUT = 6
 """One in so many episodes is not learned but tested on."""

@@ -14,13 +14,13 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from asm_gym.checks import check_number
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.collect import collect
 from asm_gym.scripts.benchmark.memory import synthetic
 from asm_gym.scripts.benchmark.turns import GROWTH, resident
 from asm_gym.scripts.command import BAD_NEWS, DONE
+from asm_gym.validation import check_number
 
 TENTHS = 10
 SAMPLES = 10

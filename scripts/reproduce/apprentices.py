@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.motor import fineness, lessons, situation
 from asm_gym.monitors.baselines.torch_model import adam, descend, padded
 from asm_gym.policies import make_policy
@@ -28,7 +28,7 @@ from asm_gym.policies.memory_policy import StreamReader, common_spec, require_mo
 from asm_gym.policies.scripted.base import Style
 from asm_gym.rollouts.trial import environment
 from asm_gym.scaling import StreamScaler
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 
 GROUPS = ("hand", "gripper", "object", "action")
 """Of the streams that are learned from."""

@@ -21,13 +21,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 
-from asm_gym.episodes import Episode, load_episode
+from asm_gym.episode import Episode, load_episode
 from asm_gym.evaluation.reliability import Reliability, reliability
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.diagnosis import CLASSES, FAMILIES, WINDOW, Diagnosis, Hypothesis, Readout, averaged
-from asm_gym.rollouts.folder import files_in
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import files_in
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce
 from asm_gym.wrappers.responses import SURE
 

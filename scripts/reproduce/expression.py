@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.association import Association, association_shapes
 from asm_gym.memory.inference import Weights
 from asm_gym.memory.learning import Schedule, Trajectory

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection import conformal_threshold
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors import make_monitor
 
 Floats = NDArray[np.float64]

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from asm_gym.choices import check_choice
-from asm_gym.episodes import Episode
-from asm_gym.stream import MOTOR, Channel, StreamSpec
+from asm_gym.episode import Episode
+from asm_gym.spec import MOTOR, Channel, StreamSpec
+from asm_gym.validation import check_choice
 
 NAMES = string.ascii_lowercase + string.ascii_uppercase[:6]
 """Of the letters; they look like none of the alphabet."""

@@ -20,9 +20,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from asm_gym.choices import check_choice
 from asm_gym.memory.learning import Trajectory, batches
 from asm_gym.monitors.baselines.torch_model import adam, descend
+from asm_gym.validation import check_choice
 
 CELLS: dict[str, Any] = {"gru": nn.GRU, "rnn": nn.RNN}
 

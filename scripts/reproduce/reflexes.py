@@ -18,27 +18,27 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from asm_gym.choices import check_choice
-from asm_gym.episodes import Episode, EpisodeLabel, load_episode
+from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.contact import QUASI_STATIC
+from asm_gym.evaluation.scored import IDEAL, NOMINAL, POLICY_ALONE, ScoredEpisode
 from asm_gym.evaluation.tables import Table, console_table, markdown
-from asm_gym.evaluation.trace import IDEAL, NOMINAL, POLICY_ALONE, Trace
 from asm_gym.faults.suite import KINDS
 from asm_gym.files import written_whole
 from asm_gym.monitors import NeuralASM, pretrained
 from asm_gym.policies.registry import agents
-from asm_gym.rollouts.benchmark import LEARNING, code_digest, fitted
 from asm_gym.rollouts.collect import check
-from asm_gym.rollouts.felt import band_of_task
-from asm_gym.rollouts.folder import claimed, files_in, locked, make_missing, versions
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import claimed, files_in, locked, make_missing, versions
+from asm_gym.rollouts.scoring import LEARNING, code_digest, fitted
 from asm_gym.rollouts.seeds import role_seeds
+from asm_gym.rollouts.substeps import band_of_task
 from asm_gym.rollouts.trial import PASSING, SPINAL, RolloutConfig, Trial, record, watch, watch_each
 from asm_gym.scripts.command import at_least, run
 from asm_gym.scripts.reproduce.reflexes_report import comparisons, row, table
 from asm_gym.tasks import task as task_spec
-from asm_gym.wrappers.arguments import ON_ALARM
+from asm_gym.validation import check_choice
+from asm_gym.wrappers.factory import ON_ALARM
 
 AGENTS = "agents"
 """As a policy: of each task the agent that was trained in it."""
@@ -193,9 +193,9 @@ def place(trial: Trial, folder: Path) -> Path:
     return folder / f"{trial.task}-{trial.seed}-{trial.kind}.json"
 
 
-def kept(trial: Trial, folder: Path) -> list[Trace]:
+def kept(trial: Trial, folder: Path) -> list[ScoredEpisode]:
     """The traces of a trial that was run."""
-    return [Trace.from_json(line) for line in place(trial, folder).read_text(encoding="utf-8").splitlines()]
+    return [ScoredEpisode.from_json(line) for line in place(trial, folder).read_text(encoding="utf-8").splitlines()]
 
 
 def run_trial(trial: Trial, args: Args, memory: Path) -> Path:
@@ -204,7 +204,7 @@ def run_trial(trial: Trial, args: Args, memory: Path) -> Path:
     nominal = replace(trial, kind=NOMINAL, severity="")
 
     @cache
-    def undisturbed() -> Trace:
+    def undisturbed() -> ScoredEpisode:
         known = kept(nominal, folder)[:1] if place(nominal, folder).is_file() else []
         return known[0] if known else watch(nominal, config, memory)
 

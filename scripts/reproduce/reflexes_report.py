@@ -10,9 +10,9 @@ from typing import Any, NamedTuple, Protocol
 
 from asm_gym.evaluation.contact import within_limits
 from asm_gym.evaluation.intervention import Comparison, IdealShare, compare, share_of_ideal
+from asm_gym.evaluation.scored import IDEAL, NOMINAL, POLICY_ALONE, ScoredEpisode
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table
-from asm_gym.evaluation.trace import IDEAL, NOMINAL, POLICY_ALONE, Trace
 
 
 class Asked(Protocol):
@@ -50,10 +50,10 @@ class Measured(NamedTuple):
     named: Counter[str]  # families of causes at the first alarm
 
 
-def comparisons(traces: Sequence[Trace], args: Asked) -> list[Measured]:
+def comparisons(traces: Sequence[ScoredEpisode], args: Asked) -> list[Measured]:
     """Each reflex under each fault, over all tasks."""
 
-    def of(fault: str, acting: str) -> list[Trace]:
+    def of(fault: str, acting: str) -> list[ScoredEpisode]:
         return [t for t in traces if (t.kind, t.acting) == (fault, acting)]
 
     def measured(fault: str, reflex: str) -> Measured:
@@ -104,7 +104,7 @@ def table(found: Sequence[Measured], args: Asked) -> Table:
     )
 
 
-def row(trace: Trace) -> dict[str, Any]:
+def row(trace: ScoredEpisode) -> dict[str, Any]:
     """An episode as it is written down."""
     return {
         "task": trace.task,

@@ -21,17 +21,16 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from asm_gym.choices import check_choice
 from asm_gym.detection import conformal_episodes
-from asm_gym.episodes import Episode, load_episode
+from asm_gym.episode import Episode, load_episode
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.tables import Table, console_table, markdown
 from asm_gym.monitors import NeuralASM, load_monitor, pretrained
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.rollouts.collect import collect_to
-from asm_gym.rollouts.folder import claimed, make_missing
 from asm_gym.rollouts.parallel import THIS_PROCESS, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import claimed, make_missing
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.exploration import Gentle, explore, harmless
 from asm_gym.rollouts.training.outcome import COUNTED, TrainingOutcome
@@ -41,6 +40,7 @@ from asm_gym.scripts import command
 from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.training_report import counts_table, learning_figure, worth_table
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import check_choice
 
 DEMONSTRATIONS, FITTING, TESTING = 11, 12, 13
 """Stages of the seeds of episodes that are recorded."""

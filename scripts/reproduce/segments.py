@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sklearn.cluster import AgglomerativeClustering
 from sklearn.metrics import adjusted_rand_score, silhouette_score
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.energy import Array
 from asm_gym.memory.recall import Recalled, follow
 from asm_gym.scripts.reproduce.expression import Memory, Rows, read

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from sklearn.ensemble import RandomForestClassifier
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.readout import KEPT, SMALLEST
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.model import running

@@ -11,13 +11,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
-from asm_gym.rollouts.benchmark import fitted
-from asm_gym.rollouts.folder import recorded
+from asm_gym.rollouts.run_folder import recorded
+from asm_gym.rollouts.scoring import fitted
 from asm_gym.scripts.reproduce.skill_switch import Switch
 
 AFTER_S = (0.5, 1.0, 2.0, 5.0)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.scripts.reproduce.handwriting import DT, NAMES, NOISE, STEPS, check_letters, pen_spec
 
 KNOTS = 5

@@ -9,15 +9,15 @@ from typing import NamedTuple
 import numpy as np
 
 from asm_gym.detection import AdaptiveThreshold
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation.comparison import visible_kinds
 from asm_gym.evaluation.metrics import placements
-from asm_gym.evaluation.trace import NOMINAL, Trace
+from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
 from asm_gym.monitors import CalibratedMonitor, NeuralASM
-from asm_gym.rollouts.benchmark import detectability_of, traces_of
-from asm_gym.scripts.reproduce.common import Record
+from asm_gym.rollouts.scoring import detectability_of, traces_of
+from asm_gym.scripts.reproduce.kit import Record
 from asm_gym.scripts.reproduce.transfer_watched import Watched
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 
 Own = Mapping[Watched, Sequence[Episode]]
 ADAPTIVE = AdaptiveThreshold(rate=0.05, step=0.3, ceiling=4.0)
@@ -76,7 +76,7 @@ class Judge(NamedTuple):
             found += self._of(memory, watched, [*judged, *faulty])
         return found
 
-    def _of(self, memory: str, watched: Watched, traces: Sequence[Trace]) -> list[Record]:
+    def _of(self, memory: str, watched: Watched, traces: Sequence[ScoredEpisode]) -> list[Record]:
         nominal = [t for t in traces if t.kind == NOMINAL]
         seen = visible_kinds(
             detectability_of(role(self.own[watched], "nominal"), role(self.own[watched], "faulty"), self.window)

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 
-from asm_gym.episodes import EpisodeLabel
+from asm_gym.episode import EpisodeLabel
 from asm_gym.faults.suite import kinds_of, possible
 from asm_gym.policies import Policy
-from asm_gym.rollouts.babbling import Babbler, Lesson
-from asm_gym.rollouts.examination import SEVERITIES
+from asm_gym.rollouts.pretraining.babbling import Babbler, Lesson
+from asm_gym.rollouts.pretraining.model_card import SEVERITIES
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, environment, record
 from asm_gym.tasks import task as task_spec

@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from asm_gym.checks import check_number
-from asm_gym.choices import check_choice
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
+from asm_gym.validation import check_choice, check_number
 from tests.soak import guard, kills, verdicts
 from tests.soak.kills import WORKS
 

@@ -22,7 +22,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 
-from asm_gym import datasets, episodes, logs
+from asm_gym import episode as one_episode
+from asm_gym.data import datasets, logs
 from asm_gym.monitors import load_monitor
 from asm_gym.policies import make_policy
 from asm_gym.policies.network import NetworkPolicy
@@ -61,7 +62,7 @@ TOKENS = ("", "0", "-1", "1e9", "nan", "inf", "None", "True", "..", "/dev/null",
 LINES = (
     *("collect Lift --episodes 3 --seed 0 --out o", "evaluate --tasks Lift --false-alarm-rate 0.05 --window 1 --out o"),
     *("train Lift --seed 0 --out o", "fit good.csv --out m.asm --seed 0", "watch good.csv --monitor good.asm"),
-    *("demo --quick --seed 0", "doctor", "reproduce laws", "react --tasks Lift --seed 0", "adopt a b", "repertoire"),
+    *("demo --quick --seed 0", "doctor", "reproduce laws", "reproduce reflexes --tasks Lift", "reproduce repertoire"),
     *("train-safely --seed 0", "benchmark coverage --rates 0.1 --episodes 20", "import good.npz --out o", "lagrangian"),
     *("benchmark env --steps 5", "benchmark experts --tasks Lift --episodes 1", "reproduce reflexes --seed 1"),
 )
@@ -129,7 +130,7 @@ class Files:
         layout, env = logs.Layout(spec=good.spec), FakeEnv()
         self.formats = {
             "memory": Format(good.memory_file, lambda p: _arrays(load_monitor(p).learned_)),
-            "episode": Format(good.episode_file, lambda p: _content(episodes.load_episode(p))),
+            "episode": Format(good.episode_file, lambda p: _content(one_episode.load_episode(p))),
             "agent": Format(good.agent_file, lambda p: _acts(NetworkPolicy.load(p), 37)),
             "agent of SB3": Format(Path("good.zip").resolve(), lambda p: _acts(make_policy(str(p), env), 2)),
             "dataset": Format(next(good.dataset.rglob("*.hdf5")), _dataset),
@@ -187,7 +188,7 @@ def _dataset(file: Path) -> list[tuple[Any, ...]]:
     return [_content(episode) for episode in datasets.read_dataset(file.parents[1])]
 
 
-def _content(episode: episodes.Episode) -> tuple[Any, ...]:
+def _content(episode: one_episode.Episode) -> tuple[Any, ...]:
     return episode.stream.tobytes(), episode.spec, episode.success, episode.seed, episode.actions.tobytes()
 
 

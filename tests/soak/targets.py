@@ -13,7 +13,8 @@ import gymnasium as gym
 import numpy as np
 
 import asm_gym
-from asm_gym import checkpoint, datasets, episodes, logs, stream, tasks
+from asm_gym import checkpoint, episode, tasks
+from asm_gym.data import datasets, logs
 from asm_gym.detection import adaptive, conformal, detector
 from asm_gym.envs import backend
 from asm_gym.envs.robosuite_env import RobosuiteEnv
@@ -24,6 +25,7 @@ from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.scripted.base import Style
 from asm_gym.rollouts import ParallelConfig, RolloutConfig, Trial, collect, parallel_map
 from asm_gym.rollouts.seeds import draw_onset, episode_seeds
+from asm_gym.spec import Channel, StreamSpec, control_period
 from asm_gym.wrappers import (
     CompletedObservation,
     FaultInjection,
@@ -46,7 +48,7 @@ class Good:
     numbers = itertools.count()
 
     @cached_property
-    def episodes(self) -> list[episodes.Episode]:
+    def episodes(self) -> list[episode.Episode]:
         return sine_episodes(24, spec=self.spec)
 
     @cached_property
@@ -61,7 +63,7 @@ class Good:
 
     @cached_property
     def episode_file(self) -> Path:
-        return episodes.save_episode(Path("good.npz").resolve(), self.episodes[0])
+        return episode.save_episode(Path("good.npz").resolve(), self.episodes[0])
 
     @cached_property
     def log_file(self) -> Path:
@@ -82,7 +84,7 @@ class Good:
     def fake_asm(self) -> NeuralASM:
         """A memory of what ``FakeEnv`` senses, which can act."""
         env = FakeEnv(own_stream=False)
-        spec = stream.StreamSpec.from_spaces(env.observation_space, env.action_space, stream.control_period(env))
+        spec = StreamSpec.from_spaces(env.observation_space, env.action_space, control_period(env))
         fit = sine_episodes(24, spec=spec)
         asm = NeuralASM(spec, hidden_size=8, association_size=16, epochs=1)
         return asm.fit(fit[:14]).calibrate(fit[14:], 0.1).learn_to_act(fit[:14], 16)
@@ -178,16 +180,16 @@ def public(good: Good) -> dict[str, Target]:
         ),
         "load_monitor": (load_monitor, lambda: {"path": good.memory_file}),
         "Episode.from_stream": (
-            episodes.Episode.from_stream,
+            episode.Episode.from_stream,
             lambda: {"x": good.episodes[0].stream, "spec": good.spec},
         ),
         "Episode.from_table": (
-            episodes.Episode.from_table,
+            episode.Episode.from_table,
             lambda: {"frame": {"a": [1.0, 2.0], "b": [0.0, 1.0]}, "channels": None, "rate": 20.0, "action": ["b"]},
         ),
-        "EpisodeLabel": (episodes.EpisodeLabel, lambda: {"task": "Lift", "role": "nominal"}),
-        "save_episode": (episodes.save_episode, lambda: {"path": "saved.npz", "episode": good.episodes[0]}),
-        "load_episode": (episodes.load_episode, lambda: {"path": good.episode_file}),
+        "EpisodeLabel": (episode.EpisodeLabel, lambda: {"task": "Lift", "role": "nominal"}),
+        "save_episode": (episode.save_episode, lambda: {"path": "saved.npz", "episode": good.episodes[0]}),
+        "load_episode": (episode.load_episode, lambda: {"path": good.episode_file}),
         "read_dataset": (datasets.read_dataset, lambda: {"path": good.dataset}),
         "write_dataset": (
             datasets.write_dataset,
@@ -203,11 +205,11 @@ def public(good: Good) -> dict[str, Target]:
             lambda path, layout: list(logs.read_logs(path, layout)),
             lambda: {"path": good.log_file, "layout": logs.Layout(spec=good.spec)},
         ),
-        "Channel": (stream.Channel, lambda: {"name": "a", "size": 2}),
-        "StreamSpec": (stream.StreamSpec, lambda: {"channels": (stream.Channel("a", 2),), "dt": 0.05}),
-        "StreamSpec.from_json": (stream.StreamSpec.from_json, lambda: {"text": SPEC.to_json()}),
+        "Channel": (Channel, lambda: {"name": "a", "size": 2}),
+        "StreamSpec": (StreamSpec, lambda: {"channels": (Channel("a", 2),), "dt": 0.05}),
+        "StreamSpec.from_json": (StreamSpec.from_json, lambda: {"text": SPEC.to_json()}),
         "StreamSpec.from_spaces": (
-            stream.StreamSpec.from_spaces,
+            StreamSpec.from_spaces,
             lambda: {"observation": FakeEnv().observation_space, "action": FakeEnv().action_space, "dt": 0.05},
         ),
         "write_checkpoint": (

@@ -14,8 +14,8 @@ from asm_gym.evaluation.comparison import IDEAL
 from asm_gym.evaluation.figures.episodes import limits
 from asm_gym.evaluation.figures.style import BLACK, figure, look, require_some
 from asm_gym.evaluation.metrics import DetectionMetrics, Kind, KindMetrics, delays_ms, in_words, placements
+from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.statistics import wilson_interval
-from asm_gym.evaluation.trace import NOMINAL, Trace
 
 MOST_BANDS = 4
 """Curves that may have a band of uncertainty each; of more, none could be told apart."""
@@ -101,7 +101,7 @@ def maxima_figure(groups: Sequence[DetectionMetrics]) -> Figure:
     return fig
 
 
-def _peak(trace: Trace, window_s: float) -> float:
+def _peak(trace: ScoredEpisode, window_s: float) -> float:
     return float(np.clip(trace.surprise[trace.window(window_s)].max(initial=0.0), *limits([trace])))
 
 

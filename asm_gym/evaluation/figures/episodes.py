@@ -13,10 +13,10 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from asm_gym.evaluation.figures.style import BLACK, BLUE, ORANGE, VERMILLION, figure, require_some
-from asm_gym.evaluation.trace import Trace, TraceDetail, spans
+from asm_gym.evaluation.scored import ScoredEpisode, TraceDetail, spans
 
 
-def surprise_figure(traces: Sequence[Trace]) -> Figure:
+def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
     """Surprise over time, a panel a trace on common axes: the threshold, the fault's span and onset, the alarms."""
     require_some(traces)
     with figure(height=0.9 + 1.35 * len(traces)) as fig:
@@ -45,7 +45,7 @@ def surprise_figure(traces: Sequence[Trace]) -> Figure:
     return fig
 
 
-def _surprise_panel(ax: Axes, trace: Trace) -> None:
+def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
     floor, ceiling = limits([trace])
     time = (np.arange(len(trace)) + 1) * trace.dt  # (T,) a row is known at the end of its step
     ax.plot(time, np.clip(trace.surprise, floor, ceiling), color=BLUE, linewidth=1.5)
@@ -65,7 +65,7 @@ def _surprise_panel(ax: Axes, trace: Trace) -> None:
     ax.grid(axis="y", color="#dddddd", linewidth=0.6)
 
 
-def attribution_figure(trace: Trace, top: int = 12) -> Figure:
+def attribution_figure(trace: ScoredEpisode, top: int = 12) -> Figure:
     """Where the surprise came from: the shares of the ``top`` channels over time, in units of the threshold."""
     detail = _detail(trace)
     share = detail.attribution / trace.threshold  # (T, D)
@@ -97,7 +97,7 @@ def attribution_figure(trace: Trace, top: int = 12) -> Figure:
     return fig
 
 
-def stream_figure(trace: Trace, top: int = 4) -> Figure:
+def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
     """What was sensed by the ``top`` channels that surprised most since the onset, beside the healthy twin.
 
     Where no fault is known, as in a log, the rows in alarm are shaded.
@@ -135,7 +135,7 @@ def stream_figure(trace: Trace, top: int = 4) -> Figure:
     return fig
 
 
-def limits(traces: Sequence[Trace]) -> tuple[float, float]:
+def limits(traces: Sequence[ScoredEpisode]) -> tuple[float, float]:
     """The range of surprise worth drawing: a log axis can show neither zero nor infinity."""
     if not all(t.threshold > 0 for t in traces):
         raise ValueError(f"a log axis needs thresholds > 0, got {sorted({t.threshold for t in traces})}")
@@ -145,7 +145,7 @@ def limits(traces: Sequence[Trace]) -> tuple[float, float]:
     return max(float(finite.min(initial=np.inf)), min(thresholds) / 1000), ceiling
 
 
-def _detail(trace: Trace) -> TraceDetail:
+def _detail(trace: ScoredEpisode) -> TraceDetail:
     if trace.detail is None:
         raise ValueError("this trace was kept without the detail that the figure needs")
     return trace.detail

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from asm_gym.evaluation.figures.style import BLACK, BLUE, VERMILLION, figure, require_some
-from asm_gym.evaluation.trace import Trace, spans
+from asm_gym.evaluation.scored import ScoredEpisode, spans
 
 AROUND_S, AROUND_ROWS = 0.5, 10
 """How much is shown before and after [s], and at least how many rows."""
@@ -29,14 +29,14 @@ class Moment(NamedTuple):
         excess: how surprising the worst of them was, in thresholds; infinite where it was not finite.
     """
 
-    trace: Trace
+    trace: ScoredEpisode
     start: int
     stop: int
     channel: int
     excess: float
 
 
-def moments_of(trace: Trace) -> list[Moment]:
+def moments_of(trace: ScoredEpisode) -> list[Moment]:
     """The alarms of an episode, in order. Raises ValueError where the trace has no detail."""
     if trace.detail is None:
         raise ValueError("this trace was kept without the detail that says which channel surprised")

@@ -16,17 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.ensemble import HistGradientBoostingRegressor
 
-from asm_gym.checks import check_number
 from asm_gym.compilation import compiled
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.association import synapses
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.association_linear import FAINTEST, LinearAssociation
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context
-from asm_gym.stream import StreamSpec
-from asm_gym.typed import typed
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number, typed
 
 FRESH = 5
 """One in so many episodes is not learned by the trees, but shows how wrong they are."""

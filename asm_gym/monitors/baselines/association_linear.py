@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
 from asm_gym.monitors.model import StreamModel
 from asm_gym.scaling import StreamScaler, rows_apart
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 
 FAINTEST = 1e-4
 """Smallest spread of what is left of a standardised change."""

@@ -17,7 +17,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.association import synapses
 from asm_gym.memory.linear import check_inputs
@@ -25,8 +24,8 @@ from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
 from asm_gym.monitors.baselines.torch_model import FRESH, TorchModel, steps_of
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
-from asm_gym.stream import StreamSpec
-from asm_gym.typed import typed
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number, typed
 
 UPDATES, BATCH = 12_000, 256
 CHECK, PATIENCE = 200, 10

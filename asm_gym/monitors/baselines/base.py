@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from asm_gym.detection.base import Arrays
 from asm_gym.memory.state import newest, past
 from asm_gym.scaling import ScaledRows, StreamScaler
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 
 
 class Standard(NamedTuple):

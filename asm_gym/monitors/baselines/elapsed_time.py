@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
 from asm_gym.monitors.model import StreamModel

@@ -25,14 +25,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Rows, no_context, no_rows, read
 from asm_gym.monitors.baselines.torch_model import TorchModel, adam, descend, steps_of
 from asm_gym.scaling import ScaledRows, StreamScaler
-from asm_gym.stream import StreamSpec
-from asm_gym.typed import typed
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number, typed
 
 BATCH = 256
 EMBEDDING = 64

@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 from sklearn.svm import SVR
 from torch import Tensor, nn
 
-from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput, Nominal
 from asm_gym.detection.scores import Squares
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Rows, no_rows, read
 from asm_gym.monitors.baselines.torch_model import TorchModel, converge, descend, padded, parted
 from asm_gym.scaling import ScaledRows, StreamScaler
-from asm_gym.stream import StreamSpec
-from asm_gym.typed import typed
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number, typed
 
 EPOCHS, BATCH = 200, 16
 """Passes at most; training ends where fresh episodes gain no more."""

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.inference import direct, expect, sense
 from asm_gym.memory.state import MemoryState, past
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
 from asm_gym.monitors.model import StreamModel, model_outputs
 from asm_gym.monitors.neural_asm import NeuralASM
-from asm_gym.stream import StreamSpec
+from asm_gym.spec import StreamSpec
 
 FAINTEST = 1e-4
 """Smallest spread of an error, in standard deviations of the sense."""

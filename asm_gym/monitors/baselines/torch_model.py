@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from asm_gym.detection.base import Arrays
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.learning import shuffled
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.model import StreamModel

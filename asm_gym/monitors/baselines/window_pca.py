@@ -15,15 +15,14 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checks import check_number
 from asm_gym.detection import ModelOutput
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
 from asm_gym.monitors.model import StreamModel
-from asm_gym.stream import StreamSpec
-from asm_gym.typed import typed
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number, typed
 
 FAINTEST = 1e-4
 """Smallest spread of a residual, in standard deviations of its channel."""

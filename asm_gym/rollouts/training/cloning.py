@@ -18,7 +18,7 @@ from stable_baselines3.sac.sac import SAC
 from stable_baselines3.td3.td3 import TD3
 from torch.nn import Parameter
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.rollouts.parallel import Progress
 
 BATCH = 256

@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episodes import Episode, load_episode, save_episode
+from asm_gym.episode import Episode, load_episode, save_episode
 from asm_gym.monitors.baselines.limits import columns
 from asm_gym.policies import make_policy
 from asm_gym.policies.base import Policy

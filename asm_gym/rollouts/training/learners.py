@@ -20,9 +20,9 @@ from stable_baselines3.sac.policies import SACPolicy
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
-from asm_gym.choices import check_choice
 from asm_gym.policies.network import NetworkPolicy, describe
 from asm_gym.policies.sb3 import network
+from asm_gym.validation import check_choice
 
 ALGORITHMS = ("sac", "td3", "ppo")
 HIDDEN = (256, 256)

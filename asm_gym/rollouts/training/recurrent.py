@@ -13,7 +13,7 @@ import torch
 from torch import nn
 from torch.nn.utils.rnn import pad_sequence
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.policies.network import Cell, NetworkPolicy
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.training.cloning import steps_of

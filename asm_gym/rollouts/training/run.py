@@ -22,7 +22,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from asm_gym.episodes import Episode
+from asm_gym.episode import Episode
 from asm_gym.policies import rollout
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.parallel import Progress

@@ -20,7 +20,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor as EpisodeMonitor
 
-from asm_gym.episodes import Episode, load_episode
+from asm_gym.episode import Episode, load_episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
@@ -46,7 +46,7 @@ ANCHOR, ANCHOR_RATE = 2, 1e-3
 
 @dataclass(frozen=True)
 class Setting:
-    """What all runs of a comparison share; the names are those of ``asm-gym train-safely``'s options."""
+    """What all runs of a comparison share; the names are those of ``asm-gym reproduce safe_training``'s options."""
 
     env_id: str
     steps: int

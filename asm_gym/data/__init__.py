@@ -1,0 +1,1 @@
+"""Readers and writers: streams from logs, data sets and sockets, as episodes, and back."""

@@ -1,0 +1,223 @@
+"""Tables as streams: the columns of a log, by name, become the channels of a stream.
+
+A column is a channel of its own. Columns that differ in a number only, ``joint[0], joint[1]`` or ``joint_0, joint_1``,
+are the elements of one channel, and so are the columns of a two-dimensional array. Each channel is a group: what it
+does is expected from what the others do. What is called ``action`` was commanded, whether somebody says so or not. A
+unit may stand behind a name, ``joint_0 [rad]``. Rows that are late or lost, by the column of time, are put right by
+``asm_gym.data.timing``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.tabular import as_array, read_table
+from asm_gym.data.timing import noise_of, period, regular
+from asm_gym.spec import MOTOR, Channel, StreamSpec
+from asm_gym.validation import check_number, shown
+
+__all__ = ["TIME", "bare_name", "label_of", "read_table", "stream_of"]
+
+Column = NDArray[Any]
+
+TIME = ("time", "timestamp", "time_s", "t")
+"""Columns that say when a row was sensed [s]: they are no channel, and tell the rate."""
+
+SLOWEST = 1e-6
+"""The least rate of a log [Hz]: a row in eleven days."""
+
+RATE_TOLERANCE = 0.01
+"""How far a log's rate may be off that of the memory which reads it, as a share."""
+
+_ELEMENT = re.compile(r"(?P<stem>.*[^\W\d_])(?:\[(?P<named>\w+)\]|[_.]?(?P<number>\d+))")
+
+
+_UNIT = re.compile(r"(?P<name>.*\S)\s+[\[(](?P<unit>[^\[\]()]+)[\])]")
+
+
+class Signal(NamedTuple):
+    """One number of every row.
+
+    Attributes:
+        column: what the table calls it.
+        channel: which channel it belongs to.
+        element: which element of that; empty where it is the only one.
+        values: (T,).
+        unit: as the table says; empty where it does not.
+    """
+
+    column: str
+    channel: str
+    element: str
+    values: Column
+    unit: str = ""
+
+    def goes_by(self, pattern: str) -> bool:
+        """Its column or its channel is called so."""
+        return any(name == pattern or fnmatchcase(name, pattern) for name in (self.column, self.channel))
+
+
+def stream_of(
+    frame: Any,
+    channels: StreamSpec | Mapping[str, str | Sequence[str]] | Sequence[str] | None = None,
+    rate: float | None = None,
+    action: Sequence[str] = (),
+) -> tuple[NDArray[np.float32], StreamSpec]:
+    """The rows (T, D) of a table, and what they are called.
+
+    Args:
+        frame: a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
+        channels: the columns to read, as patterns such as ``joint*``; or patterns by channel; or the spec of a memory
+            that is to read them. By default all columns of numbers.
+        rate: rows a second [Hz]; by default that of the column ``time``.
+        action: patterns of the columns that were commanded and not sensed.
+
+    Raises:
+        ValueError: columns are missing, doubled, of several lengths or no numbers; the rate is unknown, or another one
+            than the spec's; time runs backwards.
+    """
+    columns, units = _without_units(_columns(frame))
+    times = _times(columns)
+    dt = None if times is None else period(times)
+    dt = dt if rate is None else 1.0 / check_number("rate", rate, low=SLOWEST)
+    rows_of = {name: column for name, column in columns.items() if name not in TIME}
+    if times is not None and dt is not None and len(times) > 1:
+        theirs = channels.dt if isinstance(channels, StreamSpec) and _alike(channels.dt, dt) else dt
+        rows_of = regular(rows_of, times, theirs)
+    signals = [s._replace(unit=units.get(s.column, units.get(s.channel, ""))) for s in _signals(rows_of)]
+    if isinstance(channels, StreamSpec):
+        return _read_by(channels, signals, dt), channels
+    if dt is None:
+        raise ValueError("how many rows come a second? Say the rate [Hz] of this layout, or add a column time [s]")
+    if isinstance(channels, Mapping):
+        signals = [s for name, patterns in channels.items() for s in _renamed(name, _chosen(signals, patterns))]
+    elif channels is not None:
+        signals = _chosen(signals, channels)
+    commanded = {s.column for s in _chosen(signals, action)}
+    parts: dict[str, list[Signal]] = {}
+    for signal in sorted(signals, key=lambda s: s.column in commanded):  # the action stands last
+        parts.setdefault(signal.channel, []).append(signal)
+    for name, part in parts.items():
+        if 0 < len(commanded & {s.column for s in part}) < len(part):
+            raise ValueError(f"channel {name!r} is commanded in part: {', '.join(sorted(s.column for s in part))}")
+    made = tuple(_channel(name, part, commanded) for name, part in parts.items())
+    rows = np.column_stack([s.values for part in parts.values() for s in part])
+    return rows.astype(np.float32), StreamSpec(made, dt, "table")
+
+
+@cache
+def label_of(column: str) -> str:
+    """What a stream calls a number that a table calls so: ``joint[0]`` for ``joint_0``."""
+    found = _ELEMENT.fullmatch(column)
+    return f"{found['stem']}[{found['named'] or found['number']}]" if found else column
+
+
+def _columns(frame: Any) -> dict[str, Column]:
+    """The columns of numbers by name, (T,) or (T, k) each."""
+    # A dictionary has keys, an Arrow table column_names, pandas and Polars have columns.
+    names = frame if isinstance(frame, Mapping) else getattr(frame, "column_names", getattr(frame, "columns", None))
+    if names is None or callable(names):
+        raise TypeError(f"a table must be a dictionary of columns, or a frame of them, got {shown(frame)}")
+    columns = {str(name): as_array(frame[name]) for name in names}
+    if len(columns) < len(list(names)):
+        raise ValueError(f"columns must have different names, got {', '.join(map(str, names))}")
+    columns = {n: c for n, c in columns.items() if c.dtype.kind in "biuf" and c.ndim in (1, 2)}
+    lengths = {n: len(c) for n, c in columns.items()}
+    if not lengths or not max(lengths.values()):
+        raise ValueError(f"a frame must hold columns of numbers, got {shown(frame)}")
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"columns must have one length, got {', '.join(f'{n}: {k}' for n, k in lengths.items())}")
+    return columns
+
+
+def _alike(dt: float, other: float) -> bool:
+    return abs(dt / other - 1) <= RATE_TOLERANCE
+
+
+def bare_name(column: str) -> str:
+    """What a column is called without its unit."""
+    found = _UNIT.fullmatch(column)
+    return found["name"] if found else column
+
+
+def _without_units(columns: Mapping[str, Column]) -> tuple[dict[str, Column], dict[str, str]]:
+    """Columns by their bare names, and the unit of each that says one."""
+    bare, units = {}, {}
+    for name, column in columns.items():
+        found, short = _UNIT.fullmatch(name), bare_name(name)
+        if short in bare:
+            raise ValueError(f"columns must have different names, got {short!r} twice")
+        bare[short] = column
+        if found:
+            units[short] = found["unit"]
+    return bare, units
+
+
+def _times(columns: Mapping[str, Column]) -> Column | None:
+    return next((columns[name] for name in TIME if name in columns), None)
+
+
+def _signals(columns: Mapping[str, Column]) -> list[Signal]:
+    """Every number of a row; columns that differ in a number only are elements of one channel."""
+    split = {name: _ELEMENT.fullmatch(name) for name, column in columns.items() if column.ndim == 1}
+    stems = [found["stem"] for found in split.values() if found]
+    made = []
+    for name, column in columns.items():
+        found = split.get(name)
+        if column.ndim == 2:
+            made += [Signal(f"{name}[{k}]", name, str(k), column[:, k]) for k in range(column.shape[1])]
+        elif found and (found["named"] or stems.count(found["stem"]) > 1) and found["stem"] not in columns:
+            made.append(Signal(name, found["stem"], found["named"] or found["number"], column))
+        else:
+            made.append(Signal(name, name, "", column))
+    return made
+
+
+def _chosen(signals: Sequence[Signal], patterns: str | Sequence[str]) -> list[Signal]:
+    """Those that go by one of the patterns, in the order of the table. Raises ValueError where one finds nothing."""
+    asked = [patterns] if isinstance(patterns, str) else list(patterns)
+    for pattern in asked:
+        if not any(s.goes_by(pattern) for s in signals):
+            columns = ", ".join(s.column for s in signals) or "none"
+            raise ValueError(f"no column of these channels is called {pattern!r}; there are: {columns}")
+    return [s for s in signals if any(s.goes_by(pattern) for pattern in asked)]
+
+
+def _renamed(channel: str, signals: Sequence[Signal]) -> list[Signal]:
+    """As elements of this channel."""
+    return [s._replace(channel=channel, element=s.column if len(signals) > 1 else "") for s in signals]
+
+
+def _channel(name: str, signals: Sequence[Signal], commanded: set[str]) -> Channel:
+    elements = tuple(s.element for s in signals)
+    group = MOTOR if signals[0].column in commanded else name
+    units = {s.unit for s in signals if s.unit}
+    if len(units) > 1:
+        raise ValueError(f"channel {name!r} is of several units: {', '.join(sorted(units))}")
+    noise = 0.0 if group == MOTOR else float(np.median([noise_of(s.values) for s in signals]))
+    named = elements if any(elements) else ()
+    return Channel(name, len(signals), next(iter(units), "1"), noise, group, named)
+
+
+def _read_by(spec: StreamSpec, signals: Sequence[Signal], dt: float | None) -> NDArray[np.float32]:
+    """The rows (T, D) as a memory of this spec reads them; what else the table holds is left out."""
+    if dt is not None and not _alike(dt, spec.dt):
+        raise ValueError(f"the memory reads {1 / spec.dt:g} rows a second, these come at {1 / dt:g}")
+    # joint_0 is joint[0] too, though it may be the only one here.
+    known = {label_of(s.column): s.values for s in signals} | {s.column: s.values for s in signals}
+    units = {label: c.unit for c in spec.channels for label in c.labels}
+    for signal in signals:
+        mine = units.get(signal.column, units.get(label_of(signal.column), "1"))
+        if signal.unit and mine not in ("1", signal.unit):
+            raise ValueError(f"{signal.column} is in {signal.unit}, and the memory reads {mine}")
+    missing = [label for label in spec.labels if label not in known]
+    if missing:
+        raise ValueError(f"the memory reads channels that are not there: {', '.join(missing)}")
+    return np.column_stack([known[label] for label in spec.labels]).astype(np.float32)

@@ -1,0 +1,229 @@
+"""Rows as they come: from standard input, a file that grows, or UDP on this machine; as JSON lines or as CSV.
+
+A JSON line is a list of numbers, or an object by channel or by number. CSV begins with a header. Where there is a time,
+rows that are missing by it are said. A source that falls silent has died, which is for the reader to say.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import select
+import socket
+import time
+from collections.abc import Callable, Iterable, Iterator
+from io import UnsupportedOperation
+from pathlib import Path
+from typing import Any, NamedTuple, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.channels import TIME, bare_name, label_of
+from asm_gym.data.tabular import header_of
+from asm_gym.files import regular_file
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number
+
+POLL_S = 0.002
+"""How often a file is looked at for more [s]."""
+
+LARGEST = 65_535
+"""Bytes of a datagram, and more than a row of any robot."""
+
+SOURCES = ("-", "tail:FILE", "udp:PORT")
+
+
+class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
+    """Nothing came for longer than a source may be silent."""
+
+
+def is_live(source: str) -> bool:
+    """Whether it is followed, and no recording."""
+    return source == "-" or source.startswith(("tail:", "udp:"))
+
+
+def lines_from(source: str, stdin: TextIO, silence: float) -> Iterator[str]:
+    """The lines of a live source, as they come.
+
+    Args:
+        source: ``-`` for standard input, ``tail:FILE`` for a file that grows, ``udp:PORT`` for datagrams sent to this
+            machine from itself, of which an empty one is the end.
+        silence: seconds without a line, after the first one, from which on the source has died.
+
+    Raises:
+        SourceDied: it has.
+        ValueError: it is none of these, the port is no number, or the file became shorter.
+        OSError: there is no such file, or the port is taken.
+    """
+    if source == "-":
+        return _piped(stdin, silence)
+    kind, _, place = source.partition(":")
+    if kind == "tail":
+        return _growing(Path(place), silence)
+    if kind == "udp":
+        return _datagrams(place, silence)
+    raise ValueError(f"unknown source {source!r}; known: {', '.join(SOURCES)}")
+
+
+def _piped(stdin: TextIO, silence: float) -> Iterator[str]:
+    try:
+        number = stdin.fileno()
+    except (UnsupportedOperation, AttributeError):  # no pipe, but text in memory
+        yield from stdin
+        return
+
+    def more() -> bytes | None:
+        ready, _, _ = select.select([number], [], [], POLL_S)
+        return os.read(number, LARGEST) if ready else None
+
+    yield from _cut(more, silence)
+
+
+def _growing(path: Path, silence: float) -> Iterator[str]:
+    regular_file(path)
+    with path.open("rb") as file:
+
+        def more() -> bytes | None:
+            found = file.read(LARGEST)
+            if not found:
+                if path.stat().st_size < file.tell():
+                    raise ValueError(f"{path} became shorter while it was followed")
+                time.sleep(POLL_S)
+            return found or None
+
+        yield from _cut(more, silence)
+
+
+def _datagrams(place: str, silence: float) -> Iterator[str]:
+    if not place.isdigit():
+        raise ValueError(f"udp takes a port of this machine, as in udp:9870, got {place!r}")
+    port = int(check_number("port", int(place), low=1, high=65_535, whole=True))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there:
+        there.bind(("127.0.0.1", port))  # nobody else's rows are believed
+        there.settimeout(POLL_S)
+
+        def more() -> bytes | None:
+            try:
+                found = there.recv(LARGEST)
+            except TimeoutError:
+                return None
+            return found.rstrip(b"\n") + b"\n" if found else b""
+
+        yield from _cut(more, silence)
+
+
+def _cut(more: Callable[[], bytes | None], silence: float) -> Iterator[str]:
+    """Lines of what ``more`` hands out: bytes, none at the end, or None where there are none yet."""
+    rest, heard = b"", None
+    while True:
+        found = more()
+        if found == b"":
+            if rest.strip():
+                yield rest.decode()
+            return
+        if found is None:
+            if heard is not None and time.monotonic() - heard > silence:
+                raise SourceDied(f"nothing came for {silence:g} s")
+            continue
+        heard = time.monotonic()
+        *whole, rest = (rest + found).split(b"\n")
+        if len(rest) > 100 * LARGEST:
+            raise ValueError(f"a line of {len(rest)} bytes is no row")
+        yield from (line.decode() for line in whole)
+
+
+class Row(NamedTuple):
+    """A row, and how many were lost before it."""
+
+    numbers: NDArray[np.float64]  # (D,) NaN where one was lost
+    lost: int = 0
+
+
+class RowReader:
+    """Reads lines as rows of a spec.
+
+    Args:
+        spec: of the memory that is to read them.
+    """
+
+    def __init__(self, spec: StreamSpec) -> None:
+        self.spec, self.line = spec, 0
+        self._order: list[int] | None = None  # of CSV: where each number of a row stands
+        self._clock: int | None = None
+        self._width = 0
+        self._before: float | None = None
+
+    def rows(self, lines: Iterable[str]) -> Iterator[tuple[Row, float]]:
+        """Each row, and when its line had come, by ``time.perf_counter``.
+
+        Raises:
+            ValueError: a line is no row; the message says which.
+        """
+        for line in lines:
+            if not line.strip():
+                continue
+            came = time.perf_counter()
+            self.line += 1
+            if self.line == 1 and line.lstrip()[0] not in "[{":
+                self._begin(next(csv.reader([line])))
+                continue
+            try:
+                numbers, stamp = self._cells(line) if self._order is not None else self._json(line)
+                lost = self._lost(stamp)
+            except (ValueError, TypeError) as error:
+                raise ValueError(f"line {self.line} is no row of numbers: {error}") from error
+            if numbers.shape != (self.spec.size,):
+                raise ValueError(f"line {self.line} must hold {self.spec.size} numbers, got the shape {numbers.shape}")
+            yield Row(numbers, lost), came
+
+    def _begin(self, header: list[str]) -> None:
+        """Where the numbers stand that are read, by the header of CSV."""
+        try:
+            names = [bare_name(name) for name in header_of(header, "the header")]
+            places = {label_of(name): k for k, name in enumerate(names)} | {name: k for k, name in enumerate(names)}
+            missing = [label for label in self.spec.labels if label not in places]
+            if missing:
+                raise ValueError(f"it lacks {', '.join(missing)}")
+        except ValueError as error:
+            raise ValueError(f"line 1 is no row of numbers, and no header: {error}") from error
+        self._order, self._width = [places[label] for label in self.spec.labels], len(names)
+        self._clock = next((names.index(name) for name in TIME if name in names), None)
+
+    def _cells(self, line: str) -> tuple[NDArray[np.float64], float | None]:
+        cells = next(csv.reader([line]))
+        if len(cells) != self._width:
+            raise ValueError(f"it has {len(cells)} cells, the header {self._width}")
+        assert self._order is not None
+        numbers = np.array([float(cells[k] or "nan") for k in self._order])
+        return numbers, None if self._clock is None else float(cells[self._clock])
+
+    def _json(self, line: str) -> tuple[NDArray[np.float64], float | None]:
+        said: Any = json.loads(line)
+        if not isinstance(said, dict):
+            return np.asarray(said, np.float64), None
+        stamp = next((float(said[name]) for name in TIME if name in said), None)
+        return self._by_name(said), stamp
+
+    def _by_name(self, said: dict[str, Any]) -> NDArray[np.float64]:
+        """The numbers (D,) by the names of channels or of single numbers; the first row has to hold them all."""
+        parts, missing = [], []
+        said = {label_of(name): value for name, value in said.items()} | said
+        for channel in self.spec.channels:
+            values = said[channel.name] if channel.name in said else [said.get(label) for label in channel.labels]
+            if channel.name not in said and not set(channel.labels) <= set(said):
+                missing.append(channel.name)
+            parts.append(np.ravel(np.asarray(values, np.float64)))  # null is NaN
+        if missing and self.line == 1:
+            raise ValueError(f"it lacks {', '.join(missing)}")
+        return np.concatenate(parts)
+
+    def _lost(self, stamp: float | None) -> int:
+        """Rows that should have come before the one of this time."""
+        before, self._before = self._before, stamp if stamp is not None else self._before
+        if stamp is None or before is None:
+            return 0
+        if not stamp > before:
+            raise ValueError(f"time must increase, got {stamp:g} s after {before:g} s")
+        return max(0, round((stamp - before) / self.spec.dt) - 1)

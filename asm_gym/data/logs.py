@@ -1,0 +1,118 @@
+"""Recordings of any kind as episodes, one after another: run folders, datasets, and logs from elsewhere.
+
+A new kind of file is one row of ``READERS``.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from asm_gym.checkpoint import read_arrays
+from asm_gym.data.bags import read_bag
+from asm_gym.data.datasets import METADATA, read_dataset
+from asm_gym.data.lerobot import INFO, read_lerobot
+from asm_gym.data.tabular import read_array, read_parquet, read_table
+from asm_gym.episode import Episode, load_episode
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import typed
+
+
+class Log(NamedTuple):
+    """An episode, and where it was found."""
+
+    name: str
+    episode: Episode
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How to read logs that do not name their channels as this package does; arguments of ``stream_of``.
+
+    Args:
+        spec: of the memory that is to read them.
+        rate: rows a second [Hz].
+        action: patterns of the columns that were commanded.
+    """
+
+    spec: StreamSpec | None = None
+    rate: float | None = None
+    action: Sequence[str] = ()
+
+    def episode(self, columns: Any) -> Episode:
+        """A log is a success unless somebody says otherwise: it was handed over."""
+        return Episode.from_table(columns, self.spec, self.rate, () if self.spec else self.action, success=True)
+
+
+def _arrays(path: Path, layout: Layout) -> Episode:
+    """An episode that this package wrote, or arrays by name, (T,) or (T, k) each."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            ours = "header.json" in file.namelist()
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"it is damaged: {error}") from error
+    return load_episode(path) if ours else layout.episode(read_arrays(path))
+
+
+READERS: dict[str, Callable[[Path, Layout], Episode]] = {
+    ".npz": _arrays,
+    ".npy": lambda path, layout: layout.episode(read_array(path)),
+    ".csv": lambda path, layout: layout.episode(read_table(path)),
+    ".parquet": lambda path, layout: layout.episode(read_parquet(path)),
+    **dict.fromkeys((".mcap", ".db3", ".bag"), lambda path, layout: layout.episode(read_bag(path))),
+}
+"""By the suffix of a file."""
+
+
+@typed
+def read_logs(path: str | Path, layout: Layout | None = None) -> Iterator[Log]:
+    """The episodes at ``path``, in the order of their names, each read when it is asked for.
+
+    Args:
+        path: a file; the folder of a run, whose ``episodes`` are read; one of such files, at any depth; or one with a
+            LeRobot or a Minari dataset.
+        layout: how to read tables.
+
+    Raises:
+        FileNotFoundError: there is nothing of the kind.
+        ValueError: a file cannot be read; the message names it.
+    """
+    path, layout = Path(path), layout or Layout()
+    if not path.exists():
+        raise FileNotFoundError(f"there is no {path}")
+    if path.is_file() and path.suffix not in READERS:
+        raise ValueError(f"{path}: files that can be read end in {', '.join(READERS)}")
+    if (path / INFO).is_file():
+        yield from _lerobot(path, layout)
+        return
+    root = path / "episodes" if (path / "episodes").is_dir() else path
+    files = [path] if path.is_file() else sorted(f for f in root.rglob("*") if _readable(f.relative_to(root)))
+    for file in files:
+        try:
+            episode = READERS[file.suffix](file, layout)
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from error
+        layout = replace(layout, spec=layout.spec or episode.spec)  # the others are read as the first one was
+        yield Log(str(file.relative_to(root)) if file != path else file.name, episode)
+    if files:
+        return
+    if next(path.rglob(METADATA), None) is None:
+        raise FileNotFoundError(f"{path} holds no episodes: no {', '.join(READERS)}, no LeRobot or Minari dataset")
+    for n, episode in enumerate(read_dataset(path)):
+        yield Log(f"episode {n}", episode)
+
+
+def _lerobot(folder: Path, layout: Layout) -> Iterator[Log]:
+    for n, (columns, rate, success) in enumerate(read_lerobot(folder)):
+        known = replace(layout, rate=layout.rate or rate, action=layout.action or ("action*",))
+        episode = replace(known.episode(columns), success=success)
+        layout = replace(layout, spec=layout.spec or episode.spec)
+        yield Log(f"episode {n}", episode)
+
+
+def _readable(file: Path) -> bool:
+    """Of a kind that is read, and not half-written."""
+    return file.suffix in READERS and not any(part.startswith(".") for part in file.parts)

@@ -1,0 +1,94 @@
+"""What of recordings a memory of what is normal can be learned from, and which part of that sets its threshold."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from asm_gym.data.logs import Log
+from asm_gym.detection import conformal_episodes
+from asm_gym.episode import Episode
+from asm_gym.evaluation.scored import spans
+
+SHORTEST_S = 0.5
+"""Least length of a part between lost rows that is worth learning from [s]."""
+
+
+class Kept(NamedTuple):
+    """The episodes that are learned from, and how many others were left out, by why."""
+
+    episodes: list[Episode]
+    left_out: Counter[str]
+
+
+def normal_episodes(
+    logs: Iterable[Log], keep_failures: bool = False, progress: Callable[[int, int], object] | None = None
+) -> Kept:
+    """The normal episodes among ``logs``."""
+    kept = Kept([], Counter())
+    for n, (_, episode) in enumerate(logs, 1):
+        if progress is not None:
+            progress(n, n)  # how many there are is known at the end
+        why = _abnormal(episode)
+        if why == "failed" and keep_failures:
+            why = ""
+        if why:
+            kept.left_out[why] += 1
+        else:
+            kept.episodes.append(episode)
+    return kept
+
+
+def _abnormal(episode: Episode) -> str:
+    """What is not normal about an episode, in a word or two; empty where nothing is."""
+    if episode.faults.any() or (episode.label is not None and episode.label.role == "faulty"):
+        return "with a fault"
+    if episode.label is not None and episode.label.role == "harmless":
+        return "under a harmless variation"
+    return "" if episode.success else "failed"
+
+
+def pieces(episode: Episode, seconds: float) -> list[Episode]:
+    """An episode cut into pieces of one length; a rest that is shorter is left out."""
+    rows = max(1, round(seconds / episode.spec.dt))
+    ends = range(rows, len(episode) + 1, rows)
+    return [Episode.from_stream(episode.stream[n - rows : n], episode.spec, success=True) for n in ends]
+
+
+def unbroken(episode: Episode) -> list[Episode]:
+    """The parts of an episode between rows that were lost, in whole or in part; those under half a second left out."""
+    known = np.isfinite(episode.stream).all(axis=1)
+    if known.all():
+        return [episode]
+    least = max(2, round(SHORTEST_S / episode.spec.dt))
+    parts = [slice(start, stop) for start, stop in spans(known) if stop - start >= least]
+    return [Episode.from_stream(episode.stream[part], episode.spec, success=True) for part in parts]
+
+
+def divided(
+    episodes: list[Episode], false_alarm_rate: float, calibration_share: float, seed: int
+) -> tuple[list[Episode], list[Episode]]:
+    """Those to learn from, and those to calibrate on.
+
+    Args:
+        false_alarm_rate: that the threshold is to promise.
+        calibration_share: of the episodes, in (0, 1), that are not learned from.
+        seed: of which are which.
+
+    Raises:
+        ValueError: too few of them; the message says how many are needed.
+    """
+    n, needed = len(episodes), conformal_episodes(false_alarm_rate)
+    order = np.random.default_rng(seed).permutation(n)
+    calibration = math.floor(n * calibration_share + 1e-9)
+    if calibration < needed or calibration == n:
+        least = max(2, math.ceil(needed / calibration_share - 1e-9))
+        raise ValueError(
+            f"a false-alarm rate of {false_alarm_rate:g} needs {least} normal episodes, {needed} of them to "
+            f"calibrate on, got {n}: record more, take a higher --false-alarm-rate, or --split long logs"
+        )
+    return [episodes[i] for i in order[calibration:]], [episodes[i] for i in order[:calibration]]

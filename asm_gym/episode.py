@@ -1,0 +1,199 @@
+"""Episodes: what happened between a reset and its end, in arrays; and the one file format of a single one.
+
+A file is a checkpoint: arrays and JSON, never pickle, written whole or not at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.checkpoint import DAMAGE, read_checkpoint, write_checkpoint
+from asm_gym.data.channels import stream_of
+from asm_gym.files import regular_file
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import as_float32, typed
+
+KIND = "episode"
+
+ARRAYS = {"stream": "f", "actions": "f", "observations": "fiub", "rewards": "f", "faults": "b", "contact_force": "f"}
+"""What a file holds, and the kinds of numbers that each may have."""
+
+
+def _empty() -> NDArray[np.float32]:
+    return np.zeros((0, 0), np.float32)
+
+
+@dataclass(frozen=True)
+class EpisodeLabel:
+    """What an episode was recorded as.
+
+    Args:
+        task: a task's name.
+        role: ``"fit"``, ``"calibration"``, ``"nominal"``, ``"faulty"`` or ``"harmless"``.
+        kind: of the fault or the harmless variation; empty for the others.
+        severity: of the fault; empty for the others.
+        seed: of the environment and of the policy. Episodes that share it are twins.
+        onset: the first step with the fault or variation; None without one.
+        affected_channels: in which an attentive observer would see the fault first. Found out while recording, so two
+            labels that differ in nothing else are equal.
+    """
+
+    task: str
+    role: str
+    kind: str = ""
+    severity: str = ""
+    seed: int = 0
+    onset: int | None = None
+    affected_channels: frozenset[str] = field(default=frozenset(), compare=False)
+
+    @property
+    def path(self) -> Path:
+        """Where in a run's folder the episode lies."""
+        parts = [part for part in (self.kind, self.severity) if part]
+        return Path("episodes") / self.task / self.role / "-".join([*parts, f"{self.seed}.npz"])
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One episode of T control steps.
+
+    Args:
+        stream: (T, D) float32, the sensorimotor stream; row t was sensed after action t. (k T, D) where the stream runs
+            k times faster than control.
+        spec: names the D numbers.
+        success: the task was solved at some step.
+        seed: what ``reset`` was given.
+        actions: (T, A) float32, as the policy commanded them.
+        observations: (T + 1, O) float32, the first one from ``reset``.
+        rewards: (T,) float32.
+        faults: (T,) bool, a fault was active in that row of the stream (the ground truth).
+        contact_force: (T,) float32, between the robot and everything else [N].
+        label: what it was recorded as; None where nobody said.
+        info: whatever else is worth keeping; JSON-serialisable.
+    """
+
+    stream: NDArray[np.float32]
+    spec: StreamSpec
+    success: bool = False
+    seed: int | None = None
+    actions: NDArray[np.float32] = field(default_factory=_empty)
+    observations: NDArray[np.float32] = field(default_factory=_empty)
+    rewards: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    faults: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    contact_force: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    label: EpisodeLabel | None = None
+    info: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.stream.ndim != 2:
+            raise ValueError(f"an episode's stream must have the shape (T, D), got {self.stream.shape}")
+        self.spec.check_row(self.stream)
+
+    def __len__(self) -> int:
+        return len(self.stream)
+
+    @property
+    def labelled(self) -> EpisodeLabel:
+        """The label. Raises ValueError where there is none."""
+        if self.label is None:
+            raise ValueError("this episode has no label: nobody said which task and role it was recorded for")
+        return self.label
+
+    @classmethod
+    @typed
+    def from_stream(cls, x: NDArray[np.floating[Any]], spec: StreamSpec, **fields: Any) -> Episode:
+        """An episode from a stream recorded elsewhere, a real robot's included: ``x`` has the shape (T, D)."""
+        return cls(np.ascontiguousarray(as_float32(x, "a stream")), spec, **fields)
+
+    @classmethod
+    @typed
+    def from_table(
+        cls,
+        frame: Any,
+        channels: StreamSpec | Mapping[str, str | Sequence[str]] | Sequence[str] | None = None,
+        rate: float | None = None,
+        action: Sequence[str] = (),
+        **fields: Any,
+    ) -> Episode:
+        """An episode from a log: a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
+
+        The arguments are those of ``asm_gym.data.channels.stream_of``, and whatever else an episode has.
+        """
+        return cls(*stream_of(frame, channels, rate, action), **fields)
+
+
+def check_recorded(episode: Episode) -> None:
+    """Raises ValueError unless the arrays of an episode are of one length, and its rewards are numbers."""
+    rows, steps = len(episode), len(episode.actions)
+    for name, length in (("observations", steps + 1), ("rewards", steps), ("contact_force", steps)):
+        found = len(getattr(episode, name))
+        if steps and found not in (0, length):
+            raise ValueError(f"{steps} actions need {length} {name}, got {found}")
+    for name in ("rewards", "faults", "contact_force"):
+        if getattr(episode, name).ndim != 1:
+            raise ValueError(f"{name} must have one dimension, got the shape {getattr(episode, name).shape}")
+    if len(episode.faults) not in (0, rows):
+        raise ValueError(f"{rows} rows of a stream need {rows} faults, got {len(episode.faults)}")
+    if steps and rows % steps:
+        raise ValueError(f"{steps} actions cannot have {rows} rows of a stream")
+    bad = np.flatnonzero(~np.isfinite(episode.rewards))
+    if len(bad):
+        raise ValueError(f"the reward of step {bad[0]} must be finite, got {episode.rewards[bad[0]]}")
+
+
+@typed
+def save_episode(path: str | Path, episode: Episode) -> Path:
+    """Writes one episode to a file of its own, which appears only when it is complete; returns where it is."""
+    check_recorded(episode)
+    label = None if episode.label is None else asdict(episode.label)
+    if label is not None:
+        label["affected_channels"] = sorted(label["affected_channels"])
+    header = {
+        "spec": episode.spec.to_json(),
+        "success": bool(episode.success),
+        "seed": episode.seed,
+        "label": label,
+        "info": episode.info,
+    }
+    write_checkpoint(path, KIND, header, {name: getattr(episode, name) for name in ARRAYS})
+    return Path(path)
+
+
+@typed
+def load_episode(path: str | Path) -> Episode:
+    """What ``save_episode`` wrote.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged or something else.
+    """
+    regular_file(path)
+    try:
+        kept = _fields(Path(path))
+        for name, kinds in ARRAYS.items():
+            if name in kept and kept[name].dtype.kind not in kinds:
+                raise ValueError(f"{name} cannot be of {kept[name].dtype}")
+        episode = Episode(**kept)
+        check_recorded(episode)
+        return episode
+    except FileNotFoundError:
+        raise
+    except (*DAMAGE, TypeError) as error:
+        raise ValueError(f"{path} is damaged or no episode that can be read: {error}") from error
+
+
+def _fields(path: Path) -> dict[str, Any]:
+    """The arguments of ``Episode`` in a file."""
+    saved = read_checkpoint(path, KIND)
+    header = saved.header
+    label = header["label"]
+    if label is not None:
+        label = EpisodeLabel(**{**label, "affected_channels": frozenset(label["affected_channels"])})
+    about = {name: header[name] for name in ("success", "seed", "info")}
+    return {**saved.arrays, **about, "label": label, "spec": StreamSpec.from_json(header["spec"])}

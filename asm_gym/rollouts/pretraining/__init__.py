@@ -1,0 +1,1 @@
+"""Motor babbling (random exploration), learning from its healthy episodes, and the card of the memory it gives."""

@@ -1,0 +1,240 @@
+"""Motor babbling: a curriculum that teaches what a body does, not how one policy does a task.
+
+    a_t = clip(e_t + s x_t),   x_t = ρ x_{t-1} + √(1 - ρ²) ξ_t      e the guide's action, 0 without one; ξ white
+
+Each lesson is one episode. One in three is the expert's own and not learned from: the threshold is set on those. Of the
+others two in five are the expert's own too, at many speeds; in two of five noise drives the expert off its course, in
+jerks or slowly; in one noise alone moves the arm, or the hand reaches for one place after another, for nothing there.
+Where there is noise, the arm also drifts now and then, turning and with what it holds, as agents do once they have done
+their task. In half of all lessons the arm stops now and then, whatever it holds or leans on, and in half a thing weighs
+more or less. No noise is so strong that most of a lesson would be hits: those taught the memory to expect them, and
+cost more faults than they spared alarms.
+
+Sources: Laskey et al. 2017 (CoRL, DART) for noise on an expert's commands; Saegusa et al. 2009 (ROBIO) for babbling.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.episode import Episode, EpisodeLabel, save_episode
+from asm_gym.faults.harmless import ObjectMass
+from asm_gym.faults.object import movable
+from asm_gym.policies import Policy, make_policy
+from asm_gym.policies.registry import trained_in
+from asm_gym.policies.scripted.base import Style
+from asm_gym.rollouts.pretraining.healthy import held_out
+from asm_gym.rollouts.pretraining.reaching import Reaching
+from asm_gym.rollouts.seeds import role_seeds
+from asm_gym.rollouts.trial import RolloutConfig, Trial, environment, play, staged
+from asm_gym.tasks import task as task_spec
+from asm_gym.wrappers import StreamRecorder
+
+ALONE, LED, DRIVEN, REACHING = "noise", "expert", "disturbed", "reaching"
+LEADING = (LED, DRIVEN, ALONE, LED, DRIVEN)
+"""What leads, lesson by lesson of a task."""
+SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
+"""ρ: from the noise by which agents explore to pushing on in one direction, as half-trained ones do."""
+NOISE = 0.02, 0.2
+"""s, from hardly to about what a half-trained agent explores by [action units]."""
+SPEED = 0.5, 1.5
+"""Of the expert, relative to its usual one."""
+WEIGHT = 0.7, 1.4
+"""What the mass of a thing is multiplied by."""
+PAUSE, PAUSED = 0.01, (5, 60)
+"""Probability in a step that the arm stops, and for how many steps."""
+DRIFT, DRIFTED, DRIFTING = 0.01, (5, 60), (0.05, 0.5)
+"""Probability in a step of a disturbed lesson that the arm drifts, for how many steps, and by which commands [action
+units]."""
+
+LOOSENED, LOOSE = 0.05, 0.05
+"""Probability in a step of a disturbed lesson that the grip is commanded more or less firmly from then on, and the
+least share of what the guide would: agents seldom command it all, and a gripper may go by the sign alone."""
+
+
+class Lesson(NamedTuple):
+    """One episode of babbling.
+
+    Attributes:
+        task: its name.
+        number: among the lessons of its task.
+        seed: of the environment, of the guide and of the noise.
+        guide: what leads, ``"reaching"``, a policy's name or its file; noise alone where empty.
+        noise: s, standard deviation of the noise [action units].
+        smoothness: ρ.
+        speed: of a scripted guide, relative to its usual one.
+        pause: probability in a step that the arm stops for a while.
+        weight: what the mass of the task's thing is multiplied by.
+        drift: probability in a step that the arm drifts for a while, in one direction that is drawn.
+    """
+
+    task: str
+    number: int
+    seed: int
+    guide: str = "scripted"
+    noise: float = 0.0
+    smoothness: float = 0.0
+    speed: float = 1.0
+    pause: float = 0.0
+    weight: float = 1.0
+    drift: float = 0.0
+
+    @property
+    def path(self) -> Path:
+        """Where in a run's folder its recording lies."""
+        return self.label.path
+
+    @property
+    def label(self) -> EpisodeLabel:
+        """What it is recorded as."""
+        return EpisodeLabel(self.task, "babble", seed=self.seed)
+
+
+def curriculum(
+    tasks: Sequence[str], episodes: int, seed: int, guides: Sequence[str] = (), reaching: bool = False
+) -> list[Lesson]:
+    """Lessons, task by task; all of them follow from ``seed``, and fewer ``episodes`` are the first of more.
+
+    Args:
+        tasks: their names.
+        episodes: of each task.
+        guides: agents that take turns with the experts, in the tasks that each was trained in; by name, or the files
+            of ``asm-gym train``.
+        reaching: the hand reaches for places where noise alone would lead, as ``leads`` says.
+
+    Raises:
+        ValueError: fewer than one episode.
+        FileNotFoundError: there is no such agent.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    homes = {guide: trained_in(guide) for guide in guides}
+    return [
+        _lesson(
+            task,
+            number,
+            drawn,
+            leads(number, reaching),
+            ["scripted", *(guide for guide, home in homes.items() if home == task_spec(task).id)],
+        )
+        for task in tasks
+        for number, drawn in enumerate(role_seeds(seed, task, "babble", episodes))
+    ]
+
+
+def leads(number: int, reaching: bool = False) -> str:
+    """What leads the lesson of this number: the expert alone, where the threshold is set on it."""
+    usual = LEADING[number % len(LEADING)]
+    return LED if held_out(number) else REACHING if reaching and usual == ALONE else usual
+
+
+def _lesson(task: str, number: int, seed: int, lead: str, guides: Sequence[str]) -> Lesson:
+    rng, guide = np.random.default_rng([seed, 3]), guides[number // len(LEADING) % len(guides)]
+    return Lesson(
+        task,
+        number,
+        seed,
+        guide={ALONE: "", REACHING: REACHING}.get(lead, guide),
+        noise=0.0 if lead == LED else float(np.exp(rng.uniform(*np.log(NOISE)))),
+        smoothness=float(rng.choice(SMOOTHNESS)),
+        speed=float(rng.uniform(*SPEED)),
+        pause=PAUSE * float(rng.random() < 0.5),
+        weight=float(np.exp(rng.uniform(*np.log(WEIGHT)))) if rng.random() < 0.5 else 1.0,
+        drift=DRIFT * (lead != LED),
+    )
+
+
+class Babbler:
+    """Acts as a lesson says.
+
+    Args:
+        env: one of the lesson's task.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], lesson: Lesson) -> None:
+        self._guide = _guide(lesson, env)
+        self._lesson, self._rng = lesson, np.random.default_rng([lesson.seed, 1])
+        self._noise = self._rng.standard_normal(env.action_space.shape or ())
+        self._grip = np.isin(np.arange(len(self._noise)), list(getattr(env.unwrapped, "gripper_actions", ())))
+        self._fumbles = bool(self._rng.random() < 0.5)
+        self._left, self._course, self._grasp = 0, np.zeros_like(self._noise), 1.0
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], Any]:
+        """The next action (A,)."""
+        lesson, rng = self._lesson, self._rng
+        fresh = rng.standard_normal(self._noise.shape)
+        self._noise = lesson.smoothness * self._noise + np.sqrt(1.0 - lesson.smoothness**2) * fresh
+        action = lesson.noise * self._noise  # (A,)
+        if self._guide is not None:
+            meant, state = self._guide.predict(observation, state, episode_start)
+            # A hand that never keeps hold would never learn what holding feels like.
+            if lesson.noise and rng.random() < LOOSENED:
+                self._grasp = rng.uniform(LOOSE, 1.0)
+            meant = np.where(self._grip, self._grasp, 1.0) * meant
+            action = np.where(self._grip & (not self._fumbles), 0.0, action) + meant
+        self._left = self._left - 1 if self._left else self._leaves()
+        if self._left:  # it keeps its grip
+            action = np.where(self._grip, action, self._course)
+        return np.clip(action, -1.0, 1.0).astype(np.float32), state
+
+    def _leaves(self) -> int:
+        """For how many steps nothing leads from now on: 0, or as long as the arm stops or drifts."""
+        rng, lesson = self._rng, self._lesson
+        if rng.random() < lesson.pause:
+            self._course = np.zeros_like(self._noise)
+            return int(rng.integers(*PAUSED))
+        if rng.random() < lesson.drift:
+            strength = np.exp(rng.uniform(*np.log(DRIFTING)))
+            self._course = strength * rng.standard_normal(self._noise.shape)
+            return int(rng.integers(*DRIFTED))
+        return 0
+
+
+def _guide(lesson: Lesson, env: gym.Env[Any, Any]) -> Policy | None:
+    if lesson.guide == REACHING:
+        return Reaching(env, lesson.seed, lesson.speed)
+    style = {"style": Style(speed=lesson.speed)} if lesson.guide == "scripted" else {}
+    return make_policy(lesson.guide, env, seed=lesson.seed, **style) if lesson.guide else None
+
+
+def record_lesson(lesson: Lesson, config: RolloutConfig, folder: Path) -> Path:
+    """Records the episode of a lesson, and writes it to its place under ``folder``.
+
+    Args:
+        config: how; what acts is the lesson's to say.
+    """
+    forces: list[float] = []
+    config = replace(config, policy=partial(Babbler, lesson=lesson))
+    env_id = task_spec(lesson.task).id
+    base: Any = environment(env_id, config.settings).unwrapped
+    heavy = lesson.weight != 1.0 and bool(movable(base))
+    faults = (ObjectMass(factor=lesson.weight, onset=0, seed=lesson.seed),) if heavy else ()
+    trial = Trial(env_id, lesson.seed, "babble", faults=faults)
+    with staged(trial, config) as env:
+        recorder = StreamRecorder(env)
+        play(trial, config, recorder, lambda info: forces.append(info["contact_force"]))
+    recorded = recorder.finish()
+    kept = Episode(
+        stream=recorded.stream,
+        spec=recorded.spec,
+        success=recorded.success,
+        seed=lesson.seed,
+        contact_force=np.asarray(forces, np.float32),
+        label=lesson.label,
+        info={"skill": lesson.task, "lesson": lesson._asdict()},
+    )
+    return save_episode(folder / lesson.path, kept)

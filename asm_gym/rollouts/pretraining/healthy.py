@@ -1,0 +1,131 @@
+"""A memory of a body, learned from what is healthy of babbling."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from asm_gym.episode import Episode
+from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.base import Progress
+from asm_gym.rollouts.training.exploration import SHORTEST, Gentle, peak_torques
+
+EXPERT = "scripted"
+"""The guide that says what is usual."""
+HELD_OUT = 3
+"""One in so many lessons of a task is not learned from: the threshold is set on those."""
+LEARNED_UP_TO, DISTURBED_UP_TO = 2.0, 1.0
+"""How many times what an undisturbed expert usually feels at most may be felt in what is learned from, of a guide's own
+course and of a disturbed one. In the latter contact is an accident: a memory that knows it feels no push."""
+AROUND_S = 0.2
+"""What is left out before and after a hit [s]."""
+PASSES = 4
+"""Of the temporal network over the lessons."""
+
+
+def held_out(number: int) -> bool:
+    """Whether the lesson of this number is for the threshold."""
+    return number % HELD_OUT == HELD_OUT - 1
+
+
+class Lessons(NamedTuple):
+    """Recordings of babbling, as far as they are healthy.
+
+    Attributes:
+        fit: to learn from.
+        calibration: of lessons that are not learned from, those that are as healthy as a policy that does its task: the
+            guide's own course, and solved.
+    """
+
+    fit: list[Episode]
+    calibration: list[Episode]
+
+
+def healthy(recordings: Sequence[Episode]) -> Lessons:
+    """What of each recording presses no harder than is usual, as told by the expert where nothing disturbs it.
+
+    Noise drives arms into tables and joints into their stops, and so do agents that are half trained. That is no fault
+    of the body, but a memory that takes it for usual would be blind to every collision. So learning goes up to twice
+    what the expert usually feels at most in that task, and up to once that where a guide was disturbed. The threshold
+    is set on what stays below twice that: beyond is a crash.
+
+    Raises:
+        ValueError: a task has no undisturbed lesson that was solved, to measure by, or too little is left.
+    """
+    felt: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
+    for episode in recordings:
+        if _undisturbed(episode) and _lesson(episode)["guide"] == EXPERT:
+            most = float(np.nanmax(episode.contact_force)), float(peak_torques(episode).max())
+            felt[episode.labelled.task].append(most)
+    missing = {e.labelled.task for e in recordings} - set(felt)
+    if missing:
+        raise ValueError(
+            f"no undisturbed lesson of {', '.join(sorted(missing))} was solved by the expert, to say what is usual"
+        )
+    found = Lessons([], [])
+    for episode in recordings:
+        usual = np.median(felt[episode.labelled.task], axis=0)
+        if not held_out(_lesson(episode)["number"]):
+            share = DISTURBED_UP_TO if _lesson(episode)["noise"] else LEARNED_UP_TO
+            found.fit.extend(gentle_pieces(episode, Gentle(*(share * usual))))
+        elif _undisturbed(episode):
+            found.calibration.extend(gentle_pieces(episode, Gentle(*(LEARNED_UP_TO * usual))))
+    if not all(found):
+        raise ValueError(f"{len(recordings)} lessons leave too little that is healthy: record more")
+    return found
+
+
+def harmless(episodes: Sequence[Episode]) -> list[Episode]:
+    """The stretches of a policy's own episodes in which nothing presses twice as hard as it usually does at most.
+
+    Agents crash now and then in episodes that they solve. A memory that is specialised on those would take a crash for
+    usual, and a threshold that is set on them would be a crash's. What it promises then holds for harmless episodes.
+
+    Args:
+        episodes: of one task, at least half of them harmless; where no contact force is known, joints alone tell.
+    """
+    torque = float(np.median([peak_torques(episode).max() for episode in episodes]))
+    known = [float(np.nanmax(e.contact_force)) for e in episodes if len(e.contact_force)]
+    force = float(np.median(known)) if known else np.inf
+    limit = Gentle(LEARNED_UP_TO * force, LEARNED_UP_TO * torque)
+    return [piece for episode in episodes for piece in gentle_pieces(episode, limit)]
+
+
+def gentle_pieces(episode: Episode, limit: Gentle) -> list[Episode]:
+    """The stretches of a stream in which nothing presses harder, those that are long enough to learn from."""
+    forces = episode.contact_force if len(episode.contact_force) else np.zeros(len(episode), np.float32)
+    rows = len(episode) // len(forces)  # of the stream, in a step
+    torques = peak_torques(episode).reshape(-1, rows).max(axis=1)
+    hit = ~((forces <= limit.force) & (torques <= limit.torque))
+    around = round(AROUND_S / (rows * episode.spec.dt))
+    near = np.convolve(hit, np.ones(2 * around + 1), "same") > 0.5
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], near, [True]]).astype(int)))
+    about = {name: getattr(episode, name) for name in ("spec", "success", "seed", "label", "info")}
+    return [
+        Episode(episode.stream[rows * a : rows * b], contact_force=forces[a:b], **about)
+        for a, b in zip(edges[::2], edges[1::2], strict=True)
+        if b - a >= SHORTEST
+    ]
+
+
+def _undisturbed(episode: Episode) -> bool:
+    """Whether a guide did its task in its own way."""
+    return episode.success and _lesson(episode)["noise"] == 0.0
+
+
+def _lesson(episode: Episode) -> dict[str, Any]:
+    lesson: dict[str, Any] = episode.info["lesson"]
+    return lesson
+
+
+def learn_body(lessons: Lessons, rate: float, seed: int, progress: Progress) -> NeuralASM:
+    """The memory, calibrated so that a share ``rate`` of healthy lessons that it has not learned from alarms.
+
+    Nothing is measured against a context, which a policy that was never met would lead astray; so the temporal network,
+    which makes it, is learned for a few passes alone.
+    """
+    memory = NeuralASM(lessons.fit[0].spec, epochs=PASSES, habituates=False, seed=seed)
+    return memory.fit(lessons.fit, progress).calibrate(lessons.calibration, rate)

@@ -1,0 +1,199 @@
+"""The folder of a run: whose it is, who works in it, and what is there already.
+
+A second call with the same settings goes on in a folder, one with others is refused, and so is one at the same time.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple, TextIO, TypeVar
+
+import numpy as np
+
+import asm_gym
+from asm_gym.episode import Episode, EpisodeLabel, load_episode
+from asm_gym.evaluation.comparison import LeftOut
+from asm_gym.files import named, written_whole
+from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
+
+Item = TypeVar("Item")
+
+LOCK = ".lock"
+NOMINAL_ROLES = ("fit", "calibration", "nominal")
+"""Roles of the episodes that nothing is done to."""
+CRASH = 2.0
+"""How many times what the robot usually presses at most in nominal episodes of a task is a crash."""
+
+
+def versions() -> dict[str, str]:
+    """Of what decides over an episode."""
+    others = {}
+    for package in ("robosuite", "mujoco", "gymnasium", "numpy"):
+        with suppress(metadata.PackageNotFoundError):  # a light install may be without robosuite
+            others[package] = metadata.version(package)
+    return {"asm_gym": asm_gym.__version__, **others}
+
+
+@contextmanager
+def claimed(folder: Path, name: str, settings: dict[str, Any]) -> Iterator[None]:
+    """Makes ``folder`` a run's own, or goes on with it, and keeps others out while the block runs.
+
+    Args:
+        name: of the file in it that says whose it is.
+        settings: what all that is kept there depends on; versions are added.
+
+    Raises:
+        ValueError: it holds a run of other settings; the message names them.
+        BlockingIOError: another command works in it; the message names it.
+    """
+    ours = json.loads(json.dumps(settings, default=str)) | versions()
+    with locked(folder):
+        path = folder / name
+        if path.is_file():
+            theirs = json.loads(path.read_text(encoding="utf-8"))
+            other = [f"{n}: {theirs.get(n)!r} there, {ours[n]!r} here" for n in ours if theirs.get(n) != ours[n]]
+            if other:
+                raise ValueError(
+                    f"{folder} holds recordings of other settings ({'; '.join(other)}): name another --out"
+                )
+        with written_whole(path) as file:
+            file.write((json.dumps(ours, indent=2) + "\n").encode())
+        yield
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keeps other commands out of ``folder``, which is made, while the block runs.
+
+    The system lets go of the lock of a process that has died, however it died.
+
+    Raises:
+        BlockingIOError: another command works in it; the message says which process, where and since when.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / LOCK
+    file = _lock(path)
+    try:
+        since = time.strftime("%Y-%m-%d %H:%M:%S %Z")
+        with named(folder):
+            file.write(f"process {os.getpid()} on {platform.node()}, since {since}")
+            file.flush()
+            yield
+    finally:
+        path.unlink(missing_ok=True)
+        file.close()
+
+
+def _lock(path: Path) -> TextIO:
+    while True:
+        file = path.open("a+", encoding="utf-8")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            holder = file.read() or "another process"
+            file.close()
+            raise BlockingIOError(f"{path.parent} is in use by {holder}: wait for it, or name another --out") from None
+        # Whoever held it may have removed the file between the two lines above: then the lock is of no file.
+        if path.is_file() and path.stat().st_ino == os.fstat(file.fileno()).st_ino:
+            file.truncate(0)
+            return file
+        file.close()
+
+
+def make_missing(
+    make: Callable[[Item], Path],
+    items: Sequence[Item],
+    place: Callable[[Item], Path],
+    parallel: ParallelConfig | int = 2,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Makes the files that are not there yet; where all of them are, in the order of ``items``.
+
+    Args:
+        make: writes the file of an item, complete or not at all.
+        place: where it lies.
+        parallel, progress: as ``parallel_map`` takes them; what is there already counts as done.
+    """
+    places = [place(item) for item in items]
+    missing = [item for item, path in zip(items, places, strict=True) if not path.is_file()]
+    done, tell = len(items) - len(missing), progress or (lambda done, total: None)
+    tell(done, len(items))
+    parallel_map(make, missing, parallel, lambda k, _: tell(done + k, len(items)))
+    return places
+
+
+def tasks_in(run: Path) -> list[str]:
+    """Names of the tasks that a run has recorded."""
+    return sorted(p.name for p in (run / "episodes").glob("*") if p.is_dir())
+
+
+def files_in(run: Path, tasks: Sequence[str], *roles: str) -> list[Path]:
+    """The recordings of a run, by task, then by role, then by name."""
+    return [p for t in tasks for role in roles for p in sorted((run / "episodes" / t / role).glob("*.npz"))]
+
+
+class Recordings(NamedTuple):
+    """What a run has recorded.
+
+    Attributes:
+        roles: recordings by role; nominal ones that are no example of what is normal not among them, nor what was done
+            to scenes in which the robot crashes by itself.
+        left_out: how many nominal ones that are.
+        twins: every episode of the role nominal: a faulty one goes as its twin does until the onset.
+    """
+
+    roles: dict[str, list[Episode]]
+    left_out: LeftOut
+    twins: list[Episode]
+
+    @classmethod
+    def of(cls, recordings: Sequence[Episode]) -> Recordings:
+        """By role. Raises ValueError where there is nothing normal to learn or to test on."""
+        roles: dict[str, list[Episode]] = {}
+        hit, failed = crashes(recordings), 0
+        for recording in recordings:
+            label = recording.labelled
+            # A nominal episode that fails is no example of what should feel normal, nor an alarm in it a false one.
+            if label.role in NOMINAL_ROLES and not recording.success:
+                failed += 1
+            elif (label.task, label.seed) not in hit:
+                roles.setdefault(label.role, []).append(recording)
+        for role in NOMINAL_ROLES:
+            if not roles.get(role):
+                raise ValueError(
+                    f"none of the {role} episodes succeeded without a crash: "
+                    "there is nothing normal to learn or to test on"
+                )
+        return cls(roles, LeftOut(failed, len(hit)), [r for r in recordings if r.labelled.role == "nominal"])
+
+
+def crashes(recordings: Sequence[Episode]) -> set[tuple[str, int]]:
+    """Tasks and seeds of nominal episodes that succeed, and press ``CRASH`` times as hard as others of their task."""
+    hardest: dict[str, dict[int, float]] = {}
+    for recording in recordings:
+        label, force = recording.labelled, recording.contact_force
+        if label.role in NOMINAL_ROLES and recording.success and np.isfinite(force).any():
+            hardest.setdefault(label.task, {})[label.seed] = float(np.nanmax(force))
+    usual = {task: float(np.median(list(forces.values()))) for task, forces in hardest.items()}
+    return {(task, seed) for task, forces in hardest.items() for seed, f in forces.items() if f > CRASH * usual[task]}
+
+
+def labelled(run: Path, labels: Sequence[EpisodeLabel]) -> list[Episode]:
+    """The recordings of these labels."""
+    return [load_episode(run / label.path) for label in labels]
+
+
+@lru_cache(maxsize=1)
+def recorded(run: Path, tasks: tuple[str, ...]) -> Recordings:
+    """Every recording of these tasks but the harmless variations; kept for the next call."""
+    return Recordings.of([load_episode(p) for p in files_in(run, tasks, *NOMINAL_ROLES, "faulty")])

@@ -1,0 +1,258 @@
+"""The sensorimotor stream: what the robot senses, and what it was told to do, one row per control step.
+
+A row is ``x_t = [sensed_t, commanded_t]``: the sensors as read after the control step, and the action that was
+commanded during it (the efference copy). A :class:`StreamSpec` names every number in the row.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from asm_gym.validation import check_number, shown, typed
+
+MOTOR = "action"
+"""The group that holds the commanded action."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One named signal of one or more numbers.
+
+    Args:
+        name: for example ``joint_position``.
+        size: how many numbers it has.
+        unit: SI unit, ``"1"`` where there is none.
+        noise: standard deviation of the sensor noise [unit].
+        group: what the channel can be selected by, for example ``joint`` or ``wrench``. The group ``action`` is the
+            efference copy: it is given to the memory, not predicted from the senses.
+        elements: a name for each number; ``0, 1, …`` where empty.
+        resolution: the step between two readings that the sensor tells apart [unit]; 0 where it is not known, or where
+            the numbers are computed from several sensors.
+    """
+
+    name: str
+    size: int
+    unit: str = "1"
+    noise: float = 0.0
+    group: str = "sense"
+    elements: tuple[str, ...] = ()
+    resolution: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_number(f"channel {self.name!r}: size", self.size, low=1, whole=True)
+        check_number(f"channel {self.name!r}: noise", self.noise, low=0.0, infinite=True)
+        check_number(f"channel {self.name!r}: resolution", self.resolution, low=0.0)
+        if not isinstance(self.elements, tuple):
+            raise TypeError(f"channel {self.name!r}: elements must be a tuple of names, got {shown(self.elements)}")
+        if self.elements and len(self.elements) != self.size:
+            raise ValueError(f"channel {self.name!r} has size {self.size} but {len(self.elements)} element names")
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A name for every number, such as ``joint_position[3]``; the bare name where there is one number."""
+        if self.size == 1 and not self.elements:
+            return (self.name,)
+        return tuple(f"{self.name}[{e}]" for e in (self.elements or range(self.size)))
+
+
+@dataclass(frozen=True)
+class StreamSpec:
+    """The layout of a stream row, and the rate it comes at.
+
+    Args:
+        channels: in the order they stand in a row.
+        dt: control period [s].
+        source: what made the stream, for example ``Panda``. A name for people: two specs with the same channels and
+            rate are compatible whatever their source.
+    """
+
+    channels: tuple[Channel, ...]
+    dt: float
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.channels, tuple) or not all(isinstance(c, Channel) for c in self.channels):
+            raise TypeError(f"channels must be a tuple of Channel objects, got {shown(self.channels)}")
+        names = [c.name for c in self.channels]
+        if len(set(names)) != len(names):
+            raise ValueError(f"channel names must be unique, got {names}")
+        if not any(c.group != MOTOR for c in self.channels):
+            raise ValueError("a stream needs at least one channel that is not an action")
+        check_number("dt", self.dt, above=0.0)
+
+    @cached_property
+    def size(self) -> int:
+        """D, the length of a row."""
+        return sum(c.size for c in self.channels)
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """D names, one for each number in a row."""
+        return tuple(label for c in self.channels for label in c.labels)
+
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        """Where each channel stands in a row."""
+        ends = np.cumsum([c.size for c in self.channels])
+        return {c.name: slice(int(e) - c.size, int(e)) for c, e in zip(self.channels, ends, strict=True)}
+
+    @cached_property
+    def noise(self) -> NDArray[np.float64]:
+        """(D,) standard deviation of the sensor noise [unit of each channel]."""
+        return np.concatenate([np.full(c.size, c.noise) for c in self.channels])
+
+    @cached_property
+    def resolution(self) -> NDArray[np.float64]:
+        """(D,) the step between two readings that a sensor tells apart [unit of each channel]; 0 where unknown."""
+        return np.concatenate([np.full(c.size, c.resolution) for c in self.channels])
+
+    @cached_property
+    def motor(self) -> NDArray[np.intp]:
+        """Indices of the commanded action."""
+        return self._indices(motor=True)
+
+    @cached_property
+    def sensory(self) -> NDArray[np.intp]:
+        """Indices of everything that is sensed."""
+        return self._indices(motor=False)
+
+    def _indices(self, motor: bool) -> NDArray[np.intp]:
+        return np.array(
+            [i for c in self.channels if (c.group == MOTOR) is motor for i in range(self.size)[self.slices[c.name]]],
+            dtype=np.intp,
+        )
+
+    def check_row(self, stream: NDArray[np.floating[Any]]) -> None:
+        """Raises ValueError unless the last axis of ``stream`` is D long."""
+        if stream.ndim < 1 or stream.shape[-1] != self.size:
+            raise ValueError(
+                f"a stream of this spec has {self.size} numbers a step ({', '.join(c.name for c in self.channels)}), "
+                f"got an array of shape {stream.shape}"
+            )
+
+    def difference(self, other: StreamSpec) -> list[str]:
+        """What keeps a memory of this spec from reading streams of ``other``, a line each; empty where nothing does."""
+        mine, theirs = ({c.name: c for c in s.channels} for s in (self, other))
+        lines = [f"{n}: missing" for n in mine if n not in theirs] + [f"{n}: new" for n in theirs if n not in mine]
+        for name in mine:
+            if name in theirs and mine[name].size != theirs[name].size:
+                lines.append(f"{name}: size {mine[name].size} against {theirs[name].size}")
+            elif name in theirs and mine[name].unit != theirs[name].unit:
+                lines.append(f"{name}: unit {mine[name].unit} against {theirs[name].unit}")
+            elif name in theirs and mine[name].group != theirs[name].group:
+                lines.append(f"{name}: group {mine[name].group} against {theirs[name].group}")
+        if not lines and list(mine) != list(theirs):
+            lines.append(f"order: {', '.join(mine)} against {', '.join(theirs)}")
+        if abs(self.dt - other.dt) > 1e-9:
+            lines.append(f"dt: {self.dt} s against {other.dt} s")
+        return lines
+
+    def require(self, other: StreamSpec, whose: str) -> None:
+        """Raises ValueError naming the channels that differ, unless ``other`` can be read with this spec."""
+        lines = self.difference(other)
+        if lines:
+            raise ValueError(f"{whose} does not fit this stream:\n  " + "\n  ".join(lines))
+
+    def never_met(self, known: StreamSpec) -> list[str]:
+        """What of this stream a memory of one that is ``known`` cannot do with, a line each; commands do not matter."""
+        senses = {c.name for c in self.channels if c.group != MOTOR} | {"dt"}
+        lines = (line.partition(": ") for line in known.difference(self))
+        return ["".join(line) for line in lines if line[0] in senses and line[2] != "missing"]
+
+    def columns_in(self, known: StreamSpec) -> NDArray[np.intp]:
+        """(D,) where each number of this stream stands in one that is ``known``; -1 for commands that are not.
+
+        Raises:
+            ValueError: a sense that is not known, by name, size, unit and group; another rate.
+        """
+        lines = self.never_met(known)
+        if lines:
+            raise ValueError(
+                "the memory never met what this stream holds:\n  "
+                + "\n  ".join(lines)
+                + "\nLeave what it never met out of the "
+                f"stream, or fit a memory of your own. It knows {', '.join(c.name for c in known.channels)}"
+            )
+        theirs, columns = {c.name: c for c in known.channels}, np.full(self.size, -1, np.intp)
+        for c in self.channels:
+            if c.name in theirs and _alike(c, theirs[c.name]):
+                columns[self.slices[c.name]] = np.arange(known.size)[known.slices[c.name]]
+        return columns
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self))
+
+    @classmethod
+    @typed
+    def from_json(cls, text: str) -> StreamSpec:
+        """What ``to_json`` wrote. Raises ValueError where it is something else."""
+        try:
+            raw = json.loads(text)
+            channels = tuple(Channel(**{**c, "elements": tuple(c["elements"])}) for c in raw["channels"])
+            return cls(channels, raw["dt"], raw["source"])
+        except (ValueError, TypeError, KeyError) as error:
+            raise ValueError(f"the text of a stream's spec is damaged ({error}): {shown(text)}") from error
+
+    @classmethod
+    @typed
+    def from_spaces(cls, observation: spaces.Space[Any], action: spaces.Space[Any], dt: float = 1.0) -> StreamSpec:
+        """The spec of an environment that has no stream of its own: its observation, then the action.
+
+        A dict observation has a channel for each key, ``outer.inner`` where one lies in the other. What is discrete is
+        a 0 or 1 for each of its values.
+
+        Raises:
+            TypeError: either space cannot be read as a row of numbers.
+        """
+        for name, space in (("observation", observation), ("action", action)):
+            if not space.is_np_flattenable:
+                raise TypeError(f"the {name} space must be numbers to be read as a stream, got {space}")
+        return cls((*_channels("observation", observation), _motor(action)), dt, "spaces")
+
+
+def _channels(name: str, space: spaces.Space[Any]) -> list[Channel]:
+    """A channel for each key of a dict, in the order in which Gymnasium flattens it; one of anything else."""
+    if not isinstance(space, spaces.Dict):
+        size = spaces.flatdim(space)
+        return [Channel(name, size)] if size else []
+    prefix = "" if name == "observation" else f"{name}."
+    return [channel for key, part in space.items() for channel in _channels(f"{prefix}{key}", part)]
+
+
+def _motor(space: spaces.Space[Any]) -> Channel:
+    return Channel("action", spaces.flatdim(space), group=MOTOR)
+
+
+def flat(space: spaces.Space[Any], value: Any) -> NDArray[Any]:
+    """(n,) an observation or action as ``StreamSpec.from_spaces`` lays it out."""
+    return np.ravel(value) if isinstance(space, spaces.Box) else np.asarray(spaces.flatten(space, value))
+
+
+def flat_rows(space: spaces.Space[Any], values: Any, rows: int) -> NDArray[np.float32]:
+    """(rows, n) of so many observations or actions, which dicts hold by key."""
+    if isinstance(space, spaces.Dict):
+        return np.hstack([flat_rows(part, values[key], rows) for key, part in space.items()])
+    if isinstance(space, spaces.Box):
+        return np.asarray(values, np.float32).reshape(rows, -1)
+    return np.array([spaces.flatten(space, value) for value in values], np.float32).reshape(rows, -1)
+
+
+def _alike(one: Channel, other: Channel) -> bool:
+    return (one.size, one.unit, one.group) == (other.size, other.unit, other.group)
+
+
+def control_period(env: gym.Env[Any, Any]) -> float:
+    """Of any environment [s]; 1 where it does not say."""
+    dt = getattr(env.unwrapped, "dt", None)
+    if isinstance(dt, int | float) and dt > 0:
+        return float(dt)
+    fps = env.metadata.get("render_fps")
+    return 1.0 / fps if fps else 1.0

@@ -1,0 +1,79 @@
+"""Where any environment's sensorimotor stream comes from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.wrappers import NormalizeObservation
+from numpy.typing import NDArray
+
+from asm_gym.spec import StreamSpec, control_period, flat
+from asm_gym.validation import as_float32
+
+
+class StreamSource:
+    """Where an environment's stream comes from: ``info["stream"]``, or else its observation and the action.
+
+    Attributes:
+        own: the environment has a stream of its own.
+
+    Raises:
+        TypeError: the environment has no stream, and its spaces cannot be read as rows of numbers.
+        ValueError: it has none, and a wrapper inside changes what it makes of the same sense as it goes on.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        self._env, self.own = env, env.has_wrapper_attr("stream_spec")
+        if not self.own:
+            _refuse_running_statistics(env)
+            self._spaces = StreamSpec.from_spaces(env.observation_space, env.action_space, control_period(env))
+
+    @property
+    def spec(self) -> StreamSpec:
+        """Names the numbers of a row; whoever makes the stream run faster changes it."""
+        spec: StreamSpec = self._env.get_wrapper_attr("stream_spec") if self.own else self._spaces
+        return spec
+
+    @property
+    def rows_per_step(self) -> int:
+        """How many rows a control step has."""
+        return max(1, round(control_period(self._env) / self.spec.dt)) if self.own else 1
+
+    def row(self, observation: Any, action: Any, info: dict[str, Any]) -> NDArray[np.float32]:
+        """(D,) what was sensed after ``action``, and the action."""
+        if self.own:
+            if "stream" not in info:
+                raise KeyError('info has no "stream"')
+            row: NDArray[np.float32] = info["stream"]
+            return row
+        spaces = self._env.observation_space, self._env.action_space
+        parts = [flat(space, value) for space, value in zip(spaces, (observation, action), strict=True)]
+        return as_float32(np.concatenate(parts))
+
+    def first(self, observation: Any, info: dict[str, Any]) -> NDArray[np.float32]:
+        """(D,) what was sensed after ``reset``, when nothing had been commanded."""
+        if self.own:
+            return self.row(observation, None, info)
+        sensed = flat(self._env.observation_space, observation)
+        row: NDArray[np.float32] = np.concatenate([sensed, np.zeros(self._spaces.size - len(sensed))]).astype(
+            np.float32
+        )
+        return row
+
+    def rows(self, observation: Any, action: Any, info: dict[str, Any]) -> NDArray[np.float32]:
+        """(n, D) all that was sensed since the last step; n is 1 unless the stream runs faster than control."""
+        found: NDArray[np.float32] = info["streams"] if "streams" in info else self.row(observation, action, info)[None]
+        return found
+
+
+def _refuse_running_statistics(env: gym.Env[Any, Any]) -> None:
+    """Raises ValueError for a wrapper by which the same sense reads differently the longer it runs."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, NormalizeObservation) and env.update_running_mean:
+            raise ValueError(
+                "NormalizeObservation changes what it makes of the same sense as it goes on: put it outside, as in "
+                "NormalizeObservation(NeuralASMSafety(env, monitor)), or set its update_running_mean to False"
+            )
+        env = env.env

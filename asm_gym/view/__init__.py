@@ -1,0 +1,1 @@
+"""Pictures: a strip chart under a frame, films, and recordings for Rerun."""

@@ -1,0 +1,112 @@
+"""The stream's layout, and episodes that hold one."""
+
+import json
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+
+from asm_gym.episode import Episode
+from asm_gym.spec import MOTOR, Channel, StreamSpec
+
+SPEC = StreamSpec(
+    (
+        Channel("joint_position", 2, "rad", 0.1, "joint"),
+        Channel("force", 1, "N", 0.5, "wrench"),
+        Channel("action", 2, group=MOTOR),
+    ),
+    dt=0.05,
+    source="test",
+)
+
+
+def test_every_number_has_a_name_and_a_place():
+    assert SPEC.size == 5
+    assert SPEC.labels == ("joint_position[0]", "joint_position[1]", "force", "action[0]", "action[1]")
+    assert SPEC.slices == {"joint_position": slice(0, 2), "force": slice(2, 3), "action": slice(3, 5)}
+    assert SPEC.sensory.tolist() == [0, 1, 2]
+    assert SPEC.motor.tolist() == [3, 4]
+    assert SPEC.noise.tolist() == [0.1, 0.1, 0.5, 0, 0]
+
+
+channels = st.builds(
+    Channel,
+    name=st.text(min_size=1, max_size=8),
+    size=st.integers(1, 4),
+    unit=st.sampled_from(["1", "N m", "rad"]),
+    noise=st.floats(0, 10),
+    resolution=st.floats(0, 10),
+    group=st.sampled_from(["joint", "wrench"]),
+)
+
+
+@given(st.lists(channels, min_size=1, max_size=5, unique_by=lambda c: c.name), st.floats(1e-3, 10))
+def test_a_spec_survives_json(chosen, dt):
+    spec = StreamSpec(tuple(chosen), dt)
+    assert StreamSpec.from_json(spec.to_json()) == spec
+    assert spec.difference(StreamSpec.from_json(spec.to_json())) == []
+
+
+def test_a_spec_written_before_sensors_had_a_resolution_is_read():
+    written = json.loads(SPEC.to_json())
+    for channel in written["channels"]:
+        del channel["resolution"]
+    assert StreamSpec.from_json(json.dumps(written)) == SPEC
+    assert not SPEC.resolution.any()
+
+
+@pytest.mark.parametrize(
+    ("other", "says"),
+    [
+        ((SPEC.channels[0], SPEC.channels[2]), "force: missing"),
+        ((*SPEC.channels, Channel("smell", 1)), "smell: new"),
+        ((Channel("joint_position", 3, "rad", group="joint"), *SPEC.channels[1:]), "size 2 against 3"),
+        ((Channel("joint_position", 2, "deg", group="joint"), *SPEC.channels[1:]), "unit rad against deg"),
+        ((SPEC.channels[1], SPEC.channels[0], SPEC.channels[2]), "order"),
+    ],
+)
+def test_specs_that_differ_say_in_what(other, says):
+    assert any(says in line for line in SPEC.difference(StreamSpec(other, 0.05)))
+    with pytest.raises(ValueError, match="the memory does not fit"):
+        SPEC.require(StreamSpec(other, 0.05), "the memory")
+
+
+def test_another_rate_is_a_difference_and_another_source_or_noise_is_not():
+    assert SPEC.difference(StreamSpec(SPEC.channels, 0.01)) == ["dt: 0.05 s against 0.01 s"]
+    quiet = tuple(Channel(c.name, c.size, c.unit, 0.0, c.group) for c in SPEC.channels)
+    assert SPEC.difference(StreamSpec(quiet, 0.05, "another robot")) == []
+
+
+def test_the_spec_of_plain_spaces_is_observation_then_action():
+    box = spaces.Box(-1, 1, (2, 3), np.float32)
+    spec = StreamSpec.from_spaces(box, spaces.Box(-1, 1, (2,)), dt=0.1)
+    assert [(c.name, c.size) for c in spec.channels] == [("observation", 6), ("action", 2)]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Channel("x", 0),
+        lambda: Channel("x", 1, noise=-1.0),
+        lambda: Channel("x", 1, resolution=-1.0),
+        lambda: Channel("x", 1, resolution=float("nan")),
+        lambda: Channel("x", 2, elements=("a",)),
+        lambda: StreamSpec((Channel("x", 1), Channel("x", 2)), 0.1),
+        lambda: StreamSpec((Channel("a", 1, group=MOTOR),), 0.1),
+        lambda: StreamSpec((Channel("x", 1),), 0.0),
+        lambda: Episode.from_stream(np.zeros(5), SPEC),
+        lambda: Episode.from_stream(np.zeros((3, 4)), SPEC),
+    ],
+)
+def test_what_makes_no_sense_is_refused(make):
+    with pytest.raises(ValueError, match=r"got|must|needs|names"):
+        make()
+
+
+def test_an_episode_from_a_recorded_stream_is_float32_and_as_long():
+    episode = Episode.from_stream(np.ones((7, 5)), SPEC, success=True)
+    assert len(episode) == 7
+    assert episode.stream.dtype == np.float32
+    assert episode.success
