@@ -7,12 +7,14 @@ bin := .venv/bin
 stamp := .venv/.installed
 # Several processes share the machine: one thread each, or they slow each other down.
 one_thread := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
+# The matrix products and the functions of an older processor, which round otherwise than this one's.
+older := OPENBLAS_CORETYPE=Nehalem GLIBC_TUNABLES=glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F
 # A file stays in one process: fixtures that fit a memory are made once.
 pytest = $(one_thread) $(bin)/python -m pytest -n $(JOBS) --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo reproduce doctor test test-all extras soak check format docs page stale clean
+.PHONY: help demo reproduce doctor test test-all test-floats extras soak check format docs page pages verify clean
 
 help: ## list the commands
 	@sed -nE 's/^([a-z-]+):.* ## (.*)/  make \1\t\2/p' Makefile | expand -t 20
@@ -32,6 +34,9 @@ test: $(stamp) ## the tests that take seconds
 
 test-all: $(stamp) ## every test, those that take minutes too
 	$(pytest) $(ARGS)
+
+test-floats: $(stamp) ## experts and closed loops, where floating point rounds as on an older processor
+	$(older) $(pytest) -m "floats and not slow" $(ARGS)
 
 extras: $(stamp) ## every extra in a fresh environment, with the tests of what needs it; ARGS=learners for one
 	$(one_thread) $(bin)/python -m tests.extras $(ARGS)
@@ -56,8 +61,11 @@ docs: $(stamp) ## this documentation as a site, in docs/_build/html
 page: $(stamp) ## runs the command of a page of results, and keeps what it prints: PAGE=docs/results/demo.md
 	$(bin)/python docs/pages.py print $(PAGE)
 
-stale: $(stamp) ## marks the pages of results whose code has changed
-	$(bin)/python docs/pages.py mark
+pages: $(stamp) ## prints every page for which something has changed, and goes on where it was interrupted; hours
+	$(bin)/python docs/pages.py all $(ARGS)
+
+verify: $(stamp) ## runs the checks of the pages of results, and says which print something else
+	$(one_thread) $(bin)/python docs/pages.py verify $(ARGS)
 
 clean: ## removes .venv, builds and caches; runs/ stays
 	rm -rf .venv build dist docs/_build docs/reference/api *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,4 +1,4 @@
-"""Pages of results, which know the command that printed them and the code that it measured.
+"""Pages of results, which know the command that printed them and what it ran.
 
 The front matter of a page in ``docs/results`` says so:
 
@@ -6,48 +6,61 @@ The front matter of a page in ``docs/results`` says so:
       asm-gym evaluate --quick --out runs/quick
     printed: runs/quick/results.md   what the command leaves; without it, what the command prints
     figures: {runs/quick/roc.png: docs/img/roc.png}
-    rooms: [envs, memory, detection]
+    reads: {runs/evaluate: detection}   what the command reads, and the page whose command makes that
+    check: asm-gym evaluate … --out $CHECK   at most 30 s; says whether the page still holds; CHECK: an empty folder
+    tolerance: 0.05                  of the check's numbers, relative
     version: 0.1.0
     date: 2026-11-22
-    code: 3f2a…                      the digest of those rooms at that time
-    stale: true                      the rooms have changed since
+    commit: 3f2a1b4c5
+    machine: AMD EPYC (x86_64, family 25, model 17), 2 cores, OpenBLAS for SkylakeX
+    seconds: 812                     what printing cost
 
-    python docs/pages.py                     lists the pages, and which are stale
-    python docs/pages.py mark                writes `stale: true` where it is true
+At the end of the page, in a comment, stand the files that the command ran, each with git's id of its content, and what
+the check printed. What has changed since is found out by whoever asks: the site, or this list.
+
+    python docs/pages.py                     lists the pages, what has changed since, and what each costs
     python docs/pages.py print PAGE …        runs the command of a page, and replaces what it printed
+    python docs/pages.py all [--again]       prints all that something has changed for; or all not of this commit
+    python docs/pages.py check PAGE …        keeps what the check of a page prints now
+    python docs/pages.py verify [PAGE …]     runs the checks, and says which print something else
 """
 
 from __future__ import annotations
 
-import ast
-import hashlib
 import os
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+import tempfile
+import time
+from dataclasses import dataclass, field, replace
 from datetime import date
-from functools import cache
 from pathlib import Path
 from typing import Any
 
+import ran
 import yaml
+from kept import TOLERANCE, different, rounded
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = ran.ROOT
 RESULTS = ROOT / "docs" / "results"
+ARCHIVE = RESULTS / "archive"
 BEGIN, END = "<!-- printed by the command above: edits are lost -->", "<!-- end of what was printed -->"
-REQUIRED = ("command", "rooms", "version", "date", "code")
+RAN = "<!-- what ran: edits are lost\n"
+REQUIRED = ("command", "version", "date", "commit")
+MOST = 20  # live pages
+ALLOWED = 30.0  # for a check [s]
 
 
 @dataclass(frozen=True)
 class Page:
-    """A page of results: what stands in its front matter, and the text below."""
+    """A page of results: what stands in its front matter, the text below, and what is kept at its end."""
 
     path: Path
     meta: dict[str, Any]
     text: str
+    kept: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def read(cls, path: Path) -> Page:
@@ -63,38 +76,36 @@ class Page:
             raise ValueError(f"{path}: the front matter lacks {', '.join(missing)}")
         if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
             raise ValueError(f"{path}: what was printed must stand once between {BEGIN} and {END}")
-        return cls(path, meta, text)
+        text, _, kept = text.partition(RAN)
+        meta["commit"] = str(meta["commit"])  # one of digits alone is a number in YAML
+        return cls(path, meta, text, yaml.safe_load(kept.removesuffix("-->\n")) or {} if kept else {})
 
     def write(self) -> None:
         """Replaces the file at once, or not at all."""
         new = self.path.with_suffix(".new")
-        front = yaml.dump(self.meta, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10_000)
-        new.write_text(f"---\n{front}---\n{self.text}", encoding="utf-8")
+        kept = f"\n{RAN}{_yaml(self.kept)}-->\n" if self.kept else ""
+        new.write_text(f"---\n{_yaml(self.meta)}---\n{self.text.rstrip()}\n{kept}", encoding="utf-8")
         new.replace(self.path)
 
     @property
-    def is_old(self) -> bool:
-        """The code that was measured is not the code of this tree."""
-        return bool(self.meta["code"] != digest(self.meta["rooms"]))
+    def files(self) -> dict[str, str]:
+        """What the command ran: path to id; empty where that was not recorded."""
+        return dict(self.kept.get("files", {}))
 
     @property
-    def says_so(self) -> bool:
-        return bool(self.meta.get("stale", False))
+    def changed(self) -> list[str]:
+        """What it ran and is another today."""
+        return ran.changed(self.files)
 
-    def marked(self) -> Page:
-        """The same page, which says that it is stale if it is."""
-        kept = {key: value for key, value in self.meta.items() if key != "stale"}
-        return replace(self, meta=kept | ({"stale": True} if self.is_old else {}))
+    @property
+    def name(self) -> str:
+        return str(self.path.relative_to(ROOT)) if self.path.is_relative_to(ROOT) else str(self.path)
 
     def printed_anew(self, printed: str) -> Page:
-        """The same page with ``printed`` in place of what was printed before, by the code of this tree."""
-        from asm_gym import __version__
-
+        """The same page with ``printed`` in place of what was printed before."""
         before, _, rest = self.text.partition(BEGIN)
         _, _, after = rest.partition(END)
-        fresh = {"version": __version__, "date": date.today(), "code": digest(self.meta["rooms"])}
-        text = f"{before}{BEGIN}\n\n{printed.strip()}\n\n{END}{after}"
-        return replace(self, meta=self.meta | fresh, text=text).marked()
+        return replace(self, text=f"{before}{BEGIN}\n\n{printed.strip()}\n\n{END}{after}")
 
 
 class _Dumper(yaml.SafeDumper):
@@ -108,78 +119,141 @@ def _text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
 _Dumper.add_representer(str, _text)
 
 
-def pages() -> list[Page]:
-    """All pages of results, by name."""
-    return [Page.read(path) for path in sorted(RESULTS.glob("*.md")) if path.name != "index.md"]
+def _yaml(value: dict[str, Any]) -> str:
+    return str(yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10_000))
 
 
-def digest(rooms: Iterable[str], package: Path = ROOT / "asm_gym") -> str:
-    """Of the code in ``rooms`` (folders or modules of the package), whatever its comments, docstrings and layout.
-
-    Raises:
-        FileNotFoundError: there is no such room.
-    """
-    made = hashlib.sha256()
-    for room in rooms:
-        place = package / room
-        if not place.exists():
-            raise FileNotFoundError(f"{place}: no such room of the package")
-        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            made.update(str(path.relative_to(package)).encode())
-            made.update(_skeleton(path.read_bytes()))
-    return made.hexdigest()[:16]
-
-
-@cache
-def _skeleton(source: bytes) -> bytes:
-    """What is left of a module without comments, docstrings and layout; many pages measure the same ones."""
-    return repr(list(_shape(ast.parse(source)))).encode()
-
-
-def _shape(node: ast.AST) -> Iterator[Any]:
-    """A syntax tree as nested tuples, without texts that stand alone, and alike in every version of Python."""
-    yield type(node).__name__
-    for name, value in ast.iter_fields(node):
-        values = value if isinstance(value, list) else [value][: value is not None]
-        kept = [v for v in values if not _stands_alone(v)]
-        if kept:
-            yield name, tuple(tuple(_shape(v)) if isinstance(v, ast.AST) else repr(v) for v in kept)
-
-
-def _stands_alone(node: Any) -> bool:
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+def pages(folder: Path = RESULTS) -> list[Page]:
+    """The pages of results in a folder, by name: live ones, or those in ``ARCHIVE``."""
+    return [Page.read(path) for path in sorted(folder.glob("*.md")) if path.name != "index.md"]
 
 
 def run(page: Page) -> Page:
-    """The page as its command prints it now.
+    """The page as its command prints it now, and what it ran.
 
     Raises:
         subprocess.CalledProcessError: the command failed.
     """
-    path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
-    there = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
-    command = ["bash", "-e", "-c", page.meta["command"]]
-    said = subprocess.run(command, cwd=ROOT, env=there, stdout=subprocess.PIPE, text=True, check=True).stdout
-    out = re.sub(r"(?m)^.*: (\d+ of \d+, )?(done in )?\d+ s\n", "", said)  # how far it had come is no result
+    from asm_gym import __version__
+
+    began = time.monotonic()
+    said, files = _said(page.meta["command"])
+    seconds = round(time.monotonic() - began)
     for made, kept in page.meta.get("figures", {}).items():
         shutil.copyfile(ROOT / made, ROOT / kept)
     if "printed" in page.meta:
-        return page.printed_anew((ROOT / page.meta["printed"]).read_text(encoding="utf-8"))
-    lines = "\n".join(line.rstrip() for line in out.strip("\n").splitlines())
-    return page.printed_anew(f"```text\n{lines}\n```")
+        page = page.printed_anew((ROOT / page.meta["printed"]).read_text(encoding="utf-8"))
+    else:
+        page = page.printed_anew(f"```text\n{said}\n```")
+    fresh = {"version": __version__, "date": date.today(), "commit": ran.commit(), "machine": ran.machine()}
+    page = replace(page, meta=page.meta | fresh | {"seconds": seconds}, kept={"files": files})
+    return checked(page) if "check" in page.meta else page
+
+
+def checked(page: Page) -> Page:
+    """The page with what its check prints now."""
+    said, _ = _said(page.meta["check"])
+    return replace(page, kept=page.kept | {"check": {"commit": ran.commit(), "printed": rounded(said) + "\n"}})
+
+
+def _said(command: str) -> tuple[str, dict[str, str]]:
+    """What a command prints, and which files of the repository it ran and read."""
+    path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
+    with tempfile.TemporaryDirectory() as folder:
+        notes = Path(folder) / "ran.txt"
+        there = os.environ | {"PATH": path, "COLUMNS": "120", "CHECK": folder} | ran.noting(notes)
+        done = subprocess.run(
+            ["bash", "-e", "-c", command], cwd=ROOT, env=there, stdout=subprocess.PIPE, text=True, check=True
+        )
+        files = ran.noted(notes)
+    out = re.sub(r"(?m)^.*: (\d+ of \d+, )?(done in )?\d+ s\n", "", done.stdout)  # how far it had come is no result
+    return "\n".join(line.rstrip() for line in out.strip("\n").splitlines()), files
+
+
+def state(page: Page) -> str:
+    """In words: what has changed since the page was printed."""
+    if not page.files:
+        return "which files it ran was not recorded"
+    changed, count = len(page.changed), len(page.files)
+    return f"{changed} of its {count} files changed since" if changed else f"none of its {count} files changed since"
+
+
+def to_print(live: list[Page], again: bool) -> list[Page]:
+    """Those that something has changed for, or that are not of this commit; what another reads stands before it."""
+    here = ran.commit()
+    due = [p for p in live if (p.meta["commit"] != here if again else not p.files or p.changed)]
+    by_name = {page.path.stem: page for page in live}
+    ordered: list[Page] = []
+    for page in due:
+        for folder, maker in page.meta.get("reads", {}).items():
+            if by_name[maker] not in ordered and (by_name[maker] in due or not (ROOT / folder).exists()):
+                ordered.append(by_name[maker])
+        if page not in ordered:
+            ordered.append(page)
+    return ordered
+
+
+def print_all(again: bool) -> int:
+    """Prints what is due, a page at a time; one that fails is left as it was, and named at the end."""
+    due, failed = to_print(pages(), again), []
+    cost = sum(page.meta.get("seconds", 0) for page in due)
+    unknown = sum("seconds" not in page.meta for page in due)
+    print(f"{len(due)} of {len(pages())} pages to print; {cost / 3600:.1f} h, and {unknown} that were not timed yet")
+    for page in due:
+        print(f"{page.name}: {_cost(page)} the last time; {state(page)}", flush=True)
+        try:
+            page = run(page)
+            page.write()
+            print(f"{page.name}: {_cost(page)}", flush=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            failed.append(page.name)
+            print(f"{page.name}: {error}", file=sys.stderr)
+    print(f"failed: {', '.join(failed)}" if failed else "all pages are printed")
+    return int(bool(failed))
+
+
+def verify(live: list[Page]) -> int:
+    """Runs the checks; 1 where one prints something else, or takes longer than it may."""
+    wrong = 0
+    for page in live:
+        if "check" not in page.kept:
+            print(f"{page.name}: no check")
+            continue
+        began = time.monotonic()
+        try:
+            said, _ = _said(page.meta["check"])
+        except subprocess.CalledProcessError as error:
+            said = str(error)
+        seconds = time.monotonic() - began
+        differences = different(page.kept["check"]["printed"], said, page.meta.get("tolerance", TOLERANCE))
+        late = f"; {ALLOWED:.0f} s are allowed" if seconds > ALLOWED else ""
+        verdict = "prints something else: superseded" if differences else "holds"
+        print(f"{page.name}: {verdict}, {seconds:.0f} s{late}", *differences, sep="\n    ", flush=True)
+        wrong += bool(differences)
+    print(f"{wrong} of {len(live)} pages are superseded")
+    return int(wrong > 0)
+
+
+def _cost(page: Page) -> str:
+    seconds = page.meta.get("seconds")
+    return "not timed" if seconds is None else f"{seconds / 60:.1f} min"
 
 
 def main(argv: list[str]) -> int:
     match argv:
         case []:
             for page in pages():
-                print(f"{'stale' if page.is_old else 'fresh'}  {page.path.relative_to(ROOT)}")
-        case ["mark"]:
-            for page in pages():
-                page.marked().write()
+                print(f"{page.name}: {page.meta['commit']}, {page.meta['date']}, {state(page)}; {_cost(page)}")
         case ["print", *names] if names:
             for name in names:
                 run(Page.read(ROOT / name)).write()
+        case ["all"] | ["all", "--again"]:
+            return print_all(argv[1:] == ["--again"])
+        case ["check", *names] if names:
+            for name in names:
+                checked(Page.read(ROOT / name)).write()
+        case ["verify", *names]:
+            return verify([Page.read(ROOT / name) for name in names] or pages())
         case _:
             print(__doc__, file=sys.stderr)
             return 2

@@ -150,3 +150,10 @@ def test_a_comment_that_makes_a_block_small_must_match_it():
     assert documents.small("collect(episodes=60)", "<!-- small: 60 -> 6 -->\n") == "collect(episodes=6)"
     with pytest.raises(AssertionError, match="does not occur"):
         documents.small("collect(episodes=60)", "<!-- small: 50 -> 6 -->\n")
+
+
+@pytest.mark.parametrize("page", RESULTS, ids=documents.name)
+def test_the_check_of_a_page_of_results_can_be_given(page: Path, monkeypatch: pytest.MonkeyPatch):
+    script = documents.tool("pages").Page.read(page).meta.get("check", "").replace("\\\n", " ")
+    for command in re.findall(r"^(asm-gym [^|>\n]*)", script, re.M):
+        check(command.replace("$CHECK", "runs/check"), monkeypatch)

@@ -49,11 +49,12 @@ def test_equations_are_drawn_by_the_browser(site: Path):
 
 
 @pytest.mark.slow
-def test_stale_pages_say_so_on_the_site(site: Path):
+def test_pages_say_on_the_site_what_they_ran_and_which_are_of_the_archive(site: Path):
     pages = documents.tool("pages")
-    for page in pages.pages():
-        built = (site / "results" / f"{page.path.stem}.html").read_text()
-        assert ("<strong>Stale.</strong>" in built) is page.is_old, page.path
+    for page in (*pages.pages(), *pages.pages(pages.ARCHIVE)):
+        built = (site / page.path.relative_to(documents.DOCS).with_suffix(".html")).read_text()
+        assert ("<strong>Archived:</strong>" in built) is (page.path.parent == pages.ARCHIVE), page.path
+        assert f"Measured at {page.meta['commit']}; " in built
         first = page.meta["command"].split()[:2]
         assert all(word in built for word in first if "=" not in word), page.path
 

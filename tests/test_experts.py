@@ -19,6 +19,7 @@ from asm_gym.policies.scripted.two_arms import Hand, move_arm
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.scripts.benchmark.experts import attempt
+from tests.rates import failures, too_few
 
 QUICK = [
     "Stack",
@@ -38,11 +39,16 @@ QUICK = [
 MEET_STOPS = {"TwoArmPegInHole", "TwoArmHandover"}
 """Where the pose of the objects may turn an arm's last joint to the end of its range."""
 
+RATE = {"NutAssembly": 0.85, "PickPlace": 0.55, "TwoArmHandover": 0.95, "TwoArmTransport": 0.75, "ToolHang": 0.95}
+"""How often an expert solves its task, where that is not 98 %."""
 
+
+@pytest.mark.floats
 @pytest.mark.parametrize("task", QUICK)
 def test_an_expert_solves_its_task_and_leaves_it_solved(task):
     env = gym.make(f"asm_gym/{task}-v0")
-    for seed in (0, 1):
+
+    def trial(seed: int) -> str:
         expert, state = make_policy("scripted", env, seed=seed), None
         observation, _ = env.reset(seed=seed)
         over, solved, room = False, False, np.inf
@@ -51,9 +57,11 @@ def test_an_expert_solves_its_task_and_leaves_it_solved(task):
             observation, _, _, over, info = env.step(action)
             solved |= info["success"]
             room = min(room, room_to_the_stops(env.unwrapped.simulation))
-        assert solved
-        assert info["success"]
-        assert task in MEET_STOPS or room > 0.05, "an arm's joint meets its stop"
+        if not info["success"]:
+            return "not left solved" if solved else "not solved"
+        return "" if task in MEET_STOPS or room > 0.05 else "an arm's joint meets its stop"
+
+    assert not failures(trial, range(10), 0.95)
     env.close()
 
 
@@ -67,26 +75,24 @@ def room_to_the_stops(simulation: Simulation) -> float:
     return float(np.minimum(angles - low, high - angles).min())
 
 
+@pytest.mark.floats
 @pytest.mark.parametrize("robot", ["IIWA", "Sawyer"])
 @pytest.mark.parametrize("task", ["Lift", "Stack", "PickPlaceCan"])
 def test_other_arms_solve_it_too(task, robot):
-    made = attempt(2, task, robot)
-    assert made.solved
-    assert made.held
+    def trial(seed: int) -> str:
+        return "" if attempt(seed, task, robot).held else "not left solved"
+
+    assert not failures(trial, range(2, 10), 0.9, first=1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["IIWA", "Sawyer"])
 @pytest.mark.parametrize("task", ["Lift", "Stack", "PickPlaceCan"])
 def test_other_arms_succeed_on_most_of_100_seeds(task, robot):
-    # The IIWA, whose bin is at the end of its reach, solves 92 of 100: its bar leaves room for other seeds.
-    least = 85 if (task, robot) == ("PickPlaceCan", "IIWA") else 95
+    # The IIWA, whose bin is at the end of its reach, solves 92 of 100.
+    rate = 0.92 if (task, robot) == ("PickPlaceCan", "IIWA") else 0.97
     made = parallel_map(partial(attempt, task=task, robot=robot), episode_seeds(99, 100), 2)
-    assert sum(m.solved for m in made) >= least
-
-
-LEAST = {"NutAssembly": 0.85, "PickPlace": 0.55, "TwoArmHandover": 0.9, "TwoArmTransport": 0.7, "ToolHang": 0.9}
-"""What share is asked for where it is not 95 %: a few points under what ``asm-gym benchmark experts`` printed."""
+    assert not too_few(sum(m.solved for m in made), 100, rate)
 
 
 @pytest.mark.slow
@@ -94,7 +100,7 @@ LEAST = {"NutAssembly": 0.85, "PickPlace": 0.55, "TwoArmHandover": 0.9, "TwoArmT
 def test_an_expert_succeeds_on_nearly_all_of_100_seeds(task):
     count = 30 if task in ("TwoArmTransport", "ToolHang") else 100  # their episodes take seconds
     made = collect(f"asm_gym/{task}-v0", episodes=count, seed=99, workers=2)
-    assert sum(e.success for e in made) >= LEAST.get(task, 0.95) * count
+    assert not too_few(sum(e.success for e in made), count, RATE.get(task, 0.98))
 
 
 def test_speed_and_noise_change_the_course():

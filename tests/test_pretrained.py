@@ -15,6 +15,7 @@ from asm_gym.policies.reflexes import Hold
 from asm_gym.scripts.demo import Args, without_fitting
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety, VectorNeuralASMSafety
 from tests.fakes import FakeEnv
+from tests.rates import failures
 from tests.streams import sine_episodes, sine_spec
 
 SIZES = {"hidden_size": 4, "association_size": 4, "epochs": 1}
@@ -90,6 +91,7 @@ def test_an_environment_of_the_panda_is_watched_by_the_memory_of_its_body():
     envs.close()
 
 
+@pytest.mark.floats
 @pytest.mark.parametrize("robot", ["Panda", "Sawyer", "IIWA"])
 @pytest.mark.parametrize("stream_freq", [None, 100])
 def test_each_arm_and_rate_has_a_memory_of_its_own_and_a_healthy_episode_is_quiet(robot, stream_freq):
@@ -97,10 +99,15 @@ def test_each_arm_and_rate_has_a_memory_of_its_own_and_a_healthy_episode_is_quie
     name = robot.lower() + ("_100hz" if stream_freq else "")
     assert env.monitor.about["name"] == name
     assert env.threshold == NeuralASM.pretrained(name).threshold
-    infos = []
-    assert rollout(env, make_policy("scripted", env, seed=4), 4, infos.append)
-    assert max(max(info["asm"]["surprises"]) for info in infos) < env.threshold
-    assert len(infos[0]["asm"]["surprises"]) == (5 if stream_freq else 1)
+
+    def trial(seed: int) -> str:
+        infos = []
+        solved = rollout(env, make_policy("scripted", env, seed=seed), seed, infos.append)
+        assert len(infos[0]["asm"]["surprises"]) == (5 if stream_freq else 1)
+        quiet = max(max(info["asm"]["surprises"]) for info in infos) < env.threshold
+        return "" if solved and quiet else f"solved: {solved}, quiet: {quiet}"
+
+    assert not failures(trial, range(4, 14), 0.95, first=1)
     env.close()
 
 
@@ -132,6 +139,7 @@ def test_nothing_fitted_a_push_is_noticed_and_a_healthy_episode_is_quiet():
     assert without_fitting(Args(task="TwoArmLift")) == ""
 
 
+@pytest.mark.floats
 @pytest.mark.parametrize(
     ("fault", "completed", "unread"),
     [

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from asm_gym.monitors.spinal import SpinalBand
+from asm_gym.monitors.contact_band import ContactBand
 from gymnasium import spaces
 
 from asm_gym.checkpoint import read_checkpoint
@@ -335,4 +335,4 @@ def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):
     with pytest.raises(ValueError, match=r"^this is a memory of dynamics='traces', .* cannot be loaded as 'settling'$"):
         NeuralASM(sine_spec(), 8, 8, dynamics="settling").restore(read_checkpoint(tmp_path / "traces.asm", traces.kind))
     with pytest.raises(ValueError, match="a band needs a fitted memory of traces, got one of dynamics='settling'"):
-        SpinalBand(asm)
+        ContactBand(asm)

@@ -26,6 +26,30 @@ from asm_gym.policies.scripted.base import (
     rotation,
     turn_left,
 )
+from asm_gym.policies.scripted.hanging import (
+    FRAME_GRIP,
+    HOLE,
+    HOOK_TOP,
+    IN,
+    RING,
+    ROD,
+    STANDS,
+    STEEP,
+    TILTED,
+    TIP,
+    TOOL_GRIP,
+    TUBE,
+    UPRIGHT,
+    Pose,
+    Scene,
+    astray,
+    carried,
+    course,
+    hangs,
+    is_round,
+    steepness,
+    tilt,
+)
 
 REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, TURN, RELEASE, RETREAT = range(9)
 FRAME, TOOL = range(2)
@@ -36,50 +60,9 @@ _RAISED = 1.0  # height of the hand at which what it holds may be turned [m]
 _BEFORE = 0.1  # from where the hand comes to what it grasps [m]
 _BACK = 0.08  # how far it withdraws: further, and the arm would be stretched out [m]
 _LOST = 0.05  # from the grip, where the hand no longer holds the thing [m]
-
-# The frame's own frame: origin in the corner, z along the rod away from the tip, x along the bar away from the hook.
-_FRAME_GRIP = np.array([0.0, -0.006, -0.048])  # higher, and the palm would stand on the hook [m]
-_ROD = np.array([0.0, 0.0, -0.048])  # the rod beside the grip
-_TIP = np.array([0.0, 0.0, -0.2207])
-_HOOK = 0.0875  # from the corner along the bar to the middle of the hook [m]
-_HOOK_TOP = 0.016  # from the bar's middle [m]
-_UPRIGHT = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # with the bar to the robot's right
-
-# The stand, from the middle of its base [m].
-_HOLE = np.array([0.0, 0.045, 0.0])
-_TUBE = 0.155  # its upper end
-_IN = 0.02  # how deep in the tube the tip no longer can miss it
-_STANDS = 0.012  # the tip's height when the frame stands; the task asks for 0.021
-
-# The tool's own frame: origin in the middle of its handle, x along it, away from the ring, z along the ring's axis.
-_TOOL_GRIP = np.array([0.0, 0.0, 0.003])
-_RING = np.array([-0.0935, 0.0, 0.0])
-# How the ring passes round the bar's end without touching it: how steeply the tool points down, and where the middle of
-# the ring then is from that of the hook, along the bar and up. The room left is 2 mm at the narrowest.
-_STEEP = np.radians([20.0, 35.0, 45.0, 55.0, 65.0, 75.0])
-_ALONG = np.array([0.0, 0.0, -0.002, -0.004, -0.007, -0.011])  # [m]
-_ABOVE = np.array([0.007, 0.004, 0.002, 0.0, 0.0, -0.003])  # [m]
+_TURNING = 0.5  # while more is left to turn, the frame is turned where the arm has room [rad]
+_OUT = -0.02  # no nearer to the arm's base than that, along x [m]
 _AHEAD = 0.33  # how much further to turn it than it is, so that the hand keeps up at its speed of 1 [rad]
-
-
-class Pose(NamedTuple):
-    """Where a thing is."""
-
-    at: Vector  # (3,) [m]
-    turned: Vector  # (3, 3)
-
-    def point(self, own: Vector) -> Vector:
-        """(3,) in the world, of a point (3,) in its own frame."""
-        return self.at + self.turned @ own
-
-
-class Scene(NamedTuple):
-    """What is seen."""
-
-    hand: Pose
-    frame: Pose
-    tool: Pose
-    hole: Vector  # (3,) under the tube, at the height of the base's middle [m]
 
 
 class Goal(NamedTuple):
@@ -137,13 +120,13 @@ class ToolHangExpert(Expert):
             return Pose(self._read(observation, f"{name}_pos"), matrix(self._read(observation, f"{name}_quat")))
 
         hand = Pose(self._read(observation, "hand_position"), rotation(self._read(observation, "hand_orientation")))
-        return Scene(hand, pose("frame"), pose("tool"), pose("base").point(_HOLE))
+        return Scene(hand, pose("frame"), pose("tool"), pose("base").point(HOLE))
 
 
 def _advance(state: ToolHangState, scene: Scene, settled: bool) -> ToolHangState:
     """The phase that comes next, where this one has done its work; ``settled``: the fingers have closed or opened."""
     thing, phase = state.thing, (_grasped if state.phase <= RAISE else _placed)(state, scene, settled)
-    if state.phase == RETREAT and thing == FRAME and _left(state, scene)[0] < 0.02:
+    if state.phase == RETREAT and thing == FRAME and (_left(state, scene)[0] < 0.02 or state.since > 40):
         thing, phase = TOOL, REACH
     if (thing, phase) == (state.thing, state.phase):
         return state
@@ -153,6 +136,8 @@ def _advance(state: ToolHangState, scene: Scene, settled: bool) -> ToolHangState
 def _grasped(state: ToolHangState, scene: Scene, settled: bool) -> int:
     """The phase that follows one of those up to ``RAISE``."""
     phase = state.phase
+    if state.thing == TOOL and hangs(scene):
+        return RETREAT  # by itself: whoever takes hold of it again would knock it off
     far = float(np.linalg.norm(scene.hand.at - _grasp(state.thing, scene).at))
     if phase == REACH:
         left, turn = _left(state, scene)
@@ -174,20 +159,29 @@ def _placed(state: ToolHangState, scene: Scene, settled: bool) -> int:
     if phase == RELEASE:
         return RETREAT if settled else RELEASE
     if phase == RETREAT:
-        return RETREAT
+        return RETREAT if state.thing == FRAME or since < 20 or hangs(scene) else REACH
     if np.linalg.norm(scene.hand.at - _grasp(state.thing, scene).at) > _LOST:
         return REACH
     left, turn = _left(state, scene)
     if phase == CARRY:
         return LOWER if left < 0.003 and turn < 0.03 else CARRY
     if phase == TURN:
-        steep = _steepness(scene)
-        if np.linalg.norm(scene.tool.point(_RING) - _course(scene, steep)) > 0.012 or since > 80:
-            return CARRY  # it slipped off the hook, or jams there
-        return RELEASE if steep > _STEEP[-1] - 0.06 else TURN
+        steep = steepness(scene)
+        jams = tilt(scene) > TILTED or since > 80
+        if is_round(scene):
+            if jams:
+                return RELEASE  # there is no way back over the hook but the whole turn
+        elif jams or astray(scene) > 0.012:
+            return CARRY  # it slipped off the hook
+        enough = STEEP[-1] - 0.06 if since < 30 else STEEP[-2]  # a tool that slips in the hand turns no further
+        return RELEASE if steep > enough else TURN
     if state.thing == TOOL:
-        return TURN if left < 0.002 or since > 40 else LOWER
-    if scene.frame.point(_TIP)[2] - scene.hole[2] < _STANDS:
+        if tilt(scene) > TILTED:
+            return CARRY
+        if left < 0.002 or (since > 40 and astray(scene) < 0.005):
+            return TURN
+        return CARRY if since > 60 else LOWER
+    if scene.frame.point(TIP)[2] - scene.hole[2] < STANDS:
         return RELEASE
     return CARRY if since > 120 else LOWER
 
@@ -223,61 +217,47 @@ def _grasp(thing: int, scene: Scene) -> Pose:
     """How to hold the hand for grasping."""
     if thing == TOOL:
         turned = scene.tool.turned
-        return Pose(scene.tool.point(_TOOL_GRIP), grasping(scene.hand.turned, -turned[:, 2], turned[:, 1]))
+        return Pose(scene.tool.point(TOOL_GRIP), grasping(scene.hand.turned, -turned[:, 2], turned[:, 1]))
     x, y, z = scene.frame.turned.T
     approach = np.sin(_LEAN) * y - np.cos(_LEAN) * z
     # This way round alone: the other, the wrist would come to its limit in turning the rod upright.
-    return Pose(scene.frame.point(_FRAME_GRIP), np.stack([np.cross(-x, approach), -x, approach], axis=1))
+    return Pose(scene.frame.point(FRAME_GRIP), np.stack([np.cross(-x, approach), -x, approach], axis=1))
 
 
 def _stand(state: ToolHangState, scene: Scene) -> Goal:
     """The frame upright over the tube, or on its way down."""
-    tip = scene.frame.point(_TIP)
+    tip = scene.frame.point(TIP)
     height = float(tip[2] - scene.hole[2])
     if state.phase == CARRY:
-        over = _TUBE + 0.025 + 0.3 * state.spread[2]
+        over = TUBE + 0.025 + 0.3 * state.spread[2]
         goal = scene.hole + np.array([0.0, 0.0, over])
         near = np.linalg.norm(goal - tip) < 0.03
-        return Goal(_carried(scene.hand, scene.frame, _TIP, goal, _UPRIGHT), CLOSE, 0.5 if near else 1.0)
-    if height < _TUBE - _IN:
+        hand = carried(scene.hand, scene.frame, TIP, goal, UPRIGHT)
+        if turn_left(scene.hand.turned, hand.turned) > _TURNING:
+            # Near its base the arm would fold up in turning, and its wrist come to its stops.
+            hand = Pose(np.array([max(state.anchor.at[0], _OUT), state.anchor.at[1], _CLEAR]), hand.turned)
+        return Goal(hand, CLOSE, 0.5 if near else 1.0)
+    if height < TUBE - IN:
         # Where the tube guides the tip, the hand stays over the hole: a rod that is pushed sideways at its tip jams.
-        down = scene.frame.point(_ROD)[2] - 0.02
+        down = scene.frame.point(ROD)[2] - 0.02
         goal = np.array([*scene.hole[:2], down])
-        return Goal(_carried(scene.hand, scene.frame, _ROD, goal, _UPRIGHT), CLOSE, 0.5)
+        return Goal(carried(scene.hand, scene.frame, ROD, goal, UPRIGHT), CLOSE, 0.5)
     astray = float(np.linalg.norm((tip - scene.hole)[:2]))
-    down = 0.02 * float(np.clip(1.5 - astray / 0.002, 0.0, 1.0)) if height > _TUBE - 0.01 else 0.02
+    down = 0.02 * float(np.clip(1.5 - astray / 0.002, 0.0, 1.0)) if height > TUBE - 0.01 else 0.02
     goal = np.array([*scene.hole[:2], tip[2] - down])
-    return Goal(_carried(scene.hand, scene.frame, _TIP, goal, _UPRIGHT), CLOSE, 0.5)
+    return Goal(carried(scene.hand, scene.frame, TIP, goal, UPRIGHT), CLOSE, 0.5)
 
 
 def _hang(state: ToolHangState, scene: Scene) -> Goal:
     """The ring over the hook, or lowered on to it, or turned about the bar's end."""
-    steep = float(_STEEP[0])
+    steep = float(STEEP[0])
     if state.phase == TURN:
-        steep = float(np.clip(_steepness(scene) + min(_AHEAD * state.speed, 0.2), *_STEEP[[0, -1]]))
+        steep = float(np.clip(steepness(scene) + min(_AHEAD * state.speed, 0.2), *STEEP[[0, -1]]))
     bar, up = -scene.frame.turned[:, 0], scene.frame.turned[:, 2]
     x, z = np.cos(steep) * bar - np.sin(steep) * up, np.sin(steep) * bar + np.cos(steep) * up
-    over = _HOOK_TOP + 0.03 + 0.3 * state.spread[2] if state.phase == CARRY else 0.0
+    over = HOOK_TOP + 0.03 + 0.3 * state.spread[2] if state.phase == CARRY else 0.0
     turned = np.stack([x, np.cross(z, x), z], axis=1)
-    pose = _carried(scene.hand, scene.tool, _RING, _course(scene, steep) + over * up, turned)
+    pose = carried(scene.hand, scene.tool, RING, course(scene, steep) + over * up, turned)
     if state.phase == TURN:
         return Goal(pose, CLOSE, 0.7, gain=1.0)  # at more, the hand would run ahead of its own turning
     return Goal(pose, CLOSE, 1.0 if state.phase == CARRY else 0.4)
-
-
-def _steepness(scene: Scene) -> float:
-    """How far down from the bar's direction the tool points [rad]."""
-    handle = scene.frame.turned.T @ scene.tool.turned[:, 0]
-    return float(np.arctan2(-handle[2], -handle[0]))
-
-
-def _course(scene: Scene, steep: float) -> Vector:
-    """(3,) where the ring's middle is to be when the tool points ``steep`` [rad] down."""
-    along, above = np.interp(steep, _STEEP, _ALONG), np.interp(steep, _STEEP, _ABOVE)
-    return scene.frame.point(np.array([-_HOOK - along, 0.0, above]))
-
-
-def _carried(hand: Pose, thing: Pose, own: Vector, goal: Vector, turned: Vector) -> Pose:
-    """How to hold the hand so that the thing in it is ``turned`` (3, 3), and a point of its ``own`` at the ``goal``."""
-    turn = turned @ thing.turned.T
-    return Pose(goal + turn @ (hand.at - thing.point(own)), turn @ hand.turned)
