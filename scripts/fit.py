@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 
 from asm_gym.data.logs import Layout, read_logs
+from asm_gym.data.notes import noted
 from asm_gym.data.selection import divided, normal_episodes, pieces, unbroken
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode
@@ -35,7 +36,7 @@ class Args:
 
     data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
     """A run folder of collect, import or evaluate, a Minari or LeRobot dataset, or logs (a file, or a folder): .csv,
-    .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS."""
+    .tsv, .txt, .jsonl, .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("runs/fit/memory.asm")
     """File to write the memory to."""
     monitor: str = "neural_asm"
@@ -48,6 +49,14 @@ class Args:
     """Columns of logs that were commanded and not sensed: names, or patterns such as 'cmd*'."""
     rate: float | None = None
     """Rows of logs a second [Hz]; by default their column called time says it."""
+    channels: tuple[str, ...] = ()
+    """Columns of logs that are read: names, or patterns; by default all of numbers."""
+    label: tuple[str, ...] = ()
+    """Columns that say what is wrong, beside those called so; rows that they mark are not learned from."""
+    columns: tuple[str, ...] = ()
+    """Names of the columns of files without a header."""
+    join: bool = False
+    """The files of the folder are parts of one recording: join them by their clocks."""
     split: float | None = None
     """Length of the pieces that long logs are cut into [s]; each then counts as an episode."""
     keep_failures: bool = False
@@ -81,9 +90,9 @@ def fit(args: Args, console: Console) -> None:
     """Reads, learns, calibrates, saves, and says what came of it."""
     start = time.perf_counter()
     with stage("reading", console, {}) as progress:
-        kept = normal_episodes(
-            read_logs(args.data, Layout(rate=args.rate, action=args.action)), args.keep_failures, progress
-        )
+        layout = Layout(None, args.rate, args.action, args.channels, args.label, args.columns, args.join)
+        with noted() as notes:
+            kept = normal_episodes(read_logs(args.data, layout), args.keep_failures, progress)
     left_out = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
     if not kept.episodes:
         hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""
@@ -99,6 +108,8 @@ def fit(args: Args, console: Console) -> None:
     rows = sum(map(len, fitting))
     hourly = args.false_alarm_rate * 3600 / (spec.dt * float(np.mean([len(e) for e in calibration])))
     say = partial(console.print, soft_wrap=True, highlight=False)
+    for line in notes:
+        say(f"Note: {line}.", markup=False)
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
     if left_out:
         say(f"Left out: {left_out}.")

@@ -25,6 +25,7 @@ from rich.console import Console
 
 from asm_gym.data.live import RowReader, SourceDied, is_live, lines_from
 from asm_gym.data.logs import Layout, Log, read_logs
+from asm_gym.data.notes import noted
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, traces_of
 from asm_gym.evaluation.report import write_report
@@ -63,6 +64,10 @@ class Args:
     """Folder of the table, the figures and the report of a recording."""
     rate: float | None = None
     """Rows of logs a second [Hz]; by default their column called time says it, or else the memory."""
+    columns: tuple[str, ...] = ()
+    """Names of the columns of a recording without a header."""
+    join: bool = False
+    """The files of a folder are parts of one recording: join them by their clocks."""
     silence: float = 2.0
     """Seconds without a row after which a live source has died, which is an alarm."""
     rerun: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
@@ -89,8 +94,9 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     alarms: list[Alarm] = []
     worst: list[ScoredEpisode] = []
     episodes = 0
-    with stage("watching", console, {}) as progress:
-        for group in in_groups(read_logs(args.source, Layout(monitor.spec, args.rate)), AT_ONCE):
+    layout = Layout(monitor.spec, args.rate, columns=args.columns, join=args.join)
+    with stage("watching", console, {}) as progress, noted() as notes:
+        for group in in_groups(read_logs(args.source, layout), AT_ONCE):
             traces = traces_of(group, monitor)
             alarms += [alarm for trace in traces for alarm in alarms_of(trace)]
             worst = sorted([*worst, *traces], key=lambda trace: -float(trace.surprise.max()))[: args.figures]
@@ -101,6 +107,8 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     if args.rerun is not None:
         write_rerun(args.rerun, worst, monitor)
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
+    for line in notes:
+        say(f"Note: {line}.")
     shown = sorted(alarms, key=lambda alarm: -alarm.excess)[:SHOWN_ROWS]
     say(said + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} greatest:"))
     width = max((len(alarm.channel) for alarm in shown), default=0)

@@ -6,7 +6,6 @@ rows that are missing by it are said. A source that falls silent has died, which
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import select
@@ -20,8 +19,9 @@ from typing import Any, NamedTuple, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.channels import TIME, bare_name, label_of
-from asm_gym.data.tabular import header_of
+from asm_gym.data.channels import bare_name, label_of
+from asm_gym.data.clock import Clock, clock_among
+from asm_gym.data.text import Dialect, header_of
 from asm_gym.files import regular_file
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number
@@ -151,7 +151,9 @@ class RowReader:
     def __init__(self, spec: StreamSpec) -> None:
         self.spec, self.line = spec, 0
         self._order: list[int] | None = None  # of CSV: where each number of a row stands
-        self._clock: int | None = None
+        self._how = Dialect(",", comma=False)
+        self._clock: Clock | None = None
+        self._clock_at = 0
         self._width = 0
         self._before: float | None = None
 
@@ -167,7 +169,8 @@ class RowReader:
             came = time.perf_counter()
             self.line += 1
             if self.line == 1 and line.lstrip()[0] not in "[{":
-                self._begin(next(csv.reader([line])))
+                self._how = Dialect.of(line)
+                self._begin(next(self._how.cells(iter([line]))))
                 continue
             try:
                 numbers, stamp = self._cells(line) if self._order is not None else self._json(line)
@@ -189,22 +192,25 @@ class RowReader:
         except ValueError as error:
             raise ValueError(f"line 1 is no row of numbers, and no header: {error}") from error
         self._order, self._width = [places[label] for label in self.spec.labels], len(names)
-        self._clock = next((names.index(name) for name in TIME if name in names), None)
+        headed = [name.strip() for name in header]
+        self._clock = clock_among(headed)
+        self._clock_at = headed.index(self._clock.column) if self._clock else 0
 
     def _cells(self, line: str) -> tuple[NDArray[np.float64], float | None]:
-        cells = next(csv.reader([line]))
-        if len(cells) != self._width:
+        cells = next(self._how.cells(iter([line])))
+        if len(cells) < self._width or any(cell.strip() for cell in cells[self._width :]):
             raise ValueError(f"it has {len(cells)} cells, the header {self._width}")
         assert self._order is not None
-        numbers = np.array([float(cells[k] or "nan") for k in self._order])
-        return numbers, None if self._clock is None else float(cells[self._clock])
+        numbers = np.array([self._how.number(cells[k]) for k in self._order])
+        return numbers, None if self._clock is None else self._clock.moment(cells[self._clock_at])
 
     def _json(self, line: str) -> tuple[NDArray[np.float64], float | None]:
         said: Any = json.loads(line)
         if not isinstance(said, dict):
             return np.asarray(said, np.float64), None
-        stamp = next((float(said[name]) for name in TIME if name in said), None)
-        return self._by_name(said), stamp
+        self._clock = self._clock or clock_among(said)
+        stamp = said.get(self._clock.column) if self._clock else None
+        return self._by_name(said), None if stamp is None or self._clock is None else self._clock.moment(str(stamp))
 
     def _by_name(self, said: dict[str, Any]) -> NDArray[np.float64]:
         """The numbers (D,) by the names of channels or of single numbers; the first row has to hold them all."""
