@@ -18,7 +18,7 @@ from rich.console import Console
 
 from asm_gym.data.logs import Layout, read_logs
 from asm_gym.data.notes import noted
-from asm_gym.data.selection import divided, normal_episodes, pieces, unbroken
+from asm_gym.data.selection import declared_by_all, divided, normal_episodes, pieces, unbroken
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
@@ -97,7 +97,7 @@ def fit(args: Args, console: Console) -> None:
     if not kept.episodes:
         hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
-    whole = [part for episode in kept.episodes for part in unbroken(episode)]
+    whole = [part for episode in declared_by_all(kept.episodes) for part in unbroken(episode)]
     episodes = whole if args.split is None else [p for e in whole for p in pieces(e, args.split)]
     fitting, calibration = divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
     fitting = fitting[: _QUICK["episodes"]] if args.quick else fitting

@@ -28,12 +28,12 @@ from asm_gym.data.units import ratio
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.validation import check_number, shown
 
-__all__ = ["bare_name", "is_label", "label_of", "read_recorded", "read_table", "stream_of"]
+__all__ = ["bare_name", "counts_rows", "is_label", "label_of", "read_recorded", "read_table", "stream_of", "unit_of"]
 
 Column = NDArray[Any]
 
 COUNTERS = ("", "index", "idx", "num", "no", "no.", "row", "seq", "frame", "frame_index", "unnamed: 0")
-"""Columns that count rows, where each is one more than the one before."""
+"""What columns are called that count rows, where each is one more than the one before, but for rows that were lost."""
 
 NORMAL = ("", "0", "false", "no", "none", "normal", "nominal", "ok", "good", "healthy", "nan")
 """Words of a label that say that nothing is wrong."""
@@ -221,7 +221,7 @@ def _arrays(frame: Any) -> dict[str, Column]:
 def _numbers(everything: Mapping[str, Column], labels: Mapping[str, Any]) -> dict[str, Column]:
     """The columns of numbers by name, (T,) or (T, k) each, that are none of clocks, labels and counters of rows."""
     columns = {n: c for n, c in everything.items() if c.dtype.kind in "biuf" and c.ndim in (1, 2)}
-    columns = {n: c for n, c in columns.items() if not (is_clock(n) or n in labels or _counts(n, c))}
+    columns = {n: c for n, c in columns.items() if not (is_clock(n) or n in labels or counts_rows(n, c))}
     lengths = {n: len(c) for n, c in columns.items()}
     if not lengths or not max(lengths.values()):
         raise ValueError(f"a frame must hold columns of numbers, got {', '.join(everything)[:200] or 'nothing'}")
@@ -230,9 +230,12 @@ def _numbers(everything: Mapping[str, Column], labels: Mapping[str, Any]) -> dic
     return columns
 
 
-def _counts(name: str, column: Column) -> bool:
-    """Whether it counts rows."""
-    return name.lower() in COUNTERS and column.ndim == 1 and len(column) > 1 and bool((np.diff(column) == 1).all())
+def counts_rows(name: str, column: Column) -> bool:
+    """Whether it does."""
+    if name.lower() not in COUNTERS or column.ndim != 1 or len(column) < 2:
+        return False
+    steps = np.diff(column.astype(np.float64))
+    return bool((steps >= 1).all() and (steps == np.rint(steps)).all() and np.median(steps) == 1)
 
 
 def _alike(dt: float, other: float) -> bool:
@@ -243,6 +246,12 @@ def bare_name(column: str) -> str:
     """What a column is called without its unit."""
     found = _UNIT.fullmatch(column)
     return found["name"] if found else column
+
+
+def unit_of(column: str) -> str:
+    """The unit behind a name; empty where there is none."""
+    found = _UNIT.fullmatch(column)
+    return found["unit"] if found else ""
 
 
 def _without_units(columns: Mapping[str, Column]) -> tuple[dict[str, Column], dict[str, str]]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import read_arrays
@@ -152,6 +153,30 @@ def read_logs(path: str | Path, layout: Layout | None = None) -> Iterator[Log]:
         raise FileNotFoundError(f"{path} holds no episodes: no {', '.join(READERS)}, no LeRobot or Minari dataset")
     for n, episode in enumerate(read_dataset(path)):
         yield Log(f"episode {n}", episode)
+
+
+def read_tables(path: str | Path, layout: Layout) -> Iterator[tuple[str, Columns]]:
+    """The columns of the logs at ``path`` as they are in their files, by name; of data sets, those of their streams.
+
+    Raises:
+        FileNotFoundError: there is nothing of the kind.
+        ValueError: a file cannot be read; the message names it.
+    """
+    path = Path(path)
+    if layout.join:
+        yield path.name, joined(_parts(path, layout))
+        return
+    tables = [path] if path.is_file() else [f for f in sorted(path.rglob("*")) if _readable(f.relative_to(path))]
+    if not tables or (path / INFO).is_file() or any(f.suffix == ".npz" or f.suffix not in TABLES for f in tables):
+        for name, episode in read_logs(path, layout):
+            rows = {label: episode.stream[:, k] for k, label in enumerate(episode.spec.labels)}
+            yield name, {"time": np.arange(len(episode)) * episode.spec.dt} | rows
+        return
+    for file in tables:
+        try:
+            yield file.name, TABLES[file.suffix](file, layout)
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from error
 
 
 def _lerobot(folder: Path, layout: Layout) -> Iterator[Log]:

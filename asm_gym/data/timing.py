@@ -18,7 +18,7 @@ JITTER = 0.35
 """By what share of a step a stamp may be off, and its row still be the one that was due."""
 
 DRIFT = 0.011
-"""How far a clock may be off the rate that is read, as a share, and no row be moved for it; just above what is alike."""
+"""How far a clock may be off the rate that is read, as a share, and no row be moved for it."""
 
 NEARLY, MOSTLY = 0.15, 0.95
 """A clock loses rows and does not jitter where so many steps are that near to whole multiples of the median."""
