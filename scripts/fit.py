@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +16,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from asm_gym.data.gaps import filled
 from asm_gym.data.logs import Layout, read_logs
 from asm_gym.data.notes import noted
 from asm_gym.data.selection import declared_by_all, divided, normal_episodes, pieces, unbroken
@@ -57,6 +58,8 @@ class Args:
     """Names of the columns of files without a header."""
     join: bool = False
     """The files of the folder are parts of one recording: join them by their clocks."""
+    bridge: float = 0.0
+    """Gaps up to so long are filled, on the line between their ends [s], such as 0.05; a log is cut at others."""
     split: float | None = None
     """Length of the pieces that long logs are cut into [s]; each then counts as an episode."""
     keep_failures: bool = False
@@ -73,6 +76,7 @@ class Args:
         for name in ("rate", "split"):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), above=0)
+        check_number("bridge", self.bridge, low=0)
         if self.out.is_dir():
             raise ValueError(f"out must be a file, and {self.out} is a folder")
 
@@ -97,7 +101,8 @@ def fit(args: Args, console: Console) -> None:
     if not kept.episodes:
         hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
-    whole = [part for episode in declared_by_all(kept.episodes) for part in unbroken(episode)]
+    bridged = [replace(e, stream=filled(e.stream, e.spec.dt, args.bridge)) for e in declared_by_all(kept.episodes)]
+    whole = [part for episode in bridged for part in unbroken(episode)]
     episodes = whole if args.split is None else [p for e in whole for p in pieces(e, args.split)]
     fitting, calibration = divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
     fitting = fitting[: _QUICK["episodes"]] if args.quick else fitting
@@ -114,7 +119,10 @@ def fit(args: Args, console: Console) -> None:
     if left_out:
         say(f"Left out: {left_out}.")
     if len(whole) != len(kept.episodes):
-        say(f"Rows were lost: {len(kept.episodes)} episodes were cut there, into {len(whole)} parts.")
+        say(
+            f"Rows were lost: {len(kept.episodes)} episodes were cut there, into {len(whole)} parts."
+            + ("" if args.bridge else " --bridge 0.05 fills gaps up to 0.05 s.")
+        )
     say(
         f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: an alarm in at most "
         f"{args.false_alarm_rate:.1%} of normal ones, {hourly:.{0 if hourly >= 10 else 1}f} an hour at their length."

@@ -23,6 +23,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
 from asm_gym.data.live import RowReader, SourceDied, is_live, lines_from
 from asm_gym.data.logs import Layout, Log, read_logs
 from asm_gym.data.notes import noted
@@ -48,6 +49,9 @@ MOMENTS = 6
 SHOWN_ROWS = 20
 """Alarms printed; the file holds them all."""
 
+MOST_LOST = 1000
+"""Lost rows that a bridge is asked about one by one."""
+
 LATENCIES = 10_000
 """Newest rows whose latency is kept."""
 
@@ -68,6 +72,8 @@ class Args:
     """Names of the columns of a recording without a header."""
     join: bool = False
     """The files of a folder are parts of one recording: join them by their clocks."""
+    bridge: float = 0.0
+    """For how long a number may be missing without an alarm [s], such as 0.05; such rows are not judged."""
     silence: float = 2.0
     """Seconds without a row after which a live source has died, which is an alarm."""
     rerun: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
@@ -78,6 +84,7 @@ class Args:
     def __post_init__(self) -> None:
         check_number("figures", self.figures, low=1, whole=True)
         check_number("silence", self.silence, above=0)
+        check_number("bridge", self.bridge, low=0)
         if self.rate is not None:
             check_number("rate", self.rate, above=0)
 
@@ -97,7 +104,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     layout = Layout(monitor.spec, args.rate, columns=args.columns, join=args.join)
     with stage("watching", console, {}) as progress, noted() as notes:
         for group in in_groups(read_logs(args.source, layout), AT_ONCE):
-            traces = traces_of(group, monitor)
+            traces = traces_of(group, monitor, args.bridge)
             alarms += [alarm for trace in traces for alarm in alarms_of(trace)]
             worst = sorted([*worst, *traces], key=lambda trace: -float(trace.surprise.max()))[: args.figures]
             episodes += len(group)
@@ -113,8 +120,8 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     say(said + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} greatest:"))
     width = max((len(alarm.channel) for alarm in shown), default=0)
     for cells in [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []:
-        log, start, end, channel, excess = cells
-        say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {log}")
+        log, start, end, channel, why, excess = cells
+        say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
     say(f"Wrote {args.out / 'report.html'} and alarms.csv")
     return BAD_NEWS if alarms else DONE
 
@@ -164,8 +171,12 @@ def write_rerun(path: Path, traces: Sequence[ScoredEpisode], monitor: Any) -> No
                 view.row(seconds, row, float(surprise), trace.threshold, shares)
 
 
-def follow(lines: Iterable[str], monitor: Any, console: Console) -> int:
-    """Watches rows as they come, in constant memory: prints every alarm as it is raised."""
+def follow(lines: Iterable[str], monitor: Any, console: Console, seconds: float = 0.0) -> int:
+    """Watches rows as they come, in constant memory: prints every alarm as it is raised, and why.
+
+    Args:
+        seconds: that something may be missing without an alarm.
+    """
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     spec: StreamSpec = monitor.spec
     state = monitor.initial_state(1)
@@ -173,21 +184,28 @@ def follow(lines: Iterable[str], monitor: Any, console: Console) -> int:
     latencies: deque[float] = deque(maxlen=LATENCIES)
     rows = alarms = 0
     before = False
+    bridge = Bridge(seconds, spec.dt, spec.size)
     try:
         for (row, lost), came in RowReader(spec).rows(lines):
             if lost:
-                state, _ = monitor.observe(state, np.full((1, spec.size), np.nan))
-                say(f"{(rows + 1) * spec.dt:.3f} s  {lost} row{'s' * (lost != 1)} lost: an alarm")
-                alarms += 1
+                nothing = np.full(spec.size, np.nan)
+                over = [bridge.over(np.isnan(nothing)) for _ in range(min(lost, MOST_LOST))]
+                for _ in over if all(over) else over[:1]:
+                    state, _ = monitor.observe(state, nothing[None])
+                if not all(over):
+                    say(f"{(rows + 1) * spec.dt:.3f} s  {lost} row{'s' * (lost != 1)} lost: an alarm ({LATE})")
+                    alarms += 1
             rows += 1 + lost
             state, surprise = monitor.observe(state, row[None])
-            value = float(surprise.value[0])
+            value = 0.0 if bridge.over(np.isnan(row)) else float(surprise.value[0])
             latencies.append(1e3 * (time.perf_counter() - came))
             if value > monitor.threshold and not before:
                 alarms += 1
-                channel = spec.labels[int(np.argmax(surprise.attribution[0]))]
+                at, why = blamed(row, surprise.attribution[0]), reason(row)
+                channel = "" if at is None else spec.labels[at] + "  "
                 late = f"{latencies[-1]:.2f} ms after the row came"
-                say(f"{rows * spec.dt:.3f} s  {channel}  {value / monitor.threshold:.2f} thresholds  {late}")
+                because = "" if why == SURPRISING else f"  ({why})"
+                say(f"{rows * spec.dt:.3f} s  {channel}{value / monitor.threshold:.2f} thresholds  {late}{because}")
             before = value > monitor.threshold
     except SourceDied as error:
         alarms += 1
@@ -210,7 +228,7 @@ def watch(args: Args, console: Console) -> int:
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
     if is_live(args.source):
-        return follow(lines_from(args.source, sys.stdin, args.silence), monitor, console)
+        return follow(lines_from(args.source, sys.stdin, args.silence), monitor, console, args.bridge)
     return review(args, monitor, console)
 
 

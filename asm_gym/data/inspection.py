@@ -101,7 +101,7 @@ class ChannelFound:
             said.append(f"hardly moves: {self.values} values; its spread has a floor")
         if self.missing:
             said.append("missing numbers: bridged, or cut there")
-        if self.resolution and self.repeats > 0.1 and not self.constant:
+        if self.resolution and self.repeats > 0.02 and not self.constant:
             said.append("repeats itself at rest: healthy")
         if "deg" in self.unit or "°" in self.unit:
             said.append("a memory of radians reads it too")
