@@ -8,7 +8,7 @@ import pytest
 from asm_gym.data.inspection import in_time, inspected
 from asm_gym.data.selection import declared_by_all
 from asm_gym.episode import Episode
-from asm_gym.quantisation import resolution
+from asm_gym.readings import resolution
 from asm_gym.scripts.cli import main
 
 

@@ -15,8 +15,9 @@ from asm_gym.data.lerobot import write_lerobot
 from asm_gym.data.logs import Layout, read_logs
 from asm_gym.data.tabular import as_array, read_parquet
 from asm_gym.data.text import read_table
-from asm_gym.data.timing import noise_of, regular
+from asm_gym.data.timing import regular
 from asm_gym.episode import Episode
+from asm_gym.readings import noise_of
 from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR
 from tests.needs import needs

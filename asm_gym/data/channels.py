@@ -23,8 +23,9 @@ from asm_gym.data.clock import clock_among, is_clock
 from asm_gym.data.notes import note
 from asm_gym.data.tabular import as_array
 from asm_gym.data.text import read_table
-from asm_gym.data.timing import increasing, noise_of, period, regular
+from asm_gym.data.timing import increasing, period, regular
 from asm_gym.data.units import ratio
+from asm_gym.readings import noise_of
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.validation import check_number, shown
 

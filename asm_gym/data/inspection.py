@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from asm_gym.data.channels import bare_name, counts_rows, is_label, unit_of
 from asm_gym.data.clock import clock_among, is_clock
-from asm_gym.data.timing import FAR, increasing, noise_of, period
-from asm_gym.quantisation import resolution
+from asm_gym.data.timing import FAR, increasing, period
+from asm_gym.readings import noise_of, resolution
 
 COMMAND = re.compile(
     r"(.*[^a-z])?(target|desired|cmd|commands?|commanded|set_?points?|goal|ref|reference|action)([^a-z].*)?"

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from asm_gym.data.logs import Log
-from asm_gym.data.timing import noise_of
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode
 from asm_gym.evaluation.scored import spans
+from asm_gym.readings import noise_of
 from asm_gym.spec import MOTOR
 
 SHORTEST_S = 0.5

@@ -110,16 +110,3 @@ def _between(column: Column, stamps: NDArray[np.float64], due: NDArray[np.float6
     out = np.column_stack([np.interp(due, stamps, flat[:, k]) for k in range(flat.shape[1])])
     out[lost] = np.nan
     return out.reshape(len(due), *column.shape[1:])
-
-
-def noise_of(values: Column) -> float:
-    """Standard deviation of what is white in a signal (T,), from its third differences; 0 where most repeat.
-
-    Third differences of white noise have 20 times its variance, those of a smooth signal are small. Source: Gasser,
-    Sroka and Jennen-Steinmetz 1986 for noise by differences.
-    """
-    known = values[np.isfinite(values)].astype(np.float64)
-    if len(known) < 8:
-        return 0.0
-    third = np.abs(np.diff(known, 3))
-    return float(f"{np.median(third) / 0.6745 / np.sqrt(20):.3g}")

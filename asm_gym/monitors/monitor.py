@@ -18,6 +18,7 @@ from asm_gym.monitors.base import Model, Progress, Specialises, State, Surprise,
 from asm_gym.monitors.model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.nominal import check_nominal
 from asm_gym.monitors.saved import MAXIMA, SavedMonitor
+from asm_gym.monitors.sighted import require_sight
 from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
 
 
@@ -203,9 +204,15 @@ class CalibratedMonitor:
         return self
 
     def _set_threshold(self, scores: Sequence[Surprise], rate: float) -> None:
-        """By what was made of nominal episodes. Raises ValueError, and changes nothing, where they are too few."""
+        """By what was made of nominal episodes.
+
+        Raises:
+            ValueError: they are too few, or no fault of some channel could pass it; nothing is changed.
+        """
         maxima = np.array([s.value.max() for s in scores])
-        self.threshold_, self.maxima_ = conformal_threshold(maxima, rate), maxima
+        threshold = conformal_threshold(maxima, rate)
+        require_sight(self.detection, self.model.error_columns, self.spec, threshold)
+        self.threshold_, self.maxima_ = threshold, maxima
 
     @typed
     def initial_state(self, batch: int = 1, told: Sequence[Told] = ()) -> MonitorState:
