@@ -169,12 +169,12 @@ class Detector:
 
     @property
     def reach_of_errors(self) -> NDArray[np.float64]:
-        """(X,) what the value comes to in a context of 0 where one error alone is at ν for ever, the others at 0."""
+        """(X,) what the value comes to where least is usual, one error alone at ν for ever, and the others at 0."""
         most = (self.bound * self.whitening) ** 2  # (X of the error, X)
         with np.errstate(over="ignore", divide="ignore"):
             ratios = (most[:, None, :] * ((2.0 - self.gains) / self.gains)[:, None] / self.ceiling) ** self.tail
             pooled = pool(ratios.reshape(len(most), -1))[0]
-        found: NDArray[np.float64] = pooled / np.exp(self.context_quantile[-1])
+            found: NDArray[np.float64] = pooled / np.exp(min(self.context_quantile[-1], self.context_range[0]))
         return found
 
     def start(self, batch: int) -> Evidence:

@@ -37,8 +37,8 @@ def require_sight(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, th
     """Raises ValueError where no fault of a channel could pass the threshold; it names them."""
     blind = blind_to(detection, errors, spec, threshold)
     if blind:
-        named = ", ".join(blind[:SHOWN]) + (", …" if len(blind) > SHOWN else "")
+        named = ", ".join(blind[:SHOWN]) + (f" and {len(blind) - SHOWN} more" if len(blind) > SHOWN else "")
         raise ValueError(
             f"the threshold came to {threshold:.3g}, which no fault of {named} could pass, however strong: an episode "
-            "to calibrate on is unlike those learned from, or a channel hardly moved in them; leave it out"
+            "to calibrate on is unlike those learned from, or a channel hardly moved in them: learn from more, or leave it out"
         )
