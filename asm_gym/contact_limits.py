@@ -1,8 +1,9 @@
 """How hard an arm may press and how fast its hand may go before it stays, whatever the cause is taken for.
 
 ISO/TS 15066:2016 (Annex A) lets a robot press a hand, the least tolerant part that it is likely to meet, with 140 N for
-long and 280 N for a moment. Healthy motion of the tasks of this package reaches 10 to 71 N at the wrist on one axis and 8 to 34 N m in
-a joint; what is peculiar to a set-up is learned from its calibration episodes, and the larger of the two counts.
+long and 280 N for a moment. Healthy motion of the tasks of this package reaches 10 to 71 N at the wrist on one axis and
+8 to 34 N m in a joint; what is peculiar to a set-up is learned from its calibration episodes, and the larger of the two
+counts.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ class ContactLimits:
     Args:
         wrist_force: on each axis of the wrist, the hand's own weight included [N].
         external_torque: of each joint [N m].
-        hand_speed: a command that would move the hand faster is scaled down to it [m/s]; infinite for none. Controllers
-            whose actions are no motions, torques, are not scaled.
+        hand_speed: a command that would move the hand faster is scaled down to it [m/s]; infinite for none. Of
+            OSC_POSE and JOINT_POSITION, whose actions are changes of where the arm is; others are not scaled.
         healthy: the most that healthy motion of this body and task was seen to reach, (N,) in the order of
             ``RobosuiteEnv.felt_channels``; where that is more, it counts. Empty where nobody knows.
         stays: the arm stays from the physics substep on after a limit was passed; else it is only said.

@@ -8,6 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.contact_limits import ContactLimits
 from asm_gym.spec import Channel, StreamSpec
 
 
@@ -24,6 +25,9 @@ class HoldsItself(Protocol):
 
     holding: bool
     """Set, the arms stay in the next control step, and the grippers keep what they were told; the step unsets it."""
+
+    keeps_holding: bool
+    """Set, no step unsets ``holding``: for wrappers in between that make several steps of one."""
 
 
 @runtime_checkable
@@ -72,6 +76,19 @@ class FeelsWithinSteps(Protocol):
 
     def expect(self, low: NDArray[np.float64], high: NDArray[np.float64], stays: bool = True) -> None:
         """Says what the arms are to feel in the next step (N,); they stay from the substep after they feel more."""
+        ...
+
+
+@runtime_checkable
+class LimitsContact(Protocol):
+    """It compares what its arms feel with limits in every physics substep, and stays where one is passed."""
+
+    felt_channels: tuple[Channel, ...]
+    contact_limits: ContactLimits | None
+    """Of this episode; ``reset`` forgets them."""
+
+    def slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(A,) what is commanded in the place of ``action``, by the speed that the limits allow a hand."""
         ...
 
 

@@ -9,7 +9,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from asm_gym.extras import needed_for
-from asm_gym.validation import check_text
+from asm_gym.validation import check_choice, check_text
 
 ROBOTS = ("Panda", "Sawyer", "UR5e", "Kinova3", "IIWA", "Jaco")
 """Arms that the tasks are tested with."""
@@ -87,8 +87,7 @@ def task(name: str) -> TaskSpec:
         ValueError: there is no such task; the message lists those that exist.
     """
     short = check_text("task", name).removeprefix("asm_gym/").removesuffix("-v0")
-    if short not in TASKS:
-        raise ValueError(f"unknown task {name!r}; known tasks: {', '.join(TASKS)}")
+    check_choice("task", short, TASKS)
     return TASKS[short]
 
 

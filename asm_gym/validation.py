@@ -159,9 +159,14 @@ def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
     """
     if type(values) is np.ndarray and values.dtype == np.float32:
         return values
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        raise ValueError(f"{name} must be numbers, and some are masked: {shown(values)}")
     try:
+        given: NDArray[Any] = np.asarray(values)
+        if given.dtype.kind not in "biufO":  # complex numbers would lose a part, and text would pass for numbers
+            raise TypeError(given.dtype)
         with np.errstate(over="ignore"):
-            return np.asarray(values, np.float32)
+            return given.astype(np.float32)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be numbers, got {shown(values)}") from error
 

@@ -64,11 +64,13 @@ class Hold:
         if not isinstance(space, spaces.Box):
             raise TypeError(f"a reflex needs a Box action space, got {space}")
         inner = env.unwrapped
+        self.env = env
+        """Where it acts; a guard refuses one that was made for another environment."""
         self.explicit = safe_action is not None
         """It does ``safe_action``, and knows of no environment."""
         self._robot = inner if isinstance(inner, HoldsItself) and not self.explicit else None
         if safe_action is not None:
-            self._rest = np.asarray(safe_action, np.float32)
+            self._rest = np.array(safe_action, np.float32)
         else:
             self._rest = nearest_to_rest(space) if self._robot else resting_action(env)
         if not space.contains(self._rest):
@@ -85,7 +87,7 @@ class Hold:
 
     def begin(self, executed: NDArray[np.float32]) -> Begun:
         """The state to start from, after ``executed`` (A,)."""
-        return Begun(np.asarray(executed, np.float32), 0)
+        return Begun(np.array(executed, np.float32), 0)
 
     def predict(
         self,

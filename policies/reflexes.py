@@ -32,9 +32,6 @@ USUAL_GAIN = 0.1
 DELTAS = ("OSC_POSE", "JOINT_POSITION")
 """Controllers whose actions are changes, of pose or of joint angles."""
 
-SLOWLY = 0.5
-"""Share of a change that is done under ``slow``."""
-
 
 class Recall(Hold):
     """Goes on along what the memory expects to be commanded: the skill's own continuation.
@@ -58,7 +55,7 @@ class Recall(Hold):
 
     def expects(self, action: NDArray[np.float32]) -> None:
         """What the memory expects to be commanded next (A,)."""
-        self._expected = np.nan_to_num(np.asarray(action, np.float32))
+        self._expected = np.nan_to_num(np.array(action, np.float32))
 
     def predict(
         self,
@@ -96,7 +93,7 @@ class Retract(Hold):
 
     def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
         if not acting:
-            self._path.append(np.asarray(executed, np.float32))
+            self._path.append(np.array(executed, np.float32))
 
     def move(self) -> NDArray[np.float32]:
         if not self._path:
@@ -154,19 +151,21 @@ class Comply(Hold):
 
 
 class Graded(Hold):
-    """Does what is asked for: stays, gives way, or goes back; and slows the policy down where that is enough.
+    """Does what is asked for: stays, gives way, or goes back.
 
-    The wrapper says which, by the cause of the alarm. What the environment does not allow is replaced by staying, and
-    going slowly by going on. The wrapper hands back when surprise is quiet, and on trial after ``TRY_AFTER_S`` where it
+    The wrapper says which, by severity and cause of the alarm. What the environment does not allow is replaced by
+    staying. The wrapper hands back when surprise is quiet, and on trial after ``TRY_AFTER_S`` where it
     is not, for a robot that holds still where it never did may surprise itself; after ``GIVE_UP_AFTER_S`` in all it
-    ends the episode.
+    ends the episode. The policy may go on in alarm for ``GO_ON_S`` in an episode. It ends where the policy passes a
+    contact limit for the time ``STRIKES``, or presses with more than ``IMPULSE`` [N s] beyond healthy motion.
 
     Args:
         env: one with a Box action space.
         compliance, tolerated: of ``Comply``.
     """
 
-    TRY_AFTER_S, GIVE_UP_AFTER_S = 0.5, 3.0
+    TRY_AFTER_S, GIVE_UP_AFTER_S, GO_ON_S = 0.5, 3.0, 5.0
+    STRIKES, IMPULSE = 3, 20.0
 
     def __init__(self, env: gym.Env[Any, Any], compliance: float = 0.05, tolerated: float = 4.0) -> None:
         super().__init__(env)
@@ -176,8 +175,6 @@ class Graded(Hold):
                 self._reflexes[name] = make()
             except ValueError:  # the environment does not allow it
                 self._reflexes[name] = self._reflexes["hold"]
-        inner = env.unwrapped
-        self._changes = isinstance(inner, TurnsJoints) and inner.controller in DELTAS
         self.choose("hold")
 
     def choose(self, name: str) -> None:
@@ -195,14 +192,6 @@ class Graded(Hold):
 
     def move(self) -> NDArray[np.float32]:
         return self._chosen.move()
-
-    def slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(A,) the policy's action at half speed, its grip as it is; the same where actions are no changes."""
-        if not self._changes:
-            return action
-        slow = np.float32(SLOWLY) * action
-        slow[self._grip] = action[self._grip]
-        return slow
 
 
 def _require_deltas(env: gym.Env[Any, Any], name: str) -> TurnsJoints:

@@ -13,19 +13,19 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
 from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import EpisodeLabel, load_episode
+from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
 from asm_gym.evaluation.tables import console_table, markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
-from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
+from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
 from asm_gym.rollouts.pretraining.healthy import healthy, held_out, learn_body
 from asm_gym.rollouts.pretraining.model_card import Exam, Marks, at_rates, card, examine, usual_force
@@ -33,10 +33,11 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, labelled, make_missing, versions
 from asm_gym.rollouts.scoring import code_digest
 from asm_gym.rollouts.trial import RolloutConfig, environment, record
-from asm_gym.scripts.command import at_least, run
+from asm_gym.scripts.command import run
+from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.tasks import ROBOTS, TASKS
 from asm_gym.tasks import task as task_spec
-from asm_gym.validation import check_choice
+from asm_gym.validation import check_choice, check_number
 
 SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
@@ -57,43 +58,43 @@ _GRIPPED = tuple(name for name, task in TASKS.items() if task.arms == 1 and name
 class Args:
     """A memory of a body, from motor babbling."""
 
-    robot: str = "Panda"
+    robot: str = option("Panda", known=ROBOTS)
     """The arm."""
-    tasks: tuple[str, ...] | None = None
-    """Tasks to babble in; by default seven with the Panda, and with other arms those of them that their experts do."""
-    guides: tuple[str, ...] = ()
+    guides: tuple[str, ...] = option((), metavar="AGENT")
     """Agents that lead in turn with the experts, by name or the files of asm-gym train; none by default."""
-    episodes: int = 60
+    episodes: int = option(60, quick=18, least=1)
     """Lessons in each task; a second call with more of them goes on."""
     reaching: bool = False
     """Whether the hand reaches for places where noise alone would move it."""
-    stream_freq: int | None = None
-    """Rows of the stream a second [Hz]; one each control step by default."""
-    false_alarm_rate: float = 0.05
-    """Share of healthy lessons that may raise an alarm."""
-    exam_tasks: tuple[str, ...] | None = None
-    """Further tasks to examine in; by default two that Panda experts do, with other arms those of them they do."""
-    exam_policies: tuple[str, ...] | None = None
+    stream_freq: int | None = option(None, least=1, metavar="HZ")
+    """Rows of the stream a second; one each control step by default."""
+    exam_policies: tuple[str, ...] | None = option(None, quick=(), metavar="AGENT")
     """Agents to examine under, as guides are named; by default all that are shipped and fit this arm."""
-    exam_episodes: int = 12
+    exam_episodes: int = option(12, quick=2, least=0)
     """Healthy episodes of each examination; 0 examines nothing."""
-    exam_faults: tuple[str, ...] = (TEST,)
+    exam_faults: tuple[str, ...] = option((TEST,), quick=(), metavar="KIND")
     """Kinds of fault, each medium and strong but for pushes of 20 N, where the policy or the task was left out."""
-    exam_pushes: int = 3
+    exam_pushes: int = option(3, quick=0, least=0)
     """Pushes of 20 N in each such examination; they are judged by how soon they are noticed."""
-    window: float = 1.0
-    """How soon after its onset a fault must be noticed [s]."""
-    parallel: tyro.conf.OmitArgPrefixes[ParallelConfig] = TWO_PROCESSES
-    """Who does the work."""
-    seed: int = 0
-    """Seed of all that is drawn."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/babble")
+    workers: str = option("2", check=ParallelConfig.named, metavar="N")
+    """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
+    seed: int = option(0, least=0)
+    """Seed of all that is drawn: the same seed gives the same result."""
+    out: Path = option(Path("runs/babble"), metavar="FOLDER")
     """Folder of the run."""
     quick: bool = False
-    """Two tasks and few lessons: to see that everything runs, not to judge the figures."""
+    """To see that everything runs, not to judge the figures."""
+    tasks: tuple[str, ...] | None = fixed(None)
+    """Tasks to babble in; by default seven with the Panda, and with other arms those of them that their experts do."""
+    exam_tasks: tuple[str, ...] | None = fixed(None, quick=())
+    """Further tasks to examine in; by default two that Panda experts do, with other arms those of them they do."""
+    false_alarm_rate: float = fixed(FALSE_ALARM_RATE, quick=0.34, check=conformal_episodes)
+    """Share of healthy lessons that may raise an alarm."""
+    window: float = fixed(WINDOW_S, check=partial(check_number, "window", above=0))
+    """How soon after its onset a fault must be noticed [s]."""
 
     def __post_init__(self) -> None:
-        check_choice("robot", self.robot, ROBOTS)
+        check_options(self)
         for name in (*self.shown, *self.left_out):
             check_choice("task of one arm with a gripper", name, _GRIPPED)
         for name in (*self.guides, *(self.exam_policies or ())):
@@ -102,10 +103,6 @@ class Args:
         if not self.shown:
             raise ValueError("there must be at least one task to babble in")
         kinds_of(self.exam_faults)
-        at_least(0, self, "exam_episodes")
-        at_least(0, self, "exam_pushes")
-        if not self.window > 0:
-            raise ValueError(f"window must be > 0 s, got {self.window}")
         needed = conformal_episodes(self.false_alarm_rate)
         there = len(self.shown) * sum(map(held_out, range(self.episodes)))
         if there < needed:
@@ -114,26 +111,17 @@ class Args:
                 f"on, and {self.episodes} lessons in each of {len(self.shown)} tasks hold {there}"
             )
 
-    def scaled(self) -> Args:
-        """With the tasks of this arm, and with ``quick`` little of everything."""
-        if not self.quick:
-            return replace(self, tasks=self.shown, exam_tasks=self.left_out)
-        return replace(
-            self,
-            tasks=self.shown[:2],
-            episodes=18,
-            exam_tasks=(),
-            exam_policies=(),
-            exam_episodes=min(2, self.exam_episodes),
-            exam_faults=(),
-            exam_pushes=0,
-            false_alarm_rate=0.34,
-        )
+    @property
+    def parallel(self) -> ParallelConfig:
+        """Who does the work."""
+        return ParallelConfig.named(self.workers)
 
     @property
     def shown(self) -> tuple[str, ...]:
         """Tasks to babble in."""
-        return self._able(SHOWN) if self.tasks is None else self.tasks
+        if self.tasks is not None:
+            return self.tasks
+        return self._able(SHOWN)[: 2 if self.quick else None]
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -198,7 +186,8 @@ def learn(args: Args, console: Console) -> NeuralASM:
     about = {
         "name": args.name,
         "controller": inner.controller,
-        **{n: getattr(args, n) for n in ("tasks", "guides", "reaching", "episodes", "seed", "false_alarm_rate")},
+        "tasks": args.shown,
+        **{n: getattr(args, n) for n in ("guides", "reaching", "episodes", "seed", "false_alarm_rate")},
         "lessons": len(lessons.fit),
         "rows": sum(map(len, lessons.fit)),
         "calibrated_on": len(lessons.calibration),
@@ -243,7 +232,6 @@ def _place(label: EpisodeLabel, folder: Path) -> Path:
 def babble(args: Args, console: Console) -> None:
     """Records, learns, examines, and says what came of it."""
     check(args)
-    args = args.scaled()
     claim = {n: getattr(args, n) for n in ("robot", "guides", "stream_freq", "seed")}
     claim |= {"reaching": True} if args.reaching else {}  # folders of before there was any are of other lessons
     with claimed(args.out, "babble.json", claim):

@@ -34,13 +34,6 @@ GROUPS: dict[str, dict[str, Command]] = {
     },
     "Study it": {
         "reproduce": Command("asm_gym.scripts.reproduce", "the method's claims, one study each; all runs many"),
-        "react": Command("asm_gym.scripts.reproduce.reflexes", "what acting on alarms is worth, reflex by fault"),
-        "adopt": Command("asm_gym.scripts.reproduce.adoption", "one policy's memory on another policy"),
-        "repertoire": Command("asm_gym.scripts.reproduce.repertoire", "one memory of all skills against one for each"),
-        "train-safely": Command(
-            "asm_gym.scripts.reproduce.safe_training", "an agent trained alone, and under the wrapper"
-        ),
-        "public": Command("asm_gym.scripts.reproduce.public", "AUROC by kind on voraus-AD or AURSAD, once downloaded"),
         "benchmark": Command("asm_gym.scripts.benchmark", "speeds as ratios against rivals, and experts"),
     },
     "Examples": {

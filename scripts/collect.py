@@ -7,24 +7,23 @@ same command goes on with the rest.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import gymnasium as gym
-import tyro
 from rich.console import Console
 
 from asm_gym.data.datasets import require_minari, write_dataset
 from asm_gym.episode import Episode, load_episode
 from asm_gym.rollouts.collect import check, collect, collect_to
-from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig
+from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, versions
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig
-from asm_gym.scripts.command import at_least, run
-from asm_gym.tasks import env_id
+from asm_gym.scripts.command import run
+from asm_gym.scripts.options import check_options, option
+from asm_gym.tasks import ROBOTS, env_id
 
 __all__ = ["collect", "episode_seeds"]  # which were here before there was a room for them
 
@@ -33,28 +32,32 @@ __all__ = ["collect", "episode_seeds"]  # which were here before there was a roo
 class Args:
     """Episodes of a policy, as a Minari dataset."""
 
-    task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")] = "Lift"
+    task: str = option("Lift", positional=True, check=env_id, metavar="TASK")
     """Name of a task, or any Gymnasium id whose spaces are numbers, such as Pusher-v5."""
     policy: str = "scripted"
     """What acts: scripted, hold, sway, a shipped agent, or the path of one."""
-    robot: str | None = None
+    robot: str | None = option(None, known=ROBOTS)
     """The arm; the task's own by default."""
-    episodes: int = 100
+    episodes: int = option(100, quick=4, least=1)
     """How many; a second call with more of them goes on."""
     only_successful: bool = False
     """Leave episodes that failed out of the dataset."""
-    parallel: tyro.conf.OmitArgPrefixes[ParallelConfig] = TWO_PROCESSES
-    """Who does the work."""
-    seed: int = 0
-    """Seed of the environment and of the policy: the same seed gives the same episodes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/collect")
+    workers: str = option("2", check=ParallelConfig.named, metavar="N")
+    """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
+    seed: int = option(0, least=0)
+    """Seed of all that is drawn: the same seed gives the same episodes."""
+    out: Path = option(Path("runs/collect"), metavar="FOLDER")
     """Folder of the episodes and of the dataset."""
     quick: bool = False
-    """Four episodes: to see that everything runs."""
+    """To see that everything runs."""
 
     def __post_init__(self) -> None:
-        at_least(1, self, "episodes")
-        env_id(self.task)  # refuses what there is not
+        check_options(self)
+
+    @property
+    def parallel(self) -> ParallelConfig:
+        """Who does the work."""
+        return ParallelConfig.named(self.workers)
 
     @property
     def env_id(self) -> str:
@@ -98,7 +101,6 @@ def record(args: Args, console: Console) -> tuple[Path, list[Episode]]:
 
 def record_and_report(args: Args, console: Console) -> None:
     """Records, and says where the episodes are."""
-    args = replace(args, episodes=4) if args.quick else args
     require_minari()
     check(args.env_id, args.config)
     folder, kept = record(args, console)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import signal
 import sys
 import textwrap
@@ -26,6 +25,8 @@ from io import BytesIO, TextIOWrapper
 from typing import TYPE_CHECKING, TypeVar
 
 import gymnasium as gym
+
+from asm_gym.scripts.options import help_text, read, shortened
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -75,7 +76,12 @@ def run(
 
     def parsed_and_done() -> int | None:
         args = parse(name, kind, argv, about)
-        return DONE if args is None else work(args, Console())
+        if args is None:
+            return DONE
+        console = Console()
+        if hurried := shortened(args):
+            console.print(hurried, highlight=False)
+        return work(args, console)
 
     return exit_code(name, parsed_and_done)
 
@@ -104,24 +110,21 @@ def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None, about:
 
     Raises:
         OptionsError: they make no sense.
+        ValueError: the dataclass refuses them.
     """
-    import tyro
-
-    given = sys.argv[1:] if argv is None else list(argv)
-    helped = bool({"-h", "--help"} & set(given))
-    said = TextIOWrapper(BytesIO(), encoding=sys.stdout.encoding if helped else "utf-8", write_through=True)
+    given, prog = sys.argv[1:] if argv is None else list(argv), f"asm-gym {name}".strip()
+    if {"-h", "--help"} & set(given):
+        print(help_text(prog, kind, plain(about or kind.__doc__ or "")), end="")
+        return None
+    said = TextIOWrapper(BytesIO(), encoding="utf-8", write_through=True)
     try:
-        # Unframed again below: framed lines that are broken could not be put together as they were.
-        with redirect_stdout(said), redirect_stderr(said), _columns(None if helped else 10_000):
-            return tyro.cli(
-                kind, args=given, prog=f"asm-gym {name}".strip(), description=plain(about or kind.__doc__ or "")
-            )
-    except SystemExit as end:
+        # Unframed below: framed lines that are broken could not be put together as they were.
+        with redirect_stdout(said), redirect_stderr(said), _columns(10_000):
+            values = read(kind, given, prog)
+    except SystemExit:
         said.seek(0)
-        if end.code:
-            raise OptionsError(_complaint(said.read())) from None
-    print(_fitted(said.read()), end="")
-    return None
+        raise OptionsError(_complaint(said.read())) from None
+    return kind(**values)
 
 
 def plain(text: str) -> str:
@@ -151,31 +154,18 @@ def _complaint(said: str) -> str:
     return said + (f"; did you mean {near}?" if near else "") + "".join(f"; {choice}" for choice in choices)
 
 
-def _fitted(help_text: str) -> str:
-    """Help without marks, whose paragraphs outside of frames are broken at the width of the terminal."""
-    width = min(shutil.get_terminal_size().columns, 120)
-    lines = []
-    for line in help_text.splitlines():
-        bare = line.replace("`", "")
-        if line.startswith("│"):  # what was taken out is made up for, or the frame would be dented
-            bare = bare[:-1].ljust(len(line) - 1) + bare[-1]
-        lines.append(bare if line[:1] in "╭│╰ " else textwrap.fill(bare, width))
-    return "\n".join(lines) + "\n"
-
-
 @contextmanager
-def _columns(width: int | None) -> Iterator[None]:
-    """So wide a terminal, for whatever asks; None leaves it as it is."""
+def _columns(width: int) -> Iterator[None]:
+    """So wide a terminal, for whatever asks."""
     before = os.environ.get("COLUMNS")
-    if width is not None:
-        os.environ["COLUMNS"] = str(width)
+    os.environ["COLUMNS"] = str(width)
     try:
         yield
     finally:
-        if before is not None:
-            os.environ["COLUMNS"] = before
-        elif width is not None:
+        if before is None:
             del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = before
 
 
 @contextmanager

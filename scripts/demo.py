@@ -12,18 +12,18 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, Literal
 
 import numpy as np
-import tyro
 from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import figures
+from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
 from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, false_alarms_per_hour, typical
 from asm_gym.evaluation.report import write_json, write_report
 from asm_gym.evaluation.scored import NOMINAL
@@ -44,66 +44,56 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged, watch_pair
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
-from asm_gym.scripts.command import at_least, run
-from asm_gym.tasks import task
+from asm_gym.scripts.command import run
+from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.tasks import env_id
+from asm_gym.validation import check_choice
 from asm_gym.wrappers import NeuralASMSafety
-
-WINDOW_S = 1.0
-"""How soon after its onset a fault must be noticed to count as detected [s]."""
 
 
 @dataclass(frozen=True)
 class Args:
     """Collect, fit, calibrate, break things, and see who notices."""
 
-    task: str = "asm_gym/Lift-v0"
-    """Environment id."""
-    on_alarm: str = "graded"
-    """What the wrapper does on an alarm: graded (what the cause asks for), hold or terminate."""
-    false_alarm_rate: float = 0.05
-    """Share of nominal episodes that may raise an alarm."""
-    fit_episodes: int = 60
-    """Nominal episodes to learn from."""
-    calibration_episodes: int = 60
-    """Other nominal episodes that set the threshold."""
-    nominal_episodes: int = 40
-    """Nominal episodes to test on."""
-    faulty_episodes: int = 20
-    """Episodes to test on for each fault."""
-    epochs: int = 40
-    """Passes over the episodes in learning."""
-    workers: int = os.cpu_count() or 1
-    """Processes."""
-    seed: int = 0
-    """Seed of all that is drawn: the same seed gives the same table."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/demo")
-    """Folder to write to."""
+    task: str = option("Lift", positional=True, check=env_id, metavar="TASK")
+    """Name of a task."""
+    on_alarm: Literal["graded", "hold", "terminate"] = option("graded")
+    """What the wrapper does on an alarm: graded does what the cause asks for."""
+    false_alarm_rate: float = option(FALSE_ALARM_RATE, check=conformal_episodes)
+    """Share of nominal episodes that may raise an alarm; a smaller one takes more episodes to set its threshold."""
     video: bool = True
-    """Make a video, where this machine can render."""
+    """Make no video; there is none where this machine cannot render."""
+    workers: int = option(os.cpu_count() or 1, least=1)
+    """Processes."""
+    seed: int = option(0, least=0)
+    """Seed of all that is drawn: the same seed gives the same table."""
+    out: Path = option(Path("runs/demo"), metavar="FOLDER")
+    """Folder to write to."""
     quick: bool = False
     """A third of the episodes: to see that everything runs, not to judge the figures."""
+    fit_episodes: int = fixed(60, quick=20, least=1)
+    """Nominal episodes to learn from."""
+    calibration_episodes: int = fixed(60, quick=20, least=1)
+    """Other nominal episodes that set the threshold, where the rate needs no more."""
+    nominal_episodes: int = fixed(40, quick=13, least=1)
+    """Nominal episodes to test on."""
+    faulty_episodes: int = fixed(20, quick=6, least=1)
+    """Episodes to test on for each fault."""
+    epochs: int = fixed(40, quick=13, least=1)
+    """Passes over the episodes in learning."""
 
     def __post_init__(self) -> None:
-        if self.on_alarm not in ("hold", "graded", "terminate"):
-            raise ValueError(f"on_alarm must be hold, graded or terminate, got {self.on_alarm!r}")
-        at_least(1, self, *(n for n in vars(self) if n.endswith("_episodes")), "epochs")
-        task(self.task)
-        if self.calibration_episodes < conformal_episodes(self.false_alarm_rate):
-            raise ValueError(
-                f"a false-alarm rate of {self.false_alarm_rate:g} needs at least "
-                f"{conformal_episodes(self.false_alarm_rate)} calibration episodes, got {self.calibration_episodes}"
-            )
+        check_options(self)
+        check_choice("response", self.on_alarm, ("graded", "hold", "terminate"))
 
-    def scaled(self) -> Args:
-        """With ``quick``, a third of the work; calibration keeps what the false-alarm rate needs."""
-        if not self.quick:
-            return self
-        counts = {
-            name: max(1, getattr(self, name) // 3)
-            for name in ("fit_episodes", "nominal_episodes", "faulty_episodes", "epochs")
-        }
-        needed = conformal_episodes(self.false_alarm_rate)
-        return replace(self, calibration_episodes=max(needed, self.calibration_episodes // 3), **counts)
+    @property
+    def env_id(self) -> str:
+        return env_id(self.task)
+
+    @property
+    def calibrating(self) -> int:
+        """Episodes that set the threshold: as many as the rate needs."""
+        return max(self.calibration_episodes, conformal_episodes(self.false_alarm_rate))
 
 
 def faults(seed: int, episodes: int) -> list[tuple[str, Fault]]:
@@ -131,7 +121,7 @@ def trials(args: Args) -> list[Trial]:
     seeds = episode_seeds(args.seed, args.nominal_episodes + len(broken), stage=2)
     cases = [(NOMINAL, ())] * args.nominal_episodes + [(name, (fault,)) for name, fault in broken]
     return [
-        Trial(args.task, seed, name, faults=faulty, acting=args.on_alarm)
+        Trial(args.env_id, seed, name, faults=faulty, acting=args.on_alarm)
         for (name, faulty), seed in zip(cases, seeds, strict=True)
     ]
 
@@ -146,12 +136,12 @@ def without_fitting(args: Args) -> str:
     surprises = []
     for faults in ((), (push,)):
         infos: list[dict[str, Any]] = []
-        with staged(Trial(args.task, seed, faults=faults), RolloutConfig()) as env:
+        with staged(Trial(args.env_id, seed, faults=faults), RolloutConfig()) as env:
             try:
                 watched = NeuralASMSafety(env, on_alarm="monitor", on_overrun="ignore")
             except ValueError:
                 return ""
-            play(Trial(args.task, seed), RolloutConfig(), watched, infos.append)
+            play(Trial(args.env_id, seed), RolloutConfig(), watched, infos.append)
             surprises.append(np.array([info["asm"]["surprise"] for info in infos]) / watched.threshold)
     healthy, pushed = surprises
     noticed = np.flatnonzero(pushed[PUSHED_AT:] > 1.0)
@@ -170,9 +160,9 @@ def fit(args: Args, folder: Path, timed: Callable[[str], Any]) -> tuple[NeuralAS
     """A memory of the task as the expert does it, calibrated and saved; and how often the expert succeeded."""
     with timed("collecting nominal episodes") as progress:
         episodes = collect(
-            args.task,
+            args.env_id,
             "scripted",
-            args.fit_episodes + args.calibration_episodes,
+            args.fit_episodes + args.calibrating,
             args.seed,
             args.workers,
             progress=progress,
@@ -248,7 +238,6 @@ def figures_of(
 
 def demonstrate(args: Args, console: Console) -> None:
     """The whole demo."""
-    args = args.scaled()
     folder = args.out
     folder.mkdir(parents=True, exist_ok=True)
     seconds: dict[str, float] = {}

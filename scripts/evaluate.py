@@ -15,41 +15,44 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium as gym
-import tyro
 from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import EpisodeLabel
 from asm_gym.evaluation.comparison import BenchmarkResult
+from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_S
 from asm_gym.evaluation.report import publish
 from asm_gym.evaluation.tables import brief_monitors_table, console_table, harmless_table, kinds_table
 from asm_gym.faults import anywhere
 from asm_gym.faults.interface import FaultyInterface
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of, possible
 from asm_gym.monitors import MONITORS, PARTS, make_monitor, monitor_class
-from asm_gym.monitors.registry import model_of
+from asm_gym.monitors.registry import check_monitor, model_of
 from asm_gym.policies import make_policy
-from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress
+from asm_gym.rollouts.parallel import ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, make_missing
 from asm_gym.rollouts.scoring import benchmark, calibrated
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, horizon_of, record
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
-from asm_gym.scripts.command import at_least, one_line, run
+from asm_gym.scripts.command import one_line, run
+from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.stream_source import StreamSource
-from asm_gym.tasks import env_id, is_task
+from asm_gym.tasks import ROBOTS, env_id, is_task
 from asm_gym.validation import check_choice, check_number
 
 _HARMLESS = (*HARMLESS, *EXECUTIONS)
 SHOWN = 2
 """Typical episodes in the video."""
 
-_QUICK_ELSEWHERE = ("neural_asm", "association_linear+evidence", "window_pca+evidence", "kalman+evidence")
-_QUICK = (*_QUICK_ELSEWHERE, "logpzo", "autoregression", "external_torque_limit", "force_limit")
+_QUICK = (
+    *("neural_asm", "association_linear+evidence", "window_pca+evidence", "kalman+evidence"),
+    *("logpzo", "autoregression", "external_torque_limit", "force_limit"),
+)
 """Monitors that are fitted in seconds."""
 
 
@@ -57,73 +60,69 @@ _QUICK = (*_QUICK_ELSEWHERE, "logpzo", "autoregression", "external_torque_limit"
 class Args:
     """Tasks × monitors × faults: who notices what, how fast, and how often for nothing."""
 
-    tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan", "Door")
+    tasks: tuple[str, ...] = option(
+        ("Lift", "Stack", "PickPlaceCan", "Door"),
+        quick=("Lift", "Stack", "Door"),
+        least=1,
+        check=env_id,
+        metavar="TASK",
+    )
     """Names of tasks; or one Gymnasium id with Box spaces, such as Pusher-v5 or gymnasium_robotics:FetchReach-v4."""
-    robot: str = "Panda"
+    robot: str = option("Panda", known=ROBOTS)
     """The arm, in robosuite's tasks."""
     policy: str = "scripted"
     """What acts: scripted, sway, or the path of an agent."""
-    steps: int | None = None
+    steps: int | None = option(None, check=partial(check_number, "steps", low=2, whole=True))
     """Length of an episode, in an environment by its id; by default its own."""
-    monitors: tuple[str, ...] = tuple(name for name in MONITORS if name not in PARTS)
+    monitors: tuple[str, ...] = option(
+        tuple(name for name in MONITORS if name not in PARTS), quick=_QUICK, least=1, check=check_monitor
+    )
     """Names of monitors; any model goes under any detection, as in external_torque_limit+evidence."""
-    settings: tuple[str, ...] = ()
+    settings: tuple[str, ...] = option((), metavar="MONITOR.NAME=VALUE")
     """Hyperparameters of these monitors that are not their own, as in gru.learning_rate=0.0003."""
-    faults: tuple[str, ...] = ()
+    faults: tuple[str, ...] = option((), metavar="KIND")
     """Kinds of fault, by default all that there are; development or test for robosuite's to choose by, or to report."""
-    severities: tuple[str, ...] = SEVERITIES
+    severities: tuple[str, ...] = option(SEVERITIES, quick=("strong",), least=1, known=SEVERITIES)
     """How bad each is."""
-    harmless: tuple[str, ...] = _HARMLESS
+    harmless: tuple[str, ...] = option(_HARMLESS, check=partial(check_choice, "harmless variation", known=_HARMLESS))
     """Harmless variations, which should raise no alarm."""
-    fit_episodes: int = 60
+    fit_episodes: int = option(60, quick=16, least=1)
     """Nominal episodes of each task to learn from."""
-    calibration_episodes: int = 60
+    calibration_episodes: int = option(60, quick=10, least=1)
     """Other nominal episodes of each task; the thresholds are set on those of all tasks together."""
-    nominal_episodes: int = 60
+    nominal_episodes: int = option(60, quick=8, least=1)
     """Nominal episodes of each task to test on."""
-    faulty_episodes: int = 20
+    faulty_episodes: int = option(20, quick=3, least=1)
     """Episodes of each task for each kind and severity; each is the twin of a nominal one."""
-    harmless_episodes: int = 20
+    harmless_episodes: int = option(20, quick=2, least=1)
     """Episodes of each task for each harmless variation."""
-    false_alarm_rate: float = 0.01
+    false_alarm_rate: float = option(REPORTED_RATE, quick=FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of nominal episodes that may raise an alarm."""
-    window: float = 1.0
-    """How soon after its onset a fault must be noticed [s]."""
-    parallel: tyro.conf.OmitArgPrefixes[ParallelConfig] = TWO_PROCESSES
-    """Who does the work."""
-    seed: int = 0
-    """Seed of all that is drawn: the same seed gives the same table."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
-    """Folder of the run."""
     video: bool = True
-    """Film two typical episodes, where this machine can render."""
+    """Do not film two typical episodes; there are none where this machine cannot render."""
+    workers: str = option("2", check=ParallelConfig.named, metavar="N")
+    """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
+    seed: int = option(0, least=0)
+    """Seed of all that is drawn: the same seed gives the same table."""
+    out: Path = option(Path("runs/evaluate"), metavar="FOLDER")
+    """Folder of the run."""
     quick: bool = False
-    """Three tasks, few monitors and few episodes: to see that everything runs, not to judge the figures."""
+    """To see that everything runs, not to judge the figures."""
+    window: float = fixed(WINDOW_S, check=partial(check_number, "window", above=0))
+    """How soon after its onset a fault must be noticed [s]."""
 
     def __post_init__(self) -> None:
-        for name in self.tasks:
-            env_id(name)
+        check_options(self)
         if self.elsewhere and len(self.tasks) > 1:
             raise ValueError(f"one memory has one stream: name one environment at a time, got {', '.join(self.tasks)}")
-        if self.steps is not None:
-            if not self.elsewhere:
-                raise ValueError("robosuite's tasks have lengths of their own: leave --steps out")
-            check_number("steps", self.steps, low=2, whole=True)
-        for name in self.monitors:
-            if name not in MONITORS:
-                monitor_class(name)  # refuses what is no model under a detection
+        if self.steps is not None and not self.elsewhere:
+            raise ValueError("robosuite's tasks have lengths of their own: leave --steps out")
         _ = self.hyperparameters  # refuses what no monitor has
-        for what, names, known in (
-            ("severity", self.severities, SEVERITIES),
-            ("harmless variation", self.harmless, _HARMLESS),
-        ):
-            for name in names:
-                check_choice(what, name, known)
-        if not self.elsewhere:
+        if self.elsewhere:
+            for name in self.faults:
+                check_choice("kind of fault", name, anywhere.KINDS)
+        else:
             kinds_of(self.faults)
-        for name in self.faults if self.elsewhere else ():
-            check_choice("kind of fault", name, anywhere.KINDS)
-        at_least(1, self, *(n for n in vars(self) if n.endswith("_episodes")))
         if self.faulty_episodes > self.nominal_episodes:
             raise ValueError(
                 f"every faulty episode is the twin of a nominal one: faulty_episodes must be at most "
@@ -135,10 +134,18 @@ class Args:
                 f"a false-alarm rate of {self.false_alarm_rate:g} needs {needed} calibration episodes in all, got "
                 f"{self.calibration_episodes} for each of {len(self.tasks)} tasks"
             )
-        if not self.window > 0:
-            raise ValueError(f"window must be > 0 s, got {self.window}")
-        if not self.tasks or not self.monitors or not self.severities:
-            raise ValueError("there must be at least one task, monitor and severity")
+
+    def episodes(self, role: str) -> int:
+        """Of each task, for a role; with ``--quick`` as many to calibrate on as the rate needs."""
+        count: int = getattr(self, f"{role}_episodes")
+        if role != "calibration" or not self.quick:
+            return count
+        return max(count, math.ceil(conformal_episodes(self.false_alarm_rate) / len(self.tasks)))
+
+    @property
+    def parallel(self) -> ParallelConfig:
+        """Who does the work."""
+        return ParallelConfig.named(self.workers)
 
     @property
     def hyperparameters(self) -> dict[str, dict[str, Any]]:
@@ -163,24 +170,6 @@ class Args:
     def elsewhere(self) -> bool:
         """The environment is not one of robosuite's tasks."""
         return not all(map(is_task, self.tasks))
-
-    def scaled(self) -> Args:
-        """With ``quick``, three tasks and little of everything."""
-        if not self.quick:
-            return self
-        return replace(
-            self,
-            tasks=tuple(t for t in self.tasks if t in ("Lift", "Stack", "Door")) or self.tasks[:3],
-            monitors=tuple(m for m in self.monitors if m in (_QUICK_ELSEWHERE if self.elsewhere else _QUICK))
-            or self.monitors[:1],
-            severities=("strong",) if "strong" in self.severities else self.severities[-1:],
-            fit_episodes=16,
-            calibration_episodes=max(10, math.ceil(conformal_episodes(0.05) / len(self.tasks))),
-            nominal_episodes=8,
-            faulty_episodes=3,
-            harmless_episodes=2,
-            false_alarm_rate=0.05,
-        )
 
     @property
     def config(self) -> RolloutConfig:
@@ -236,7 +225,7 @@ def labels(args: Args) -> list[EpisodeLabel]:
         horizon = horizon_of(env)
         env.close()
         for role in ("fit", "calibration", "nominal"):
-            seeds = role_seeds(args.seed, task, role, getattr(args, f"{role}_episodes"))
+            seeds = role_seeds(args.seed, task, role, args.episodes(role))
             made += [EpisodeLabel(task, role, seed=s) for s in seeds]
         twins = role_seeds(args.seed, task, "nominal", args.nominal_episodes)[: args.faulty_episodes]
         onsets = {s: draw_onset(s, horizon) for s in twins}
@@ -296,7 +285,6 @@ def evaluate(args: Args, console: Console) -> BenchmarkResult:
 
 def evaluate_and_report(args: Args, console: Console) -> None:
     """Evaluates, and prints the tables in brief."""
-    args = args.scaled()
     result = evaluate(args, console)
     details = kinds_table(result) if args.elsewhere else harmless_table(result, args.monitors[:1])
     for table in (brief_monitors_table(result), details):

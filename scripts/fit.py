@@ -10,10 +10,9 @@ import time
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 from rich.console import Console
 
 from asm_gym.data.gaps import filled
@@ -22,61 +21,60 @@ from asm_gym.data.notes import noted
 from asm_gym.data.selection import declared_by_all, divided, normal_episodes, pieces, unbroken
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode
-from asm_gym.monitors import MONITORS, make_monitor, monitor_class
+from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
+from asm_gym.monitors import make_monitor, monitor_class
+from asm_gym.monitors.registry import check_monitor
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
-from asm_gym.validation import check_choice, check_number
-
-_QUICK = {"episodes": 20, "epochs": 5}
+from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.validation import check_number
 
 
 @dataclass(frozen=True)
 class Args:
     """A memory from recordings."""
 
-    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
+    data: Path = option(positional=True, metavar="DATA")
     """A run folder of collect, import or evaluate, a Minari or LeRobot dataset, or logs (a file, or a folder): .csv,
     .tsv, .txt, .jsonl, .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("runs/fit/memory.asm")
+    out: Path = option(Path("runs/fit/memory.asm"), metavar="FILE")
     """File to write the memory to."""
-    monitor: str = "neural_asm"
+    monitor: str = option("neural_asm", check=check_monitor)
     """Name of the monitor."""
-    false_alarm_rate: float = 0.05
+    false_alarm_rate: float = option(FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of normal episodes that may raise an alarm."""
-    calibration_share: float = 0.5
-    """Share of the episodes that set the threshold, and are not learned from."""
-    action: tuple[str, ...] = ()
+    action: tuple[str, ...] = option((), metavar="COLUMN")
     """Columns of logs that were commanded and not sensed: names, or patterns such as 'cmd*'."""
-    rate: float | None = None
-    """Rows of logs a second [Hz]; by default their column called time says it."""
-    channels: tuple[str, ...] = ()
+    rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
+    """Rows of logs a second; by default their column called time says it."""
+    channels: tuple[str, ...] = option((), metavar="COLUMN")
     """Columns of logs that are read: names, or patterns; by default all of numbers."""
-    label: tuple[str, ...] = ()
+    label: tuple[str, ...] = option((), metavar="COLUMN")
     """Columns that say what is wrong, beside those called so; rows that they mark are not learned from."""
-    columns: tuple[str, ...] = ()
+    columns: tuple[str, ...] = option((), metavar="NAME")
     """Names of the columns of files without a header."""
     join: bool = False
-    """The files of the folder are parts of one recording: join them by their clocks."""
-    bridge: float = 0.0
-    """Gaps up to so long are filled, on the line between their ends [s], such as 0.05; a log is cut at others."""
-    split: float | None = None
-    """Length of the pieces that long logs are cut into [s]; each then counts as an episode."""
+    """The files of a folder are parts of one recording: join them by their clocks."""
+    bridge: float = option(0.0, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
+    """Gaps up to so long are filled, on the line between their ends, such as 0.05; a log is cut at others."""
+    split: float | None = option(None, check=partial(check_number, "split", above=0), metavar="SECONDS")
+    """Length of the pieces that long logs are cut into; each then counts as an episode."""
     keep_failures: bool = False
     """Learn from episodes that did not succeed, too."""
-    seed: int = 0
+    seed: int = option(0, least=0)
     """Seed of the memory, and of which episodes it learns from."""
     quick: bool = False
     """Learn little, from few episodes: to see that everything runs."""
+    calibration_share: float = fixed(0.5, check=partial(check_number, "calibration_share", above=0, below=1))
+    """Share of the episodes that set the threshold, and are not learned from."""
+    most: int | None = fixed(None, quick=20)
+    """Episodes to learn from at most."""
+    epochs: int | None = fixed(None, quick=5)
+    """Passes over them, of a monitor that learns in passes."""
 
     def __post_init__(self) -> None:
-        check_choice("monitor", self.monitor, MONITORS)
-        conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
-        check_number("calibration_share", self.calibration_share, above=0, below=1)
-        for name in ("rate", "split"):
-            if getattr(self, name) is not None:
-                check_number(name, getattr(self, name), above=0)
-        check_number("bridge", self.bridge, low=0)
+        check_options(self)
         if self.out.is_dir():
             raise ValueError(f"out must be a file, and {self.out} is a folder")
 
@@ -84,8 +82,8 @@ class Args:
 def learned(args: Args, fitting: list[Episode], calibration: list[Episode], progress: Progress) -> Any:
     """The monitor, fitted and calibrated."""
     settings: dict[str, Any] = {"seed": args.seed}
-    if args.quick and "epochs" in monitor_class(args.monitor).hyperparameters:
-        settings["epochs"] = _QUICK["epochs"]
+    if args.epochs is not None and "epochs" in monitor_class(args.monitor).hyperparameters:
+        settings["epochs"] = args.epochs
     monitor: Any = make_monitor(args.monitor, fitting[0].spec, **settings)
     return monitor.fit(fitting, progress).calibrate(calibration, args.false_alarm_rate)
 
@@ -105,7 +103,7 @@ def fit(args: Args, console: Console) -> None:
     whole = [part for episode in bridged for part in unbroken(episode)]
     episodes = whole if args.split is None else [p for e in whole for p in pieces(e, args.split)]
     fitting, calibration = divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
-    fitting = fitting[: _QUICK["episodes"]] if args.quick else fitting
+    fitting = fitting[: args.most]
     with stage("learning", console, {}) as progress:
         monitor = learned(args, fitting, calibration, progress)
     monitor.save(args.out)

@@ -9,9 +9,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from rich.console import Console
 
 from asm_gym.data.datasets import write_dataset
@@ -21,20 +19,24 @@ from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.scripts.command import run
+from asm_gym.scripts.options import check_options, fixed, option
 
 
 @dataclass(frozen=True)
 class Args:
     """Demonstrations as a Minari dataset."""
 
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.hdf5")]
+    file: Path = option(positional=True, metavar="FILE.hdf5")
     """What robosuite's collect_human_demonstrations or robomimic wrote."""
-    sensor_noise: float = 1.0
-    """Scales the noise of the sensors; 0 for exact readings."""
-    seed: int = 0
-    """Seed of that noise."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/import")
+    seed: int = option(0, least=0)
+    """Seed of the sensors' noise."""
+    out: Path = option(Path("runs/import"), metavar="FOLDER")
     """Folder of the dataset."""
+    sensor_noise: float = fixed(1.0, least=0)
+    """Scales the noise of the sensors; 0 for exact readings."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
 
 def convert(args: Args, progress: Progress) -> tuple[Path, list[Episode]]:

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from rich.console import Console
 
 from asm_gym.data.inspection import ChannelFound, Inspection, in_time, inspected
@@ -22,7 +20,8 @@ from asm_gym.data.logs import Layout, read_tables
 from asm_gym.data.notes import noted
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.tables import Table, console_table
-from asm_gym.scripts.command import BAD_NEWS, DONE, at_least, run
+from asm_gym.scripts.command import BAD_NEWS, DONE, run
+from asm_gym.scripts.options import check_options, option
 from asm_gym.validation import check_number
 
 HEADINGS = ("channel", "unit", "is", "what is done", "from", "to", "noise", "resolution", "repeats", "missing")
@@ -32,27 +31,25 @@ HEADINGS = ("channel", "unit", "is", "what is done", "from", "to", "noise", "res
 class Args:
     """What a log is."""
 
-    log: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")]
+    log: Path = option(positional=True, metavar="LOG")
     """A file or a folder, as asm-gym fit reads it."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/inspect")
+    out: Path = option(Path("runs/inspect"), metavar="FOLDER")
     """Folder of the pictures."""
-    rate: float | None = None
-    """Rows a second [Hz], where the log has no clock."""
-    action: tuple[str, ...] = ()
+    rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
+    """Rows a second, where the log has no clock."""
+    action: tuple[str, ...] = option((), metavar="COLUMN")
     """Columns that were commanded and not sensed: names, or patterns such as 'cmd*'."""
-    label: tuple[str, ...] = ()
+    label: tuple[str, ...] = option((), metavar="COLUMN")
     """Columns that say what is wrong, beside those called so."""
-    columns: tuple[str, ...] = ()
+    columns: tuple[str, ...] = option((), metavar="NAME")
     """Names of the columns of files without a header."""
     join: bool = False
-    """The files of the folder are parts of one recording."""
-    logs: int = 3
+    """The files of a folder are parts of one recording: join them by their clocks."""
+    logs: int = option(3, least=1)
     """How many logs of a folder are shown."""
 
     def __post_init__(self) -> None:
-        at_least(1, self, "logs")
-        if self.rate is not None:
-            check_number("rate", self.rate, above=0)
+        check_options(self)
 
 
 def inspect(args: Args, console: Console) -> int:

@@ -11,13 +11,12 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium as gym
 import torch
-import tyro
 from rich.console import Console
 
 from asm_gym.data.datasets import read_dataset
@@ -25,7 +24,7 @@ from asm_gym.episode import Episode, load_episode
 from asm_gym.policies.network import NetworkPolicy, describe
 from asm_gym.rollouts.collect import check as check_policy
 from asm_gym.rollouts.collect import collect_to
-from asm_gym.rollouts.parallel import THIS_PROCESS, ParallelConfig, Progress
+from asm_gym.rollouts.parallel import ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.seeds import episode_seeds
@@ -33,13 +32,13 @@ from asm_gym.rollouts.training.learners import ALGORITHMS
 from asm_gym.rollouts.training.recurrent import RECURRENT, clone_recurrent
 from asm_gym.rollouts.training.run import BEST, CLONE, Plan, TrainingRun, success_rate
 from asm_gym.rollouts.trial import RolloutConfig
-from asm_gym.scripts.command import at_least, run
-from asm_gym.tasks import task as task_spec
-from asm_gym.validation import check_choice
+from asm_gym.scripts.command import run
+from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.tasks import ROBOTS, env_id
 
 KEPT = ("env_id", "algorithm", "robot", "demonstrations", "dataset", "cloning_updates", "seed")
 """What must not change while a run goes on."""
-FREE = ("task", "out", "quick", "parallel")
+FREE = ("task", "out", "quick", "workers")
 """What is left out of the command that is noted down."""
 
 Curve = tuple[tuple[int, float], ...]
@@ -50,67 +49,52 @@ Curve = tuple[tuple[int, float], ...]
 class Args:
     """An agent for a task."""
 
-    task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")] = "Lift"
+    task: str = option("Lift", positional=True, check=env_id, metavar="TASK")
     """Name of a task, or any Gymnasium id with Box spaces."""
-    algorithm: str = "sac"
-    """sac, td3 or ppo; or gru, a recurrent clone, with steps 0."""
-    robot: str | None = None
+    algorithm: str = option("sac", known=(*ALGORITHMS, RECURRENT))
+    """How it learns; gru is a recurrent clone, and takes no steps of its own."""
+    robot: str | None = option(None, known=ROBOTS)
     """The arm; the task's own by default."""
-    steps: int = 20_000
+    steps: int = option(20_000, quick=300, least=0)
     """Control steps of its own that the agent learns from; 0 for a clone."""
-    demonstrations: int = 200
+    demonstrations: int = option(200, quick=4, least=0)
     """Episodes of the scripted expert to begin with; 0 for none."""
-    dataset: Path | None = None
+    dataset: Path | None = option(None, metavar="FOLDER")
     """Minari dataset of demonstrations, in place of the scripted expert's."""
-    cloning_updates: int = 15_000
+    cloning_updates: int = option(15_000, quick=200, least=1)
     """Updates of the actor on demonstrations, before it acts."""
-    evaluate_every: int = 5_000
-    """Control steps between evaluations."""
-    evaluation_episodes: int = 40
+    evaluation_episodes: int = option(40, quick=1, least=1)
     """Episodes of each evaluation."""
-    final_episodes: int = 100
+    final_episodes: int = option(100, quick=2, least=1)
     """Episodes of the last evaluation, on other seeds."""
-    checkpoint_every: int = 2_500
-    """Control steps between checkpoints: what a kill loses at most. PPO's wait for the end of its rollout."""
-    parallel: tyro.conf.OmitArgPrefixes[ParallelConfig] = THIS_PROCESS
-    """Who records demonstrations; learning is done by one process."""
-    seed: int = 0
-    """Seed of all that is drawn."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/train")
+    workers: str = option("1", check=ParallelConfig.named, metavar="N")
+    """Processes that record demonstrations; or a running cluster, as dask:tcp://host:8786 or ray:host:6379."""
+    seed: int = option(0, least=0)
+    """Seed of all that is drawn: the same seed gives the same result."""
+    out: Path = option(Path("runs/train"), metavar="FOLDER")
     """Folder of the run."""
     quick: bool = False
     """Few demonstrations, few steps: to see that everything runs."""
+    evaluate_every: int = fixed(5_000, quick=150, least=1)
+    """Control steps between evaluations."""
+    checkpoint_every: int = fixed(2_500, quick=100, least=1)
+    """Control steps between checkpoints: what a kill loses at most. PPO's wait for the end of its rollout."""
 
     def __post_init__(self) -> None:
-        check_choice("algorithm", self.algorithm, (*ALGORITHMS, RECURRENT))
-        if self.task not in gym.registry:
-            task_spec(self.task)
-        at_least(1, self, "cloning_updates", "evaluate_every", "evaluation_episodes", "final_episodes")
-        at_least(1, self, "checkpoint_every")
-        at_least(0, self, "steps", "demonstrations")
+        check_options(self)
         if not self.steps and not self.demonstrations and self.dataset is None:
             raise ValueError("there is nothing to learn from: neither steps nor demonstrations")
         if self.algorithm == RECURRENT and self.steps:
             raise ValueError(f"{RECURRENT} learns from demonstrations alone: steps must be 0, got {self.steps}")
 
-    def scaled(self) -> Args:
-        """With ``quick``, little of everything."""
-        if not self.quick:
-            return self
-        return replace(
-            self,
-            steps=min(300, self.steps),
-            demonstrations=min(4, self.demonstrations),
-            cloning_updates=200,
-            evaluate_every=150,
-            evaluation_episodes=1,
-            final_episodes=2,
-            checkpoint_every=100,
-        )
+    @property
+    def parallel(self) -> ParallelConfig:
+        """Who does the work."""
+        return ParallelConfig.named(self.workers)
 
     @property
     def env_id(self) -> str:
-        return self.task if self.task in gym.registry else task_spec(self.task).id
+        return env_id(self.task)
 
     @property
     def plan(self) -> Plan:
@@ -215,7 +199,6 @@ def _command(args: Args) -> str:
 
 def train_and_report(args: Args, console: Console) -> None:
     """Trains, and says how good the agent is."""
-    args = args.scaled()
     check(args)
     result = train(args, console)
     console.print(f"success {result['success']:.0%} of {args.final_episodes} episodes: {args.out / 'agent.npz'}")

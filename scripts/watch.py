@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 from rich.console import Console
 
 from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
@@ -36,6 +35,7 @@ from asm_gym.extras import require
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
+from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number
 from asm_gym.view.rerun import LiveView
@@ -60,33 +60,29 @@ LATENCIES = 10_000
 class Args:
     """Watches a recording, or rows as they come."""
 
-    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    source: str = option(positional=True, metavar="SOURCE")
     """What asm-gym fit reads; or what is live: -, tail:FILE or udp:PORT."""
-    monitor: Annotated[Path, tyro.conf.arg(metavar="FILE.asm")]
+    monitor: Path = option(metavar="FILE.asm")
     """A calibrated monitor, such as asm-gym fit writes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/watch")
+    out: Path = option(Path("runs/watch"), metavar="FOLDER")
     """Folder of the table, the figures and the report of a recording."""
-    rate: float | None = None
-    """Rows of logs a second [Hz]; by default their column called time says it, or else the memory."""
-    columns: tuple[str, ...] = ()
-    """Names of the columns of a recording without a header."""
+    rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
+    """Rows of logs a second; by default their column called time says it, or else the memory."""
+    columns: tuple[str, ...] = option((), metavar="NAME")
+    """Names of the columns of files without a header."""
     join: bool = False
     """The files of a folder are parts of one recording: join them by their clocks."""
-    bridge: float = 0.0
-    """For how long a number may be missing without an alarm [s], such as 0.05; such rows are not judged."""
-    silence: float = 2.0
-    """Seconds without a row after which a live source has died, which is an alarm."""
-    rerun: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
+    bridge: float = option(0.0, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
+    """For how long a number may be missing without an alarm, such as 0.05; such rows are not judged."""
+    silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
+    """Without a row for so long a live source has died, which is an alarm."""
+    rerun: Path | None = option(None, metavar="FILE.rrd")
     """Where to write the most surprising episodes of a recording for Rerun's viewer."""
-    figures: int = 4
+    figures: int = fixed(4, check=partial(check_number, "figures", low=1, whole=True))
     """How many of the most surprising episodes are drawn."""
 
     def __post_init__(self) -> None:
-        check_number("figures", self.figures, low=1, whole=True)
-        check_number("silence", self.silence, above=0)
-        check_number("bridge", self.bridge, low=0)
-        if self.rate is not None:
-            check_number("rate", self.rate, above=0)
+        check_options(self)
 
 
 def in_groups(logs: Iterable[Log], size: int) -> Iterator[list[Log]]:

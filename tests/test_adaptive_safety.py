@@ -37,7 +37,7 @@ def episode(env, steps=20):
 
 
 def test_a_false_alarm_raises_the_threshold_of_the_next_episode_and_not_of_its_own():
-    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0}), on_alarm="monitor", adapt=HOW)
+    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0}), on_alarm="monitor", adaptive_threshold=HOW)
     first, second = episode(env), episode(env)
     assert first["threshold"] == 1.0
     assert np.isnan(first["level"])
@@ -56,24 +56,24 @@ def test_without_adapt_nothing_moves_and_nothing_is_added():
 def test_what_goes_on_while_the_reflex_acts_is_no_drift():
     passing, lasting = {5: 2.0}, dict.fromkeys(range(5, 20), 2.0)
     for values, moved in ((passing, True), (lasting, False)):
-        env = NeuralASMSafety(FakeEnv(), ScriptedMonitor(values), release_after=3, adapt=HOW)
+        env = NeuralASMSafety(FakeEnv(), ScriptedMonitor(values), release_after=3, adaptive_threshold=HOW)
         episode(env)
         assert (episode(env)["threshold"] > 1.0) is moved
 
 
 def test_surprise_of_the_reflex_itself_is_not_the_policys():
-    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0, 6: 1000.0}), release_after=3, adapt=HOW)
+    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0, 6: 1000.0}), release_after=3, adaptive_threshold=HOW)
     episode(env)
     assert episode(env)["threshold"] == pytest.approx(np.exp(0.45))  # by the 2; 1000 is above the ceiling
 
 
 def test_a_confirmed_alarm_and_one_above_the_ceiling_teach_nothing():
-    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0}), on_alarm="monitor", adapt=HOW)
+    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0}), on_alarm="monitor", adaptive_threshold=HOW)
     episode(env)
     env.confirm_alarm()
     assert episode(env)["threshold"] == 1.0
     assert episode(env)["threshold"] > 1.0  # the confirmation was of one episode
-    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 20.5}), on_alarm="monitor", adapt=HOW)
+    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 20.5}), on_alarm="monitor", adaptive_threshold=HOW)
     for _ in range(5):
         last = episode(env)
     assert last["threshold"] == 1.0
@@ -90,7 +90,7 @@ def test_many_environments_share_a_threshold_and_keep_it_to_the_end_of_their_epi
 
     lengths = (6, 10)
     made = SyncVectorEnv([lambda n=n: FakeEnv(n) for n in lengths], autoreset_mode=AutoresetMode.NEXT_STEP)
-    env = VectorNeuralASMSafety(made, Monitor({3: 2.0}), on_alarm="monitor", adapt=HOW)
+    env = VectorNeuralASMSafety(made, Monitor({3: 2.0}), on_alarm="monitor", adaptive_threshold=HOW)
     env.reset()
     thresholds = []
     for _ in range(24):
@@ -138,7 +138,7 @@ def test_a_policy_that_changes_alarms_no_more_than_was_promised_and_a_fault_stil
     monitor.calibrate(recorder.episodes[30:], rate)
     alarms, how = {}, AdaptiveThreshold(rate, step=1.0, ceiling=60.0)
     for adapt, episodes in ((None, 20), (how, 90)):
-        env = NeuralASMSafety(pendulum, monitor, on_alarm="monitor", adapt=adapt, on_overrun="ignore")
+        env = NeuralASMSafety(pendulum, monitor, on_alarm="monitor", adaptive_threshold=adapt, on_overrun="ignore")
         ends = [play(env, rougher, seed) for seed in range(200, 200 + episodes)]
         alarms[adapt is not None] = np.array([largest > info["asm"]["threshold"] for largest, info in ends])
     assert alarms[False].mean() > 2.5 * rate

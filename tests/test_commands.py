@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from asm_gym.scripts import cli, command, reproduce
+from asm_gym.scripts.options import rows as options_of
 
 ROOT = Path(__file__).resolve().parents[1]
 STUDIES = [f"reproduce {study}" for study in ("all", *reproduce.STUDIES)]
@@ -63,6 +64,33 @@ def test_nonsense_is_refused_in_one_line(name, capsys):
     assert said.startswith("asm-gym ")
 
 
+def test_a_person_can_hold_the_options_of_all_commands_that_are_used():
+    shared = {"--workers", "--seed", "--out", "--quick"}
+    own = {}
+    for name, what in cli.GROUPS["Use it"].items():
+        kind = importlib.import_module(what.module).Args
+        own[name] = [row.name for row in options_of(kind) if row.name.split()[0] not in shared]
+    assert sum(map(len, own.values())) + len(shared) <= 60, own
+
+
+@pytest.mark.parametrize("name", EVERY_COMMAND)
+def test_help_has_no_marks_of_the_parser(name, capsys):
+    assert cli.main([*name.split(), "--help"]) == 0
+    said = capsys.readouterr().out
+    assert "{None}" not in said
+    assert "(default" not in said
+
+
+def test_help_says_what_will_do_and_what_is_shortened(capsys):
+    assert cli.main(["train", "--help"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "--algorithm NAME How it learns" in said
+    assert "One of sac, td3, ppo, gru. Default: sac." in said
+    assert "Unless asked otherwise: steps 300, demonstrations 4" in said
+    assert cli.main(["demo", "--help"]) == 0
+    assert "--on-alarm {graded,hold,terminate}" in capsys.readouterr().out
+
+
 def test_the_commands_fit_a_terminal(capsys):
     for asked in (["--help"], ["reproduce", "--help"]):
         assert cli.main(asked) == 0
@@ -78,12 +106,12 @@ def test_a_slip_of_the_finger_is_told_what_was_meant(typed, near, capsys):
 
 
 def test_all_studies_check_the_options_of_all_before_the_first_runs(capsys, monkeypatch):
-    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{reproduce.INDEPENDENT[i]}") for i in (0, -1))
+    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{name}") for name in ("retention", "failure"))
     ran: list[str] = []
     for module in (first, last):
-        monkeypatch.setattr(module, "main", lambda argv, name=module.__name__: ran.append(name) or 0)
-    monkeypatch.setattr(last, "Args", Options)  # which has no --seeds
-    monkeypatch.setattr(reproduce, "INDEPENDENT", (reproduce.INDEPENDENT[0], reproduce.INDEPENDENT[-1]))
+        monkeypatch.setattr(module, "run", lambda config, name=module.__name__: ran.append(name))
+    monkeypatch.setattr(last, "Config", Options)  # which has no --seeds
+    monkeypatch.setattr(reproduce, "INDEPENDENT", ("retention", "failure"))
     assert cli.main(["reproduce", "all", "--seeds", "2"]) == 2
     assert "--seeds" in capsys.readouterr().err
     assert not ran

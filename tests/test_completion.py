@@ -12,7 +12,7 @@ from asm_gym.monitors.diagnosis import CLASSES, Diagnosis, Readout
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import CompletedObservation, NeuralASMSafety
-from asm_gym.wrappers.completion import ObservationMap, Repair
+from asm_gym.wrappers.repair import ObservationMap, Repair
 from tests.fakes import CueMonitor
 
 SPEC = StreamSpec(

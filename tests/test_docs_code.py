@@ -13,10 +13,10 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-import tyro
 
 from asm_gym.faults import FAULTS
 from asm_gym.monitors import MONITORS
+from asm_gym.scripts import command as command_of
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.command import run
 from tests import documents
@@ -96,13 +96,13 @@ def check(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
         called: Callable[[], int] = partial(run, "soak", soak.Args, soak.soak, argv[2:])
     else:
         called = partial(main, argv)
-    parse = tyro.cli
+    parse = command_of.parse
 
     def dry(*args: Any, **kwargs: Any) -> Any:
         parse(*args, **kwargs)
         raise Parsed
 
-    monkeypatch.setattr(tyro, "cli", dry)
+    monkeypatch.setattr(command_of, "parse", dry)
     try:
         code = called()
     except Parsed:
@@ -110,7 +110,7 @@ def check(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     except SystemExit as stopped:
         code = stopped.code
     finally:
-        monkeypatch.setattr(tyro, "cli", parse)
+        monkeypatch.setattr(command_of, "parse", parse)
     assert code == 0, command
 
 

@@ -18,7 +18,10 @@ from asm_gym.monitors import load_monitor, registry
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 from asm_gym.rollouts.seeds import draw_onset
 from asm_gym.rollouts.trial import RolloutConfig, record
+from asm_gym.scripts import command
+from asm_gym.scripts.cli import main as cli
 from asm_gym.scripts.evaluate import Args, labels, main
+from asm_gym.scripts.options import shortened
 from asm_gym.spec import Channel, StreamSpec
 
 MONITORS = ("neural_asm", "kalman+evidence", "autoregression", "force_limit")
@@ -104,8 +107,8 @@ def test_a_folder_of_other_settings_is_refused(run, capsys):
         ("--false-alarm-rate 0.001", "needs 999 calibration"),
         ("--faulty-episodes 5", "at most 4, got 5"),
         ("--fit-episodes 0", "fit_episodes.*0"),
-        ("--window -1", "window"),
-        ("--backend dask", "address"),
+        ("--workers dask", "address"),
+        ("--workers many", "workers must be a number"),
         ("--policy door_sac", "door_sac takes observations of 41"),
         ("--policy nobody.npz", "nobody.npz"),
         ("--settings gru.hidden_size=8", "monitor with settings 'gru'; known: "),
@@ -136,13 +139,25 @@ def test_a_monitor_of_the_table_is_set_otherwise_under_every_detection(run):
 
 
 def test_quick_is_less_of_everything():
-    quick = Args(quick=True).scaled()
+    quick = command.parse("evaluate", Args, ["--quick"])
     assert quick.tasks == ("Lift", "Stack", "Door")
     assert quick.severities == ("strong",)
-    assert Args().scaled() == Args()
+    assert quick.episodes("calibration") * 3 >= 19
+    with pytest.raises(ValueError, match="window"):
+        Args(window=-1.0)
     made = labels(Args(tasks=("Door",), faults=("push", "slip"), harmless=("touch",), false_alarm_rate=0.05))
     assert {label.kind for label in made} == {"", "push", "touch"}  # a door is nothing that could slip
     assert len({label.path for label in made}) == len(made)
+
+
+def test_quick_keeps_what_was_asked_for():
+    asked = ["--monitors", "neural_asm", "gru", "--tasks", "PickPlaceCan", "--fit-episodes", "60"]
+    args = command.parse("evaluate", Args, ["--quick", *asked])
+    assert args.monitors == ("neural_asm", "gru")
+    assert args.tasks == ("PickPlaceCan",)
+    assert (args.fit_episodes, args.nominal_episodes, args.episodes("calibration")) == (60, 8, 19)
+    assert "fit episodes" not in shortened(args)
+    assert "nominal episodes 8" in shortened(args)
 
 
 def test_onsets_leave_room_before_and_after():
@@ -193,24 +208,8 @@ class _Recorder:
         return record(label, RolloutConfig(), self.folder)
 
 
-def test_a_search_asks_every_setting_of_a_monitor_and_keeps_each(run, tmp_path):
-    from asm_gym.scripts.reproduce import search
-
-    asked = ["--run", str(run), "--monitors", "kalman+evidence", "association_linear+evidence", "--episodes", "3"]
-    assert search.main([*asked, "--workers", "1", "--out", str(tmp_path)]) == 0
-    rows = list(csv.DictReader((tmp_path / "search.csv").open()))
-    assert [(r["monitor"], r["setting"]) for r in rows] == [
-        *(("kalman+evidence", s) for s in ("its own", "ridge 1e-05", "ridge 0.0001", "ridge 0.001", "ridge 0.01")),
-        ("association_linear+evidence", "its own"),
-    ]
-    assert len({r["auroc"] for r in rows[:5]}) > 1  # a setting says something
-    kept = {load_monitor(p).get_params().get("ridge") for p in (tmp_path / "search" / "monitors").iterdir()}
-    assert kept == {1e-4, 1e-6, 1e-5, 1e-3, 1e-2, None}
-    assert search.main(["--monitors", "oracle"]) == 2
-
-
 def test_a_learning_curve_learns_from_few_of_the_many(run, tmp_path):
-    from asm_gym.scripts.reproduce import learning_curve
+    from asm_gym.scripts.reproduce.recordings import in_turn
 
     asked = [
         "--run",
@@ -224,7 +223,7 @@ def test_a_learning_curve_learns_from_few_of_the_many(run, tmp_path):
         "--seeds",
         "2",
     ]
-    assert learning_curve.main([*asked, "--workers", "1", "--out", str(tmp_path)]) == 0
+    assert cli(["reproduce", "learning_curve", *asked, "--workers", "1", "--out", str(tmp_path)]) == 0
     rows = list(csv.DictReader((tmp_path / "learning_curve.csv").open()))
     assert [(r["monitor"], r["episodes"], r["seed"]) for r in rows] == [
         (m, n, s) for n in ("2", "4") for m in ("kalman+evidence", "force_limit") for s in ("0", "1")
@@ -232,7 +231,7 @@ def test_a_learning_curve_learns_from_few_of_the_many(run, tmp_path):
     assert all(0 <= float(r[key]) <= 1 for r in rows for key in ("auroc", "whole", "found", "false_alarms"))
     of_all = [r["auroc"] for r in rows if (r["monitor"], r["episodes"]) == ("force_limit", "4")]
     assert of_all[0] == of_all[1]  # it draws nothing, and all there is to learn from is the same
-    first, second = (in_turn for in_turn in (learning_curve.in_turn(_labelled(), seed) for seed in (0, 1)))
+    first, second = (in_turn(_labelled(), seed) for seed in (0, 1))
     assert [e.labelled.task for e in first] == ["Lift", "Stack"] * 2 + ["Stack"]
     assert [e.labelled.seed for e in first] != [e.labelled.seed for e in second]
 
@@ -241,7 +240,10 @@ def test_association_is_taught_in_every_way_that_is_asked_for_and_judged_alike(r
     from asm_gym.scripts.reproduce import feedback
 
     asked = ["--run", str(run), "--ways", "transported", "random", "linear", "--kinds", "test", "--seeds", "2"]
-    assert feedback.main([*asked, "--false-alarm-rate", "0.05", "--workers", "1", "--out", str(tmp_path)]) == 0
+    assert (
+        cli(["reproduce", "feedback", *asked, "--false-alarm-rate", "0.05", "--workers", "1", "--out", str(tmp_path)])
+        == 0
+    )
     rows = list(csv.DictReader((tmp_path / "feedback.csv").open()))
     ways = ["transported", "random", "linear"]
     assert [(r["way"], r["seed"]) for r in rows] == [(way, seed) for seed in "01" for way in ways]
@@ -249,7 +251,7 @@ def test_association_is_taught_in_every_way_that_is_asked_for_and_judged_alike(r
     facts = json.loads((tmp_path / "feedback.json").read_text())
     assert set(facts["kinds"]) == {"frozen_encoder", "gripper_opens"}  # a push is there to develop on
     with pytest.raises(ValueError, match="transported, learned"):
-        feedback.Args(run=run, ways=("none",))
+        feedback.Config(run=run, ways=("none",))
 
 
 def _labelled():

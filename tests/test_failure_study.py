@@ -11,7 +11,7 @@ from asm_gym.evaluation.statistics import Share
 from asm_gym.monitors import Surprise
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.scripts.reproduce import failure_rivals
-from asm_gym.scripts.reproduce.failure import AGENTS, Args, Watched, early, in_order, labels, order, separated, ways
+from asm_gym.scripts.reproduce.failure import AGENTS, Config, Watched, early, in_order, labels, order, separated, ways
 from asm_gym.scripts.reproduce.failure_rivals import entropy, inconsistency, reversals, scored
 from asm_gym.scripts.reproduce.weakened import Weakened
 from asm_gym.spec import Channel, StreamSpec
@@ -40,7 +40,7 @@ def test_failures_are_told_from_successes_by_rank_and_nothing_is_said_where_all_
 
 
 def test_the_tables_count_what_was_known_by_when_and_in_which_order():
-    (row,) = early({"one": WATCHED}, Args()).rows
+    (row,) = early({"one": WATCHED}, Config()).rows
     assert row[2].startswith("0.889 (")
     assert row[4:] == ("1 of 3", "2 of 3", "1 of 2")
     table = ways({"one": WATCHED})
@@ -126,7 +126,7 @@ def test_an_agent_is_weakened_anew_by_each_seed_and_alike_by_the_same():
 
 
 def test_roles_and_repetitions_share_no_seed_and_every_disturbance_has_its_turn():
-    args = Args(tasks=tuple(AGENTS), episodes=8)
+    args = Config(tasks=tuple(AGENTS), episodes=8)
     made = [*labels(args, 0), *labels(args, 1)]
     assert len({(x.task, x.seed) for x in made}) == len(made) == 2 * 3 * 5 * 8
     assert len({(x.task, x.kind) for x in made if x.role == "disturbed"}) == 12
@@ -141,4 +141,4 @@ def test_settings_that_cannot_be_judged_are_refused():
         ({"false_alarm_rate": 0.0}, "false_alarm_rate"),
     ):
         with pytest.raises(ValueError, match=says):
-            Args(**wrong)
+            Config(**wrong)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from asm_gym.wrappers import FlatInfo, NeuralASMSafety, SafetyLog, SixValues
-from asm_gym.wrappers.learners import SafetyCounter, WandbWriter
+from asm_gym.wrappers.logging import SafetyCounter, WandbWriter
 from tests.fakes import CueMonitor, FakeEnv
 from tests.needs import needs
 

@@ -200,3 +200,12 @@ def test_no_cluster_at_the_address_is_said():
     needs("distributed")
     with pytest.raises(ConnectionError, match=r"tcp://127\.0\.0\.1:1"):
         parallel_map(abs, [1], ParallelConfig(2, "dask", "tcp://127.0.0.1:1"))
+
+
+def test_workers_are_named_in_one_word():
+    assert ParallelConfig.named("3") == ParallelConfig(3)
+    assert ParallelConfig.named("dask:tcp://host:8786") == ParallelConfig(backend="dask", address="tcp://host:8786")
+    assert ParallelConfig.named("ray") == ParallelConfig(backend="ray")
+    for wrong in ("", "two", "0", "-1", "loky", "dask", "slurm:host"):
+        with pytest.raises(ValueError, match=r"workers must be|needs the address"):
+            ParallelConfig.named(wrong)

@@ -90,7 +90,7 @@ def test_abilities_of_a_monitor_that_fail_do_not_end_the_guard(ability):
         return value
 
     rate = 0.1 if ability == "adapt" else 0.0
-    env = NeuralASMSafety(FakeEnv(), Able([2]), on_alarm="recall", learning_rate=rate)
+    env = NeuralASMSafety(FakeEnv(), Able([2]), on_alarm="recall", online_learning_rate=rate)
     env.reset()
     infos = [env.step(ACT)[4] for _ in range(6)]
     assert ability in next(i["asm"]["failure"] for i in infos if i["asm"]["alarm"])

@@ -153,19 +153,23 @@ def table_of(said: str) -> dict[str, list[str]]:
     return {row[0]: row[1:] for row in rows}
 
 
+def out(folder: Path) -> list[str]:
+    return ["--out", str(folder / "out")]
+
+
 HOW = ["--monitors", "window_pca+evidence", "--false-alarm-rate", "0.2", "--calibration-share", "0.5"]
 
 
 def test_a_kind_that_shows_is_told_from_normal_and_one_that_does_not_is_not(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
-    assert main(["public", str(voraus(tmp_path / "v.parquet", everything())), *HOW]) == 0
+    assert main(["reproduce", "public", str(voraus(tmp_path / "v.parquet", everything())), *HOW, *out(tmp_path)]) == 0
     rows = table_of(capsys.readouterr().out)
     assert rows["collision foam"] == ["4", "1.000 / 100 %"]
     hidden = float(rows["wobbling station"][1].split(" / ")[0])
     assert 0.1 < hidden < 0.9
     assert float(rows["mean over kinds"][1]) == pytest.approx((1 + hidden) / 2, abs=1e-3)
     assert rows["normal"][0] == "6"
-    assert main(["public", str(aursad(tmp_path / "AURSAD.h5", LABELS)), *HOW]) == 0
+    assert main(["reproduce", "public", str(aursad(tmp_path / "AURSAD.h5", LABELS)), *HOW, *out(tmp_path)]) == 0
     rows = table_of(capsys.readouterr().out)
     assert rows["damaged screw"] == ["3", "1.000 / 100 %"]
     assert float(rows["missing screw"][1].split(" / ")[0]) < 1.0
@@ -207,7 +211,7 @@ def cut(path: Path) -> Path:
     ],
 )
 def test_a_file_that_is_not_what_it_should_be_is_refused_in_a_line(make, name, message, tmp_path, capsys):
-    assert main(["public", str(make(tmp_path / name)), *HOW]) == 2
+    assert main(["reproduce", "public", str(make(tmp_path / name)), *HOW, *out(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert message in said
     assert len(said.strip().splitlines()) == 1

@@ -7,18 +7,21 @@ import json
 import math
 import re
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
 
 from asm_gym.episode import Episode
 from asm_gym.scripts.cli import main as cli
+from asm_gym.scripts.options import rows
 from asm_gym.scripts.reproduce import (
     INDEPENDENT,
     STUDIES,
     contextual_inference,
     express_skills,
     fault_detection,
+    kit,
     memorise_and_recall,
     retention,
     robot_recall,
@@ -28,7 +31,6 @@ from asm_gym.scripts.reproduce import (
     unnamed_skills,
 )
 from asm_gym.scripts.reproduce.apprentices import DISTURBANCE, demonstrate, stream_of
-from asm_gym.scripts.reproduce.common import Common, over_seeds, shown
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     Hopfield,
@@ -45,6 +47,7 @@ from asm_gym.scripts.reproduce.handwriting import (
     copybook,
     repertoire,
 )
+from asm_gym.scripts.reproduce.kit import Config, over_seeds, shown
 from asm_gym.scripts.reproduce.laws import LAWS, fit
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
@@ -135,7 +138,7 @@ def test_a_slip_is_one_of_so_many_centimetres_from_its_onset_on():
 
 
 def test_the_state_tells_a_pair_apart_only_once_it_has_parted():
-    args = contextual_inference.Args(skills=("a", "c"), repertoire=4, hidden=32, writings=8, steps=1500)
+    args = contextual_inference.Config(skills=("a", "c"), repertoire=4, hidden=32, writings=8, steps=1500)
     records, _ = contextual_inference.one_seed(0, args)
     right = {r["step"]: r["right"] for r in records if (r["how"], r["source"]) == ("named", "state")}
     assert np.mean([right[t] for t in range(40, 60)]) > 0.9
@@ -143,7 +146,7 @@ def test_the_state_tells_a_pair_apart_only_once_it_has_parted():
 
 
 def test_a_library_told_a_wrong_skill_is_always_in_alarm_and_the_memory_needs_none():
-    args = fault_detection.Args(letters=3, writings=8, hidden=32, robot_episodes=0)
+    args = fault_detection.Config(letters=3, writings=8, hidden=32, robot_episodes=0)
     records, _ = fault_detection.judged(0, written_fault_set(0, 3, 8), args)
     alarms = {way: over_seeds(records, "alarm", way=way)[0] for way in fault_detection.WAYS}
     assert alarms["wrong"] == 1.0
@@ -167,7 +170,7 @@ def test_what_was_done_is_in_the_stream_and_what_was_intended_in_the_actions():
 
 @pytest.mark.slow
 def test_a_memory_that_watched_lifts_the_cube_in_new_scenes():
-    args = express_skills.Args(tasks=("Lift",), demonstrations=25, units=256, trials=12, workers=1)
+    args = express_skills.Config(tasks=("Lift",), demonstrations=25, units=256, trials=12, workers=1)
     spec = stream_of(args.tasks)
     lessons = [demonstrate(("Lift", seed), spec) for seed in range(args.demonstrations)]
     pupil = express_skills.learn(("memory", 0), [e for e in lessons if e is not None], args)
@@ -188,10 +191,7 @@ def test_spread_is_over_seeds_and_not_over_measurements():
     ("study", "arguments", "message"),
     [
         ("memorise_and_recall", ["--cues", "60"], "shorter than the letter, 1 to 59 steps, got 60"),
-        ("memorise_and_recall", ["--dims", "3"], "in 2 dimensions, or in 2 and 3, got \\(3,\\)"),
         ("memorise_and_recall", ["--repertoires", "0"], "1 to 32 skills, got 0"),
-        ("memorise_and_recall", ["--hidden", "3"], "at least the number of channels, 6, got 3"),
-        ("memorise_and_recall", ["--robot-hidden", "20"], "at least the number of channels, 75, got 20"),
         ("memorise_and_recall", ["--seeds", "0"], "seeds must be at least 1, got 0"),
         ("contextual_inference", ["--skills", "a", "zebra"], "unknown skill 'zebra'; known: a, b, c"),
         ("contextual_inference", ["--skills", "a"], "two skills at least.*got a"),
@@ -216,8 +216,7 @@ def test_spread_is_over_seeds_and_not_over_measurements():
         ("memorise_and_recall", ["--robot-episodes", "-1"], "robot_episodes must be at least 0, got -1"),
         ("fault_detection", ["--writings", "0"], "writings must be at least 1, got 0"),
         ("fault_detection", ["--tasks", "Lift", "Stack", "Lift"], "named twice"),
-        ("memorise_and_recall", ["--splines", "33"], "1 to 32 skills, got 33"),
-        ("memorise_and_recall", ["--repertoires", "--splines", "0", "--robot-episodes", "0"], "nothing to recall: rep"),
+        ("memorise_and_recall", ["--repertoires", "--robot-episodes", "0"], "nothing to recall: rep"),
         ("skill_change", ["--tasks", "Lift", "PickPlaceCan"], "changed between, PickPlaceMilk is missing"),
         ("skill_change", ["--switches", "0"], "switches must be at least 1, got 0"),
         ("fault_detection", ["--hidden", "20"], r"hidden \(robosuite's 75.*at least 38, got 20"),
@@ -245,16 +244,47 @@ def test_a_skill_that_the_repertoire_lacks_is_named():
 
 def test_arguments_that_all_studies_share_are_checked():
     with pytest.raises(ValueError, match="workers must be at least 1, got 0"):
-        Common(workers=0)
+        Config(workers=0)
     with pytest.raises(ValueError, match="seed must be at least 0, got -1"):
-        Common(seed=-1)
-    with pytest.raises(ValueError, match="cue must be shorter"):
-        memorise_and_recall.Args(cues=(10, STEPS))
+        Config(seed=-1)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"cues": (10, STEPS)}, "cue must be shorter"),
+        ({"dims": (3,)}, r"in 2 dimensions, or in 2 and 3, got \(3,\)"),
+        ({"hidden": 3}, "at least the number of channels, 6, got 3"),
+        ({"robot_hidden": 20}, "at least the number of channels, 75, got 20"),
+        ({"splines": 33}, "1 to 32 skills, got 33"),
+    ],
+)
+def test_what_is_set_in_python_only_is_checked_too(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        memorise_and_recall.Config(**wrong)
+
+
+def test_what_was_asked_for_is_not_shortened_and_what_is_shortened_is_named(capsys, monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(retention, "run", lambda config: asked.append(config) or kit.Findings([], []))
+    where = ["--out", str(tmp_path)]
+    assert cli(["reproduce", "retention", "--quick", "--skills", "8", "--steps", "16000", *where]) == 0
+    assert (asked[0].skills, asked[0].steps, asked[0].blocks, asked[0].hidden) == (8, 16000, 2, 32)
+    assert "--quick: seeds 2, blocks 2, hidden 32, writings 4\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("study", list(STUDIES))
+def test_a_study_has_at_most_six_options_beside_those_of_all(study):
+    module = import_module(f"asm_gym.scripts.reproduce.{study}")
+    if not hasattr(module, "Config"):
+        pytest.skip("not moved onto the kit")
+    shared = {row.name.split()[0] for row in rows(Config)}
+    assert len([row for row in rows(module.Config) if row.name.split()[0] not in shared]) <= 6
 
 
 def test_a_folder_that_cannot_be_made_is_refused_before_the_study(tmp_path, capsys, monkeypatch):
     (tmp_path / "file").write_text("taken")
-    monkeypatch.setattr(memorise_and_recall, "study", None)
+    monkeypatch.setattr(memorise_and_recall, "run", None)
     assert cli(["reproduce", "memorise_and_recall", "--out", str(tmp_path / "file")]) == 2
     assert "file" in capsys.readouterr().err
 
@@ -288,7 +318,7 @@ def test_the_mean_demonstration_is_as_far_off_as_it_is():
 
 
 def test_robosuite_can_be_recalled_without_letters():
-    args = memorise_and_recall.Args(repertoires=(), splines=0)
+    args = memorise_and_recall.Config(repertoires=(), splines=0)
     assert memorise_and_recall.conditions(args) == []
     models = [m for m in memorise_and_recall.MODELS if m != "memory_wide"] + ["mean"]
     records = [
@@ -362,14 +392,14 @@ def test_a_replay_knows_no_more_of_a_letter_than_the_rows_that_begin_it():
 
 @pytest.mark.slow
 def test_replay_keeps_what_is_lost_without_it():
-    records = retention.one_seed(0, retention.Args(skills=4, blocks=2, hidden=32, writings=6, steps=4000))
+    records = retention.one_seed(0, retention.Config(skills=4, blocks=2, hidden=32, writings=6, steps=4000))
     first = {way: over_seeds(records, "error_cm", way=way, last=True, block=1).mean for way in retention.WAYS}
     assert first["replay from a cue"] < 0.6 * first["one after another"]
     assert first["at once"] < 0.6 * first["one after another"]
 
 
 def test_a_stream_of_letters_is_parted_and_counted_without_a_label():
-    records = unnamed_skills.one((0, 3), unnamed_skills.Args(hidden=32, steps=4000, length=4))
+    records = unnamed_skills.one((0, 3), unnamed_skills.Config(hidden=32, steps=4000, length=4))
     state = next(r for r in records if r["source"] == "state")
     assert state["found"] > 0.9
     assert state["true"] > 0.9

@@ -10,19 +10,20 @@ from asm_gym.policies.reflexes import Graded
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.arbitration import Arbiter
-from asm_gym.wrappers.arguments import make_fallback
-from asm_gym.wrappers.patience import Patience
-from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, Responder, responses_from
+from asm_gym.wrappers.arbiter import Arbiter, ReleaseRule, Sensed
+from asm_gym.wrappers.factory import make_fallback
+from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, responses_from
 from tests.fakes import CueMonitor, FakeEnv
 from tests.needs import needs
-from tests.test_completion import MEMORY, SPEC, Arm, Judge, Named, arm, offset
+from tests.test_completion import MEMORY, SPEC, Arm, Judge, Named, offset
 
 ACT = np.array([0.5, -0.5], np.float32)
 
 
 class Acting(Arm):
-    """Keeps the actions it was given."""
+    """Keeps the actions it was given, and feels that nothing presses, unless it is told to say something else."""
+
+    felt: float | None = 0.1
 
     def reset(self, **kwargs):
         self.actions = []
@@ -30,7 +31,8 @@ class Acting(Arm):
 
     def step(self, action):
         self.actions.append(np.array(action))
-        return super().step(action)
+        *out, info = super().step(action)
+        return *out, info if self.felt is None else info | {"contact_load": self.felt}
 
 
 def infos(env, steps):
@@ -147,8 +149,8 @@ class Partial(Acting):
         return super().reset(**kwargs)[0], {"stream": np.append(self.row, self.last)}
 
     def step(self, action):
-        observation, *rest, _ = super().step(action)
-        return observation, *rest, {"stream": np.append(self.row, np.float32(action))}
+        observation, *rest, info = super().step(action)
+        return observation, *rest, info | {"stream": np.append(self.row, np.float32(action))}
 
     def _observe(self):
         self.row = super()._observe()
@@ -212,11 +214,11 @@ def test_where_nothing_is_left_to_check_by_the_robot_holds_and_says_so():
         row[4] = np.nan if t >= 10 else row[4]  # what nothing else tells of
 
     env = NeuralASMSafety(Acting(silent), Judge(()), on_alarm="graded")
-    with pytest.warns(UserWarning, match=r"nothing else has told of observation\[4\] for too long"):
+    with pytest.warns(UserWarning, match=r"too much is missing, or for too long: observation\[4\]"):
         said = infos(env, 40)
     assert not any(s["intervened"] for s in said[:30])
     assert all(s["intervened"] for s in said[32:])
-    assert "nothing else has told" in said[-1]["failure"]
+    assert "too much is missing" in said[-1]["failure"]
 
 
 def test_all_senses_lost_is_held():
@@ -291,7 +293,7 @@ class Solid(gym.Env):
     def step(self, action):
         self.t += 1
         row = self.row(action)
-        return row[:2], 0.0, False, False, {"stream": row}
+        return row[:2], 0.0, False, False, {"stream": row, "contact_load": 0.1}
 
 
 def healthy(seed):
@@ -318,7 +320,7 @@ def test_nobody_goes_on_against_what_blocks_the_arm(family, fault, case, monkeyp
     monitor.diagnosis_ = Diagnosis(Completion.fit(StreamScaler.fit(SOLID, streams), streams), Named(family))
     joint = next(h for h in monitor.diagnosis_.hypotheses if h.part == "joint[1]")
     monkeypatch.setattr(Diagnosis, "named", lambda *_: joint)
-    env = NeuralASMSafety(Solid(*fault), monitor, "graded", responses={"actuator": "slow"}, release_after=2)
+    env = NeuralASMSafety(Solid(*fault), monitor, "graded", release_after=2)
     env.reset(seed=99)
     said = []
     while len(said) < 125 and not (said and said[-1]["gave_up"]):
@@ -327,36 +329,87 @@ def test_nobody_goes_on_against_what_blocks_the_arm(family, fault, case, monkeyp
     assert {s["case"] for s in said[60:80]} == {"", "actuator" if family == "joint" else family}  # not at once
     assert first is not None
     assert (first >= 60 + 25) == case.startswith("lasting")
-    assert any(s["intervened"] and s["transition"] != "slow" for s in said) or not case.startswith("lasting")
+    assert any(s["intervened"] for s in said) or not case.startswith("lasting")
     assert said[-1]["gave_up"] == (case == "lasting actuator")
 
 
+@pytest.mark.parametrize("family", ["joint", "object", "contact", "sensor", "command"])
+def test_what_presses_decides_whatever_the_cause_is_taken_for(family):
+    class Pressing(Acting):
+        @property
+        def felt(self):
+            return 1.2 if self.t == 10 else 0.1
+
+    env = NeuralASMSafety(Pressing(), Judge({9}, family), release_after=2)
+    said = infos(env, 12)
+    assert (said[9]["case"], said[9]["response"], said[9]["reason"]) == ("pressing", "hold", "contact")
+    assert said[9]["cause"]["family"] == {"joint": "actuator", "command": "action"}.get(family, family)
+    assert said[9]["severity"]["presses"]
+    assert [s["intervened"] for s in said[8:12]] == [False, False, True, True]
+
+
+def test_what_presses_is_an_alarm_though_nobody_is_surprised():
+    class Pressing(Acting):
+        @property
+        def felt(self):
+            return 1.2 if self.t == 10 else 0.1
+
+    for on_alarm in ("graded", "hold", "monitor", "terminate"):
+        env = NeuralASMSafety(Pressing(), Judge(()), on_alarm)
+        env.reset(seed=0)
+        outs = [env.step(ACT) for _ in range(10)]
+        said = outs[-1][4]
+        assert (said["asm"]["alarm"], said["asm"]["reason"], said["cost"]) == (True, "contact", 1.0)
+        assert said["asm"]["surprise"] < said["asm"]["threshold"]
+        assert outs[-1][2] == (on_alarm == "terminate")
+        assert said["asm"]["state"] == ("reflex" if on_alarm in ("graded", "hold") else "policy")
+
+
+def test_who_presses_for_the_third_time_is_ended_and_who_presses_for_long_is_too():
+    class Often(Acting):
+        @property
+        def felt(self):
+            return 1.2 if self.actions and np.array_equal(self.actions[-1], ACT) else 0.1
+
+    env = NeuralASMSafety(Often(), Judge(()), release_after=2)
+    env.reset(seed=0)
+    ends = []
+    while not ends or not ends[-1]:
+        ends.append(env.step(ACT)[2])
+    assert len(ends) == 1 + 2 * (2 + 1)  # pressed, held for two, and so again; the third ends it
+
+
 @pytest.mark.parametrize(
-    ("family", "left_at", "case", "later"),
-    [
-        ("joint", 0, "contact", "contact"),
-        ("joint", 2, "contact", "contact"),
-        ("joint", 3, "actuator", "actuator"),
-        ("object", 0, "contact", "contact"),
-        ("sensor", 0, "sensor", "sensor"),
-    ],
+    ("felt", "probability", "goes_on"), [(0.1, 0.9, True), (None, 0.9, False), (0.1, 0.6, False), (1.1, 0.9, False)]
 )
-def test_a_band_that_is_left_early_is_answered_as_a_contact_and_nothing_else_is_said_of_the_cause(
-    family, left_at, case, later
-):
-    monitor = Judge({10}, family)
-    responder = Responder(Acting(), monitor, {**DEFAULT, "sensor": "slow"}, repairs=True)
-    found = []
-    for t, row in enumerate(arm(40, 31)):
-        responder.read(row)
-        if t >= 20:
-            found.append(responder.respond(True, False, np.eye(monitor.spec.size)[0], felt=t == 20 + left_at))
-    unfelt = {"joint": "actuator"}.get(family, family)
-    assert [r.case for r in found[:left_at]] == [unfelt] * left_at
-    assert found[left_at].case == case
-    assert found[left_at + 5].case == later
-    assert {r.cause["family"] for r in found} == {unfelt}
-    assert found[left_at].name == {"contact": "hold", "actuator": "go on", "sensor": "slow"}[case]
+def test_the_policy_goes_on_only_where_somebody_would_feel_and_the_cause_is_sure(felt, probability, goes_on):
+    monitor = Judge({10}, "object")
+    named = monitor.diagnosis_.readout
+    named.p = probability * (named.p == named.p.max()) + (1 - probability) * (named.p != named.p.max()) / (
+        len(named.p) - 1
+    )
+    inner = Acting()
+    inner.felt = felt
+    said = infos(NeuralASMSafety(inner, monitor, "graded"), 13)
+    assert (said[10]["transition"] == "go on") == goes_on
+    assert said[11]["intervened"] != goes_on
+
+
+def test_the_policy_goes_on_for_a_bounded_time_and_is_held_then():
+    env = NeuralASMSafety(Acting(), Judge(range(2, 150), "object"), "graded")
+    env.reset(seed=0)
+    said = []
+    while len(said) < 119 and not (said and said[-1]["gave_up"]):
+        said.append(env.step(ACT)[4]["asm"])
+    assert [s["transition"] for s in said[2:102]] == ["go on"] * 100  # five seconds
+    assert said[102]["transition"] == "override"
+
+
+@pytest.mark.parametrize("response", ["go on", "complete"])
+@pytest.mark.parametrize("cause", ["pressing", "lasting pressing"])
+def test_a_table_that_lets_a_pressing_arm_go_on_is_refused(cause, response):
+    with pytest.raises(ValueError, match=f"'{response}' would let an arm go on that presses: {cause} takes hold"):
+        NeuralASMSafety(Acting(), Judge(()), responses={cause: response})
 
 
 def test_a_diagnosis_that_raises_is_answered_as_the_unknown_is():
@@ -371,7 +424,7 @@ def test_a_diagnosis_that_raises_is_answered_as_the_unknown_is():
 
 def test_a_completion_that_raises_loses_the_row_and_not_the_guard(monkeypatch):
     env = NeuralASMSafety(Acting(offset), Judge({21}, "sensor"), on_alarm="graded")
-    monkeypatch.setattr(env._responder.repair, "read", lambda row: 1 / 0)
+    monkeypatch.setattr(env._guard.responder.repair, "read", lambda row: 1 / 0)
     with pytest.warns(UserWarning, match="completion: ZeroDivisionError"):
         infos(env, 2)
 
@@ -393,38 +446,25 @@ def test_a_cause_is_named_whatever_is_done_about_it():
     assert [s["intervened"] for s in said[21:25]] == [False, True, True, False]
 
 
-def test_going_slowly_halves_what_moves_the_arm_and_keeps_the_grip():
-    env = gym.make("asm_gym/Lift-v0", horizon=10)
-    reflex = Graded(env)
-    arbiter = Arbiter(reflex, 1.0, Patience(release_after=2), make_fallback(env), env.action_space)
-    action = np.array([0.4, 0, 0, 0, 0.2, 0, -1], np.float32)
-    row = np.zeros(env.unwrapped.stream_spec.size)
-    assert arbiter.decide(2.0, row, action, response="slow").transition == "slow"
-    np.testing.assert_allclose(arbiter.command(action, None).action, [0.2, 0, 0, 0, 0.1, 0, -1])
-    assert arbiter.decide(0.0, row, action).intervened  # what was done was not the policy's
-    assert arbiter.decide(0.0, row, action).transition == "release"
-    np.testing.assert_array_equal(arbiter.command(action, None).action, action)
-    env.close()
-
-
 def held_by_a_contact():
     env = FakeEnv()
-    arbiter = Arbiter(Graded(env), 1.0, Patience(10, try_after=10), make_fallback(env), env.action_space)
-    assert arbiter.decide(2.0, np.zeros(5), np.ones(3, np.float32), response="hold").transition == "override"
-    return lambda surprise, **kw: arbiter.decide(surprise, np.zeros(5), np.ones(3, np.float32), **kw).transition
+    arbiter = Arbiter(Graded(env), 1.0, ReleaseRule(10, try_after=10), make_fallback(env), env.action_space)
+    row, act = np.zeros(5), np.ones(3, np.float32)
+    assert arbiter.decide(Sensed(2.0, row, act, response="hold")).transition == "override"
+    return lambda surprise, **kw: arbiter.decide(Sensed(surprise, row, act, **kw)).transition
 
 
 def test_control_goes_back_once_nothing_presses_though_surprise_is_not_quiet_and_later_each_time_it_was_too_early():
     decide = held_by_a_contact()
-    assert [decide(0.9, pressed=False) for _ in range(5)] == [*[""] * 4, "release"]
+    assert [decide(0.9, touched=False) for _ in range(5)] == [*[""] * 4, "release"]
     assert decide(2.0, response="hold") == "override"
-    assert [decide(0.9, pressed=False) for _ in range(10)] == [*[""] * 9, "release"]
+    assert [decide(0.9, touched=False) for _ in range(10)] == [*[""] * 9, "release"]
 
 
 def test_control_does_not_go_back_while_something_presses_though_surprise_is_quiet():
     decide = held_by_a_contact()
-    assert {decide(0.0, pressed=True) for _ in range(30)} == {""}
-    assert "release" in [decide(0.0, pressed=None) for _ in range(1)]
+    assert {decide(0.0, touched=True) for _ in range(30)} == {""}
+    assert "release" in [decide(0.0, touched=None) for _ in range(1)]
 
 
 def test_the_force_of_a_push_is_found_where_it_pushes():

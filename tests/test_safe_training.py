@@ -179,7 +179,7 @@ def test_a_novice_is_untrained_and_hesitant():
     ],
 )
 def test_what_makes_no_sense_is_refused(arguments, message, tmp_path, capsys):
-    assert main(["train-safely", *arguments, "--out", str(tmp_path / "out")]) == 2
+    assert main(["reproduce", "safe_training", *arguments, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -199,7 +199,7 @@ def test_a_memory_that_is_there_already_watches_and_nothing_is_explored_for_it(t
 
 @pytest.mark.slow
 def test_a_comparison_runs_end_to_end_and_goes_on(tmp_path):
-    how = ["train-safely", "--quick", "--workers", "2", "--out", str(tmp_path)]
+    how = ["reproduce", "safe_training", "--quick", "--workers", "2", "--out", str(tmp_path)]
     assert main(how) == 0
     written = {p.name for p in tmp_path.iterdir() if p.is_file()}
     tables = {f"training.{kind}" for kind in ("md", "csv", "json", "png")}

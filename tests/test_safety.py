@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from asm_gym.policies.reflexes import Graded
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.arguments import REFLEXES, make_patience
+from asm_gym.wrappers.factory import REFLEXES, make_rule
 from tests.fakes import SPEC, CueMonitor, FakeEnv
 
 ACT = np.array([0.3, -0.2, 1.0], np.float32)
@@ -205,12 +205,12 @@ def test_a_monitor_learns_on_the_job_only_when_asked_and_never_from_an_override(
     learned: list[tuple[int, float]] = []
     run(NeuralASMSafety(FakeEnv(), Learner([2]), on_alarm="hold", release_after=2), 7)
     assert not learned
-    run(NeuralASMSafety(FakeEnv(), Learner([2]), on_alarm="hold", release_after=2, learning_rate=0.25), 7)
+    run(NeuralASMSafety(FakeEnv(), Learner([2]), on_alarm="hold", release_after=2, online_learning_rate=0.25), 7)
     assert learned == [(t, 0.25) for t in (0, 1, 2, 5, 6)]  # steps 3 and 4 were held
     with pytest.raises(ValueError, match="CueMonitor cannot learn"):
-        NeuralASMSafety(FakeEnv(), CueMonitor(), learning_rate=0.1)
-    with pytest.raises(ValueError, match=r"learning_rate must be a number in \[0, 1\], got 3"):
-        NeuralASMSafety(FakeEnv(), Learner(), learning_rate=3)
+        NeuralASMSafety(FakeEnv(), CueMonitor(), online_learning_rate=0.1)
+    with pytest.raises(ValueError, match=r"online_learning_rate must be a number in \[0, 1\], got 3"):
+        NeuralASMSafety(FakeEnv(), Learner(), online_learning_rate=3)
 
 
 class Broken:
@@ -325,7 +325,7 @@ def test_graded_gives_up_after_seconds_and_not_steps():
     for fps in (20, 100):
         env = FakeEnv()
         env.metadata = {"render_fps": fps}
-        patience[fps] = make_patience(reflex, env, 10, 0.8, None, None)
+        patience[fps] = make_rule(reflex, env, 10, 0.8, None, None)
     assert (patience[20].try_after, patience[20].max_override) == (10, 60)
     assert (patience[100].try_after, patience[100].max_override) == (50, 300)
 
@@ -335,7 +335,7 @@ def test_a_reflex_takes_over_within_a_control_step():
     env.unwrapped.stream_freq = 100
     spec = env.unwrapped.stream_spec
     env.unwrapped.stream_freq = 20
-    action = np.array([0.5, 0, 0, 0, 0, 0, 1], np.float32)
+    action = np.array([0.4, 0, 0, 0, 0, 0, 1], np.float32)
     # Rows 0 to 4 are those of the first step; the third of the second step alarms.
     env = NeuralASMSafety(env, CueMonitor([7], spec=spec), monitor_freq=100, release_after=2)
     env.reset(seed=0)
@@ -343,7 +343,7 @@ def test_a_reflex_takes_over_within_a_control_step():
     assert first["asm"]["surprises"].shape == (5,)
     assert not first["asm"]["intervened"]
     commanded = second["streams"][:, spec.slices["action"]]
-    np.testing.assert_allclose(commanded[:, 0], [0.5, 0.5, 0.5, 0, 0])
+    np.testing.assert_allclose(commanded[:, 0], [0.4, 0.4, 0.4, 0, 0])
     np.testing.assert_allclose(commanded[:, 6], 1)
     assert second["asm"]["intervened"]
     assert second["asm"]["alarm"]

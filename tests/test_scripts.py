@@ -1,26 +1,31 @@
 """Collecting and the demo, end to end on the real simulator with few episodes."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from asm_gym.evaluation.report import write_json
 from asm_gym.evaluation.statistics import Share
 from asm_gym.faults import FrozenEncoder, Push
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.trial import RolloutConfig, Trial, watch
-from asm_gym.scripts import demo
+from asm_gym.scripts import command, demo
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.collect import collect, episode_seeds
 from asm_gym.wrappers import StreamRecorder
 from tests.fakes import FakeEnv
 
 LIFT = "asm_gym/Lift-v0"
-TINY = [
-    *("--fit-episodes", "6", "--calibration-episodes", "19", "--nominal-episodes", "2"),
-    *("--faulty-episodes", "1", "--epochs", "3", "--workers", "2"),
-]
+TINY = {"fit_episodes": 6, "calibration_episodes": 19, "nominal_episodes": 2, "faulty_episodes": 1, "epochs": 3}
+
+
+def tiny(out: Path) -> None:
+    """Little of the demo."""
+    demo.demonstrate(demo.Args(**TINY, workers=2, video=False, out=out), Console())
+
 
 CONDITIONS = "nominal", "frozen encoder", "push", "weak joint", "collision"
 
@@ -66,7 +71,7 @@ def test_the_recorder_keeps_whole_and_cut_short_episodes():
 def folder(tmp_path_factory):
     """What a tiny demo writes."""
     out = tmp_path_factory.mktemp("demo")
-    assert main(["demo", *TINY, "--no-video", "--out", str(out)]) == 0
+    tiny(out)
     return out
 
 
@@ -82,7 +87,7 @@ def test_the_demo_writes_everything_it_promises(folder):
 
 
 def test_the_same_seed_gives_the_same_table(folder, tmp_path):
-    assert main(["demo", *TINY, "--no-video", "--out", str(tmp_path)]) == 0
+    tiny(tmp_path)
     first, second = (json.loads((f / "demo.json").read_text())["results"] for f in (folder, tmp_path))
     assert first == second
 
@@ -105,10 +110,10 @@ def test_a_hard_push_raises_an_alarm_even_in_a_memory_that_has_learned_little(fo
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--on-alarm", "dance"], "hold, graded or terminate"),
-        (["--epochs", "0"], "epochs"),
-        (["--task", "asm_gym/Juggle-v0"], "Juggle"),
-        (["--calibration-episodes", "10"], "19"),
+        (["--on-alarm", "dance"], "graded"),
+        (["--workers", "0"], "workers"),
+        (["asm_gym/Juggle-v0"], "Juggle"),
+        (["Lfit"], "did you mean 'Lift'?"),
     ],
 )
 def test_a_bad_argument_is_refused_before_anything_is_written(arguments, message, tmp_path, capsys):
@@ -125,8 +130,8 @@ def test_what_is_infinite_or_undefined_is_null_in_the_json(tmp_path):
 
 
 def test_quick_keeps_the_calibration_that_the_rate_needs():
-    args = demo.Args(quick=True).scaled()
-    assert args.calibration_episodes >= 19
+    args = command.parse("demo", demo.Args, ["--quick", "--false-alarm-rate", "0.02"])
+    assert args.calibrating == 49
     assert args.faulty_episodes < demo.Args().faulty_episodes
 
 

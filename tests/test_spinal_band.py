@@ -12,7 +12,7 @@ from asm_gym.envs.threads import ThreadVectorEnv
 from asm_gym.episode import Episode
 from asm_gym.faults import Push
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.spinal import UNJUDGED, FeltEpisode, SpinalBand
+from asm_gym.monitors.contact_band import UNJUDGED, ContactBand, FeltEpisode
 from asm_gym.rollouts.substeps import felt_episodes
 from asm_gym.scripts.reproduce.spinal import main, table
 from asm_gym.spec import Channel, StreamSpec
@@ -59,7 +59,7 @@ def memory(nominal):
 
 @pytest.fixture(scope="module")
 def band(memory, nominal):
-    return SpinalBand(memory).fit(nominal[12:60]).calibrate(nominal[60:], 0.05)
+    return ContactBand(memory).fit(nominal[12:60]).calibrate(nominal[60:], 0.05)
 
 
 def bands(band, episode):
@@ -100,7 +100,7 @@ def test_what_is_not_a_number_is_outside(band):
 
 def test_its_file_holds_all_of_it_and_its_export_the_thresholds(band, memory, tmp_path):
     band.save(tmp_path / "arm.band")
-    again = SpinalBand.load(tmp_path / "arm.band", memory)
+    again = ContactBand.load(tmp_path / "arm.band", memory)
     episode = felt_episode(np.random.default_rng(4))
     for one, other in zip(bands(band, episode)[2:], bands(again, episode)[2:], strict=True):
         np.testing.assert_array_equal(one, other)
@@ -112,11 +112,11 @@ def test_its_file_holds_all_of_it_and_its_export_the_thresholds(band, memory, tm
     assert (np.array(said["least"]) <= np.min(half, axis=0) + 1e-12).all()
     assert (np.array(said["most"]) >= np.max(half, axis=0) - 1e-12).all()
     with pytest.raises(ValueError, match="does not fit"):
-        SpinalBand.load(tmp_path / "arm.band", NeuralASM.pretrained("panda"))
+        ContactBand.load(tmp_path / "arm.band", NeuralASM.pretrained("panda"))
 
 
 def test_what_was_never_calibrated_is_refused(memory, nominal, tmp_path):
-    band = SpinalBand(memory)
+    band = ContactBand(memory)
     with pytest.raises(RuntimeError, match="learned nothing"):
         band.calibrate(nominal[:30], 0.05)
     band.fit(nominal[:8])
@@ -133,8 +133,8 @@ def test_what_was_never_calibrated_is_refused(memory, nominal, tmp_path):
 
 
 def test_what_is_sent_down_is_what_was_calibrated_whatever_was_sent_before(memory, nominal):
-    band = SpinalBand(memory).fit(nominal[:8]).calibrate(nominal[8:30], 0.05)
-    other = SpinalBand(memory).fit(nominal[8:16]).calibrate(nominal[16:38], 0.05)
+    band = ContactBand(memory).fit(nominal[:8]).calibrate(nominal[8:30], 0.05)
+    other = ContactBand(memory).fit(nominal[8:16]).calibrate(nominal[16:38], 0.05)
     x = band._read(0, nominal[0])[0][:5]
     for _ in range(2):
         for each, scale in ((band, band.scale_), (band, 2.0), (other, other.scale_)):
@@ -152,7 +152,7 @@ def test_a_memory_that_expects_no_torque_or_no_force_is_refused(nominal, gone):
     memory = NeuralASM(spec, hidden_size=8, association_size=20, epochs=1)
     memory.fit([Episode.from_stream(e.stream[:, keep], spec) for e in nominal[:4]])
     with pytest.raises(ValueError, match="expects external_torque and wrist_force"):
-        SpinalBand(memory)
+        ContactBand(memory)
 
 
 @pytest.mark.parametrize("what", ["few", "short", "wide", "nan"])
@@ -165,7 +165,7 @@ def test_episodes_that_cannot_be_learned_from_are_refused(memory, nominal, what)
         "nan": [FeltEpisode(stream, np.full_like(felt, np.nan))] * 4,
     }
     with pytest.raises(ValueError, match=r"four|should have|not finite"):
-        SpinalBand(memory).fit(bad[what])
+        ContactBand(memory).fit(bad[what])
 
 
 class Sways:
@@ -187,7 +187,7 @@ def swaying():
     env = gym.make("asm_gym/Lift-v0", horizon=100)
     memory = NeuralASM.pretrained("panda").with_threshold(1e9)
     felt = felt_episodes(env, range(36), Sways, steps=20)
-    yield env, memory, SpinalBand(memory).fit(felt[:16]).calibrate(felt[16:], 0.05)
+    yield env, memory, ContactBand(memory).fit(felt[:16]).calibrate(felt[16:], 0.05)
     env.close()
 
 
@@ -202,20 +202,20 @@ def sway(env, seed, steps=20):
 
 def test_a_push_in_free_motion_is_an_alarm_within_ten_milliseconds_and_the_reflex_goes_on(swaying):
     env, memory, band = swaying
-    quiet = sway(NeuralASMSafety(env, memory, on_alarm="hold", spinal=band), 100)
+    quiet = sway(NeuralASMSafety(env, memory, on_alarm="hold", band=band), 100)
     assert not any(i["alarm"] for i in quiet)
-    assert all(i["spinal_s"] is None for i in quiet)
+    assert all(np.isnan(i["severity"]["left_s"]) for i in quiet)
     pushed = FaultInjection(env, [Push(body="robot0_link5", newtons=20.0, onset=10, duration=4)])
-    infos = sway(NeuralASMSafety(pushed, memory, on_alarm="hold", spinal=band), 100)
+    infos = sway(NeuralASMSafety(pushed, memory, on_alarm="hold", band=band), 100)
     assert [i["alarm"] for i in infos[:11]] == [False] * 10 + [True]
-    assert infos[10]["spinal_s"] <= 0.01
+    assert infos[10]["severity"]["left_s"] <= 0.01
     assert infos[10]["transition"] == "override"
     assert infos[11]["intervened"]
     worst = max(infos[10]["attribution"], key=infos[10]["attribution"].get)
     assert worst.startswith(("external_torque", "wrist_force"))
     assert sum(infos[10]["attribution"].values()) == pytest.approx(infos[10]["surprise"])
-    watched = sway(NeuralASMSafety(pushed, memory, on_alarm="monitor", spinal=band), 100)
-    assert watched[10]["spinal_s"] <= 0.01
+    watched = sway(NeuralASMSafety(pushed, memory, on_alarm="monitor", band=band), 100)
+    assert watched[10]["severity"]["left_s"] <= 0.01
     assert not any(i["intervened"] for i in watched)
     pushed.undo_faults()
 
@@ -226,7 +226,7 @@ def test_no_band_is_sent_while_a_reflex_acts_and_in_the_first_steps_after_it(swa
     expect = env.unwrapped.expect
     monkeypatch.setattr(env.unwrapped, "expect", lambda *a: (sent.append(step), expect(*a)))
     pushed = FaultInjection(env, [Push(body="robot0_link5", newtons=20.0, onset=6, duration=2)])
-    guarded = NeuralASMSafety(pushed, memory, on_alarm="hold", spinal=band, release_after=4)
+    guarded = NeuralASMSafety(pushed, memory, on_alarm="hold", band=band, release_after=4)
     guarded.reset(seed=100)
     policy, state, acted = Sways(env), None, []
     for step in range(16):  # noqa: B007 (what is sent says in which step)
@@ -243,7 +243,7 @@ def test_side_by_side_each_member_has_its_own_band(swaying):
 
     def made(newtons):
         push = Push(body="robot0_link5", newtons=newtons, onset=10, duration=4)
-        return NeuralASMSafety(FaultInjection(gym.make("asm_gym/Lift-v0"), [push]), memory, "hold", spinal=band)
+        return NeuralASMSafety(FaultInjection(gym.make("asm_gym/Lift-v0"), [push]), memory, "hold", band=band)
 
     envs = ThreadVectorEnv([partial(made, newtons) for newtons in (0.1, 20.0)])
     envs.reset(seed=100)
@@ -251,7 +251,7 @@ def test_side_by_side_each_member_has_its_own_band(swaying):
     for _ in range(12):
         action, state = policy.predict(None, state)
         infos = envs.step(np.stack([action, action]))[-1]
-        left.append(np.array(infos["asm"]["spinal_s"], np.float64))
+        left.append(infos["asm"]["severity"]["left_s"])
     envs.close()
     left = np.array(left)
     assert np.isnan(left[:10]).all()
@@ -283,25 +283,25 @@ def test_where_nothing_is_felt_within_steps_it_is_compared_once_a_step_and_said(
     rows = episode.stream.copy()
     rows[12, memory.spec.slices["external_torque"].start] += 60.0
     with pytest.warns(UserWarning, match="compared once a step"):
-        guarded = NeuralASMSafety(Replay(memory.spec, rows), memory, on_alarm="hold", spinal=band)
+        guarded = NeuralASMSafety(Replay(memory.spec, rows), memory, on_alarm="hold", band=band)
     infos = sway(guarded, 200, 14)
     assert [i["alarm"] for i in infos[:13]] == [False] * 12 + [True]
-    assert infos[12]["spinal_s"] == pytest.approx(0.05)
+    assert infos[12]["severity"]["left_s"] == pytest.approx(0.05)
 
 
 def test_a_band_that_does_not_fit_is_refused(swaying, memory, nominal):
     env, known, band = swaying
-    with pytest.raises(TypeError, match="SpinalBand"):
-        NeuralASMSafety(env, known, spinal=0.5)
+    with pytest.raises(TypeError, match="ContactBand"):
+        NeuralASMSafety(env, known, band=0.5)
     with pytest.raises(RuntimeError, match="never calibrated"):
-        NeuralASMSafety(env, known, spinal=SpinalBand(known))
+        NeuralASMSafety(env, known, band=ContactBand(known))
     with pytest.raises(ValueError, match="another memory"):
-        NeuralASMSafety(env, NeuralASM.pretrained("panda").with_threshold(1e9), spinal=band)
+        NeuralASMSafety(env, NeuralASM.pretrained("panda").with_threshold(1e9), band=band)
     fast = StreamSpec(SPEC.channels, 0.01)
     quick = NeuralASM(fast, hidden_size=8, association_size=20, epochs=1)
     quick.fit([Episode.from_stream(e.stream, fast) for e in nominal[:4]])
     with pytest.raises(ValueError, match="100 rows a second"):
-        SpinalBand(quick)
+        ContactBand(quick)
 
 
 @pytest.mark.slow  # records 17 episodes and plays 16: half a minute

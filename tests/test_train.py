@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 from stable_baselines3.common.logger import configure
 from torch.utils._pytree import tree_leaves
 
@@ -24,6 +25,7 @@ from asm_gym.rollouts.training.recurrent import clone_recurrent
 from asm_gym.rollouts.training.run import Plan, Standard, TrainingRun
 from asm_gym.rollouts.training.state import TrainingState, newest, resume, save
 from asm_gym.scripts.cli import main
+from asm_gym.scripts.train import Args, train_and_report
 from asm_gym.spec import StreamSpec
 
 PENDULUM = ["train", "Pendulum-v1", "--demonstrations", "0", "--evaluation-episodes", "1", "--final-episodes", "1"]
@@ -188,7 +190,7 @@ def test_a_recurrent_clone_remembers_what_its_expert_saw():
 def test_a_recurrent_clone_is_trained_by_the_command_and_takes_no_steps(tmp_path, capsys):
     how = ["train", "Lift", "--quick", "--algorithm", "gru", "--out", str(tmp_path / "run")]
     assert main(how) == 2
-    assert "steps must be 0, got 20000" in " ".join(capsys.readouterr().err.split())
+    assert "steps must be 0, got 300" in " ".join(capsys.readouterr().err.split())
     assert main([*how, "--steps", "0"]) == 0
     agent = NetworkPolicy.load(tmp_path / "run" / "agent.npz")
     assert agent.cell is not None
@@ -205,9 +207,11 @@ def test_a_checkpoint_that_no_disk_holds_is_a_line_that_names_the_file(env, tmp_
 
 
 def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path):
-    how = ["--algorithm", "td3", "--checkpoint-every", "100", "--evaluate-every", "400", "--out", str(tmp_path)]
-    command = [sys.executable, "-m", "asm_gym.scripts.cli", *PENDULUM, *how, "--steps", "100000"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    few = {"evaluation_episodes": 1, "final_episodes": 1, "checkpoint_every": 100, "evaluate_every": 400}
+    how = {"task": "Pendulum-v1", "algorithm": "td3", "demonstrations": 0, **few}
+    begun = f"Args(**{how}, steps=100000, out=Path({str(tmp_path)!r})), Console()"
+    begun = f"from pathlib import Path; from asm_gym.scripts.train import *; train_and_report({begun})"
+    process = subprocess.Popen([sys.executable, "-c", begun], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
     while (newest(tmp_path) is None or newest(tmp_path).name == "checkpoint_0") and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -218,7 +222,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path):
     done = int(folder.name.rsplit("_", 1)[-1])
     assert done >= 100
     steps = done + 150
-    assert main([*PENDULUM, *how, "--steps", str(steps)]) == 0
+    train_and_report(Args(**how, steps=steps, out=tmp_path), Console())
     assert (tmp_path / "log" / f"from_{done}" / "progress.csv").is_file()
     assert newest(tmp_path).name == f"checkpoint_{steps}"
     result = json.loads((tmp_path / "result.json").read_text())
@@ -320,7 +324,7 @@ def test_a_dataset_that_does_not_fit_is_refused_before_anything_is_learned(name,
         (["Lift", "--steps", "0", "--demonstrations", "0"], "nothing to learn from"),
         (["Pendulum-v1", "--steps", "10"], "no scripted expert"),
         (["Lift", "--dataset", "nowhere"], "nowhere"),
-        (["Lift", "--evaluate-every", "0"], "evaluate_every"),
+        (["Lift", "--final-episodes", "0"], "final_episodes"),
         (["CartPole-v1", "--demonstrations", "0"], "actions are a Box"),
     ],
 )

@@ -7,7 +7,7 @@ import pytest
 
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.scripts.reproduce import transfer_judge
-from asm_gym.scripts.reproduce.transfer import Args
+from asm_gym.scripts.reproduce.transfer import Config
 from asm_gym.scripts.reproduce.transfer_judge import ADAPTIVE, Judge
 from asm_gym.scripts.reproduce.transfer_report import alarmed, detection, drawn, per_hour, tables
 from asm_gym.scripts.reproduce.transfer_watched import KNOWN, POLICIES, WATCHED, Watched
@@ -104,7 +104,7 @@ def test_a_fault_that_shows_only_in_a_missing_sense_is_left_out():
 def test_tables_and_figure_have_a_row_and_a_point_for_each_memory():
     judge = Judge(1.0, {LIFT: OWN[LIFT], SAC: [*OWN[SAC], *broken(SAC)[SAC]]}, 0)
     records = [*judge.records("of one policy", Says(), (LIFT, SAC)), *judge.records("gru", Says(9.0), (LIFT, SAC))]
-    by_memory, by_policy, by_sense = tables(records, judge.records("without the wrist", Says(), (LIFT,)), Args())
+    by_memory, by_policy, by_sense = tables(records, judge.records("without the wrist", Says(), (LIFT,)), Config())
     assert [row[0] for row in by_memory.rows] == ["of one policy", "gru"]
     assert by_memory.rows[0][1:4] == ("1 of 2", "0 of 4", "1 of 1")
     assert by_memory.rows[1][1:4] == ("0 of 2", "0 of 4", "0 of 1")
@@ -145,7 +145,7 @@ def test_fewer_episodes_to_learn_from_are_the_first_of_more():
 
 
 def test_agents_of_ones_own_are_watched_besides(tmp_path):
-    watched = Args(agents=(("Lift", str(tmp_path / "td3" / "clone.npz")),)).watched
+    watched = Config(agents=(("Lift", str(tmp_path / "td3" / "clone.npz")),)).watched
     assert watched[:-1] == WATCHED
     assert watched[-1].name == "Lift, td3 clone"
     assert watched[-1].folder == "Lift-td3_clone"
@@ -165,4 +165,4 @@ def test_agents_of_ones_own_are_watched_besides(tmp_path):
 )
 def test_settings_that_cannot_be_judged_are_refused(wrong, says):
     with pytest.raises(ValueError, match=says):
-        Args(**wrong)
+        Config(**wrong)

@@ -11,7 +11,7 @@ from asm_gym.policies.reflexes import Hold, Retract
 from asm_gym.scripts.collect import collect
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
-from asm_gym.wrappers.batches import choose
+from asm_gym.wrappers.vector_utils import choose
 from tests.fakes import SPEC, FadingMonitor, FakeEnv, Remembered
 
 LENGTHS = (9, 7, 12)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.monitors import ExpectsActions, ForgetsEvidence, LearnsOnTheJob, Monitor, Surprise
-from asm_gym.wrappers.batches import Mask, choose
+from asm_gym.wrappers.vector_utils import Mask, choose
 
 
 class Observation(NamedTuple):

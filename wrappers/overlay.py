@@ -94,7 +94,7 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if cause.get("family"):
             self._cause = " ".join(filter(None, (cause["family"], cause["part"])))
         self._since_force += 1
-        if cause.get("force"):
+        if cause.get("force", {}).get("link"):
             self._force, self._since_force = cause["force"], 0
         completed = asm.get("completed") or ()
         self._completed = f"{', '.join(completed)} completed" if completed else ""

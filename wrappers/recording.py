@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -53,18 +54,21 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._finish()
         observation, info = self.env.reset(seed=seed, options=options)
         self._clear(seed)
-        self._observations.append(observation)
+        info = dict(info)
+        self._observations.append(deepcopy(observation))
         info["stream"] = self._source.first(observation, info)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
+        # Copies: an environment, a driver or a policy may use its arrays again.
+        info = dict(info)
         info["stream"] = self._source.row(observation, action, info)
-        self._observations.append(observation)
-        self._actions.append(np.atleast_1d(as_float32(action)))
+        self._observations.append(deepcopy(observation))
+        self._actions.append(np.array(np.atleast_1d(as_float32(action))))
         self._rewards.append(float(reward))
         rows = self._source.rows(observation, action, info)
-        self._rows += list(rows)
+        self._rows += list(np.array(rows))
         self._faults += [bool(info.get("fault"))] * len(rows)
         said = info.get("success", info.get("is_success"))
         self._success = self._success if said is None else bool(self._success or said)

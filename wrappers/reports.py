@@ -11,9 +11,20 @@ from numpy.typing import NDArray
 
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec
-from asm_gym.wrappers.arbitration import Decision
+from asm_gym.wrappers.arbiter import Decision
 from asm_gym.wrappers.observer import joined
 from asm_gym.wrappers.responses import NO_RESPONSE, Response
+from asm_gym.wrappers.severity import Severity
+
+NO_SEVERITY = Severity()
+
+
+CONTACT, FAILURE, SURPRISE, MISSING = "contact", "failure", "surprise", "missing"
+"""Reasons of an alarm: a contact limit was passed, something failed, surprise is over its threshold, a number is not
+finite."""
+
+
+REASONS = CONTACT, FAILURE, SURPRISE, MISSING
 
 
 class RowReport(NamedTuple):
@@ -24,6 +35,8 @@ class RowReport(NamedTuple):
     latency: float = 0.0  # of the monitor [s]
     failure: str = ""
     response: Response = NO_RESPONSE
+    severity: Severity = NO_SEVERITY
+    reason: str = ""
 
 
 def report(
@@ -42,20 +55,25 @@ def report(
     Returns:
         ``surprise``: the largest of this step; infinite where something failed. ``surprise_body`` and
         ``surprise_skill``: the largest at what no body does, and at what no skill that was shown does, not a number
-        where the monitor does not listen for it. ``threshold``, and ``alarm``: ``surprise`` is over it.
-        ``intervened``: something else than the policy acted, or slowed it down, in a part of this step at least.
-        ``gave_up``: it has acted for ``max_override`` steps, or was to stop, and the episode ends.
-        ``transition``: who acts from now on, ``"override"``, ``"release"``, ``"trial"``, ``"give_up"``, or how the
-        policy goes on, ``"go on"``, ``"complete"``, ``"slow"``; empty where nothing changes. They go to the log
+        where the monitor does not listen for it. ``threshold``. ``alarm``, and its ``reason``: ``"surprise"`` is over
+        the threshold, a ``"contact"`` limit was passed, a number of the stream is ``"missing"``, or a ``"failure"``.
+        ``intervened``: something else than the policy acted, in a part of this step at least.
+        ``state``: who acts next, one of ``asm_gym.wrappers.arbiter.State``. ``gave_up``: the episode ends.
+        ``transition``: the name in ``asm_gym.wrappers.arbiter.TRANSITIONS`` of what has led there, ``"override"``,
+        ``"release"``, ``"trial"``, ``"give_up"``, or how the policy goes on in alarm, ``"go on"``, ``"complete"``;
+        empty where nothing changes. They go to the log
         ``asm_gym.safety`` with the cause. ``failure``: what failed in this step, ``policy: …``, ``stream: …``,
         ``monitor: …``, ``completion: …`` or ``reflex: …``; or empty. ``cause``: at an alarm, ``family`` (one of
         ``asm_gym.monitors.diagnosis.FAMILIES``), ``part``, ``probability`` of the family, ``probabilities`` of all,
-        and for a contact ``force``: the link, the force's size [N] and its vector. ``response``: what is done about it
-        under ``"graded"``, and ``case``: the row of the table that says so. ``executed_action``: the last one.
+        and for a contact ``force``: the link, the force's size [N] and its vector. ``severity``: how bad it is, see
+        ``asm_gym.wrappers.severity.Severity``. ``response``: what is done about it
+        under ``"graded"``, and ``case``: the row of the table that says so. ``executed_action``: the last one, a copy;
+        beneath it ``contact_limits`` may have slowed the hand down, as the stream says.
         ``attribution``: what each number of the stream adds to surprise. ``surprises`` (n,) of all rows in this step.
         ``latency_us``: the longest time that the monitor took for one. The wrapper adds ``completed``, the sensors that
-        are not believed now, and ``unread``, those of them that stand in no observation, so that the policy goes on
-        without them.
+        are not believed now, ``unread``, those of them that stand in no observation, so that the policy goes on
+        without them, ``lost``, the numbers that were not finite, and ``alarms``, steps in alarm in this episode so far,
+        for wrappers outside that skip steps.
     """
     surprises = [float(row.surprise.value[0]) for row in rows]
     largest = max(surprises)
@@ -66,7 +84,9 @@ def report(
         "surprise_body": _largest((row.surprise.of_body for row in rows), largest),
         "surprise_skill": _largest((row.surprise.of_skill for row in rows), math.nan),
         "threshold": threshold,
-        "alarm": largest > threshold,
+        "alarm": any(row.decision.alarm for row in rows),
+        "reason": next((r for r in REASONS if any(row.reason == r for row in rows)), ""),
+        "state": str(rows[-1].decision.state),
         "intervened": any(row.decision.intervened for row in rows),
         "gave_up": any(row.decision.gave_up for row in rows),
         "transition": next((t for row in reversed(rows) if (t := row.decision.transition)), ""),
@@ -74,7 +94,8 @@ def report(
         "cause": caused.cause,
         "response": caused.name,
         "case": caused.case,
-        "executed_action": executed,
+        "severity": rows[-1].severity._asdict(),
+        "executed_action": None if executed is None else np.array(executed),
         "attribution": dict(zip(spec.labels, worst.attribution[0].tolist(), strict=True)),
         "surprises": np.array(surprises),
         "latency_us": 1e6 * max(row.latency for row in rows),

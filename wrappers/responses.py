@@ -1,4 +1,4 @@
-"""What is done about what is wrong: a table of causes, and the responses that it names."""
+"""What is done about what is wrong: a table of severity and causes, and the responses that it names."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from asm_gym.monitors import ExplainsItself, Monitor
 from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, as_info, averaged
 from asm_gym.validation import check_choice, shown
-from asm_gym.wrappers.arbitration import GOING_ON
-from asm_gym.wrappers.completion import ObservationMap, Repair
-from asm_gym.wrappers.touch import Touch
+from asm_gym.wrappers.arbiter import GOING_ON
+from asm_gym.wrappers.contact import ContactEstimator
+from asm_gym.wrappers.repair import ObservationMap, Repair
+from asm_gym.wrappers.severity import Severity
 
 _log = logging.getLogger("asm_gym.safety")
 
@@ -27,12 +28,15 @@ arm is pressed so and does not move, it is a lasting contact."""
 UNREAD = "unread sensor"
 """One at fault of which nothing stands in the observation, so that the policy has never read it."""
 
-CAUSES = (*FAMILIES, UNREAD, *(f"lasting {family}" for family in LASTING))
+PRESSING = "pressing"
+"""The arm presses harder than healthy motion does, whatever the cause is taken for."""
+
+CAUSES = (*FAMILIES, UNREAD, *(f"lasting {family}" for family in LASTING), PRESSING, f"lasting {PRESSING}")
 """What a table of responses says something about."""
 
 RESPONSES = (*GOING_ON, "hold", "yield", "retract", "stop")
-"""Let the policy go on; complete the sensors at fault and go on; go on at half speed; stay and keep the grip; give way
-to what presses; go back along the path; stay, and end the episode."""
+"""Let the policy go on; complete the sensors at fault and go on; stay and keep the grip, yielding to more than a hold's
+force; give way to what presses; go back along the path; stay, and end the episode."""
 
 DEFAULT: dict[str, str] = {
     "sensor": "complete",
@@ -44,8 +48,12 @@ DEFAULT: dict[str, str] = {
     "action": "hold",
     "object": "go on",
     "unknown": "hold",
+    PRESSING: "hold",
+    f"lasting {PRESSING}": "yield",
 }
-"""What ``on_alarm="graded"`` does."""
+"""What ``on_alarm="graded"`` does. What presses comes first: then only its two rows count, and neither may let the
+policy go on. Below that, the policy may go on where the cause is sure, the hand is not faster than any healthy one, for
+a bounded time, and where somebody would feel if it pressed; else the robot holds."""
 
 QUIET_S = 1.0
 """After so long without an alarm, what comes next has a cause of its own [s]."""
@@ -53,8 +61,8 @@ QUIET_S = 1.0
 SURE = 0.5
 """A family that is less probable is unknown."""
 
-FELT_BY = 3
-"""Diagnoses by which a band has been left where something touches the arm; a weak joint leaves it later."""
+SURE_ENOUGH = 0.7
+"""The policy goes on in alarm only where a family is as probable as this."""
 
 
 class Response(NamedTuple):
@@ -64,13 +72,13 @@ class Response(NamedTuple):
         name: one of ``RESPONSES``; empty where there is nothing to respond to, or nothing is to be done by the table.
         cause: as ``info["asm"]["cause"]`` says it.
         case: one of ``CAUSES``: the row of the table that was followed; empty where none was.
-        pressed: whether the contact that was responded to is still there; None where that is not known, and where it
+        touched: whether the contact that was responded to is still there; None where that is not known, and where it
             has lasted for so long that it may never end.
     """
 
     name: str
     cause: dict[str, Any]
-    pressed: bool | None = None
+    touched: bool | None = None
     case: str = ""
 
     @property
@@ -90,13 +98,18 @@ def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:
     """The default table with the entries of ``table`` in place of its own.
 
     Raises:
-        ValueError: an unknown cause or response; the message lists those that exist.
+        ValueError: an unknown cause or response (the message lists those that exist), or one that lets the policy go on
+            while the arm presses.
     """
     if table is not None and not isinstance(table, Mapping):
         raise ValueError(f"responses must map causes to responses, got {shown(table)}")
     for cause, response in (table or {}).items():
         check_choice("cause", cause, CAUSES)
         check_choice("response", response, RESPONSES)
+        if cause.endswith(PRESSING) and response in GOING_ON:
+            raise ValueError(
+                f"{shown(response)} would let an arm go on that presses: {cause} takes hold, yield, retract or stop"
+            )
     return {**DEFAULT, **(table or {})}
 
 
@@ -115,10 +128,10 @@ class Responder:
         self._diagnosis = monitor.diagnosis_ if isinstance(monitor, ExplainsItself) else None
         self.repair: Repair | None = None
         self._map: ObservationMap | None = None
-        self._touch: Touch | None = None
+        self._touch: ContactEstimator | None = None
         self._kept = WINDOW + 1 + round(LASTING["actuator"] / self._spec.dt)
         if self._diagnosis is not None:
-            self._touch = Touch.where_measured(env, self._diagnosis.completion)
+            self._touch = ContactEstimator.where_measured(env, self._diagnosis.completion)
             self._map = self._mapped(env) if repairs else None
             self.repair = Repair(self._diagnosis.completion, read=None if self._map is None else self._map.shown)
         self.reset()
@@ -142,7 +155,6 @@ class Responder:
     def _forget(self) -> None:
         """What was wrong is over."""
         self._since: dict[str, int] = {}  # rows since a family was first the cause
-        self._felt = False  # it began with a band that was left
         self._touched = False  # the last alarm was answered as a contact, or looked like one
         self._belief, self._diagnoses = np.zeros(len(FAMILIES)), 0
         self._latest: dict[str, Cause] = {}  # the newest diagnosis of each family
@@ -154,15 +166,27 @@ class Responder:
 
     @property
     def missing(self) -> NDArray[np.bool_]:
-        """(D,) the numbers that are completed, at which nobody is surprised."""
+        """(D,) the numbers that are completed."""
         return np.zeros(self._spec.size, bool) if self.repair is None else self.repair.missing
+
+    @property
+    def unjudged(self) -> NDArray[np.bool_]:
+        """(D,) the numbers at which nobody is surprised, for they are completed or were a moment ago."""
+        return np.zeros(self._spec.size, bool) if self.repair is None else self.repair.unjudged
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """The numbers of the last row that were not finite and are completed."""
+        if self.repair is None or self._map is None or not self.repair.lost.any():
+            return ()
+        return tuple(self._spec.labels[i] for i in np.flatnonzero(self.repair.lost))
 
     @property
     def doubt(self) -> str:
         """What can no longer be relied on; empty where everything can."""
         if self.repair is None or self.repair.trusted:
             return ""
-        return f"completion: nothing else has told of {', '.join(self.repair.names)} for too long"
+        return f"completion: too much is missing, or for too long: {', '.join(self.repair.names)}"
 
     @property
     def completed(self) -> tuple[str, ...]:
@@ -199,44 +223,65 @@ class Responder:
         """(D,) the last row, repaired; None where nothing is."""
         return self._rows[-1] if self._rows and self.completed else None
 
-    def respond(self, alarm: bool, failed: bool, attribution: NDArray[np.float64], felt: bool = False) -> Response:
+    def respond(
+        self, alarm: bool, failed: bool, attribution: NDArray[np.float64], severity: Severity, may_go_on: bool = True
+    ) -> Response:
         """What is to be done about the last row.
 
         Args:
-            alarm: surprise is over the threshold.
+            alarm: surprise is over the threshold, or a number is missing, or it presses.
             failed: monitor, stream or policy failed, so that nothing is known.
             attribution: (D,) where the surprise is.
-            felt: a band on what the arm feels was left within the step. That early, but for a sensor at fault,
-                it is answered as a contact, whatever explains the row best.
+            severity: how bad it is.
+            may_go_on: the policy has not gone on in alarm for too long yet.
         """
-        dt = self._spec.dt
         self._quiet = 0 if alarm else self._quiet + 1
-        if self._since and self._quiet > QUIET_S / dt:
+        if self._since and self._quiet > QUIET_S / self._spec.dt:
             self._forget()
-        pressed = self._pressed() if self._repairs else None
+        touched = self._touches() if self._repairs else None
         for family in self._since:
             self._since[family] += 1
         if not alarm:
-            return NO_RESPONSE._replace(pressed=pressed)
+            return NO_RESPONSE._replace(touched=touched)
         cause = self._believed(self._cause(failed, attribution))
-        self._felt = self._felt or (felt and self._diagnoses <= FELT_BY)
         family = cause.family if cause is not None and cause.probability >= SURE else "unknown"
-        touched = self._felt and cause is not None and cause.family != "sensor"
-        self._touched = touched or (cause is not None and cause.family == "contact")
-        answered = "contact" if touched else family
-        self._since.setdefault(answered, 0)
-        case = self._case(answered, cause)
+        self._touched = severity.presses or (cause is not None and cause.family == "contact")
+        self._since.setdefault(PRESSING if severity.presses else family, 0)
+        case = (
+            f"{'lasting ' if self._lasts(PRESSING) else ''}{PRESSING}"
+            if severity.presses
+            else self._case(family, cause)
+        )
         name = self._table[case]
-        if name in ("go on", "slow") and self._blocked(answered, cause):
+        if name == "go on" and self._blocked(family, cause):
             # Whatever the policy goes on with, it does not move the arm, and presses.
-            case = "lasting actuator" if answered == "actuator" else "lasting contact"
+            case = "lasting actuator" if family == "actuator" else "lasting contact"
             name = self._table[case]
-        if name == "complete" and not self._complete(cause):
+        if name in GOING_ON and not self._lets(name, cause, severity, may_go_on):
+            name = self._held(case)
+        elif name == "complete" and not self._complete(cause):
             name = self._table["unknown"]
         said = as_info(cause, self._force(family))
         if cause is None or family != cause.family:
             said |= {"family": family, "part": ""}
-        return Response(name, said, pressed, case) if self._repairs else Response("", said, pressed)
+        return Response(name, said, touched, case) if self._repairs else Response("", said, touched)
+
+    def _lets(self, name: str, cause: Cause | None, severity: Severity, may_go_on: bool) -> bool:
+        """Whether the policy may go on in alarm."""
+        if name == "complete":  # what is left judges on, and what is completed is bounded by itself
+            return not severity.fast
+        sure = cause is not None and cause.probability >= SURE_ENOUGH
+        return sure and may_go_on and severity.felt and not severity.fast
+
+    def _held(self, case: str) -> str:
+        """What is done where the policy may not go on: the response to what is unknown, or staying."""
+        name = self._table["unknown"] if case != "unknown" else "hold"
+        return "hold" if name in GOING_ON else name
+
+    def missed(self) -> Response:
+        """What is done about a row in which numbers are missing, and nothing else is wrong: they are completed."""
+        said = as_info(None) | {"family": "sensor", "part": ", ".join(self.completed), "probability": 1.0}
+        return Response("complete", said, None, "sensor")
 
     def _case(self, family: str, cause: Cause | None) -> str:
         """The row of the table for a cause of ``family``."""
@@ -280,13 +325,13 @@ class Responder:
             self._forget()
         return row is not None
 
-    def _pressed(self) -> bool | None:
+    def _touches(self) -> bool | None:
         """Whether what touched the body still does."""
         if not self._touched or self._touch is None or len(self._rows) < 2:
             return None
         if not self._touch.presses(np.stack(self._rows[-2:])):
             return False
-        return None if self._lasts("contact") else True
+        return None if self._lasts("contact") or self._lasts(PRESSING) else True
 
     def _blocked(self, family: str, cause: Cause | None) -> bool:
         """Whether the joint at fault, or else the arm, is pressed and still, for as long as what lasts."""
@@ -297,7 +342,8 @@ class Responder:
         return self._touch.blocked(np.stack(self._rows[-rows:]), joint)
 
     def _lasts(self, family: str) -> bool:
-        return self._since.get(family, 0) >= LASTING.get(family, np.inf) / self._spec.dt
+        longest = LASTING["contact" if family == PRESSING else family] if family in (*LASTING, PRESSING) else np.inf
+        return self._since.get(family, 0) >= longest / self._spec.dt
 
     def _force(self, family: str) -> dict[str, Any] | None:
         """What is behind a contact."""

@@ -11,29 +11,28 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import LearnsOnTheJob, Monitor, Surprise
-from asm_gym.monitors.spinal import SpinalBand
-from asm_gym.policies.base import Policy
+from asm_gym.monitors.contact_band import ContactBand
+from asm_gym.protocols import HoldsItself
+from asm_gym.spec import control_period
 from asm_gym.stream_source import StreamSource
-from asm_gym.validation import as_float32, check_choice, check_flag, check_number, shown
-from asm_gym.wrappers.arbitration import NOTHING, Arbiter
-from asm_gym.wrappers.arguments import (
+from asm_gym.validation import as_float32, check_choice, check_number, shown
+from asm_gym.wrappers.factory import (
+    LOG,
+    OnAlarm,
     body_memory,
-    check_expectation,
     check_monitor,
     check_rate,
+    fitted_parts,
     fitted_to,
-    make_fallback,
-    make_patience,
-    make_reflex,
-    names_causes,
     running,
 )
+from asm_gym.wrappers.guard import Guard, GuardOptions, nothing
 from asm_gym.wrappers.observer import Observer, joined
 from asm_gym.wrappers.reports import RowReport, report
-from asm_gym.wrappers.responses import Responder, responses_from
-from asm_gym.wrappers.spinal import Left, SpinalCord
+from asm_gym.wrappers.substeps import Beneath
 
 
 class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -48,9 +47,12 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     missing, a policy whose action is not finite, which is not done. A reflex that fails is replaced by staying; its
     actions are clipped to the box. Where an exception leaves ``reset`` or ``step``, the episode has ended.
 
-    What is wrong is named at every alarm, by monitors that can: ``info["asm"]["cause"]``. Under ``"graded"`` it decides
-    what is done, and from the step after an alarm about a sensor on observation and stream hold what that sensor should
-    say, completed from all others, until it has been well for a second.
+    What presses decides, not what it is called: in environments of this package the arm stays from the physics substep
+    on in which it felt more than ``contact_limits``, and its hand goes no faster than they say; that is an alarm,
+    whatever the surprise. What is wrong is named at every alarm, by monitors that can: ``info["asm"]["cause"]``. Under
+    ``"graded"`` severity and cause decide what is done, and from the step after an alarm about a sensor on observation
+    and stream hold what that sensor should say, completed from all others, until it has been well for a second. A
+    number that is not finite is an alarm; under ``"graded"`` it is completed, and surprise goes on from what is left.
 
     ``info["asm"]`` says what came of a step: see ``asm_gym.wrappers.reports.report``. For loggers the same stands
     beside it as NumPy scalars: ``info["asm_surprise"]``, ``info["asm_alarm"]``, ``info["asm_intervened"]``, and
@@ -60,13 +62,17 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Args:
         env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream. No
-            reflex can act where actions are not a Box: ``on_alarm`` must be ``"monitor"`` or ``"terminate"`` there.
+            reflex can act where actions are not a Box: ``on_alarm`` must be ``"monitor"`` or ``"terminate"`` there. A
+            wrapper inside that makes several steps of one is held in all of them; one outside sees ``info`` of the last
+            alone, and ``info["asm"]["alarms"]`` and ``info["cost_sum"]`` count those that it skips.
         monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that ``env`` moves.
         on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip, in environments of this package under
             every controller and wrapper; ``"retract"`` goes back along the path; ``"comply"`` yields to what presses;
-            ``"recall"`` goes on as the memory expects; ``"graded"`` does what the cause asks for (``responses``), hands
-            back on trial, and ends the episode where trials fail; ``"terminate"`` ends the episode; any other policy
-            acts itself, and where it raises, or returns what is no finite action, the robot holds. None for
+            ``"recall"`` goes on as the memory expects; ``"graded"`` does what severity and cause ask for
+            (``responses``), hands back on trial, and ends the episode where trials fail, or the policy presses too
+            often; ``"terminate"`` ends the episode; any other policy acts itself, and where it raises, or returns what
+            is no finite action, the robot holds. A class, or a function that makes a policy for an environment, is
+            given this one. None for
             ``"graded"`` with a monitor that names causes, and for ``"hold"`` with any other.
         release_after: control steps of quiet after which control is handed back.
         release_below: share of the threshold, in (0, 1], that surprise must be under to count as quiet.
@@ -76,27 +82,29 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         try_after: control steps of override after which control is handed back on trial, though surprise is not quiet;
             after each trial that fails, twice as many. None for no trials, with ``"graded"`` for 0.5 s.
         truncate: an episode that is ended by an alarm is truncated rather than terminated.
-        learning_rate: above 0 the monitor goes on learning from steps that do not surprise it, by its ``adapt``, which
-            changes it for all who watch with it: for a robot that slowly wears.
+        online_learning_rate: above 0 the monitor goes on learning from steps that do not surprise it, by its
+            ``adapt``, which changes it for all who watch with it: for a robot that slowly wears.
         monitor_freq: rows watched a second [Hz], by a monitor fitted at that rate, on environments whose
             ``stream_freq`` can be set; it is set to this. None for the rate that the environment's stream has.
         on_overrun: where the monitor takes longer for a row than a row lasts, ``"warn"`` says so once, ``"alarm"``
             takes it for infinite surprise, and ``"ignore"`` is for simulations, which wait. The first row does not
             count.
-        adapt: how the threshold follows a policy that changes, from episode to episode; ``info["asm"]`` then holds the
-            ``threshold`` of this episode, its ``ceiling``, and ``level``, the share of episodes so far with a false
-            alarm. Not counted are alarms above the ceiling, those that went on while the reflex acted, and those that
-            ``confirm_alarm`` was called for. None for a threshold that stays.
-
+        adaptive_threshold: how the threshold follows a policy that changes, from episode to episode; ``info["asm"]``
+            then holds the ``threshold`` of this episode, its ``ceiling``, and ``level``, the share of episodes so far
+            with a false alarm. Not counted are alarms above the ceiling, those that went on while the reflex acted, and
+            those that ``confirm_alarm`` was called for. None for a threshold that stays.
         responses: under ``"graded"``, what is done about which cause, where it is not what
-            ``asm_gym.wrappers.responses.DEFAULT`` says: ``{"contact": "yield"}``.
-        spinal: a calibrated band on what the arm feels, made with ``monitor``. It is compared in every physics substep
-            of the policy's steps; once it is left, the arm stays from the next substep on, and the step is an alarm.
-            ``info["asm"]["spinal_s"]`` says when in the step that was [s], or None. What it promises comes beside what
-            ``monitor`` does. Elsewhere than in this package it is compared once a step, and a warning says so.
+            ``asm_gym.wrappers.responses.DEFAULT`` says: ``{"contact": "yield"}``. None may let a pressing arm go on.
+        contact_limits: what an arm may feel and how fast its hand may go. ``"memory"`` for the usual ones, and more
+            where the monitor's calibration episodes have shown that healthy motion here does. None for none: then
+            nobody knows what presses, and ``"graded"`` holds at every alarm but a sensor's.
+        band: a calibrated band on what the arm feels, made with ``monitor``, compared within the limits in every
+            physics substep of the policy's steps. What it promises comes beside what ``monitor`` does. Elsewhere than
+            in this package it is compared once a step, and a warning says so.
 
     Raises:
-        ValueError: an unknown ``on_alarm``, cause or response, a monitor fitted for another stream or rate (the message
+        ValueError: an unknown ``on_alarm``, cause or response, a response that lets a pressing arm go on, a reflex
+            that was made for another environment, a monitor fitted for another stream or rate (the message
             names what differs), no monitor where no shipped memory fits (the message lists them), a rate that does not
             fit, ``"recall"`` with a monitor that expects no action, or a wrapper inside that changes actions, where the
             reflex cannot know what reaches the robot. Nothing is changed then.
@@ -107,36 +115,41 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self,
         env: gym.Env[Any, Any],
         monitor: Monitor | None = None,
-        on_alarm: str | Policy | None = None,
+        on_alarm: OnAlarm | None = None,
         *,
         release_after: int = 10,
         release_below: float = 0.8,
         max_override: int | None = None,
         try_after: int | None = None,
         truncate: bool = False,
-        learning_rate: float = 0.0,
+        online_learning_rate: float = 0.0,
         monitor_freq: int | None = None,
         on_overrun: Literal["warn", "alarm", "ignore"] = "warn",
-        adapt: AdaptiveThreshold | None = None,
+        adaptive_threshold: AdaptiveThreshold | None = None,
         responses: Mapping[str, str] | None = None,
-        spinal: SpinalBand | None = None,
+        contact_limits: ContactLimits | Literal["memory"] | None = "memory",
+        band: ContactBand | None = None,
     ) -> None:
+        given: dict[str, Any] = {
+            "on_alarm": on_alarm,
+            "release_after": release_after,
+            "release_below": release_below,
+            "max_override": max_override,
+            "try_after": try_after,
+            "truncate": truncate,
+            "responses": responses,
+            "contact_limits": contact_limits,
+            "band": band,
+        }
         RecordConstructorArgs.__init__(
             self,
             _disable_deepcopy=True,  # a reflex holds its environment, and a memory is large
             monitor=monitor,
-            on_alarm=on_alarm,
-            release_after=release_after,
-            release_below=release_below,
-            max_override=max_override,
-            try_after=try_after,
-            truncate=truncate,
-            learning_rate=learning_rate,
+            online_learning_rate=online_learning_rate,
             monitor_freq=monitor_freq,
             on_overrun=on_overrun,
-            adapt=adapt,
-            responses=responses,
-            spinal=spinal,
+            adaptive_threshold=adaptive_threshold,
+            **given,
         )
         gym.Wrapper.__init__(self, env)
         self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
@@ -146,111 +159,122 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 'only be watched, on_alarm="monitor", or ended, "terminate"'
             )
         check_choice("on_overrun", on_overrun, ("warn", "alarm", "ignore"))
-        self.learning_rate = check_number("learning_rate", learning_rate, low=0, high=1)
-        self._source = StreamSource(env)
-        watched = self._source.spec
+        self._options = GuardOptions(**given)
+        self.online_learning_rate = check_number("online_learning_rate", online_learning_rate, low=0, high=1)
+        self._source, self._monitor_freq = StreamSource(env), monitor_freq
+        self._adaptive = adaptive_threshold
+        self._spec = self._source.spec
         if monitor_freq is not None:
             sensing = check_rate(env, monitor_freq)
-            watched = sensing.stream_spec_at(monitor_freq)
-        monitor = fitted_to(body_memory(env, watched) if monitor is None else monitor, watched)
-        if learning_rate > 0 and not isinstance(monitor, LearnsOnTheJob):
-            raise ValueError(f"{type(monitor).__name__} cannot learn on the job: learning_rate must be 0")
-        threshold = check_monitor(monitor, watched)
-        self._running = running(adapt, threshold)
-        self.monitor = monitor
-        if on_alarm is None:
-            on_alarm = "graded" if names_causes(monitor) else "hold"
-        self._ends = "truncated" if check_flag("truncate", truncate) else "terminated"
-        self._on_alarm = on_alarm if isinstance(on_alarm, str) else "policy"
-        reflex = make_reflex(on_alarm, env)
-        self._observer = Observer(monitor, recalls=check_expectation(reflex, monitor))
-        table = responses_from(responses)
-        if responses is not None and on_alarm != "graded":
-            raise ValueError(f"responses are those of on_alarm='graded', got on_alarm={shown(on_alarm)}")
-        self._responder = Responder(env, monitor, table, repairs=on_alarm == "graded")
-        patience = make_patience(reflex, env, release_after, release_below, max_override, try_after)
-        fallback = None if self._box is None else make_fallback(env)
-        acts = on_alarm != "monitor" and self._box is not None
-        self._spinal = None if spinal is None else SpinalCord(env, spinal, monitor, acts)
+            self._spec = sensing.stream_spec_at(monitor_freq)
+        self._rows_per_step = max(1, round(control_period(env) / self._spec.dt)) if self._source.own else 1
+        self._watch_with(body_memory(env, self._spec) if monitor is None else monitor)
         if monitor_freq is not None:
             sensing.stream_freq = monitor_freq  # nothing changes before everything is known to fit
-        self._rows_per_step = self._source.rows_per_step
-        self._arbiter = Arbiter(reflex, threshold, patience.in_rows(self._rows_per_step), fallback, self._box)
-        self._largest: float | None = None  # surprise in this episode, while the policy acted
-        self._confirmed = False
         self._on_overrun: str = on_overrun
         self._warm = self._warned = False
+        self._holds = env.unwrapped if isinstance(env.unwrapped, HoldsItself) else None
         self._ended = True
+
+    @property
+    def monitor(self) -> Monitor:
+        """What watches. Another that is assigned, or one that was fitted or calibrated since, takes over at the next
+        ``reset``. Raises as the constructor does where it does not fit."""
+        return self._monitor
+
+    @monitor.setter
+    def monitor(self, monitor: Monitor) -> None:
+        check_monitor(fitted_to(monitor, self._spec), self._spec)
+        self._next = monitor
+
+    def _watch_with(self, monitor: Monitor) -> None:
+        """Takes up a monitor, and all that depends on it."""
+        monitor = fitted_to(monitor, self._spec)
+        if self.online_learning_rate > 0 and not isinstance(monitor, LearnsOnTheJob):
+            raise ValueError(f"{type(monitor).__name__} cannot learn on the job: online_learning_rate must be 0")
+        threshold = check_monitor(monitor, self._spec)
+        self._running = running(self._adaptive, threshold)
+        self._guard = Guard(self.env, monitor, self._options, threshold, self._box, self._rows_per_step)
+        self._observer = Observer(monitor, recalls=self._guard.recalls)
+        self._monitor = self._next = monitor
+        self._parts, self._promised = fitted_parts(monitor), threshold
+        self._confirmed = False
+
+    def _take_over(self) -> None:
+        """Sees whether the monitor has changed since it was taken up."""
+        changed = any(a is not b for a, b in zip(fitted_parts(self._next), self._parts, strict=True))
+        if changed or check_monitor(self._next, self._spec) != self._promised:
+            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
+            self._watch_with(self._next)
 
     @property
     def threshold(self) -> float:
         """What surprise must exceed for an alarm in this episode."""
-        return self._arbiter.threshold
+        return self._guard.arbiter.threshold
 
     def confirm_alarm(self) -> None:
-        """Says that what has alarmed in this episode was real, so that ``adapt`` does not take it for a false alarm."""
+        """Says that what has alarmed in this episode was real, so that ``adaptive_threshold`` does not take it for a
+        false alarm."""
         self._confirmed = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._ended = True  # until it has worked
         observation, info = self.env.reset(seed=seed, options=options)
+        info = dict(info)
+        self._follow()
+        self._take_over()
         self._observer.begin()
         self._observation = observation
-        self._follow()
-        self._arbiter.reset()
-        self._responder.reset()
-        if self._spinal is not None:
-            self._spinal.reset()
+        self._guard.begin()
+        self._alarms = 0
         none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))
         self._ended = False
-        return observation, self._report(info, [RowReport(none, NOTHING)], None)
+        return observation, self._report(info, [nothing(none)], None)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         if self._ended:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
         if self._box is not None:
-            action = as_float32(action, "an action")
+            action = np.array(as_float32(action, "an action"))  # a policy may use its buffer again
             if action.shape != self._box.shape:
                 raise ValueError(f"an action has the shape {self._box.shape}, got {action.shape}")
         self._ended = True  # where anything raises, nobody knows what was done
         self._failed = ""
         self._command(action)
-        overridden = self._arbiter.overriding or self._refused
+        overridden = self._guard.arbiter.overriding or self._refused
         self._rows: list[RowReport] = []
-        self._left: Left | None = None
-        if self._spinal is not None:
-            if overridden:
-                self._spinal.pause()
-            else:
-                self._spinal.send(self._observer.state, self._executed)
-        with self._within_steps():
+        self._guard.substeps.send(self._observer.state, self._executed, overridden)
+        with self._within_steps(), self._held_throughout():
             observation, reward, terminated, truncated, info = self.env.step(self._executed)
-        self._look(*self._sensed(observation, info), ends_step=True)
-        self._observation = observation = self._responder.observed(observation)
-        repaired = self._responder.row()
+        info = dict(info)  # an environment may use its own again
+        row, failure = self._sensed(observation, info)
+        self._look(row, failure, self._guard.substeps.came(row, info))
+        self._observation = observation = self._guard.responder.observed(observation)
+        repaired = self._guard.responder.row()
         if repaired is not None and "stream" in info:
             info["stream"] = repaired
         info["overridden"] = overridden or bool(info.get("overridden"))
         asm = self._report(info, self._rows, self._executed)["asm"]
-        if asm["gave_up"] or (asm["alarm"] and self._on_alarm == "terminate"):
-            terminated, truncated = terminated or self._ends == "terminated", truncated or self._ends == "truncated"
+        if asm["gave_up"] or (asm["alarm"] and self._guard.ends_on_alarm):
+            terminated, truncated = terminated or not self._options.truncate, truncated or self._options.truncate
         self._ended = bool(terminated or truncated)
         return observation, reward, terminated, truncated, info
 
     def _follow(self) -> None:
         """Moves the threshold by the episode that has ended."""
-        if self._running is not None and self._largest is not None:
-            confirmed = self._confirmed or self._arbiter.confirmed
-            self._running.follow(self._largest, self._arbiter.threshold, confirmed)
-            self._arbiter.threshold = self._running.value
-        self._largest, self._confirmed = None, False
+        guard = self._guard
+        if self._running is not None and guard.largest is not None:
+            confirmed = self._confirmed or guard.arbiter.confirmed
+            self._running.follow(guard.largest, guard.arbiter.threshold, confirmed)
+            guard.arbiter.threshold = self._running.value
+        guard.largest, self._confirmed = None, False
 
     def _command(self, action: Any) -> None:
         """Says what is to be done next: the policy's ``action`` (A,), or something else; never, where it is no Box."""
         if self._box is None:
             self._executed, self._refused = action, False
             return
-        self._executed, failure, self._refused = self._arbiter.command(action, self._observation)
+        self._executed, failure, self._refused = self._guard.arbiter.command(action, self._observation)
         self._failed = joined(self._failed, failure)
 
     @contextmanager
@@ -266,6 +290,18 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         finally:
             hooks.remove(self._look)
 
+    @contextmanager
+    def _held_throughout(self) -> Iterator[None]:
+        """While the block runs, who is held is held in all steps that wrappers in between make of one."""
+        if self._holds is None:
+            yield
+            return
+        self._holds.keeps_holding = True
+        try:
+            yield
+        finally:
+            self._holds.keeps_holding = self._holds.holding = False
+
     def _sensed(self, observation: Any, info: dict[str, Any]) -> tuple[NDArray[np.float32], str]:
         """The row (D,) that ends a step, or NaN and what failed."""
         try:
@@ -276,48 +312,28 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             return np.full(self.monitor.spec.size, np.nan, np.float32), f"stream: {error!r}"
         return row, ""
 
-    def _look(self, row: NDArray[np.float32], failure: str = "", ends_step: bool = False) -> None:
+    def _look(self, row: NDArray[np.float32], failure: str = "", beneath: Beneath | None = None) -> None:
         """One row: what the monitor makes of it, and who acts next."""
+        guard = self._guard
         if self._refused:
             failure, self._refused = joined(self._failed, failure), False
-        row = self._responder.read(row)
-        failure = joined(failure, self._responder.doubt)
+        if any(a is not b for a, b in zip(fitted_parts(self._monitor), self._parts, strict=True)):
+            failure = joined(failure, "monitor: it was fitted while it watched; reset() takes it over")
+        row, failure = guard.read(row, failure)
         surprise, expected, (failure,), latency = self._observer.observe(row[None], (failure,))
         if self._late(latency):
             surprise = surprise._replace(value=np.full(1, np.inf))
-        if self._responder.completed:
-            surprise = surprise.without(self._responder.missing)
-        if self._responder.settling and not failure:
-            surprise = surprise.silenced(np.ones(1, np.bool_))
-        if self.learning_rate > 0 and not self._arbiter.overriding and not failure:
-            failure = self._observer.learn(row[None], surprise, self.learning_rate)
+        surprise = guard.heard(surprise, bool(failure))
+        if self.online_learning_rate > 0 and not guard.arbiter.overriding and not failure:
+            failure = self._observer.learn(row[None], surprise, self.online_learning_rate)
             surprise = surprise if not failure else surprise._replace(value=np.full(1, np.inf))
-        if failure:
-            self._arbiter.warn(failure, "which counts as an alarm")
-        watched = float(surprise.value[0])
-        if self._spinal is not None and ends_step:
-            self._left = self._spinal.left(row)
-            surprise = surprise if self._left is None else self._left.added_to(surprise, self.threshold)
-        value = float(surprise.value[0])
-        alarm = not value <= self.threshold
-        response = self._responder.respond(alarm, bool(failure), surprise.attribution[0], self._left is not None)
-        decision = self._arbiter.decide(
-            value,
-            row,
-            self._executed,
-            ends_step,
-            None if expected is None else expected[0],
-            response.name,
-            response.pressed,
-            response.why,
+        said = guard.judge(
+            surprise, row, self._executed, failure, beneath, None if expected is None else expected[0], latency
         )
-        if not decision.intervened:
-            self._largest = max(self._largest or 0.0, watched)
-        forget = decision.acted_on or self._responder.settling
-        forgot = self._observer.forget(np.ones(1, np.bool_)) if forget else ""
-        failure = joined(failure, decision.failure, forgot)
-        self._rows.append(RowReport(surprise, decision, latency, failure, response))
-        if self._arbiter.overriding and not decision.intervened and not ends_step:
+        if said.decision.acted_on or guard.forgets:
+            said = said._replace(failure=joined(said.failure, self._observer.forget(np.ones(1, np.bool_))))
+        self._rows.append(said)
+        if guard.arbiter.overriding and not said.decision.intervened and beneath is None:
             self._command(self._executed)
             self.env.get_wrapper_attr("command")(self._executed)
 
@@ -332,14 +348,15 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return late and self._on_overrun == "alarm"
 
     def _report(self, info: dict[str, Any], rows: list[RowReport], executed: Any) -> dict[str, Any]:
-        failed = self._failed if executed is not None else ""
+        failed, responder = self._failed if executed is not None else "", self._guard.responder
         asm = report(rows, self.monitor.spec, self.threshold, executed, failed)
-        asm |= {"completed": self._responder.completed, "unread": self._responder.unread}
-        if self._spinal is not None:
-            asm["spinal_s"] = None if executed is None or self._left is None else self._left.after_s
+        self._alarms += asm["alarm"]
+        asm |= {"completed": responder.completed, "unread": responder.unread, "lost": responder.lost}
+        asm["alarms"] = self._alarms
         if self._running is not None:
             asm |= {"ceiling": self._running.ceiling, "level": self._running.level}
         info["asm"] = asm
         info["asm_surprise"], info["asm_alarm"] = np.float64(asm["surprise"]), np.bool_(asm["alarm"])
         info["asm_intervened"], info["cost"] = np.bool_(asm["intervened"]), np.float64(asm["alarm"])
+        info["cost_sum"] = np.float64(self._alarms)
         return info

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from itertools import zip_longest
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -10,26 +12,29 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
+from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import Monitor, Surprise
-from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, Reflex, nearest_to_rest
-from asm_gym.protocols import HoldsItself
+from asm_gym.protocols import HoldsItself, LimitsContact
 from asm_gym.stream_source import StreamSource
-from asm_gym.validation import as_float32, check_flag
-from asm_gym.wrappers.arbitration import NOTHING, Arbiter, Command, Decision
-from asm_gym.wrappers.arguments import (
-    body_memory,
-    check_expectation,
-    check_monitor,
-    fitted_to,
-    make_fallback,
-    make_patience,
-    make_reflex,
-    running,
-)
-from asm_gym.wrappers.batches import Mask, Member, final, members, refuse_changes, replace, set_attribute
+from asm_gym.validation import as_float32
+from asm_gym.wrappers.arbiter import Command
+from asm_gym.wrappers.factory import LOG, OnAlarm, body_memory, check_monitor, fitted_parts, fitted_to, running
+from asm_gym.wrappers.guard import Guard, GuardOptions, nothing
 from asm_gym.wrappers.observer import Observer, joined
+from asm_gym.wrappers.reports import RowReport, report
+from asm_gym.wrappers.vector_utils import (
+    Mask,
+    Member,
+    final,
+    members,
+    put,
+    refuse_changes,
+    refuse_running_statistics,
+    replace,
+    set_attribute,
+)
 
 
 class VectorNeuralASMSafety(VectorWrapper):
@@ -48,15 +53,16 @@ class VectorNeuralASMSafety(VectorWrapper):
         env: of ``gym.make_vec``; where ``info`` has no ``"stream"``, observation and action are the stream.
         monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that they move.
         on_alarm: as in ``NeuralASMSafety``; a policy of yours is shared, and must keep what it knows in its state.
-            Causes are not named here and senses not completed, so that ``"graded"`` holds as it does for the unknown.
-            Nor is a band sent down: for ``spinal``, wrap each member and put those side by side in ``ThreadVectorEnv``.
-        release_after, release_below, max_override, try_after, truncate: as in ``NeuralASMSafety``.
-        adapt: as there; all environments share one running threshold, and an episode keeps what it began with.
+        release_after, release_below, max_override, try_after, truncate, responses, contact_limits: as there. Nor is a
+            band sent down: for ``band``, wrap each member and put those side by side in ``ThreadVectorEnv``.
+        adaptive_threshold: as there; all environments share one running threshold, and an episode keeps what it began
+            with.
 
     Raises:
         TypeError: ``env`` is no vector environment, cannot be asked for what its members are, or takes no Box actions.
         ValueError: an unknown ``on_alarm``, a monitor fitted for another stream (the message names the channels), or a
-            wrapper inside that changes actions, where the reflex cannot know what reaches the robot.
+            wrapper inside that changes actions, where the reflex cannot know what reaches the robot, or what it
+            makes of the same sense as it goes on.
         RuntimeError: the monitor is not calibrated.
     """
 
@@ -64,14 +70,16 @@ class VectorNeuralASMSafety(VectorWrapper):
         self,
         env: VectorEnv[Any, Any, Any],
         monitor: Monitor | None = None,
-        on_alarm: str | Policy = "hold",
+        on_alarm: OnAlarm | None = None,
         *,
         release_after: int = 10,
         release_below: float = 0.8,
         max_override: int | None = None,
         try_after: int | None = None,
         truncate: bool = False,
-        adapt: AdaptiveThreshold | None = None,
+        adaptive_threshold: AdaptiveThreshold | None = None,
+        responses: Mapping[str, str] | None = None,
+        contact_limits: ContactLimits | Literal["memory"] | None = "memory",
     ) -> None:
         super().__init__(env)
         if not isinstance(env.single_action_space, gym.spaces.Box):
@@ -79,52 +87,74 @@ class VectorNeuralASMSafety(VectorWrapper):
         self._space = env.single_action_space
         if isinstance(on_alarm, Reflex) and not (isinstance(on_alarm, Hold) and on_alarm.explicit):
             raise ValueError(f"one {type(on_alarm).__name__} cannot act in several environments: give its name instead")
+        refuse_running_statistics(env)
+        self._options = GuardOptions(
+            on_alarm, release_after, release_below, max_override, try_after, truncate, responses, contact_limits
+        )
+        self._adaptive = adaptive_threshold
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self._members = members(env)
-        if monitor is None:
-            first = self._members[0]
-            monitor = body_memory(first, StreamSource(first).spec)
-        self._own_stream = self._members[0].has_wrapper_attr("stream_spec")
+        first = self._members[0]
+        self._own_stream = first.has_wrapper_attr("stream_spec")
         if not self._own_stream and not isinstance(env.single_observation_space, gym.spaces.Box):
             raise TypeError(
                 f"environments without a stream are watched side by side where each senses a Box, got "
                 f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
             )
+        self._watch_with(body_memory(first, StreamSource(first).spec) if monitor is None else monitor)
+        self._limits = any(isinstance(member, LimitsContact) for member in self._members)
+        self._told: list[ContactLimits | None] = []
+        self._holding = np.zeros(env.num_envs, bool)
+        if any(isinstance(member, HoldsItself) for member in self._members):
+            # Who is held is held in all steps that wrappers in between make of one.
+            set_attribute(env, "keeps_holding", [True] * env.num_envs)
+        self._confirmed = np.zeros(env.num_envs, bool)
+        self._alarms = np.zeros(env.num_envs, np.int64)
+        self._ended: Mask | None = None
+        self._forced = np.zeros(env.num_envs, bool)  # ended by this wrapper, which the environment does not know yet
+
+    def _watch_with(self, monitor: Monitor) -> None:
+        """Takes up a monitor, and all that depends on it."""
         for member in self._members:
             source = StreamSource(member)
             if source.rows_per_step > 1:
                 raise ValueError("many environments are watched at their control rate: make them without stream_freq")
             monitor = fitted_to(monitor, source.spec)
             threshold = check_monitor(monitor, source.spec)
-        self.monitor = monitor
-        self._running = running(adapt, threshold)
-        self._ends_truncated = check_flag("truncate", truncate)
-        self._terminates = on_alarm == "terminate"
-        limits = release_after, release_below, max_override, try_after
-        self._arbiters = [self._arbiter(on_alarm, member, threshold, limits) for member in self._members]
-        self._largest = np.full(env.num_envs, np.nan)  # surprise in each episode, while the policy acted
-        self._confirmed = np.zeros(env.num_envs, bool)
-        self._failures = [""] * env.num_envs
-        self._ended: Mask | None = None
-        self._forced = np.zeros(env.num_envs, bool)  # ended by this wrapper, which the environment does not know yet
+        self._running = running(self._adaptive, threshold)
+        self._guards = [self._guard(member, monitor, threshold) for member in self._members]
+        self._observer = Observer(monitor, self.num_envs, any(guard.recalls for guard in self._guards))
+        self._monitor = self._next = monitor
+        self._parts, self._promised = fitted_parts(monitor), threshold
+
+    def _guard(self, env: Member, monitor: Monitor, threshold: float) -> Guard:
+        guard = Guard(env, monitor, self._options, threshold, self._space)
+        reflex = guard.reflex
+        holds = type(reflex) is Hold and (reflex.explicit or isinstance(env, HoldsItself))
+        graded = self._options.reaction(monitor) == "graded" and isinstance(env, HoldsItself)
+        if isinstance(reflex, Reflex) and not (holds or graded):
+            refuse_changes(self.env)
+        return guard
+
+    @property
+    def monitor(self) -> Monitor:
+        """As in ``NeuralASMSafety``; what has changed is taken over at the next ``reset`` of all environments."""
+        return self._monitor
+
+    @monitor.setter
+    def monitor(self, monitor: Monitor) -> None:
+        spec = self._monitor.spec
+        check_monitor(fitted_to(monitor, spec), spec)
+        self._next = monitor
 
     @property
     def threshold(self) -> NDArray[np.float64]:
         """(n,) what surprise must exceed for an alarm in the episodes that run."""
-        return np.array([arbiter.threshold for arbiter in self._arbiters])
+        return np.array([guard.arbiter.threshold for guard in self._guards])
 
     def confirm_alarm(self, which: Mask | None = None) -> None:
         """As in ``NeuralASMSafety``, of ``which`` (n,) environments; of all by default."""
         self._confirmed |= np.ones(self.num_envs, bool) if which is None else which
-
-    def _arbiter(self, on_alarm: str | Policy, env: Member, threshold: float, limits: tuple[Any, ...]) -> Arbiter:
-        reflex = make_reflex(on_alarm, env)
-        holds = type(reflex) is Hold and (reflex.explicit or isinstance(env, HoldsItself))
-        if isinstance(reflex, Reflex) and not holds:
-            refuse_changes(self.env)
-        self._observer = Observer(self.monitor, self.num_envs, check_expectation(reflex, self.monitor))
-        patience = make_patience(reflex, env, *limits)
-        return Arbiter(reflex, threshold, patience, make_fallback(env), self._space)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         n = self.num_envs
@@ -132,13 +162,19 @@ class VectorNeuralASMSafety(VectorWrapper):
         ended, self._ended = self._ended, None  # until it has worked
         # A copy: vector environments take the mask out of the options they are given.
         self._observations, infos = self.env.reset(seed=seed, options=dict(options) if options else options)
-        if ended is None:
-            if not begun.all():
-                raise gym.error.ResetNeeded("the first reset() must be of all environments")
+        infos = dict(infos)
+        if ended is None and not begun.all():
+            raise gym.error.ResetNeeded("the first reset() must be of all environments")
+        if begun.all():
+            self._follow(begun)
+            changed = any(a is not b for a, b in zip(fitted_parts(self._next), self._parts, strict=True))
+            if changed or check_monitor(self._next, self._next.spec) != self._promised:
+                LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
+                self._watch_with(self._next)
             self._observer.begin()
         self._ended = np.zeros(n, bool) if ended is None else ended
         self._begin(begun)
-        self._report(infos, self._nothing(), self._no_actions(), None, begun)
+        self._report(infos, self._nothing(), self._no_actions(), begun)
         return self._observations, infos
 
     def step(self, actions: Any) -> tuple[Any, NDArray[Any], Mask, Mask, dict[str, Any]]:
@@ -147,7 +183,8 @@ class VectorNeuralASMSafety(VectorWrapper):
         begun, self._ended = self._ended.copy(), None  # where anything raises, nobody knows what was done
         # Those of ``begun`` begin an episode in this step; none of them under SAME_STEP.
         executed, commands = self._command(actions, begun)
-        observations, rewards, terminated, truncated, infos = self.env.step(executed)
+        observations, rewards, terminated, truncated, infos = self.env.step(executed.copy())
+        infos = dict(infos)
         if self._forced.any():
             forced = self._forced
             observations, fresh = self.env.reset(options={"reset_mask": forced.copy()})
@@ -157,20 +194,27 @@ class VectorNeuralASMSafety(VectorWrapper):
         known = np.asarray(terminated | truncated, bool)
         last = known if same else np.zeros_like(known)
         rows, failures = self._sensed(observations, executed, infos, last)
-        surprise, decisions = self._decide(rows, executed, begun, commands, failures)
-        stopped = np.array([d.gave_up or (d.alarm and self._terminates) for d in decisions]) & ~begun
-        terminated = np.asarray(terminated, bool) | (stopped & (not self._ends_truncated))
-        truncated = np.asarray(truncated, bool) | (stopped & self._ends_truncated)
+        reports = self._judge(rows, executed, begun, commands, failures, infos, last)
+        stopped = np.array(
+            [
+                r.decision.gave_up or (r.decision.alarm and g.ends_on_alarm)
+                for r, g in zip(reports, self._guards, strict=True)
+            ]
+        )
+        stopped &= ~begun
+        terminated = np.asarray(terminated, bool) | (stopped & (not self._options.truncate))
+        truncated = np.asarray(truncated, bool) | (stopped & self._options.truncate)
         self._forced = stopped & ~known
+        observations = self._repaired(observations, infos, ~begun & ~last)
         if same and self._forced.any():
             observations, infos = self._restart(observations, infos)
         executed[begun] = np.nan
         self._ended = np.zeros_like(begun)
         if same:
-            self._report_ends(infos, surprise, executed, decisions, terminated | truncated)
+            self._report_ends(infos, reports, executed, terminated | truncated)
         else:
             self._begin(begun)
-            self._report(infos, surprise, executed, decisions, np.ones(self.num_envs, bool))
+            self._report(infos, reports, executed, np.ones(self.num_envs, bool))
             self._ended = terminated | truncated
         self._observations = observations
         return observations, rewards, terminated, truncated, infos
@@ -182,12 +226,15 @@ class VectorNeuralASMSafety(VectorWrapper):
             raise ValueError(f"actions have the shape {self.env.action_space.shape}, got {chosen.shape}")
         rest = Command(nearest_to_rest(self._space))  # where an episode begins, nothing is done
         observed = iterate(self.observation_space, self._observations)
-        each = zip(self._arbiters, chosen, observed, begun, strict=True)
-        commands = [rest if fresh else arbiter.command(action, seen) for arbiter, action, seen, fresh in each]
-        able = [member for member in self._members if isinstance(member, HoldsItself)]
-        if any(member.holding for member in able):
-            set_attribute(self.env, "holding", [member.holding for member in able])
-            for member in able:
+        each = zip(self._guards, chosen, observed, begun, strict=True)
+        commands = [rest if fresh else guard.arbiter.command(action, seen) for guard, action, seen, fresh in each]
+        self._limit()
+        wanted = np.array([isinstance(m, HoldsItself) and m.holding for m in self._members])
+        if (wanted | self._holding).any():
+            set_attribute(self.env, "holding", wanted.tolist())
+        self._holding = wanted
+        for member in self._members:
+            if isinstance(member, HoldsItself):
                 member.holding = False
         return np.stack([command.action for command in commands]), commands
 
@@ -213,59 +260,95 @@ class VectorNeuralASMSafety(VectorWrapper):
     ) -> NDArray[np.float32]:
         """(D,) of one environment."""
         if self._own_stream:
-            said = infos.get("final_info", {}) if last else infos
-            there = said.get("_stream")
-            if "stream" not in said or not (there is None or there[i]):
+            said = _said(infos, i, last, ("stream",))
+            if "stream" not in said:
                 raise KeyError('info has no "stream"')
-            return as_float32(said["stream"][i])
+            return as_float32(said["stream"])
         sensed = infos["final_obs"][i] if last else observations[i]
         return as_float32(np.concatenate([np.ravel(sensed), np.ravel(executed[i])]))
 
-    def _decide(
+    def _judge(
         self,
         rows: NDArray[np.float32],
         executed: NDArray[np.float32],
         begun: Mask,
         commands: list[Command],
         failures: list[str],
-    ) -> tuple[Surprise, list[Decision]]:
+        infos: dict[str, Any],
+        last: Mask,
+    ) -> list[RowReport]:
         """One ``observe`` for all, and who acts next in each; nothing counts where an episode has only ``begun``."""
-        refused = (c.failure if c.refused else "" for c in commands)
-        known = (joined(r, f) if not b else "" for r, f, b in zip(refused, failures, begun, strict=True))
-        surprise, expected, failed, _ = self._observer.observe(rows, tuple(known))
-        surprise = surprise.silenced(begun)
-        value = surprise.value
-        decisions: list[Decision] = []
-        self._failures = [""] * self.num_envs
-        for i, arbiter in enumerate(self._arbiters):
+        known = [
+            "" if b else joined(c.failure if c.refused else "", f)
+            for c, f, b in zip(commands, failures, begun, strict=True)
+        ]
+        if any(a is not b for a, b in zip(fitted_parts(self._monitor), self._parts, strict=True)):
+            known = [joined(f, "monitor: it was fitted while it watched; reset() takes it over") for f in known]
+        for i in np.flatnonzero(~begun):
+            rows[i], known[i] = self._guards[i].read(rows[i], known[i])
+        surprise, expected, failed, latency = self._observer.observe(rows, tuple(known))
+        reports: list[RowReport] = []
+        for i, guard in enumerate(self._guards):
+            own = surprise.of(i)
             if begun[i]:
-                decisions.append(NOTHING)
+                reports.append(nothing(own.silenced(np.ones(1, bool))))
                 continue
-            if failed[i]:
-                arbiter.warn(failed[i], "which counts as an alarm")
+            beneath = guard.substeps.came(rows[i], _said(infos, i, bool(last[i]), ("contact_load", "contact_left_s")))
             said = None if expected is None else expected[i]
-            decisions.append(arbiter.decide(float(value[i]), rows[i], executed[i], expected=said))
-            if not decisions[i].intervened:
-                self._largest[i] = np.fmax(self._largest[i], value[i])
-            self._failures[i] = joined(commands[i].failure, failed[i], decisions[i].failure)
-        forgot = self._observer.forget(np.array([d.acted_on for d in decisions]))
-        for i in np.flatnonzero([d.acted_on for d in decisions]):
-            self._failures[i] = joined(self._failures[i], forgot)
-        return surprise, decisions
+            heard = guard.heard(own, bool(failed[i]))
+            report = guard.judge(heard, rows[i], executed[i], failed[i], beneath, said, latency)
+            reports.append(report._replace(failure=joined(commands[i].failure, report.failure)))
+        acted = (
+            np.array([r.decision.acted_on or g.forgets for r, g in zip(reports, self._guards, strict=True)]) & ~begun
+        )
+        if forgot := self._observer.forget(acted):
+            reports = [
+                r._replace(failure=joined(r.failure, forgot)) if a else r for r, a in zip(reports, acted, strict=True)
+            ]
+        return reports
+
+    def _repaired(self, observations: Any, infos: dict[str, Any], where: Mask) -> Any:
+        """The observations, and the streams in ``infos``, with what is completed in the environments of ``where``."""
+        for i in np.flatnonzero(where):
+            responder = self._guards[i].responder
+            row = responder.row()
+            if row is None:
+                continue
+            seen = list(iterate(self.observation_space, observations))[i]
+            observations = put(observations, i, responder.observed(seen))
+            if "stream" in infos:
+                infos["stream"] = put(infos["stream"], i, row)
+        return observations
+
+    def _follow(self, begun: Mask) -> None:
+        """Moves the threshold by the episodes that have ended."""
+        for i in np.flatnonzero(begun):
+            guard = self._guards[i]
+            if self._running is not None and guard.largest is not None:
+                confirmed = guard.arbiter.confirmed or bool(self._confirmed[i])
+                self._running.follow(guard.largest, guard.arbiter.threshold, confirmed)
+                guard.arbiter.threshold = self._running.value
+            guard.largest = None
+        self._confirmed[begun] = False
 
     def _begin(self, begun: Mask) -> None:
         """New episodes."""
         assert self._ended is not None
         self._ended[begun] = self._forced[begun] = False
+        self._alarms[begun] = 0
         self._observer.begin_in(begun)
+        self._follow(begun)
         for i in np.flatnonzero(begun):
-            arbiter = self._arbiters[i]
-            if self._running is not None and not np.isnan(self._largest[i]):
-                confirmed = arbiter.confirmed or bool(self._confirmed[i])
-                self._running.follow(float(self._largest[i]), arbiter.threshold, confirmed)
-                arbiter.threshold = self._running.value
-            arbiter.reset()
-        self._largest[begun], self._confirmed[begun] = np.nan, False
+            self._guards[i].begin()
+        if begun.any():
+            self._told = []  # a new episode has forgotten its limits
+
+    def _limit(self) -> None:
+        """Tells the environments their limits, where those have changed."""
+        limits = [m.contact_limits if isinstance(m, LimitsContact) else None for m in self._members]
+        if self._limits and any(a is not b for a, b in zip_longest(limits, self._told)):
+            set_attribute(self.env, "contact_limits", limits)
+            self._told = limits
 
     def _restart(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Begins anew what this wrapper has ended, in the same step."""
@@ -275,59 +358,68 @@ class VectorNeuralASMSafety(VectorWrapper):
         return observations, replace(infos, fresh, forced, keep=("final_obs", "final_info"))
 
     def _report_ends(
-        self,
-        infos: dict[str, Any],
-        surprise: Surprise,
-        executed: NDArray[np.float32],
-        decisions: list[Decision],
-        ended: Mask,
+        self, infos: dict[str, Any], reports: list[RowReport], executed: NDArray[np.float32], ended: Mask
     ) -> None:
         """What ended is reported in ``final_info``, and what has begun in its place in ``infos``."""
         if ended.any():
-            self._report(infos["final_info"], surprise, executed, decisions, ended)
+            infos["final_info"] = dict(infos["final_info"])
+            self._report(infos["final_info"], reports, executed, ended)
             self._begin(ended)
-            surprise = surprise.silenced(ended)
             executed = np.where(ended[:, None], np.float32(np.nan), executed)
-            decisions = [NOTHING if e else d for e, d in zip(ended, decisions, strict=True)]
-        self._report(infos, surprise, executed, decisions, np.ones(self.num_envs, bool))
+            blank = self._nothing()
+            reports = [n if e else r for n, r, e in zip(blank, reports, ended, strict=True)]
+            self._alarms -= np.where(ended, 0, [r.decision.alarm for r in reports])  # counted by the next report
+        self._report(infos, reports, executed, np.ones(self.num_envs, bool))
 
     def _report(
-        self,
-        infos: dict[str, Any],
-        surprise: Surprise,
-        executed: NDArray[np.float32],
-        decisions: list[Decision] | None,
-        present: Mask,
+        self, infos: dict[str, Any], reports: list[RowReport], executed: NDArray[np.float32], present: Mask
     ) -> None:
         """Adds ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
-        threshold = self.threshold
-        alarm = surprise.value > threshold
-        decisions = decisions or [NOTHING] * self.num_envs
-        intervened = np.array([d.intervened for d in decisions])
-        body, skill = surprise.parts
-        infos["asm"] = {
-            "surprise": surprise.value,
-            "surprise_body": body,
-            "surprise_skill": skill,
-            "threshold": threshold,
-            "alarm": alarm,
-            "intervened": intervened,
-            "gave_up": np.array([d.gave_up for d in decisions]),
-            "transition": np.array([d.transition for d in decisions]),
-            "failure": np.where([d is NOTHING for d in decisions], "", self._failures),
-            "executed_action": executed,
-            "attribution": dict(zip(self.monitor.spec.labels, surprise.attribution.T, strict=True)),
-        }
+        spec, responders = self.monitor.spec, [guard.responder for guard in self._guards]
+        self._alarms += [r.decision.alarm for r in reports]
+        each = [
+            report([r], spec, guard.arbiter.threshold, None, "")
+            | {"completed": s.completed, "unread": s.unread, "lost": s.lost, "alarms": int(n)}
+            for r, s, n, guard in zip(reports, responders, self._alarms, self._guards, strict=True)
+        ]
+        asm = {name: _stacked([one[name] for one in each]) for name in each[0]}
+        asm["executed_action"] = executed.copy()
         if self._running is not None:
             both = {"ceiling": self._running.ceiling, "level": self._running.level}
-            infos["asm"] |= {name: np.full(self.num_envs, value) for name, value in both.items()}
-        flat = {"asm_surprise": surprise.value, "asm_alarm": alarm, "asm_intervened": intervened}
-        infos.update(flat, cost=alarm.astype(np.float64))
-        infos.update({f"_{key}": present for key in ("asm", "cost", *flat)})
+            asm |= {name: np.full(self.num_envs, value) for name, value in both.items()}
+        infos["asm"] = asm
+        alarm = asm["alarm"]
+        flat = {"asm_surprise": asm["surprise"], "asm_alarm": alarm, "asm_intervened": asm["intervened"]}
+        flat |= {"cost": alarm.astype(np.float64), "cost_sum": self._alarms.astype(np.float64)}
+        infos.update(flat)
+        infos.update({f"_{key}": present for key in ("asm", *flat)})
 
-    def _nothing(self) -> Surprise:
-        return Surprise(np.zeros(self.num_envs), np.zeros((self.num_envs, self.monitor.spec.size)))
+    def _nothing(self) -> list[RowReport]:
+        none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))
+        return [nothing(none)] * self.num_envs
 
     def _no_actions(self) -> NDArray[np.float32]:
         shape = self.env.single_action_space.shape or ()
         return np.full((self.num_envs, *shape), np.nan, np.float32)
+
+
+def _said(infos: dict[str, Any], i: int, last: bool, names: tuple[str, ...]) -> dict[str, Any]:
+    """What environment ``i`` said of ``names`` in its step, the ``last`` of an episode or not."""
+    said = infos.get("final_info", {}) if last else infos
+    there = {name: said.get(f"_{name}") for name in names if name in said}
+    return {name: said[name][i] for name, mask in there.items() if mask is None or mask[i]}
+
+
+def _stacked(values: list[Any]) -> Any:
+    """One array whose first axis is n; of dicts, a dict of such where all have the same keys and hold numbers."""
+    if isinstance(values[0], dict) and len({tuple(v) for v in values}) == 1 and _numbers(values):
+        return {key: np.array([v[key] for v in values]) for key in values[0]}
+    if isinstance(values[0], dict | tuple) or values[0] is None:
+        array = np.empty(len(values), object)
+        array[:] = values
+        return array
+    return np.array(values)
+
+
+def _numbers(values: list[dict[str, Any]]) -> bool:
+    return all(isinstance(x, float | int | bool | np.number) for v in values for x in v.values())

@@ -198,7 +198,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._layout = Layout(self.measured_spec, self._groups, self._flat)
         self.observation_layout = self._layout.sizes
         """The observation's parts in order, and how many numbers each has."""
-        self.observation_space = self._layout.space(self._pictures.spaces)
+        self.observation_space = self.laid_out_space = self._layout.space(self._pictures.spaces)
 
     @property
     def stream_freq(self) -> int:
@@ -262,7 +262,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         else:
             self.simulation.begin_episode()
         self._warnings = self._bad_count()
-        self._steps, self.holding, self.keeps_holding = 0, False, False
+        self._steps, self.holding = 0, False
         self.contact_limits = self._band = None
         self._action = np.zeros(self._actions.size, np.float32)
         self._row = self.measure()

@@ -42,7 +42,6 @@ class Simulation:
     def __init__(self, env: Any, substeps: int) -> None:
         self.env = env
         self.substeps = substeps
-        self._step_s = 1.0 / env.control_freq
         self.model: mujoco.MjModel = env.sim.model._model
         self.data: mujoco.MjData = env.sim.data._data
         self._rotations = importlib.import_module("robosuite.utils.transform_utils")
@@ -184,6 +183,20 @@ class Simulation:
         parts = [[s[:count, :n], s[:count, wrist]] for s, n in zip(self._samples, self._arms.joints, strict=True)]
         return np.hstack([part for arm in parts for part in arm])
 
+    @property
+    def contact_forces(self) -> NDArray[np.float64]:
+        """(K,) the largest net contact force on an arm in each substep since the row began [N]; no sensor tells it."""
+        forces = self._samples[:, : self._done - self._row_began, kernels.CONTACT]
+        found: NDArray[np.float64] = np.linalg.norm(forces, axis=2).max(axis=0)
+        return found
+
+    @property
+    def strain(self) -> NDArray[np.float64]:
+        """(K,) the largest external torque in a joint in each substep since the row began [N m]."""
+        torques = self._samples[:, : self._done - self._row_began, kernels.EXTERNAL]
+        found: NDArray[np.float64] = np.abs(torques).max(axis=(0, 2))
+        return found
+
     def sense(self) -> NDArray[np.float64]:
         """What the arms' sensors read now, summarised over the substeps since the row began; noiseless."""
         if self._done > self._row_began:
@@ -224,7 +237,7 @@ class Simulation:
     # ------------------------------------------------------------------ knowledge of the robot
 
     def slowed(self, action: NDArray[np.float64], most: float) -> list[tuple[slice, float]]:
-        """For each arm, its part of the action, and the share of it at which its hand goes no faster than ``most`` [m/s].
+        """For each arm, its part of the action, and what share of it keeps its hand below ``most`` [m/s].
 
         A controller that is asked for a change Δx of pose again and again, from where it is, comes to the velocity
         Kp/Kd Δx. Actions of controllers that take anything else are left as they are.
@@ -235,15 +248,14 @@ class Simulation:
             controller, part = self._controllers[a], slice(start + low, start + high)
             start += robot.action_dim
             kind, n = controller.name, int(self._arms.joints[a])
-            if kind not in ("OSC_POSE", "IK_POSE", "JOINT_POSITION") or controller.input_type != "delta":
+            if kind not in ("OSC_POSE", "JOINT_POSITION") or controller.input_type != "delta":
                 continue
             delta = np.asarray(controller.scale_action(action[part]), np.float64)
             if kind == "JOINT_POSITION":
                 jacobian = np.zeros((3, self.model.nv))
                 mujoco.mj_jacSite(self.model, self.data, jacobian, None, int(self._arms.site[a]))
                 delta = jacobian[:, self._arms.dofs[a, :n]] @ delta
-            # IK_POSE hands joint positions on to a controller with gains of its own; a change a step is its most.
-            gain = 1.0 / self._step_s if kind == "IK_POSE" else float(np.mean(controller.kp[:3] / controller.kd[:3]))
+            gain = float(np.mean(controller.kp[:3] / controller.kd[:3]))
             speed = gain * float(np.linalg.norm(delta[:3]))
             found.append((part, 1.0 if speed <= most else most / speed))
         return found

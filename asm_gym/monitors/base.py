@@ -48,6 +48,12 @@ class Surprise(NamedTuple):
         body = self.value if self.of_body is None else self.of_body
         return body, np.full(len(body), np.nan) if self.of_skill is None else self.of_skill
 
+    def of(self, stream: int) -> Surprise:
+        """That of one stream, in a batch of one."""
+        at = slice(stream, stream + 1)
+        skill, body, of_skill = (None if p is None else p[at] for p in (self.skill, self.of_body, self.of_skill))
+        return Surprise(self.value[at], self.attribution[at], skill, body, of_skill)  # type: ignore[arg-type]
+
     def silenced(self, where: NDArray[np.bool_]) -> Surprise:
         """No surprise ``where`` (B,) nothing is judged."""
 

@@ -312,9 +312,13 @@ def hypotheses_of(completion: Completion) -> tuple[Hypothesis, ...]:
     return tuple(found)
 
 
-def as_info(cause: Cause | None, force: Any = None) -> dict[str, Any]:
+NO_FORCE: dict[str, Any] = {"link": "", "newtons": 0.0, "vector": [0.0, 0.0, 0.0]}
+"""Where no force is behind it, or nobody knows which; the same in kind, so that many environments' go together."""
+
+
+def as_info(cause: Cause | None, force: dict[str, Any] | None = None) -> dict[str, Any]:
     """What ``info["asm"]["cause"]`` says; all empty where there is nothing to explain."""
     if cause is None:
-        return {"family": "", "part": "", "probability": 0.0, "force": None, "probabilities": {}}
+        return {"family": "", "part": "", "probability": 0.0, "force": NO_FORCE, "probabilities": {}}
     named = {"family": cause.family, "part": cause.part, "probability": cause.probability}
-    return {**named, "force": force, "probabilities": cause.probabilities}
+    return {**named, "force": force or NO_FORCE, "probabilities": cause.probabilities}

@@ -153,6 +153,15 @@ def model_of(name: str) -> str:
     return name.partition("+")[0]
 
 
+def check_monitor(name: str) -> None:
+    """Raises ValueError unless there is such a monitor, or such a model and detection; nothing is imported."""
+    model, plus, detection = name.partition("+")
+    if plus and name not in MONITORS and model in MONITORS:
+        check_choice("detection", detection, DETECTIONS)
+    else:
+        check_choice("monitor", name, MONITORS)
+
+
 @typed
 def monitor_class(name: str) -> MonitorKind:
     """What makes and loads the monitors of that name; torch is imported only for those that need it.
@@ -161,12 +170,9 @@ def monitor_class(name: str) -> MonitorKind:
         ValueError: there is no monitor of that name, or no such detection; the message lists what exists.
         ImportError: a package that it needs is not installed; the message says what to install.
     """
-    model, plus, detection = name.partition("+")
-    if name in MONITORS or not plus or model not in MONITORS:
-        check_choice("monitor", name, MONITORS)
-        kind = MONITORS[name]
-    else:
-        kind = MONITORS[model].under(detection)
+    check_monitor(name)
+    model, _, detection = name.partition("+")
+    kind = MONITORS[name] if name in MONITORS else MONITORS[model].under(detection)
     with needed_for(f"monitor {name}"):
         _ = kind.model_class, kind.detection_classes
     return kind

@@ -68,6 +68,20 @@ class ParallelConfig:
         if self.backend == "loky" and self.address is not None:
             raise ValueError(f"an address is for a cluster: backend must be dask or ray, got loky with {self.address}")
 
+    @classmethod
+    def named(cls, workers: str) -> ParallelConfig:
+        """From one word: how many processes here, or ``dask:ADDRESS``, ``ray`` or ``ray:ADDRESS`` for a cluster.
+
+        Raises:
+            ValueError: it is none of these.
+        """
+        if workers.lstrip("-").isdecimal():
+            return cls(int(workers))
+        backend, _, address = workers.partition(":")
+        if backend not in BACKENDS or backend == "loky":
+            raise ValueError(f"workers must be a number, dask:ADDRESS or ray:ADDRESS, got {workers!r}")
+        return cls(backend=backend, address=address or None)
+
 
 @typed
 def parallel_map(

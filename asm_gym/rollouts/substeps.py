@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.spinal import FeltEpisode, SpinalBand
+from asm_gym.monitors.contact_band import ContactBand, FeltEpisode
 from asm_gym.policies import rollout
 from asm_gym.protocols import FeelsWithinSteps
 from asm_gym.rollouts.seeds import role_seeds
@@ -20,7 +20,7 @@ from asm_gym.tasks import env_id
 def felt_episodes(
     env: gym.Env[Any, Any], seeds: Sequence[int], policy: PolicySource = "scripted", steps: int | None = None
 ) -> list[FeltEpisode]:
-    """Nominal episodes for ``SpinalBand``; those that a policy of this package failed in are left out.
+    """Nominal episodes for ``ContactBand``; those that a policy of this package failed in are left out.
 
     Args:
         env: of this package, with one row of the stream a control step.
@@ -51,7 +51,7 @@ def felt_episodes(
 
 def band_of_task(
     memory: NeuralASM, task: str, config: RolloutConfig, counts: tuple[int, int], rate: float, seed: int
-) -> SpinalBand:
+) -> ContactBand:
     """A band on one task, of as many nominal episodes to learn from and to calibrate on as ``counts`` says.
 
     Args:
@@ -63,4 +63,4 @@ def band_of_task(
         felt_episodes(env, role_seeds(seed, task, f"spinal {role}", count), config.policy)
         for role, count in zip(("fit", "calibration"), counts, strict=True)
     )
-    return SpinalBand(memory).fit(seen).calibrate(fresh, rate)
+    return ContactBand(memory).fit(seen).calibrate(fresh, rate)

@@ -27,14 +27,14 @@ from asm_gym.faults.interface import FaultyInterface
 from asm_gym.faults.sensor import corrupts_senses
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
 from asm_gym.monitors import Monitor, NeuralASM
-from asm_gym.monitors.spinal import SpinalBand
+from asm_gym.monitors.contact_band import ContactBand
 from asm_gym.policies import Policy, Seeded, make_policy, rollout
 from asm_gym.policies.scripted.base import Style
 from asm_gym.rollouts.seeds import draw_onset, episode_seeds
 from asm_gym.spec import control_period
 from asm_gym.tasks import env_id
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder
-from asm_gym.wrappers.ideal import IdealReflex
+from asm_gym.wrappers.oracle import OracleReflex
 
 Settings = tuple[tuple[str, Any], ...]
 """Arguments by name, in an order of their own."""
@@ -63,7 +63,7 @@ class RolloutConfig:
         stream_freq: rows of the stream a second [Hz]; one each control step by default.
         max_override_s: how long a reflex may act at a stretch before the episode is ended [s].
         env_kwargs: what ``gym.make`` is given besides.
-        band: file of a calibrated ``SpinalBand`` of the memory that watches, for reflexes that are ``"+spinal"``.
+        band: file of a calibrated ``ContactBand`` of the memory that watches, for reflexes that are ``"+spinal"``.
     """
 
     policy: PolicySource = "scripted"
@@ -226,7 +226,7 @@ def staged(trial: Trial, config: RolloutConfig, env: gym.Env[Any, Any] | None = 
     faulty = FaultInjection(base, faults)
     touching = [fault for fault in faults if touches_body(fault)] if trial.acting == IDEAL else []
     try:
-        yield IdealReflex(faulty, touching) if touching else faulty
+        yield OracleReflex(faulty, touching) if touching else faulty
     finally:
         faulty.undo_faults()  # the next trial has wrappers of its own around the same environment
 
@@ -264,12 +264,12 @@ def guarded(
     monitor: Monitor,
     trial: Trial,
     max_override_s: float | None = None,
-    band: SpinalBand | None = None,
+    band: ContactBand | None = None,
 ) -> gym.Env[Any, Any]:
     """``env`` under the safety wrapper, which acts as the trial says."""
     limited = max_override_s is not None and trial.acting not in (POLICY_ALONE, IDEAL)
     steps = max(1, round((max_override_s or 0.0) / control_period(env))) if limited else None
-    return NeuralASMSafety(env, monitor, on_alarm=trial.on_alarm, max_override=steps, on_overrun="ignore", spinal=band)
+    return NeuralASMSafety(env, monitor, on_alarm=trial.on_alarm, max_override=steps, on_overrun="ignore", band=band)
 
 
 def record(label: EpisodeLabel, config: RolloutConfig, folder: Path) -> Path:
@@ -361,11 +361,11 @@ def watch_pair(trial: Trial, config: RolloutConfig, memory: Path) -> list[Scored
     return watch_each(replace(trial, acting=POLICY_ALONE), (POLICY_ALONE, trial.acting), config, memory)
 
 
-def band_of(config: RolloutConfig, monitor: NeuralASM) -> SpinalBand:
+def band_of(config: RolloutConfig, monitor: NeuralASM) -> ContactBand:
     """The band beneath a reflex. Raises ValueError where none was named."""
     if config.band is None:
         raise ValueError(f"a reflex that ends in {SPINAL} needs the file of a band: RolloutConfig(band=...)")
-    return SpinalBand.load(config.band, monitor)
+    return ContactBand.load(config.band, monitor)
 
 
 def watch_each(
@@ -377,9 +377,8 @@ def watch_each(
 ) -> list[ScoredEpisode]:
     """The traces of one trial with each of ``actings``, of which those that must be the same run once.
 
-    Without a band the wrapper acts only after an alarm, so without one any reflex's episode is that of the policy
-    alone. The ideal reflex's is, where nothing touches the body and no sense is at fault. Where nothing but senses is
-    at fault, it is the one in which nothing goes wrong.
+    The ideal reflex's is that of the policy alone, where nothing touches the body and no sense is at fault. Where
+    nothing but senses is at fault, it is the one in which nothing goes wrong.
 
     Args:
         undisturbed: makes the trace of the policy alone in this trial when nothing goes wrong, where that is known.
@@ -394,8 +393,7 @@ def watch_each(
         if acting == IDEAL and of_senses and undisturbed is not None:
             return replace(undisturbed(), kind=trial.kind, severity=trial.severity, acting=IDEAL)
         told = acting == IDEAL and concerns_ideal(trial, config)
-        warned = acting != IDEAL and (alone.alarm.any() or acting.endswith(SPINAL))
-        if acting == POLICY_ALONE or not (told or warned):
+        if acting == POLICY_ALONE or (acting == IDEAL and not told):
             return replace(alone, acting=acting)
         return watch(replace(trial, acting=acting), config, memory)
 

@@ -6,15 +6,15 @@ Machines differ and are noisy: rivals take turns, step by step, and the medians 
 from __future__ import annotations
 
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Any
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.progress import track
 
@@ -28,9 +28,9 @@ from asm_gym.scripts.benchmark.memory import Memory, Safety
 from asm_gym.scripts.benchmark.turns import GROWTH, BusyError, resident, take_turns
 from asm_gym.scripts.benchmark.vector import vector_table
 from asm_gym.scripts.benchmark.watch import Watch
-from asm_gym.scripts.command import BAD_NEWS, DONE, run
+from asm_gym.scripts.command import BAD_NEWS, DONE, exit_code, run
 from asm_gym.tasks import task as task_spec
-from asm_gym.validation import check_number
+from asm_gym.validation import check_choice, check_number
 
 
 @dataclass
@@ -193,35 +193,49 @@ class Leaks:
         return BAD_NEWS if growth > GROWTH else DONE
 
 
-@dataclass
-class Args:
-    """Speeds as ratios, each against a named rival in the same run."""
-
-    what: Annotated[
-        Annotated[Env, tyro.conf.subcommand("env")]
-        | Annotated[Leaks, tyro.conf.subcommand("leaks")]
-        | Annotated[Experts, tyro.conf.subcommand("experts")]
-        | Annotated[Coverage, tyro.conf.subcommand("coverage")]
-        | Annotated[Memory, tyro.conf.subcommand("memory")]
-        | Annotated[Fit, tyro.conf.subcommand("fit")]
-        | Annotated[Safety, tyro.conf.subcommand("safety")]
-        | Annotated[Watch, tyro.conf.subcommand("watch")],
-        tyro.conf.arg(name=""),
-    ] = field(default_factory=Env)
+BENCHMARKS: dict[str, type[Any]] = {
+    "env": Env,
+    "leaks": Leaks,
+    "experts": Experts,
+    "coverage": Coverage,
+    "memory": Memory,
+    "fit": Fit,
+    "safety": Safety,
+    "watch": Watch,
+}
 
 
-def measure(args: Args, console: Console) -> int:
+def usage() -> str:
+    """The benchmarks, a line each."""
+    lines = [
+        textwrap.fill(f"  {name:<9} {(kind.__doc__ or '').splitlines()[0]}", 80, subsequent_indent=" " * 12)
+        for name, kind in BENCHMARKS.items()
+    ]
+    return "\n".join(["usage: asm-gym benchmark WHAT [OPTIONS]", "", *lines])
+
+
+def measure(args: Any, console: Console) -> int:
     """Runs the one that was asked for."""
     try:
-        return args.what.run(console)
+        code: int = args.run(console)
     except BusyError as busy:
         console.print(str(busy))
         return BAD_NEWS
+    return code
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one benchmark, and returns the exit code; 1 where memory leaks."""
-    return run("benchmark", Args, measure, argv, __doc__)
+    name, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
+    if name in ("-h", "--help"):
+        print(usage())
+        return DONE
+
+    def chosen() -> int:
+        check_choice("benchmark", name, BENCHMARKS)
+        return run(f"benchmark {name}", BENCHMARKS[name], measure, rest)
+
+    return exit_code("benchmark", chosen)
 
 
 if __name__ == "__main__":

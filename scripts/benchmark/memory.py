@@ -21,7 +21,7 @@ from asm_gym.episode import Episode
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.memory.traces import DECAYS
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.spinal import SpinalBand
+from asm_gym.monitors.contact_band import ContactBand
 from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.substeps import felt_episodes
 from asm_gym.scripts.benchmark.turns import take_turns
@@ -229,7 +229,7 @@ class Safety:
         memory = self._memory(None)
         guarded, banded = "step under the wrapper", "step under the wrapper and a band"
         envs = {"step": plain, guarded: NeuralASMSafety(self._make(None), memory)}
-        envs[banded] = NeuralASMSafety(self._make(None), memory, spinal=self._band(memory))
+        envs[banded] = NeuralASMSafety(self._make(None), memory, band=self._band(memory))
         rate = self.monitor_freq
         watched = NeuralASMSafety(self._make(rate), self._memory(rate), monitor_freq=rate)
         envs |= {f"step, stream at {rate} Hz": self._make(rate), f"step under the wrapper at {rate} Hz": watched}
@@ -256,9 +256,9 @@ class Safety:
         asm = NeuralASM(episodes[0].spec, hidden_size=self.hidden, epochs=1).fit(episodes)
         return asm.with_threshold(1e300)  # beyond any surprise of these rows: nothing is to be held
 
-    def _band(self, memory: NeuralASM) -> SpinalBand:
+    def _band(self, memory: NeuralASM) -> ContactBand:
         """One that has learned little and is as wide as can be: the cost is the same."""
         felt = felt_episodes(self._make(None), range(6), steps=20)
-        band = SpinalBand(memory).fit(felt[:4]).calibrate(felt[4:], 0.5)
+        band = ContactBand(memory).fit(felt[:4]).calibrate(felt[4:], 0.5)
         band.scale_ = 1e30
         return band

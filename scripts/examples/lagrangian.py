@@ -12,10 +12,8 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import gymnasium as gym
-import tyro
 from rich.console import Console
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -23,6 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
+from asm_gym.scripts.options import option
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.cost import CostlyReward
@@ -83,9 +82,9 @@ class LagrangeMultiplier(BaseCallback):
 class Args:
     """PPO that learns to stay out of alarm, by a Lagrange multiplier on the reward: an example to copy."""
 
-    memory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MEMORY.asm")]
-    """A calibrated memory of harmless moving, such as asm-gym train-safely makes: exploration.asm."""
-    task: str = "Lift"
+    memory: Path = option(positional=True, metavar="MEMORY.asm")
+    """A calibrated memory of harmless moving, such as asm-gym reproduce safe_training makes: exploration.asm."""
+    task: str = option("Lift", check=task_spec)
     """Name of a task."""
     steps: int = 20_000
     """Control steps."""
@@ -95,7 +94,7 @@ class Args:
     """How fast the multiplier follows."""
     seed: int = 0
     """Seed of the agent."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/lagrangian")
+    out: Path = option(Path("runs/lagrangian"), metavar="FOLDER")
     """Folder of the agent and of the multiplier's history."""
 
 

@@ -6,7 +6,8 @@ import sys
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from asm_gym.scripts.command import DONE, REFUSED, exit_code, parse
+from asm_gym.scripts import command
+from asm_gym.scripts.command import DONE, REFUSED, exit_code
 from asm_gym.validation import check_choice
 
 
@@ -32,14 +33,12 @@ STUDIES = {
     "failure": Study("does surprise tell that a policy will fail"),
     "spinal": Study("how soon an arm feels what it should not, in substeps"),
     "reflexes": Study("what acting on alarms is worth, reflex by fault", needs_a_run=True),
-    "adoption": Study("one policy's memory on another policy", needs_a_run=True),
     "learning_curve": Study("detection by the number of episodes learned from", needs_a_run=True),
-    "recall_search": Study("the same few settings tried for all that recalls"),
-    "search": Study("the same few settings tried for every monitor", needs_a_run=True),
     "feedback": Study("what local learning of association costs", needs_a_run=True),
     "completion": Study("what a faulty sense should say, from all others", needs_a_run=True),
     "diagnosis": Study("what is wrong, of kinds of faults that were never seen", needs_a_run=True),
     "repertoire": Study("one memory of all skills against one for each", needs_a_run=True),
+    "public": Study("AUROC by kind on voraus-AD or AURSAD, once downloaded", needs_a_run=True),
 }
 INDEPENDENT = tuple(name for name, study in STUDIES.items() if not study.needs_a_run)
 
@@ -55,7 +54,7 @@ def usage() -> str:
         [
             *("usage: asm-gym reproduce STUDY [OPTIONS]", "       asm-gym reproduce all [OPTIONS]", ""),
             *("All of these, one after another, with the options they share:", *lines(False), ""),
-            *("One by one, on what asm-gym evaluate recorded:", *lines(True), ""),
+            *("One by one, on what asm-gym evaluate recorded, or on a file:", *lines(True), ""),
             "asm-gym reproduce STUDY --help lists the options of one.",
         ]
     )
@@ -70,29 +69,38 @@ def main(argv: list[str] | None = None) -> int:
 
     def chosen() -> int:
         check_choice("study", name, ("all", *STUDIES))
-        if name == "all":
-            return everything(rest)
-        code: int = _module(name).main(rest)
-        return code
+        return everything(rest) if name == "all" else _run(name, rest)
 
     return exit_code("reproduce", chosen)
 
 
 def everything(argv: list[str]) -> int:
     """Runs the independent studies; the options are checked against each of them before the first begins."""
-    from asm_gym.scripts.reproduce.common import Common
+    from asm_gym.scripts.reproduce.kit import Config
 
-    if parse("reproduce all", Common, argv, f"Runs {', '.join(INDEPENDENT)}.") is None:
+    if command.parse("reproduce all", Config, argv, f"Runs {', '.join(INDEPENDENT)}.") is None:
         return DONE
-    modules = [_module(name) for name in INDEPENDENT]
-    for name, module in zip(INDEPENDENT, modules, strict=True):
-        parse(f"reproduce {name}", module.Args, argv)
+    for name in INDEPENDENT:
+        command.parse(f"reproduce {name}", _options(_module(name)), argv)
     code = DONE
-    for module in modules:
-        code = max(code, module.main(argv))
+    for name in INDEPENDENT:
+        code = max(code, _run(name, argv))
         if code > REFUSED:  # interrupted
             break
     return code
+
+
+def _run(name: str, argv: list[str]) -> int:
+    """By the kit, or by itself where it was not moved onto it."""
+    from asm_gym.scripts.reproduce import kit
+
+    module = _module(name)
+    code: int = kit.main(module, argv) if hasattr(module, "Config") else module.main(argv)
+    return code
+
+
+def _options(module: Any) -> Any:
+    return module.Config if hasattr(module, "Config") else module.Args
 
 
 def _module(study: str) -> Any:

@@ -8,7 +8,6 @@ are compared with the skills. The reference is told every mean demonstration and
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,24 +15,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from scipy.cluster.vq import kmeans2
 from scipy.optimize import linear_sum_assignment
 
 from asm_gym.episode import Episode
 from asm_gym.memory.readout import certainty, learn_readout
-from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import at_least
-from asm_gym.scripts.reproduce.common import (
-    SKILLS,
-    Common,
-    Findings,
-    Record,
-    demonstrations,
-    reproduce,
-    wide_enough,
-)
+from asm_gym.scripts.options import option
+from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.contextual_report import SPLICE, TIMES, Example, drawn, tables
 from asm_gym.scripts.reproduce.expression import Memory, Rows
 from asm_gym.scripts.reproduce.handwriting import (
@@ -47,6 +35,8 @@ from asm_gym.scripts.reproduce.handwriting import (
     detoured,
     repertoire,
 )
+from asm_gym.scripts.reproduce.kit import Findings, Record
+from asm_gym.scripts.reproduce.recordings import SKILLS, demonstrations, wide_enough
 from asm_gym.validation import check_choice
 
 SHARED = 2
@@ -57,60 +47,49 @@ MIRRORED = 2.6
 
 
 @dataclass(frozen=True)
-class Args(Common):
+class Config(kit.Config):
     """Which skill is running, read from the state."""
 
     skills: tuple[str, ...] = ("a", "b", "c", "d", "e", "f")
     """Letters to learn, of a to p; the second half of the repertoire begins as the first half does."""
-    repertoire: int = 6
+    repertoire: int = option(6, check=partial(check_letters, least=2))
     """How many letters there are."""
-    hidden: int = 128
+    hidden: int = option(128, quick=32, check=partial(wide_enough, channels=4))
     """Hidden units."""
-    writings: int = 16
+    writings: int = option(16, quick=6, least=2)
     """Writings of each letter to learn from; as many others are judged."""
-    steps: int = 12000
+    steps: int = option(12000, quick=1500, least=1)
     """Steps in which the synapses change."""
-    robot_episodes: int = 20
+    robot_episodes: int = option(20, quick=0, least=0)
     """Episodes of each robosuite skill to learn from; 0 leaves them out."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(0, self, "robot_episodes")
-        check_letters(self.repertoire, least=2)
         for name in self.skills:
             check_choice("skill", name, NAMES[: self.repertoire])
         if len(set(self.skills)) < 2:
             raise ValueError(
                 f"two skills at least are needed to tell them apart, got {', '.join(self.skills) or 'none'}"
             )
-        at_least(1, self, "steps")
-        at_least(2, self, "writings")
-        wide_enough(self.hidden, 4)
-
-    def scaled(self) -> Args:
-        """With ``quick``, little of everything."""
-        if not self.quick:
-            return self
-        return replace(self, seeds=min(self.seeds, 2), hidden=32, steps=1500, writings=6, robot_episodes=0)
 
 
-def alphabet(args: Args, rng: np.random.Generator) -> list[Letter]:
+def alphabet(config: Config, rng: np.random.Generator) -> list[Letter]:
     """Letters, and from the second half on letters that begin as one of the first half does."""
-    first = repertoire(-(-args.repertoire // 2), 2, rng)
-    twins = [branching(first[n], NAMES[len(first) + n], SHARED, rng) for n in range(args.repertoire - len(first))]
-    return chosen([*first, *twins], sorted(set(args.skills)))
+    first = repertoire(-(-config.repertoire // 2), 2, rng)
+    twins = [branching(first[n], NAMES[len(first) + n], SHARED, rng) for n in range(config.repertoire - len(first))]
+    return chosen([*first, *twins], sorted(set(config.skills)))
 
 
-def one_seed(seed: int, args: Args) -> tuple[list[Record], Example]:
+def one_seed(seed: int, config: Config) -> tuple[list[Record], Example]:
     """Learns the letters, and asks at every step which is being written."""
     rng = np.random.default_rng(seed)
-    letters = alphabet(args, rng)
-    train, tests = copybook(letters, args.writings, 2, rng), copybook(letters, args.writings, 2, rng)
-    memory = Memory.learned(train, args.hidden, rng, args.steps)
+    letters = alphabet(config, rng)
+    train, tests = copybook(letters, config.writings, 2, rng), copybook(letters, config.writings, 2, rng)
+    memory = Memory.learned(train, config.hidden, rng, config.steps)
     names = [letter.name for letter in letters]
     (rows, skill), (seen, truth) = (_stacked(e, names) for e in (train, tests))
     features = _features(memory, rows, seen)
-    records, readouts = one_middle(seed, args), {}
+    records, readouts = one_middle(seed, config), {}
     for source, (known, asked) in features.items():
         readouts[source] = _readout(_flat(known), np.tile(skill, len(known)), len(names), rng)
         p = _certainty(asked, readouts[source])  # (T, B, K)
@@ -123,15 +102,15 @@ def one_seed(seed: int, args: Args) -> tuple[list[Record], Example]:
     return records, _example(memory, readouts["state"], seen, truth, features["state"][1])
 
 
-def one_middle(seed: int, args: Args) -> list[Record]:
+def one_middle(seed: int, config: Config) -> list[Record]:
     """Two letters that begin differently, are one in the middle, and part again: is the beginning remembered?"""
     rng = np.random.default_rng([seed, 1])
     letter = repertoire(1, 2, rng)[0]
     first = replace(letter.strokes[0], turn=MIRRORED, length=4.0)
     letters = [Letter("a", (first, *letter.strokes[1:]))]
     letters.append(detoured(letters[0], "b", rng))
-    train, tests = copybook(letters, 2 * args.writings, 2, rng), copybook(letters, 2 * args.writings, 2, rng)
-    memory = Memory.learned(train, args.hidden, rng, args.steps)
+    train, tests = copybook(letters, 2 * config.writings, 2, rng), copybook(letters, 2 * config.writings, 2, rng)
+    memory = Memory.learned(train, config.hidden, rng, config.steps)
     (rows, skill), (seen, truth) = (_stacked(e, "ab") for e in (train, tests))
     records = []
     for source, (known, asked) in _features(memory, rows, seen).items():
@@ -248,10 +227,10 @@ def _example(memory: Memory, readout: Any, seen: Rows, truth: NDArray[np.intp], 
     )
 
 
-def robot(seed: int, train: Sequence[Episode], tests: Sequence[Episode], args: Args) -> list[Record]:
+def robot(seed: int, train: Sequence[Episode], tests: Sequence[Episode], config: Config) -> list[Record]:
     """The same question for robosuite skills in one memory."""
     rng = np.random.default_rng(seed)
-    memory = Memory.learned(train, max(args.hidden, 128), rng, args.steps // 2)
+    memory = Memory.learned(train, max(config.hidden, 128), rng, config.steps // 2)
     (rows, skill), (seen, truth) = (_stacked(e, SKILLS) for e in (train, tests))
     readout = _readout(_flat(np.tanh(memory.hidden(rows))), np.tile(skill, len(rows)), len(SKILLS), rng)
     right = _certainty(np.tanh(memory.hidden(seen)), readout).argmax(axis=2) == truth
@@ -259,28 +238,15 @@ def robot(seed: int, train: Sequence[Episode], tests: Sequence[Episode], args: A
     return [{**r, "skill": name} for name, records in made for r in records]
 
 
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Letters for every seed, then robosuite."""
-    args = args.scaled()
-    with stage("learning letters", console, seconds) as progress:
-        found = parallel_map(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
+    found = kit.each("learning letters", partial(one_seed, config=config), config.repetitions, config)
     records = [r for own, _ in found for r in own]
-    if args.robot_episodes:
-        train = demonstrations(args, SKILLS, "fit", args.robot_episodes, console, seconds)
-        tests = demonstrations(args, SKILLS, "nominal", 15, console, seconds)
-        with stage("learning robosuite skills", console, seconds) as progress:
-            one = partial(robot, train=train, tests=tests, args=args)
-            for own in parallel_map(one, list(args.repetitions), args.workers, progress):
-                records += own
+    if config.robot_episodes:
+        train = demonstrations(config, SKILLS, "fit", config.robot_episodes)
+        tests = demonstrations(config, SKILLS, "nominal", 15)
+        one = partial(robot, train=train, tests=tests, config=config)
+        records += kit.together(kit.each("learning robosuite skills", one, config.repetitions, config))
     return Findings(
-        records, tables(records, len(set(args.skills))), drawn(records, found[0][1]), {"letter_steps": STEPS}
+        records, tables(records, len(set(config.skills))), drawn(records, found[0][1]), {"letter_steps": STEPS}
     )
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Runs the study, and returns the exit code."""
-    return reproduce("contextual_inference", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

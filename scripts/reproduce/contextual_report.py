@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.tables import Table
-from asm_gym.scripts.reproduce.common import SKILLS, Record, over_seeds, shown
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import Rows
+from asm_gym.scripts.reproduce.kit import Record, over_seeds, shown
+from asm_gym.scripts.reproduce.recordings import SKILLS
 
 SPLICE = 30
 """Step at which another letter is gone on with."""

@@ -7,16 +7,14 @@ The scripted experts themselves are the ceiling.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from asm_gym.episode import Episode
 from asm_gym.evaluation.figures import figure, look
@@ -26,21 +24,13 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.base import Policy
 from asm_gym.policies.registry import EXPERTS
-from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import environment
-from asm_gym.scripts.command import at_least
+from asm_gym.scripts.options import option
+from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.apprentices import CONSISTENT, SETTINGS, Clone, demonstrate, stream_of
-from asm_gym.scripts.reproduce.common import (
-    Common,
-    Findings,
-    Record,
-    over_seeds,
-    reproduce,
-    shown,
-    wide_enough,
-)
+from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds, shown
+from asm_gym.scripts.reproduce.recordings import wide_enough
 
 MODELS = ("memory", "gru", "expert")
 INPUTS = 75
@@ -50,41 +40,30 @@ CALLED = {"memory": "Neural ASM, no BPTT", "gru": "GRU, BPTT", "expert": "script
 
 
 @dataclass(frozen=True)
-class Args(Common):
+class Config(kit.Config):
     """Skills expressed in closed loop, against a clone by backpropagation and the expert."""
 
-    tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan", "Door")
+    tasks: tuple[str, ...] = option(("Lift", "Stack", "PickPlaceCan", "Door"), quick=("Lift",), least=1)
     """Whose skills one memory learns."""
-    demonstrations: int = 80
+    demonstrations: int = option(80, quick=6, least=1)
     """Demonstrations of each task; those that fail are left out."""
-    units: int = 512
+    units: int = option(512, check=partial(wide_enough, channels=INPUTS))
     """Hidden units of the motor association of the memory."""
-    hidden: int = 256
+    hidden: int = option(256, check=partial(wide_enough, channels=INPUTS))
     """Units of the GRU, which have several times as many weights."""
-    updates: int = 600
+    updates: int = option(600, quick=20, least=1)
     """Updates of the GRU, 16 episodes each."""
-    trials: int = 34
+    trials: int = option(34, quick=2, least=1)
     """Scenes of each task, for each seed other ones."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(1, self, "tasks")
         if len(set(self.tasks)) < len(self.tasks):
             raise ValueError(f"a task was named twice: {', '.join(self.tasks)}")
         for task in self.tasks:
             if task not in EXPERTS or task.startswith("TwoArm"):
                 known = ", ".join(t for t in EXPERTS if not t.startswith("TwoArm"))
                 raise ValueError(f"unknown skill {task!r}; there is an expert of one arm for: {known}")
-        at_least(1, self, "demonstrations", "updates", "trials")
-        for width in (self.units, self.hidden):
-            wide_enough(width, INPUTS)
-
-    def scaled(self) -> Args:
-        """With ``quick``, little of everything."""
-        if not self.quick:
-            return self
-        few: dict[str, Any] = {"tasks": self.tasks[:1], "demonstrations": 6, "updates": 20, "trials": 2}
-        return replace(self, seeds=min(self.seeds, 2), **few)
 
 
 class Trial(NamedTuple):
@@ -105,18 +84,18 @@ class TrainedModel(NamedTuple):
     seconds: float
 
 
-def learn(what: tuple[str, int], episodes: Sequence[Episode], args: Args) -> TrainedModel:
+def learn(what: tuple[str, int], episodes: Sequence[Episode], config: Config) -> TrainedModel:
     """(model, seed) after the lessons."""
     model, seed = what
     start = time.perf_counter()
     brain: NeuralASM | Clone
     if model == "gru":
-        brain = Clone.learned(episodes, args.hidden, args.updates, np.random.default_rng(seed))
+        brain = Clone.learned(episodes, config.hidden, config.updates, np.random.default_rng(seed))
     else:
         # What watches may be small here, for only what acts is measured.
         sizes = {"hidden_size": 32, "association_size": 32, "epochs": 1, "iterations": 5}
         brain = NeuralASM(episodes[0].spec, seed=seed, **sizes).fit(episodes)  # type: ignore[arg-type]
-        brain.learn_to_act(episodes, args.units)
+        brain.learn_to_act(episodes, config.units)
     return TrainedModel(seed, model, brain, time.perf_counter() - start)
 
 
@@ -138,34 +117,34 @@ def attempt(trial: Trial, brains: Mapping[tuple[str, int], NeuralASM | Clone]) -
     return records
 
 
-def trials(args: Args) -> list[Trial]:
+def trials(config: Config) -> list[Trial]:
     """Every policy in every scene, a task after the other, so that a process seldom makes a new environment."""
     plan = []
-    for task in args.tasks:
-        for seed in args.repetitions:
-            scenes = tuple(role_seeds(seed, task, "express", args.trials))
+    for task in config.tasks:
+        for seed in config.repetitions:
+            scenes = tuple(role_seeds(seed, task, "express", config.trials))
             plan += [Trial(task, m, seed, scenes[i : i + 17]) for m in MODELS for i in range(0, len(scenes), 17)]
     return plan
 
 
-def tables(records: Sequence[Record], args: Args) -> list[Table]:
+def tables(records: Sequence[Record], config: Config) -> list[Table]:
     """Success, and how long it took."""
-    columns = ("", *args.tasks)
+    columns = ("", *config.tasks)
     of = {m: [r for r in records if r["model"] == m] for m in MODELS}
 
     def row(model: str, value: str, scale: float, digits: int) -> tuple[str, ...]:
         own = [{**r, value: scale * r[value]} for r in of[model] if value == "success" or r["success"]]
-        return (CALLED[model], *(shown(own, value, digits, task=t) for t in args.tasks))
+        return (CALLED[model], *(shown(own, value, digits, task=t) for t in config.tasks))
 
     intervals = []
     for model in MODELS:
         bounds = []
-        for task in args.tasks:
+        for task in config.tasks:
             won = [r["success"] for r in of[model] if r["task"] == task]
             low, high = wilson_interval(int(sum(won)), len(won))
             bounds.append(f"{100 * low:.0f} to {100 * high:.0f}")
         intervals.append((CALLED[model], *bounds))
-    scenes = f"{args.trials} scenes a task and seed, {args.demonstrations} demonstrations a task, one network"
+    scenes = f"{config.trials} scenes a task and seed, {config.demonstrations} demonstrations a task, one network"
     return [
         Table(f"Success [%], {scenes}; mean ± SD over seeds", columns, [row(m, "success", 100, 1) for m in MODELS]),
         Table("Success [%], 95 % Wilson interval over all scenes and seeds", columns, intervals),
@@ -173,55 +152,42 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
     ]
 
 
-def drawn(records: Sequence[Record], args: Args) -> Figure:
+def drawn(records: Sequence[Record], config: Config) -> Figure:
     """Success by task, and how soon."""
     with figure(height=3.4, width=9.0) as fig:
         bars, curves = fig.subplots(1, 2)
         for i, model in enumerate(MODELS):
-            found = [over_seeds(records, "success", task=t, model=model) for t in args.tasks]
+            found = [over_seeds(records, "success", task=t, model=model) for t in config.tasks]
             mean, spread = 100 * np.array(found).T
-            x = np.arange(len(args.tasks)) + 0.26 * (i - 1)
+            x = np.arange(len(config.tasks)) + 0.26 * (i - 1)
             bars.bar(x, mean, 0.24, yerr=spread, color=look(i)[0], error_kw={"linewidth": 1}, label=CALLED[model])
             own = [r for r in records if r["model"] == model]
             ended = np.sort([r["steps"] if r["success"] else np.inf for r in own])
             steps = np.arange(1 + max(r["steps"] for r in records))
             share = 100 * np.searchsorted(ended, steps, side="right") / len(ended)
             curves.plot(steps, share, color=look(i)[0], linestyle=look(i)[1])
-        bars.set_xticks(range(len(args.tasks)), list(args.tasks))
+        bars.set_xticks(range(len(config.tasks)), list(config.tasks))
         bars.set(ylabel="success [% of scenes]", ylim=(0, 105))
         curves.set(xlabel="steps", ylabel="solved so far, all tasks [%]", ylim=(0, 105), xlim=0)
         fig.legend(loc="outside upper center", ncols=3)
     return fig
 
 
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Shows, teaches, and lets everybody try."""
-    args = args.scaled()
-    spec = stream_of(args.tasks)
-    plan = [(t, s) for t in args.tasks for s in role_seeds(0, t, "demonstrate", args.demonstrations)]
-    with stage("demonstrating", console, seconds) as progress:
-        shown_ones = parallel_map(partial(demonstrate, spec=spec), plan, args.workers, progress)
+    spec = stream_of(config.tasks)
+    plan = [(t, s) for t in config.tasks for s in role_seeds(0, t, "demonstrate", config.demonstrations)]
+    shown_ones = kit.each("demonstrating", partial(demonstrate, spec=spec), plan, config)
     episodes = [e for e in shown_ones if e is not None]
     # Those who take longest first, so that nobody waits for the last of them.
-    wanted = [(m, s) for m in ("gru", "memory") for s in args.repetitions]
-    with stage("learning", console, seconds) as progress:
-        learned = parallel_map(partial(learn, episodes=episodes, args=args), wanted, args.workers, progress)
+    wanted = [(m, s) for m in ("gru", "memory") for s in config.repetitions]
+    learned = kit.each("learning", partial(learn, episodes=episodes, config=config), wanted, config)
     brains = {(p.model, p.seed): p.brain for p in learned}
-    with stage("acting", console, seconds) as progress:
-        found = parallel_map(partial(attempt, brains=brains), trials(args), args.workers, progress)
+    found = kit.each("acting", partial(attempt, brains=brains), trials(config), config)
     records = [r for each in found for r in each]
     facts = {
-        "demonstrations": {t: sum(e.info["skill"] == t for e in episodes) for t in args.tasks},
+        "demonstrations": {t: sum(e.info["skill"] == t for e in episodes) for t in config.tasks},
         "steps": sum(map(len, episodes)),
         "seconds_to_learn": {m: [round(p.seconds, 1) for p in learned if p.model == m] for m in ("memory", "gru")},
     }
-    return Findings(records, tables(records, args), drawn(records, args), facts)
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Runs the study, and returns the exit code."""
-    return reproduce("express_skills", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return Findings(records, tables(records, config), drawn(records, config), facts)

@@ -8,9 +8,8 @@ succeeded or not, so that all are of one length.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -18,26 +17,25 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode, EpisodeLabel, load_episode, save_episode
+from asm_gym.evaluation import defaults
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.scored import NOMINAL
 from asm_gym.evaluation.statistics import RESAMPLES, Estimate, Share, auroc
 from asm_gym.evaluation.tables import Table, count
 from asm_gym.monitors import MONITORS
-from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged
-from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce
+from asm_gym.scripts.options import option
+from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.failure_rivals import NAMES, scored
+from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.scripts.reproduce.weakened import weakened
 from asm_gym.tasks import env_id
 from asm_gym.tasks import task as task_spec
-from asm_gym.validation import check_choice
 from asm_gym.wrappers import StreamRecorder
 
 AGENTS = {"Lift": "lift_sac", "Stack": "stack_sac", "Door": "door_sac"}
@@ -51,51 +49,34 @@ TESTED = ("as it is", "weakened", "disturbed")
 SHARES = (0.25, 0.5, 1.0)
 """Of an episode, after which it is asked whether it will fail."""
 
-QUICK = 3
-"""Episodes with ``--quick``, of one task, for the monitors that are fitted in seconds."""
-_QUICKLY = ("memory_skill", "elapsed_time")
-
 
 @dataclass(frozen=True)
-class Args(Common):
+class Config(kit.Config):
     """Failures of learned policies, told beforehand."""
 
-    seeds: int = 1
+    seeds: int = option(1, least=1)
     """How often it repeats itself, with other episodes."""
-
-    tasks: tuple[str, ...] = ("Lift", "Stack")
-    """Tasks that have an agent: Lift, Stack, Door; one monitor learns all of them."""
-    monitors: tuple[str, ...] = ("memory_skill", "neural_asm", "logpzo", "rnd", "gru+evidence", "elapsed_time")
-    """Names of monitors, or reversals, inconsistency, two_signals; memory_skill is skill surprise."""
-    episodes: int = 40
+    tasks: tuple[str, ...] = option(("Lift", "Stack"), quick=("Lift",), least=1, known=AGENTS)
+    """Tasks that have an agent; one monitor learns all of them."""
+    monitors: tuple[str, ...] = option(
+        ("memory_skill", "neural_asm", "logpzo", "rnd", "gru+evidence", "elapsed_time"),
+        quick=("memory_skill", "elapsed_time"),
+        least=1,
+        known=(*MONITORS, *NAMES),
+    )
+    """Names of monitors, and of rivals that read commands; memory_skill is skill surprise."""
+    episodes: int = option(40, quick=3, least=2)
     """Episodes of each task to learn from, to calibrate on, and to test on for each way of acting."""
-    false_alarm_rate: float = 0.05
+    false_alarm_rate: float = option(defaults.FALSE_ALARM_RATE, quick=0.5, check=conformal_episodes)
     """Share of the agent's successful episodes that may raise an alarm."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in self.monitors:
-            check_choice("monitor", name, (*MONITORS, *NAMES))
-        for name in self.tasks:
-            check_choice("task", name, AGENTS)
-        conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
-        if not self.tasks or not self.monitors or self.episodes < 2:
-            raise ValueError("there must be a task, a monitor, and two episodes at least")
 
-    def scaled(self) -> Args:
-        """With ``quick``, one task and little of everything."""
-        if not self.quick:
-            return self
-        monitors = tuple(name for name in self.monitors if name in _QUICKLY) or self.monitors[:1]
-        return replace(self, tasks=self.tasks[:1], monitors=monitors, episodes=QUICK, false_alarm_rate=0.5)
-
-
-def labels(args: Args, seed: int) -> list[EpisodeLabel]:
+def labels(config: Config, seed: int) -> list[EpisodeLabel]:
     """What is recorded for one repetition."""
     made = []
-    for task in args.tasks:
+    for task in config.tasks:
         for role in ("fit", "calibration", *TESTED):
-            for n, s in enumerate(role_seeds(seed, task, f"agent/{role}", args.episodes)):
+            for n, s in enumerate(role_seeds(seed, task, f"agent/{role}", config.episodes)):
                 happens = (KINDS[task][n % len(KINDS[task])], "strong") if role == "disturbed" else ("", "")
                 onset = draw_onset(s, task_spec(task).horizon) if role == "disturbed" else None
                 made.append(EpisodeLabel(task, role.replace(" ", "_"), *happens, s, onset))
@@ -124,7 +105,7 @@ class Watched(NamedTuple):
     alarmed_after: float  # share of the episode; infinite without an alarm
 
 
-def watched(name: str, seed: int, recordings: Sequence[Episode], args: Args) -> list[Watched]:
+def watched(name: str, seed: int, recordings: Sequence[Episode], config: Config) -> list[Watched]:
     """What one monitor, fitted and calibrated, made of all test episodes."""
 
     def of(role: str) -> list[Episode]:
@@ -132,7 +113,7 @@ def watched(name: str, seed: int, recordings: Sequence[Episode], args: Args) -> 
 
     roles = {how.replace(" ", "_"): how for how in TESTED}
     tested = [e for e in recordings if e.labelled.role in roles]
-    values, threshold = scored(name, seed, of("fit"), of("calibration"), tested, args.false_alarm_rate)
+    values, threshold = scored(name, seed, of("fit"), of("calibration"), tested, config.false_alarm_rate)
     found = []
     for episode, value in zip(tested, values, strict=True):
         so_far = np.maximum.accumulate(value)
@@ -143,17 +124,15 @@ def watched(name: str, seed: int, recordings: Sequence[Episode], args: Args) -> 
     return found
 
 
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Records the agents, and asks every monitor."""
-    args = args.scaled()
-    folder = args.out.resolve()
-    wanted = {seed: labels(args, seed) for seed in args.repetitions}
-    with stage("recording agents", console, seconds) as progress:
+    folder = config.out.resolve()
+    wanted = {seed: labels(config, seed) for seed in config.repetitions}
+    with kit.stage("recording agents") as progress:
         every = [label for own in wanted.values() for label in own]
-        make_missing(partial(record, folder=folder), every, lambda label: folder / label.path, args.workers, progress)
-    jobs = [(name, seed) for seed in args.repetitions for name in args.monitors]
-    with stage("fitting and judging", console, seconds) as progress:
-        made = parallel_map(partial(_job, folder=folder, wanted=wanted, args=args), jobs, args.workers, progress)
+        make_missing(partial(record, folder=folder), every, lambda label: folder / label.path, config.workers, progress)
+    jobs = [(name, seed) for seed in config.repetitions for name in config.monitors]
+    made = kit.each("fitting and judging", partial(_job, folder=folder, wanted=wanted, config=config), jobs, config)
     by_monitor: dict[str, list[Watched]] = {}
     for (name, _), found in zip(jobs, made, strict=True):
         by_monitor.setdefault(name, []).extend(found)
@@ -162,12 +141,14 @@ def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
     ]
     outcomes = {how: Share.of([w.failed for w in made[0] if w.how == how]) for how in TESTED}
     facts = {"failed": {how: [share.k, share.n] for how, share in outcomes.items()}}
-    return Findings(records, [early(by_monitor, args), ways(by_monitor), order(by_monitor)], curve(by_monitor), facts)
+    return Findings(records, [early(by_monitor, config), ways(by_monitor), order(by_monitor)], curve(by_monitor), facts)
 
 
-def _job(job: tuple[str, int], folder: Path, wanted: Mapping[int, Sequence[EpisodeLabel]], args: Args) -> list[Watched]:
+def _job(
+    job: tuple[str, int], folder: Path, wanted: Mapping[int, Sequence[EpisodeLabel]], config: Config
+) -> list[Watched]:
     name, seed = job
-    return watched(name, seed, [load_episode(folder / label.path) for label in wanted[seed]], args)
+    return watched(name, seed, [load_episode(folder / label.path) for label in wanted[seed]], config)
 
 
 def separated(own: Sequence[Watched], share: int) -> Estimate:
@@ -188,7 +169,7 @@ def _shown(found: Estimate) -> str:
     return "" if np.isnan(found.value) else f"{found.value:.3f} ({found.low:.2f}–{found.high:.2f})"
 
 
-def early(by_monitor: Mapping[str, Sequence[Watched]], args: Args) -> Table:
+def early(by_monitor: Mapping[str, Sequence[Watched]], config: Config) -> Table:
     """A row a monitor: how well, and how early, it tells failures from successes."""
 
     def row(name: str, own: Sequence[Watched]) -> tuple[str, ...]:
@@ -202,7 +183,7 @@ def early(by_monitor: Mapping[str, Sequence[Watched]], args: Args) -> Table:
     return Table(
         f"Failures told from successes by the greatest surprise after {', '.join(percent)} of an episode: AUROC, in "
         "brackets 95 % intervals over episodes drawn anew. Failures with an alarm before half of the episode and at "
-        f"all, and alarms in successful episodes of the agent as it is, at {100 * args.false_alarm_rate:g} %.",
+        f"all, and alarms in successful episodes of the agent as it is, at {100 * config.false_alarm_rate:g} %.",
         ("Monitor", *(f"AUROC at {p}" for p in percent), "known by half", "known", "false alarms"),
         [row(name, own) for name, own in by_monitor.items()],
     )
@@ -262,12 +243,3 @@ def curve(by_monitor: Mapping[str, Sequence[Watched]]) -> Figure:
         ax.grid(color="#dddddd", linewidth=0.6)
         fig.legend(loc="outside upper center", ncols=4, handlelength=3.5)
     return fig
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Asks, and returns the exit code."""
-    return reproduce("failure", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,7 +9,6 @@ sensors and actions. Each fault is compared with nominal episodes of its own ski
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +17,6 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.console import Console
 
 from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.episode import Episode
@@ -28,22 +26,12 @@ from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.faults.suite import KINDS, SEVERITIES
 from asm_gym.monitors import NeuralASM, make_monitor
-from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import at_least
-from asm_gym.scripts.reproduce.common import (
-    SENSED,
-    SKILLS,
-    Common,
-    Findings,
-    Record,
-    over_seeds,
-    reproduce,
-    shown,
-    wide_enough,
-)
+from asm_gym.scripts.options import fixed, option
+from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.fault_sets import FaultSet, robot_fault_set, written_fault_set
 from asm_gym.scripts.reproduce.handwriting import check_letters
+from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds, shown
+from asm_gym.scripts.reproduce.recordings import SENSED, SKILLS, wide_enough
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_choice, check_number
 
@@ -63,53 +51,42 @@ RATE = 0.05
 
 
 @dataclass(frozen=True)
-class Args(Common):
+class Config(kit.Config):
     """Surprise without selection against a library that needs it."""
 
-    letters: int = 8
+    letters: int = option(8, quick=3, check=partial(check_letters, least=2))
     """Letters in the repertoire of handwriting."""
-    writings: int = 16
+    writings: int = option(16, quick=8, least=1)
     """Writings of each letter to learn from; as many more to calibrate on, and to judge."""
-    hidden: int = 128
+    hidden: int = option(128, quick=32, check=partial(wide_enough, channels=4))
     """Hidden units."""
-    tasks: tuple[str, ...] = SKILLS
+    tasks: tuple[str, ...] = option(SKILLS, check=task_spec)
     """Robosuite skills."""
-    robot_episodes: int = 30
+    robot_episodes: int = option(30, quick=0, least=0)
     """Episodes of each robosuite skill to learn from, and half as many to calibrate on; 0 leaves them out."""
-    faults: tuple[str, ...] = ("push", "weak_joint", "encoder_bias", "wrist_bias", "action_delay")
+    faults: tuple[str, ...] = option(
+        ("push", "weak_joint", "encoder_bias", "wrist_bias", "action_delay"),
+        check=partial(check_choice, "kind of fault", known=KINDS),
+    )
     """Kinds of fault."""
-    severity: str = "medium"
+    severity: str = fixed("medium", check=partial(check_choice, "severity", known=SEVERITIES))
     """How bad they are."""
-    faulty_episodes: int = 4
+    faulty_episodes: int = fixed(4, least=1)
     """Faulty episodes of each robosuite skill and kind."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_letters(self.letters, least=2)
-        for name in self.tasks:
-            task_spec(name)
-        for name in self.faults:
-            check_choice("kind of fault", name, KINDS)
-        check_choice("severity", self.severity, SEVERITIES)
         if len(set(self.tasks)) < 2 or not self.faults:
             raise ValueError("there must be at least two tasks and a kind of fault")
-        at_least(1, self, "faulty_episodes")
-        needed = conformal_episodes(RATE)
-        for what, count in (("letters", self.letters * self.writings), ("tasks", self.robot_episodes)):
-            if 0 < (count if what == "letters" else len(self.tasks) * (count // 2)) < needed or count < 0:
-                raise ValueError(f"a false-alarm rate of {RATE} needs {needed} calibration episodes of {what}")
-        at_least(1, self, "writings")
         if len(set(self.tasks)) < len(self.tasks):
             raise ValueError(f"a task was named twice: {', '.join(self.tasks)}")
-        wide_enough(self.hidden, 4)
+        needed = conformal_episodes(RATE)
+        given = {"letters": self.letters * self.writings, "tasks": len(self.tasks) * (self.robot_episodes // 2)}
+        for what, count in given.items():
+            if count < needed and not (what == "tasks" and self.robot_episodes == 0):
+                raise ValueError(f"a false-alarm rate of {RATE} needs {needed} calibration episodes of {what}")
         if self.robot_episodes:
             check_number(f"hidden (robosuite's {SENSED} channels take twice as many)", self.hidden, low=-(-SENSED // 2))
-
-    def scaled(self) -> Args:
-        """With ``quick``, letters only, and few of them."""
-        if not self.quick:
-            return self
-        return replace(self, seeds=min(self.seeds, 2), letters=3, writings=8, hidden=32, robot_episodes=0)
 
 
 Scores = list[NDArray[np.float64]]
@@ -145,11 +122,11 @@ def _skill(episode: Episode) -> str:
     return str(episode.info["skill"])
 
 
-def judged(seed: int, trial: FaultSet, args: Args) -> tuple[list[Record], dict[str, Any]]:
+def judged(seed: int, trial: FaultSet, config: Config) -> tuple[list[Record], dict[str, Any]]:
     """Every way of telling faults, on one domain; and the surprise in one faulty episode, for the figure."""
     skills = sorted({_skill(e) for e in trial.fit})
     spec = trial.fit[0].spec
-    hidden = args.hidden if trial.domain == "letters" else 2 * args.hidden
+    hidden = config.hidden if trial.domain == "letters" else 2 * config.hidden
     # With few rows a wide association would learn them by heart.
     size = 960 if trial.domain == "robosuite" else 64
     memory = NeuralASM(spec, hidden, size, iterations=10, seed=seed).fit(trial.fit)
@@ -191,7 +168,7 @@ def _found(fault: ScoredEpisode, nominal: Sequence[ScoredEpisode]) -> Record:
     return {"auroc": None if math.isnan(score) else score, "found": detected([fault], window_s).value}
 
 
-def tables(records: Sequence[Record], args: Args) -> list[Table]:
+def tables(records: Sequence[Record], config: Config) -> list[Table]:
     """By domain, and by kind."""
     made = []
     for domain in dict.fromkeys(r["domain"] for r in records):
@@ -201,13 +178,13 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
         ]
         caption = f"{domain}: thresholds for {100 * RATE:g} % of nominal episodes; mean ± SD over seeds"
         made.append(Table(caption, ("", "AUROC", "found within 20 steps", "nominal episodes in alarm"), rows))
-    if args.robot_episodes:
+    if config.robot_episodes:
         rows = [
-            (label, *(shown(records, "auroc", domain="robosuite", way=w, kind=k) for k in args.faults))
+            (label, *(shown(records, "auroc", domain="robosuite", way=w, kind=k) for k in config.faults))
             for w, label in WAYS.items()
         ]
-        heads = ("", *(k.replace("_", " ") for k in args.faults))
-        made.append(Table(f"AUROC by kind of fault, {args.severity}", heads, rows))
+        heads = ("", *(k.replace("_", " ") for k in config.faults))
+        made.append(Table(f"AUROC by kind of fault, {config.severity}", heads, rows))
     return made
 
 
@@ -241,31 +218,18 @@ def drawn(records: Sequence[Record], example: dict[str, Any]) -> Figure:
     return fig
 
 
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Letters for every seed, then robosuite."""
-    args = args.scaled()
-    with stage("letters", console, seconds) as progress:
-        found = parallel_map(partial(_letters, args=args), list(args.repetitions), args.workers, progress)
-    if args.robot_episodes:
-        faults = args.faults, args.severity, args.faulty_episodes
-        trial = robot_fault_set(args, args.tasks, args.robot_episodes, *faults, console, seconds)
-        with stage("robosuite", console, seconds) as progress:
-            one = partial(judged, trial=trial, args=args)
-            found += parallel_map(one, list(args.repetitions), args.workers, progress)
+    found = kit.each("letters", partial(_letters, config=config), config.repetitions, config)
+    if config.robot_episodes:
+        faults = config.faults, config.severity, config.faulty_episodes
+        trial = robot_fault_set(config, config.tasks, config.robot_episodes, *faults)
+        found += kit.each("robosuite", partial(judged, trial=trial, config=config), config.repetitions, config)
     records = [r for own, _ in found for r in own]
     example = found[-1][1]
     facts = {"false_alarm_rate": RATE, "example": {k: np.asarray(v).tolist() for k, v in example.items()}}
-    return Findings(records, tables(records, args), drawn(records, example), facts)
+    return Findings(records, tables(records, config), drawn(records, example), facts)
 
 
-def _letters(seed: int, args: Args) -> tuple[list[Record], dict[str, Any]]:
-    return judged(seed, written_fault_set(seed, args.letters, args.writings), args)
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Runs the study, and returns the exit code."""
-    return reproduce("fault_detection", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def _letters(seed: int, config: Config) -> tuple[list[Record], dict[str, Any]]:
+    return judged(seed, written_fault_set(seed, config.letters, config.writings), config)

@@ -7,12 +7,12 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from rich.console import Console
 
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
-from asm_gym.scripts.reproduce.common import Common, demonstrations, recorded
+from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.handwriting import copybook, repertoire
+from asm_gym.scripts.reproduce.recordings import demonstrations, made
 from asm_gym.scripts.reproduce.speed_accuracy import slips
 from asm_gym.tasks import task as task_spec
 
@@ -41,17 +41,15 @@ def written_fault_set(seed: int, count: int, writings: int) -> FaultSet:
 
 
 def robot_fault_set(
-    args: Common,
+    config: kit.Config,
     tasks: Sequence[str],
     episodes: int,
     kinds: Sequence[str],
     severity: str,
     faulty_episodes: int,
-    console: Console,
-    seconds: dict[str, float],
 ) -> FaultSet:
     """Robosuite skills, and the twins of nominal episodes with a fault each."""
-    ask = partial(demonstrations, args, tasks, console=console, seconds=seconds)
+    ask = partial(demonstrations, config, tasks)
     nominal = max(faulty_episodes, 12)
     labels = [
         EpisodeLabel(task, "faulty", kind, severity, seed, draw_onset(seed, task_spec(task).horizon))
@@ -59,7 +57,7 @@ def robot_fault_set(
         for kind in kinds
         for seed in role_seeds(0, task, "nominal", faulty_episodes)
     ]
-    recordings = recorded(args, labels, console, seconds)
+    recordings = made(labels, config)
     faulty = [
         (x.kind, int(x.onset or 0), e) for x, e in zip(labels, recordings, strict=True) if len(e) > (x.onset or 0)
     ]

@@ -6,22 +6,19 @@ gives, so that nothing but the way that errors come back differs: see ``memory.f
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Annotated, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
-import tyro
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.console import Console
 
 from asm_gym.detection import EvidenceDetection, ModelOutput, conformal_episodes
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
+from asm_gym.evaluation import defaults
 from asm_gym.evaluation.comparison import BenchmarkResult, MonitorResult
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.resampling import interval
@@ -33,15 +30,14 @@ from asm_gym.monitors import CalibratedMonitor, make_monitor
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
 from asm_gym.monitors.model import StreamModel
-from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import recorded
-from asm_gym.rollouts.scoring import detectability_of, judged
+from asm_gym.rollouts.scoring import judged
 from asm_gym.scaling import StreamScaler, rows_apart
-from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce, tasks_recorded
-from asm_gym.scripts.reproduce.learning_curve import in_turn
+from asm_gym.scripts.options import option
+from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.kit import Findings, Record
+from asm_gym.scripts.reproduce.recordings import RunConfig, in_turn
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_choice
 
 UNITS = 960
 """Of association, shared out among the groups, as in the memory."""
@@ -50,42 +46,25 @@ LINEAR = "linear"
 """No hidden units at all."""
 WAYS = (*FEEDBACK, LINEAR)
 
-QUICK = 12
-"""Episodes that are learned from with ``--quick``."""
-
 
 @dataclass(frozen=True)
-class Args(Common):
+class Config(RunConfig):
     """Association whose errors come back in different ways."""
 
-    seeds: int = 1
+    seeds: int = option(1, least=1)
     """How often it repeats itself."""
-    run: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
-    """Folder of an evaluation, whose recordings are learned from and judged."""
-    ways: tuple[str, ...] = WAYS
+    ways: tuple[str, ...] = option(WAYS, least=1, known=WAYS)
     """How errors come back to the hidden units."""
     kinds: tuple[str, ...] = ()
     """Kinds of fault, development or test, of those that the run has recorded; all by default."""
-    episodes: int = 1000
+    episodes: int = option(1000, quick=12, least=1)
     """How many episodes are learned from at most, of all tasks together."""
-    false_alarm_rate: float = 0.01
+    false_alarm_rate: float = option(defaults.REPORTED_RATE, check=conformal_episodes)
     """Share of nominal episodes that may raise an alarm."""
-    window: float = 1.0
-    """How soon after its onset a fault must be noticed [s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in self.ways:
-            check_choice("way of feedback", name, WAYS)
         kinds_of(self.kinds)
-        conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
-        if not self.ways or self.episodes < 1:
-            raise ValueError("there must be a way of feedback, and one episode to learn from")
-
-    @property
-    def tasks(self) -> tuple[str, ...]:
-        """What the run has recorded; ValueError where there is nothing."""
-        return tasks_recorded(self.run)
 
 
 class FedAssociation(StreamModel):
@@ -142,34 +121,33 @@ def monitor_of(job: Job, spec: StreamSpec) -> CalibratedMonitor:
     return CalibratedMonitor(FedAssociation(spec, job.way), EvidenceDetection(spec), seed=job.seed)
 
 
-def roles_of(args: Args) -> dict[str, Sequence[Episode]]:
+def roles_of(config: Config) -> dict[str, Sequence[Episode]]:
     """The recordings by role, those of the kinds that are asked for."""
-    roles = recorded(args.run, args.tasks).roles
-    asked = kinds_of(args.kinds or tuple(KINDS))
+    roles = config.roles
+    asked = kinds_of(config.kinds or tuple(KINDS))
     return {**roles, "faulty": [e for e in roles.get("faulty", []) if e.labelled.kind in asked], "harmless": []}
 
 
-def score(job: Job, args: Args) -> MonitorResult:
+def score(job: Job, config: Config) -> MonitorResult:
     """What association that was taught in one way makes of the recordings."""
-    roles = roles_of(args)
-    learned = in_turn(roles["fit"], job.seed)[: QUICK if args.quick else args.episodes]
-    return judged(job.monitor, monitor_of(job, learned[0].spec).fit(learned), roles, args.false_alarm_rate)
+    roles = roles_of(config)
+    learned = in_turn(roles["fit"], job.seed)[: config.episodes]
+    return judged(job.monitor, monitor_of(job, learned[0].spec).fit(learned), roles, config.false_alarm_rate)
 
 
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Teaches association in every way, and asks it."""
-    jobs = [Job(way, seed) for seed in args.repetitions for way in args.ways]
-    with stage("fitting and judging", console, seconds) as progress:
-        found = parallel_map(partial(score, args=args), jobs, args.workers, progress)
-    _, left_out, twins = recorded(args.run, args.tasks)
-    seen = detectability_of(twins, roles_of(args)["faulty"], args.window)
+    jobs = [Job(way, seed) for seed in config.repetitions for way in config.ways]
+    found = kit.each("fitting and judging", partial(score, config=config), jobs, config)
+    left_out = recorded(config.run, config.tasks).left_out
+    seen = config.detectable(roles_of(config)["faulty"])
     by_name = {job.monitor: result for job, result in zip(jobs, found, strict=True)}
-    result = BenchmarkResult(by_name, seen, args.false_alarm_rate, args.window, left_out)
+    result = BenchmarkResult(by_name, seen, config.false_alarm_rate, config.window, left_out)
     records: list[Record] = [
-        {**job._asdict(), "auroc": m.auroc, "found": m.found[args.false_alarm_rate].value}
+        {**job._asdict(), "auroc": m.auroc, "found": m.found[config.false_alarm_rate].value}
         for job, m in zip(jobs, result.on_visible, strict=True)
     ]
-    facts = {"tasks": args.tasks, "kinds": sorted({kind for kind, _ in result.visible})}
+    facts = {"tasks": config.tasks, "kinds": sorted({kind for kind, _ in result.visible})}
     return Findings(records, [monitors_table(result), lead_table(result)], bars(result), facts)
 
 
@@ -185,12 +163,3 @@ def bars(result: BenchmarkResult) -> Figure:
         ax.set(xlabel="AUROC, same steps")
         ax.grid(axis="x", color="#dddddd", linewidth=0.6)
     return fig
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Compares, and returns the exit code."""
-    return reproduce("feedback", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -10,10 +10,9 @@ change are measured, by length of the episode.
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from typing import Any
@@ -21,7 +20,6 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
@@ -30,23 +28,15 @@ from asm_gym.memory.learning import Batch, Learner, Schedule, Trajectory, batche
 from asm_gym.memory.network import initial_weights
 from asm_gym.memory.scheduled_sampling import ScheduledSampling, one_after_another
 from asm_gym.memory.traces import fit_gains
-from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.progress import stage
 from asm_gym.scaling import StreamScaler
-from asm_gym.scripts.command import at_least
-from asm_gym.scripts.reproduce.common import (
-    Common,
-    Findings,
-    Record,
-    over_seeds,
-    reproduce,
-    shown,
-    wide_enough,
-)
+from asm_gym.scripts.options import fixed, option
+from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import trajectories
 from asm_gym.scripts.reproduce.gradients import COMPARED, CUE, Changes, cosine, exact, local
 from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire
+from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds, shown
+from asm_gym.scripts.reproduce.recordings import wide_enough
 from asm_gym.validation import check_number
 
 TARGETS = {
@@ -54,7 +44,6 @@ TARGETS = {
     "error": "gradient of the prediction error",
     "alone": f"gradient of the error alone, after a cue of {CUE}",
 }
-LENGTHS = (30, 60, 120)
 RATES = {"local": 3e-3, "backpropagation": 1e-2}
 """Of a change per step, and of one per batch."""
 PRIOR_PRECISION = 30.0
@@ -62,39 +51,28 @@ PRIOR_PRECISION = 30.0
 
 
 @dataclass(frozen=True)
-class Args(Common):
+class Config(kit.Config):
     """Angles between local changes and exact gradients."""
 
-    skills: int = 8
+    skills: int = option(8, quick=2, check=check_letters)
     """Letters."""
-    hidden: int = 64
+    hidden: int = option(64, quick=16, check=partial(wide_enough, channels=4))
     """Hidden units."""
-    writings: int = 8
+    writings: int = option(8, quick=4, least=1)
     """Writings of each letter."""
-    epochs: int = 40
+    epochs: int = option(40, quick=3, least=1)
     """Passes over them."""
-    iterations: tuple[int, ...] = (1, 5, 20, 60)
+    iterations: tuple[int, ...] = option(
+        (1, 5, 20, 60), quick=(1, 5), least=1, check=partial(check_number, "iterations", low=1, whole=True)
+    )
     """Steps of inference at which angles are measured; the memory learns with 5."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_letters(self.skills)
-        at_least(1, self, "writings", "epochs")
-        at_least(1, self, "iterations")
-        for count in self.iterations:
-            check_number("iterations", count, low=1, whole=True)
-        wide_enough(self.hidden, 4)
-
-    def scaled(self) -> Args:
-        """With ``quick``, little of everything."""
-        if not self.quick:
-            return self
-        return replace(self, seeds=min(self.seeds, 2), skills=2, hidden=16, writings=4, epochs=3, iterations=(1, 5))
+    lengths: tuple[int, ...] = fixed((30, 60, 120), quick=(30, 60))
+    """Steps of the episodes along which the costs of a change are measured."""
 
 
-def usual(args: Args) -> int:
+def usual(config: Config) -> int:
     """Steps of inference at which angles are followed over learning."""
-    return 5 if 5 in args.iterations else max(args.iterations)
+    return 5 if 5 in config.iterations else max(config.iterations)
 
 
 def checkpoints(epochs: int) -> list[int]:
@@ -102,30 +80,30 @@ def checkpoints(epochs: int) -> list[int]:
     return sorted({0, *(round(epochs ** (k / 6)) for k in range(7)), epochs})
 
 
-def one_seed(seed: int, args: Args) -> list[Record]:
+def one_seed(seed: int, config: Config) -> list[Record]:
     """Angles over learning, and the error that either way of learning reaches."""
     torch.set_num_threads(1)
     rng = np.random.default_rng(seed)
-    letters = repertoire(args.skills, 2, rng)
-    train, tests = copybook(letters, args.writings, 2, rng), copybook(letters, 2, 2, rng)
+    letters = repertoire(config.skills, 2, rng)
+    train, tests = copybook(letters, config.writings, 2, rng), copybook(letters, 2, 2, rng)
     reader = StreamScaler.fit(train[0].spec, [e.stream for e in train])
     learned, judged = trajectories(reader, train), side_by_side(trajectories(reader, tests))
-    weights = initial_weights(args.hidden, reader.size, 2, rng)
+    weights = initial_weights(config.hidden, reader.size, 2, rng)
     weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in learned])
     probe, start = side_by_side(learned[:: max(1, len(learned) // 16)]), Weights(*(w.copy() for w in weights))
     records: list[Record] = []
-    measured = checkpoints(args.epochs)
-    learner = Learner(weights, Schedule(args.epochs, 16, RATES["local"], 5, PRIOR_PRECISION, 1.0, 0.0), rng)
+    measured = checkpoints(config.epochs)
+    learner = Learner(weights, Schedule(config.epochs, 16, RATES["local"], 5, PRIOR_PRECISION, 1.0, 0.0), rng)
     streams, moments = ScheduledSampling(learner, 16), one_after_another(learned, 16, rng)
     steps = -(-sum(len(t.senses) for t in learned) // 16)
-    for epoch in range(args.epochs + 1):
+    for epoch in range(config.epochs + 1):
         if epoch in measured:
-            last = epoch == args.epochs
-            records += angles(weights, probe, args.iterations if last else (usual(args),), seed, epoch)
+            last = epoch == config.epochs
+            records += angles(weights, probe, config.iterations if last else (usual(config),), seed, epoch)
             records.append(_reached("local", weights, judged, seed, epoch))
-        if epoch < args.epochs:
-            streams.run(islice(moments, steps), cosine_decay(RATES["local"], epoch / args.epochs), 0.0)
-    return records + backpropagated(start, learned, judged, args, seed)
+        if epoch < config.epochs:
+            streams.run(islice(moments, steps), cosine_decay(RATES["local"], epoch / config.epochs), 0.0)
+    return records + backpropagated(start, learned, judged, config, seed)
 
 
 def angles(weights: Weights, probe: Batch, iterations: Sequence[int], seed: int, epoch: int) -> list[Record]:
@@ -143,18 +121,18 @@ def angles(weights: Weights, probe: Batch, iterations: Sequence[int], seed: int,
 
 
 def backpropagated(
-    weights: Weights, learned: Sequence[Trajectory], judged: Batch, args: Args, seed: int
+    weights: Weights, learned: Sequence[Trajectory], judged: Batch, config: Config, seed: int
 ) -> list[Record]:
     """The same network, from the same weights, by Adam on the exact gradient of the prediction error."""
     rng, records = np.random.default_rng(seed), []
     W = {name: torch.from_numpy(getattr(weights, name)) for name in COMPARED}  # shares memory with the weights
     adam = torch.optim.Adam(W.values(), RATES["backpropagation"])
-    for epoch in range(args.epochs + 1):
-        if epoch in checkpoints(args.epochs):
+    for epoch in range(config.epochs + 1):
+        if epoch in checkpoints(config.epochs):
             records.append(_reached("backpropagation", weights, judged, seed, epoch))
         for group in adam.param_groups:
-            group["lr"] = cosine_decay(RATES["backpropagation"], epoch / args.epochs)
-        for batch in batches(learned, 16, rng) if epoch < args.epochs else ():
+            group["lr"] = cosine_decay(RATES["backpropagation"], epoch / config.epochs)
+        for batch in batches(learned, 16, rng) if epoch < config.epochs else ():
             gradient = exact(weights, batch, 5, PRIOR_PRECISION, ("error",))["error"].arrays
             for name, w in W.items():
                 w.grad = torch.from_numpy(-gradient[name].astype(np.float32))
@@ -169,12 +147,12 @@ def _reached(how: str, weights: Weights, judged: Batch, seed: int, epoch: int) -
     return {"seed": seed, "epoch": epoch, "learned_by": how, "mse": 2 * error / numbers}
 
 
-def costs(args: Args) -> list[Record]:
+def costs(config: Config) -> list[Record]:
     """Time and memory of one change, by length of the episode."""
     torch.set_num_threads(1)
-    rng = np.random.default_rng(args.seed)
-    weights, records = initial_weights(args.hidden, 4, 2, rng), []
-    for length in LENGTHS[:2] if args.quick else LENGTHS:
+    rng = np.random.default_rng(config.seed)
+    weights, records = initial_weights(config.hidden, 4, 2, rng), []
+    for length in config.lengths:
         senses = rng.normal(size=(length, 16, 4)).astype(np.float32)
         commands = rng.normal(size=(length, 16, 3)).astype(np.float32)
         batch = Batch(senses, commands, np.full(length, 16))
@@ -188,7 +166,9 @@ def costs(args: Args) -> list[Record]:
                 since = time.perf_counter()
                 change()
                 taken.append(time.perf_counter() - since)
-            records.append({"seed": args.seed, "cost_of": how, "steps": length, "ms": 1e3 * min(taken), "bytes": saved})
+            records.append(
+                {"seed": config.seed, "cost_of": how, "steps": length, "ms": 1e3 * min(taken), "bytes": saved}
+            )
     return records
 
 
@@ -196,17 +176,17 @@ def _exact_error(weights: Weights, batch: Batch) -> Changes:
     return exact(weights, batch, 5, PRIOR_PRECISION, ("error",))["error"]
 
 
-def tables(records: Sequence[Record], args: Args) -> list[Table]:
+def tables(records: Sequence[Record], config: Config) -> list[Table]:
     """Angles over learning, by array, by iterations; errors; costs."""
-    epochs = checkpoints(args.epochs)
+    epochs = checkpoints(config.epochs)
 
     def angle(value: str = "degrees", **where: Any) -> str:
-        return shown(records, value, 0, **{"array": "all", "iterations": usual(args), **where})
+        return shown(records, value, 0, **{"array": "all", "iterations": usual(config), **where})
 
     heads = ("", *map(str, epochs))
     return [
         Table(
-            f"Angle [°] between the local change and the exact one, before so many epochs, {usual(args)} iterations; "
+            f"Angle [°] between the local change and the exact one, before so many epochs, {usual(config)} iterations; "
             "mean ± SD over seeds",
             heads,
             [(label, *(angle(target=t, epoch=e) for e in epochs)) for t, label in TARGETS.items()],
@@ -218,9 +198,9 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
         ),
         Table(
             "By iterations, after learning",
-            ("", *map(str, args.iterations)),
+            ("", *map(str, config.iterations)),
             [
-                (label, *(angle(target=t, epoch=args.epochs, iterations=k) for k in args.iterations))
+                (label, *(angle(target=t, epoch=config.epochs, iterations=k) for k in config.iterations))
                 for t, label in TARGETS.items()
             ],
         ),
@@ -240,18 +220,18 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
     ]
 
 
-def drawn(records: Sequence[Record], args: Args) -> Figure:
+def drawn(records: Sequence[Record], config: Config) -> Figure:
     """Angles, errors, costs."""
-    epochs = checkpoints(args.epochs)
-    where = {"array": "all", "iterations": usual(args)}
+    epochs = checkpoints(config.epochs)
+    where = {"array": "all", "iterations": usual(config)}
     with figure(height=3.0, width=11) as fig:
         axes = fig.subplots(1, 4)
         for i, (target, label) in enumerate(TARGETS.items()):
             mean = [over_seeds(records, "degrees", target=target, epoch=e, **where) for e in epochs]
             curve(axes[0], epochs, mean, i, label)
-            ends = {"target": target, "epoch": args.epochs, "array": "all"}
-            mean = [over_seeds(records, "degrees", **ends, iterations=k) for k in args.iterations]
-            curve(axes[1], args.iterations, mean, i, None)
+            ends = {"target": target, "epoch": config.epochs, "array": "all"}
+            mean = [over_seeds(records, "degrees", **ends, iterations=k) for k in config.iterations]
+            curve(axes[1], config.iterations, mean, i, None)
         for i, how in enumerate(RATES):
             curve(axes[2], epochs, [over_seeds(records, "mse", learned_by=how, epoch=e) for e in epochs], i + 2, how)
             own = [r for r in records if r.get("cost_of") == how]
@@ -263,26 +243,15 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
         for ax in axes[:2]:
             ax.axhline(90, color="#999999", linewidth=1)
         for ax in (axes[0], axes[2]):
-            ax.set_xlim(0, 1.2 * args.epochs)
+            ax.set_xlim(0, 1.2 * config.epochs)
         for ax, place in ((axes[0], "lower right"), (axes[2], "upper right"), (axes[3], "center right")):
             ax.legend(fontsize=7, loc=place)
     return fig
 
 
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Every seed, then the costs."""
-    args = args.scaled()
-    with stage("learning both ways", console, seconds) as progress:
-        found = parallel_map(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
-    with stage("measuring costs", console, seconds):
-        records = [r for own in found for r in own] + costs(args)
-    return Findings(records, tables(records, args), drawn(records, args), {"rates": RATES})
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Runs the study, and returns the exit code."""
-    return reproduce("local_learning", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    found = kit.each("learning both ways", partial(one_seed, config=config), config.repetitions, config)
+    with kit.stage("measuring costs"):
+        records = kit.together(found) + costs(config)
+    return Findings(records, tables(records, config), drawn(records, config), {"rates": RATES})

@@ -7,111 +7,89 @@ and ``robot_recall``.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.tables import Table
-from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import at_least
-from asm_gym.scripts.reproduce import robot_recall
-from asm_gym.scripts.reproduce.common import (
-    SENSED,
-    SKILLS,
-    Common,
-    Findings,
-    Record,
-    demonstrations,
-    over_seeds,
-    reproduce,
-    shown,
-    wide_enough,
-)
+from asm_gym.scripts.options import fixed, option
+from asm_gym.scripts.reproduce import kit, robot_recall
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters
+from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds, shown
 from asm_gym.scripts.reproduce.recall_rivals import CALLED, MODELS, Condition, Practice, recall
+from asm_gym.scripts.reproduce.recordings import SENSED, SKILLS, demonstrations, wide_enough
 from asm_gym.scripts.reproduce.robot_recall import RECALLED, ROBOT_CUE
 
 
 @dataclass(frozen=True)
-class Args(Common):
+class Config(kit.Config):
     """Recall from a cue, against what else can recall."""
 
-    repertoires: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
-    """How many letters one network learns; none leaves letters out."""
-    widths: tuple[int, ...] = (16, 32, 64, 128, 256, 512)
+    repertoires: tuple[int, ...] = option((1, 2, 4, 8, 16, 32), quick=(1, 4), check=check_letters)
+    """How many letters one network learns; none leaves letters and splines out."""
+    widths: tuple[int, ...] = option(
+        (16, 32, 64, 128, 256, 512), quick=(16, 32), least=1, check=partial(wide_enough, channels=6)
+    )
     """Hidden units, for a repertoire of eight."""
-    hidden: int = 64
-    """Hidden units for the other repertoires."""
-    dims: tuple[int, ...] = (2, 3)
-    """Dimensions to write in; 3 with a repertoire of eight only."""
-    splines: int = 16
-    """How many cubic splines one network learns; 0 leaves them out."""
-    width_seeds: int = 1
-    """How many of the seeds are repeated with other widths, and in three dimensions."""
-    robot_hidden: int = 256
-    """Hidden units for the robosuite skills."""
-    cues: tuple[int, ...] = (1, 2, 5, 10, 20, 30)
+    cues: tuple[int, ...] = option((1, 2, 5, 10, 20, 30), least=1)
     """Steps that are read before recall begins."""
-    writings: int = 8
-    """Writings of each letter to learn from."""
-    robot_episodes: int = 40
+    robot_episodes: int = option(40, quick=0, least=0)
     """Episodes of each robosuite skill to learn from; 0 leaves them out."""
-    steps: int = 16000
+    steps: int = option(16000, quick=1500, least=1)
     """Steps in which the synapses of the memory change."""
-    updates: int = 1200
+    updates: int = option(1200, quick=40, least=1)
     """Updates of the networks trained by backpropagation through time, by 16 letters each."""
+    hidden: int = fixed(64, quick=32, check=partial(wide_enough, channels=6))
+    """Hidden units for the other repertoires."""
+    dims: tuple[int, ...] = fixed((2, 3))
+    """Dimensions to write in; 3 with a repertoire of eight only."""
+    splines: int = fixed(16, quick=2, least=0)
+    """How many cubic splines one network learns; 0 leaves them out."""
+    width_seeds: int = fixed(1, least=0)
+    """How many of the seeds are repeated with other widths, and in three dimensions."""
+    robot_hidden: int = fixed(256, check=partial(wide_enough, channels=SENSED))
+    """Hidden units for the robosuite skills."""
+    writings: int = fixed(8, quick=4, least=1)
+    """Writings of each letter to learn from."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_letters(*self.repertoires)
-        at_least(1, self, "widths", "cues")
-        for hidden in (*self.widths, self.hidden):
-            wide_enough(hidden, 2 * 3)
-        wide_enough(self.robot_hidden, SENSED)
         for cue in self.cues:
             if not 1 <= cue < STEPS:
                 raise ValueError(f"a cue must be shorter than the letter, 1 to {STEPS - 1} steps, got {cue}")
-        at_least(1, self, "writings", "steps", "updates")
-        at_least(0, self, "robot_episodes", "splines", "width_seeds")
         if self.splines:
             check_letters(self.splines)
-        if not (self.repertoires or self.splines or self.robot_episodes):
-            raise ValueError("there is nothing to recall: repertoires, splines and robot_episodes are all left out")
+        if not (self.repertoires or self.robot_episodes):
+            raise ValueError("there is nothing to recall: repertoires and robot_episodes are both left out")
         if 2 not in self.dims or not set(self.dims) <= {2, 3}:
             raise ValueError(f"letters are written in 2 dimensions, or in 2 and 3, got {self.dims}")
 
-    def scaled(self) -> Args:
-        """With ``quick``, little of everything."""
-        if not self.quick:
-            return self
-        few = {"repertoires": (1, 4), "widths": (16, 32), "hidden": 32, "steps": 1500, "updates": 40, "splines": 2}
-        return replace(self, seeds=min(self.seeds, 2), robot_episodes=0, writings=4, **few)  # type: ignore[arg-type]
 
-
-def conditions(args: Args) -> list[Condition]:
+def conditions(config: Config) -> list[Condition]:
     """Repertoires and splines for every seed; widths and three dimensions for some."""
-    middle = _middle(args)
-    few = args.repetitions[: args.width_seeds if args.repertoires else 0]
-    all_seeds = [Condition(s, n, args.hidden, 2) for s in args.repetitions for n in args.repertoires]
-    all_seeds += [Condition(s, args.splines, args.hidden, 2, "splines") for s in args.repetitions if args.splines]
-    wide = [Condition(s, middle, h, 2) for s in few for h in args.widths]
-    deep = [Condition(s, middle, args.hidden, d) for s in few for d in args.dims if d > 2]
+    middle = _middle(config)
+    few = config.repetitions[: config.width_seeds if config.repertoires else 0]
+    all_seeds = [Condition(s, n, config.hidden, 2) for s in config.repetitions for n in config.repertoires]
+    all_seeds += [
+        Condition(s, spline_count(config), config.hidden, 2, "splines")
+        for s in config.repetitions
+        if spline_count(config)
+    ]
+    wide = [Condition(s, middle, h, 2) for s in few for h in config.widths]
+    deep = [Condition(s, middle, config.hidden, d) for s in few for d in config.dims if d > 2]
     return list(dict.fromkeys(all_seeds + wide + deep))
 
 
-def tables(records: Sequence[Record], args: Args) -> list[Table]:
+def tables(records: Sequence[Record], config: Config) -> list[Table]:
     """Repertoires, widths, cues, splines, and robosuite."""
-    middle, longest = _middle(args), max(args.cues)
-    basis: Record = {"domain": "letters", "dims": 2, "skills": middle, "hidden": args.hidden, "cue": longest}
+    middle, longest = _middle(config), max(config.cues)
+    basis: Record = {"domain": "letters", "dims": 2, "skills": middle, "hidden": config.hidden, "cue": longest}
 
     def cell(right: bool, **where: Any) -> str:
         error = shown(records, "error_cm", **basis | where)
@@ -120,29 +98,29 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
     def rows(key: str, values: Sequence[int], right: bool = True, **where: Any) -> list[tuple[str, ...]]:
         return [(CALLED[m], *(cell(right, **{**where, key: v, "model": m}) for v in values)) for m in MODELS]
 
-    sizes, widths, cues = (("", *map(str, v)) for v in (args.repertoires, args.widths, args.cues))
-    units = f"{args.hidden} units, cue of {longest}; mean ± SD over seeds, and share of right skills"
+    sizes, widths, cues = (("", *map(str, v)) for v in (config.repertoires, config.widths, config.cues))
+    units = f"{config.hidden} units, cue of {longest}; mean ± SD over seeds, and share of right skills"
     made = []
-    if args.repertoires:
-        made.append(Table(f"Offline error [cm] by letters, {units}", sizes, rows("skills", args.repertoires)))
-        online = rows("skills", args.repertoires, right=False, cue=STEPS)
+    if config.repertoires:
+        made.append(Table(f"Offline error [cm] by letters, {units}", sizes, rows("skills", config.repertoires)))
+        online = rows("skills", config.repertoires, right=False, cue=STEPS)
         made.append(Table("Online error [cm] by letters", sizes, online))
     made += [
-        Table(f"Offline error [cm] by cue, {n} letters", cues, rows("cue", args.cues, skills=n))
-        for n in args.repertoires
+        Table(f"Offline error [cm] by cue, {n} letters", cues, rows("cue", config.cues, skills=n))
+        for n in config.repertoires
         if n >= middle
     ]
-    if args.splines:
-        own = rows("cue", args.cues, domain="splines", skills=args.splines)
-        made.append(Table(f"Offline error [cm] by cue, {args.splines} splines", cues, own))
-    if args.repertoires and args.width_seeds:
-        seeds = "one seed" if args.width_seeds == 1 else f"{args.width_seeds} seeds"
-        where = f"{middle} letters, {seeds} for widths other than {args.hidden}"
-        made.append(Table(f"Offline error [cm] by hidden units, {where}", widths, rows("hidden", args.widths)))
-        if len(args.dims) > 1:
-            heads = ("", *map(str, args.dims))
-            made.append(Table(f"Offline error [cm] by dimensions, {middle} letters", heads, rows("dims", args.dims)))
-    if args.robot_episodes:
+    if spline_count(config):
+        own = rows("cue", config.cues, domain="splines", skills=config.splines)
+        made.append(Table(f"Offline error [cm] by cue, {config.splines} splines", cues, own))
+    if config.repertoires and config.width_seeds:
+        seeds = "one seed" if config.width_seeds == 1 else f"{config.width_seeds} seeds"
+        where = f"{middle} letters, {seeds} for widths other than {config.hidden}"
+        made.append(Table(f"Offline error [cm] by hidden units, {where}", widths, rows("hidden", config.widths)))
+        if len(config.dims) > 1:
+            heads = ("", *map(str, config.dims))
+            made.append(Table(f"Offline error [cm] by dimensions, {middle} letters", heads, rows("dims", config.dims)))
+    if config.robot_episodes:
         told = {"mean": "mean demonstration, told the skill"}
         names = {m: name for m, name in CALLED.items() if m != "memory_wide"} | told
         made.append(
@@ -155,24 +133,29 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
     return made
 
 
-def _middle(args: Args) -> int:
+def spline_count(config: Config) -> int:
+    """How many splines are learned: none where there are no letters."""
+    return config.splines if config.repertoires else 0
+
+
+def _middle(config: Config) -> int:
     """The repertoire for which widths and dimensions are tried."""
-    return 8 if 8 in args.repertoires else max(args.repertoires, default=0)
+    return 8 if 8 in config.repertoires else max(config.repertoires, default=0)
 
 
-def drawn(records: Sequence[Record], args: Args) -> Figure:
+def drawn(records: Sequence[Record], config: Config) -> Figure:
     """Error by repertoire, width and cue; robosuite."""
-    middle, longest = _middle(args), max(args.cues)
-    base = {"domain": "letters", "dims": 2, "skills": middle, "hidden": args.hidden, "cue": longest}
+    middle, longest = _middle(config), max(config.cues)
+    base = {"domain": "letters", "dims": 2, "skills": middle, "hidden": config.hidden, "cue": longest}
     panels: list[tuple[str, str, Sequence[int], str]] = [
-        ("skills", "skills in the repertoire", args.repertoires, "error_cm"),
-        ("hidden", "hidden units", args.widths, "error_cm"),
-        ("cue", "cue [steps]", args.cues, "error_cm"),
-        ("cue", "cue [steps]", args.cues, "right"),
+        ("skills", "skills in the repertoire", config.repertoires, "error_cm"),
+        ("hidden", "hidden units", config.widths, "error_cm"),
+        ("cue", "cue [steps]", config.cues, "error_cm"),
+        ("cue", "cue [steps]", config.cues, "right"),
     ]
-    if not args.width_seeds:
+    if not config.width_seeds:
         del panels[1]
-    if not args.repertoires:
+    if not config.repertoires:
         with figure(height=4.0, width=7.6) as fig:
             _robot(fig.subplots(), records, named=True)
             fig.legend(loc="outside right upper")
@@ -187,8 +170,8 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
             if key != "cue":
                 ax.set_xscale("log", base=2)
             ax.set_xticks(values, [str(v) for v in values])
-        _online(axes[1, 1], records, args, base)
-        if args.robot_episodes:
+        _online(axes[1, 1], records, config, base)
+        if config.robot_episodes:
             _robot(axes[1, 2], records)
         for ax in axes.flat:
             ax.set_visible(ax.has_data())
@@ -196,15 +179,15 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
     return fig
 
 
-def _online(ax: Any, records: Sequence[Record], args: Args, base: Record) -> None:
+def _online(ax: Any, records: Sequence[Record], config: Config, base: Record) -> None:
     for i, model in enumerate(MODELS):
         found = [
             over_seeds(records, "error_cm", **base | {"cue": STEPS, "skills": n, "model": model})
-            for n in args.repertoires
+            for n in config.repertoires
         ]
-        curve(ax, args.repertoires, found, i, None)
+        curve(ax, config.repertoires, found, i, None)
     ax.set_xscale("log", base=2)
-    ax.set_xticks(args.repertoires, [str(v) for v in args.repertoires])
+    ax.set_xticks(config.repertoires, [str(v) for v in config.repertoires])
     ax.set(xlabel="skills in the repertoire", ylabel="online error [cm]", ylim=0)
 
 
@@ -220,32 +203,17 @@ def _robot(ax: Any, records: Sequence[Record], named: bool = False) -> None:
     ax.set(ylabel="offline hand error [cm]", title="robosuite; grey: the mean")
 
 
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Runs every condition and sums up."""
-    args = args.scaled()
     jobs: list[Callable[[], list[Record]]] = []
-    if args.robot_episodes:
-        train = demonstrations(args, SKILLS, "fit", args.robot_episodes, console, seconds)
-        tests = demonstrations(args, SKILLS, "nominal", 15, console, seconds)
-        sizes = args.robot_hidden, args.steps, args.updates // 2
-        jobs += [partial(robot_recall.learned, seed, train, tests, *sizes) for seed in args.repetitions]
-        jobs.append(partial(robot_recall.stored, train, tests, {"seed": args.seed, "hidden": args.robot_hidden}))
+    if config.robot_episodes:
+        train = demonstrations(config, SKILLS, "fit", config.robot_episodes)
+        tests = demonstrations(config, SKILLS, "nominal", 15)
+        sizes = config.robot_hidden, config.steps, config.updates // 2
+        jobs += [partial(robot_recall.learned, seed, train, tests, *sizes) for seed in config.repetitions]
+        jobs.append(partial(robot_recall.stored, train, tests, {"seed": config.seed, "hidden": config.robot_hidden}))
     # The longest first, so that no process is left with one of them at the end.
-    practice = Practice(args.writings, args.steps, args.updates)
-    jobs += [partial(recall, c, practice, args.cues) for c in conditions(args)]
-    with stage("learning", console, seconds) as progress:
-        records = [r for found in parallel_map(_done, jobs, args.workers, progress) for r in found]
-    return Findings(records, tables(records, args), drawn(records, args), {})
-
-
-def _done(job: Callable[[], list[Record]]) -> list[Record]:
-    return job()
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Runs the study, and returns the exit code."""
-    return reproduce("memorise_and_recall", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    practice = Practice(config.writings, config.steps, config.updates)
+    jobs += [partial(recall, c, practice, config.cues) for c in conditions(config)]
+    records = kit.together(kit.each("learning", kit.called, jobs, config))
+    return Findings(records, tables(records, config), drawn(records, config))

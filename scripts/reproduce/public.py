@@ -8,62 +8,56 @@ the test; the mean over kinds is what papers report.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
-from rich.console import Console
 
 from asm_gym.data.public import Recorded, read_public
 from asm_gym.data.selection import divided
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode
+from asm_gym.evaluation import defaults
 from asm_gym.evaluation.statistics import auroc
-from asm_gym.evaluation.tables import Table, console_table
-from asm_gym.monitors import MONITORS, make_monitor, monitor_class
-from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import run
-from asm_gym.validation import check_choice, check_number
+from asm_gym.evaluation.tables import Table
+from asm_gym.monitors import make_monitor, monitor_class
+from asm_gym.monitors.registry import check_monitor
+from asm_gym.scripts.options import fixed, option
+from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.kit import Findings, Record
+from asm_gym.validation import check_number
 
 AT_ONCE = 64
 """Episodes scored side by side."""
 
-QUICK_EPOCHS, QUICK_EPISODES = 2, 40
-
 
 @dataclass(frozen=True)
-class Args:
+class Config(kit.Config):
     """AUROC by kind of fault on a public dataset."""
 
-    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """The downloaded file: voraus-ad-dataset-100hz.parquet, voraus-ad-dataset-500hz.parquet, or AURSAD.h5."""
-    monitors: tuple[str, ...] = ("neural_asm", "association_linear+evidence", "kalman+evidence")
+    data: Path = option(Path("voraus-ad-dataset-100hz.parquet"), positional=True, metavar="FILE")
+    """The downloaded file, of 100 or 500 Hz, or AURSAD.h5."""
+    monitors: tuple[str, ...] = option(
+        ("neural_asm", "association_linear+evidence", "kalman+evidence"), least=1, check=check_monitor
+    )
     """Names of monitors."""
-    false_alarm_rate: float = 0.05
+    false_alarm_rate: float = option(defaults.FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of normal episodes that may raise an alarm."""
-    calibration_share: float = 0.3
+    calibration_share: float = option(0.3, check=partial(check_number, "calibration_share", above=0, below=1))
     """Share of the normal episodes of the training set that set the threshold, and are not learned from."""
-    rate: float | None = None
+    rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
     """Rows of the file a second [Hz], where its time does not say it."""
-    every: int = 1
+    every: int = option(1, least=1)
     """Keep one row of so many: AURSAD's own package takes 2."""
-    seed: int = 0
-    """Seed of the monitors, and of which episodes they learn from."""
-    quick: bool = False
-    """Learn little, from few episodes: to see that everything runs."""
-
-    def __post_init__(self) -> None:
-        for name in self.monitors:
-            check_choice("monitor", name, MONITORS)
-        conformal_episodes(self.false_alarm_rate)  # refuses a rate that is none
-        check_number("calibration_share", self.calibration_share, above=0, below=1)
-        check_number("every", self.every, low=1, whole=True)
-        if self.rate is not None:
-            check_number("rate", self.rate, above=0)
+    seeds: int = fixed(1)
+    """It is not repeated."""
+    most: int | None = fixed(None, quick=40)
+    """Episodes to learn from at most."""
+    epochs: int | None = fixed(None, quick=2)
+    """Passes over them, of monitors that learn in passes."""
 
     def read(self) -> Iterator[Recorded]:
         """The episodes, anew at each call."""
@@ -75,18 +69,18 @@ def is_finite(one: Recorded) -> bool:
     return bool(np.isfinite(one.episode.stream).all())
 
 
-def fitted(args: Args, normal: list[Episode], console: Console) -> dict[str, Any]:
+def fitted(config: Config, normal: list[Episode]) -> dict[str, Any]:
     """The monitors, each fitted and calibrated on the same episodes."""
-    fitting, calibration = divided(normal, args.false_alarm_rate, args.calibration_share, args.seed)
-    fitting = fitting[:QUICK_EPISODES] if args.quick else fitting
+    fitting, calibration = divided(normal, config.false_alarm_rate, config.calibration_share, config.seed)
+    fitting = fitting[: config.most]
     made = {}
-    for name in args.monitors:
-        settings: dict[str, Any] = {"seed": args.seed}
-        if args.quick and "epochs" in monitor_class(name).hyperparameters:
-            settings["epochs"] = QUICK_EPOCHS
-        with stage(f"fitting {name}", console, {}) as progress:
+    for name in config.monitors:
+        settings: dict[str, Any] = {"seed": config.seed}
+        if config.epochs is not None and "epochs" in monitor_class(name).hyperparameters:
+            settings["epochs"] = config.epochs
+        with kit.stage(f"fitting {name}") as progress:
             monitor: Any = make_monitor(name, fitting[0].spec, **settings)
-            made[name] = monitor.fit(fitting, progress).calibrate(calibration, args.false_alarm_rate)
+            made[name] = monitor.fit(fitting, progress).calibrate(calibration, config.false_alarm_rate)
     return made
 
 
@@ -131,25 +125,27 @@ def table(found: Mapping[str, Mapping[str, Sequence[float]]], monitors: Mapping[
     return Table(caption, ("kind", "episodes", *found), rows)
 
 
-def examine(args: Args, console: Console) -> None:
-    """Learns, tests, and prints the table."""
-    with stage("reading", console, {}):
-        normal = [one.episode for one in args.read() if one.learned and not one.kind and is_finite(one)]
+def records(found: Mapping[str, Mapping[str, Sequence[float]]], seed: int) -> list[Record]:
+    """How surprising each episode of the test was to each monitor."""
+    return [
+        {"monitor": name, "seed": seed, "kind": kind, "peak": peak}
+        for name, mine in found.items()
+        for kind, values in mine.items()
+        for peak in values
+    ]
+
+
+def run(config: Config) -> Findings:
+    """Learns, and tests."""
+    with kit.stage("reading"):
+        normal = [one.episode for one in config.read() if one.learned and not one.kind and is_finite(one)]
     if not normal:
-        raise ValueError(f"{args.data} holds no normal episode to learn from")
-    monitors = fitted(args, normal, console)
-    with stage("testing", console, {}):
-        found, left_out = peaks(args.read(), monitors)
-    caption = f"{args.data.name}: AUROC / found at a false-alarm rate of {100 * args.false_alarm_rate:g} %"
-    console.print(console_table(table(found, monitors, caption)))
+        raise ValueError(f"{config.data} holds no normal episode to learn from")
+    monitors = fitted(config, normal)
+    with kit.stage("testing"):
+        found, left_out = peaks(config.read(), monitors)
+    caption = f"{config.data.name}: AUROC / found at a false-alarm rate of {100 * config.false_alarm_rate:g} %"
     if left_out:
-        console.print(f"{left_out} episodes of the test with numbers that are not finite were left out.")
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Prints the table, and returns the exit code."""
-    return run("public", Args, examine, argv, __doc__)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        caption += f"; {left_out} episodes of the test with numbers that are not finite were left out"
+    made = table(found, monitors, caption)
+    return Findings(records(found, config.seed), [made], facts={"left_out": left_out})

@@ -5,7 +5,7 @@ four times as many; a GRU and a plain RNN trained by backpropagation through tim
 step, which is as local; a modern continuous Hopfield network, which keeps every window; and a library of movement
 primitives, which is told the skill.
 
-How each is set was chosen by the same search for all, ``asm-gym reproduce recall_search``, on letters of seed 100,
+How each is set was chosen by the same search for all, of nine settings each, on letters of seed 100,
 which is none of those that are reported.
 """
 
@@ -18,7 +18,6 @@ import numpy as np
 
 from asm_gym.episode import Episode
 from asm_gym.scripts.reproduce import splines
-from asm_gym.scripts.reproduce.common import Record
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     Expresser,
@@ -29,6 +28,7 @@ from asm_gym.scripts.reproduce.expression import (
     recalled,
 )
 from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, copybook, repertoire
+from asm_gym.scripts.reproduce.kit import Record
 
 MODELS = ("memory", "memory_wide", "gru", "rnn", "gru_one_step", "hopfield", "library")
 CALLED = {

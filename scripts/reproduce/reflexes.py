@@ -38,7 +38,7 @@ from asm_gym.scripts.command import at_least, run
 from asm_gym.scripts.reproduce.reflexes_report import comparisons, row, table
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_choice
-from asm_gym.wrappers.arguments import ON_ALARM
+from asm_gym.wrappers.factory import ON_ALARM
 
 AGENTS = "agents"
 """As a policy: of each task the agent that was trained in it."""

@@ -16,33 +16,23 @@ a network itself makes.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from asm_gym.episode import Episode
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
-from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import at_least
-from asm_gym.scripts.reproduce.common import (
-    Common,
-    Findings,
-    Record,
-    over_seeds,
-    reproduce,
-    shown,
-    wide_enough,
-)
+from asm_gym.scripts.options import option
+from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import Memory, mean_demonstrations, recalled
 from asm_gym.scripts.reproduce.handwriting import NAMES, NOISE, check_letters, copybook, pen_spec, repertoire
+from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds, shown
+from asm_gym.scripts.reproduce.recordings import wide_enough
 
 WAYS = ("at once", "one after another", "replay from a cue", "replay from nothing")
 BEGUN = 8
@@ -53,60 +43,50 @@ CUE = 20
 
 
 @dataclass(frozen=True)
-class Args(Common):
+class Config(kit.Config):
     """What is kept of skills that were learned first."""
 
-    skills: int = 8
+    skills: int = option(8, quick=4, check=partial(check_letters, least=2))
     """Letters."""
-    blocks: int = 4
+    blocks: int = option(4, quick=2, least=2)
     """Lessons that the letters are shared out to, one block each."""
-    hidden: int = 64
+    hidden: int = option(64, quick=32, check=partial(wide_enough, channels=4))
     """Hidden units."""
-    writings: int = 8
+    writings: int = option(8, quick=4, least=1)
     """Writings of each letter to learn from, and replays of each."""
-    steps: int = 16000
+    steps: int = option(16000, quick=1500, least=1)
     """Steps in which the synapses change, in all."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_letters(self.skills, least=2)
-        at_least(2, self, "blocks")
         if self.skills % self.blocks:
             raise ValueError(f"{self.skills} skills cannot be shared out evenly among {self.blocks} blocks")
-        at_least(1, self, "writings", "steps")
-        wide_enough(self.hidden, 4)
-
-    def scaled(self) -> Args:
-        """With ``quick``, little of everything."""
-        if not self.quick:
-            return self
-        return replace(self, seeds=min(self.seeds, 2), skills=4, blocks=2, hidden=32, writings=4, steps=1500)
 
 
-def one_seed(seed: int, args: Args) -> list[Record]:
+def one_seed(seed: int, config: Config) -> list[Record]:
     """Every way, and after each lesson every block that was learned so far."""
     rng = np.random.default_rng(seed)
-    letters = repertoire(args.skills, 2, rng)
-    train, tests = copybook(letters, args.writings, 2, rng), copybook(letters, 4, 2, rng)
+    letters = repertoire(config.skills, 2, rng)
+    train, tests = copybook(letters, config.writings, 2, rng), copybook(letters, 4, 2, rng)
     means = mean_demonstrations(train, 2)
 
     def of(block: int, episodes: Sequence[Episode]) -> list[Episode]:
-        each = len(episodes) // args.blocks
+        each = len(episodes) // config.blocks
         return list(episodes[block * each : (block + 1) * each])
 
     records = []
     for way in WAYS:
         own = np.random.default_rng(seed)
-        lessons = [train] if way == "at once" else [of(block, train) for block in range(args.blocks)]
-        memory = Memory.untaught(lessons[0], args.hidden, own, 5, 30.0)
+        lessons = [train] if way == "at once" else [of(block, train) for block in range(config.blocks)]
+        memory = Memory.untaught(lessons[0], config.hidden, own, 5, 30.0)
         known: list[Episode] = []
         for number, lesson in enumerate(lessons):
-            again = replayed(memory, known, way, args.writings, own)
-            memory = memory.taught([*lesson, *again], own, args.steps // len(lessons))
+            again = replayed(memory, known, way, config.writings, own)
+            memory = memory.taught([*lesson, *again], own, config.steps // len(lessons))
             # What was made up stands for what was seen, so that nothing else need be kept.
-            known = [*again, *lesson] if way == "replay from nothing" else [*known, *lesson[:: args.writings]]
-            for block in range(args.blocks if way == "at once" else number + 1):
-                error, right = recalled(memory, of(block, tests), means, CUE, NAMES[: args.skills])
+            known = [*again, *lesson] if way == "replay from nothing" else [*known, *lesson[:: config.writings]]
+            for block in range(config.blocks if way == "at once" else number + 1):
+                error, right = recalled(memory, of(block, tests), means, CUE, NAMES[: config.skills])
                 where = {"seed": seed, "way": way, "after": number + 1, "block": block + 1}
                 records.append({**where, "last": number + 1 == len(lessons), "error_cm": error, "right": right})
     return records
@@ -139,9 +119,9 @@ def replayed(
     return [Episode.from_stream(streams[:, n], pen_spec(2)) for n in range(streams.shape[1])]
 
 
-def tables(records: Sequence[Record], args: Args) -> list[Table]:
+def tables(records: Sequence[Record], config: Config) -> list[Table]:
     """By way: what is left of each block after the last lesson."""
-    blocks = range(1, args.blocks + 1)
+    blocks = range(1, config.blocks + 1)
     heads = ("", *(f"block {b}" for b in blocks), "all")
 
     def rows(value: str) -> list[tuple[str, ...]]:
@@ -150,16 +130,17 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
 
         return [(way, *(last(way, block=b) for b in blocks), last(way)) for way in WAYS]
 
-    what = f"of {args.skills} letters in {args.blocks} blocks after the last lesson, cue of {CUE}; mean ± SD over seeds"
+    what = f"of {config.skills} letters in {config.blocks} blocks after the last lesson"
+    what += f", cue of {CUE}; mean ± SD over seeds"
     return [
         Table(f"Offline error [cm] {what}", heads, rows("error_cm")),
         Table("Right letter recalled [share]", heads, rows("right")),
     ]
 
 
-def drawn(records: Sequence[Record], args: Args) -> Figure:
+def drawn(records: Sequence[Record], config: Config) -> Figure:
     """The first block over the lessons, and each block after the last."""
-    lessons = range(1, args.blocks + 1)
+    lessons = range(1, config.blocks + 1)
     with figure(height=3.0, width=8) as fig:
         axes = fig.subplots(1, 2)
         for i, way in enumerate(WAYS):
@@ -176,19 +157,8 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
     return fig
 
 
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Every seed."""
-    args = args.scaled()
-    with stage("learning letters in blocks", console, seconds) as progress:
-        found = parallel_map(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
-    records = [r for own in found for r in own]
-    return Findings(records, tables(records, args), drawn(records, args), {})
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Runs the study, and returns the exit code."""
-    return reproduce("retention", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    work = partial(one_seed, config=config)
+    records = kit.together(kit.each("learning letters in blocks", work, config.repetitions, config))
+    return Findings(records, tables(records, config), drawn(records, config))

@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 
 from asm_gym.episode import Episode
-from asm_gym.scripts.reproduce.common import Record
 from asm_gym.scripts.reproduce.expression import Backpropagated, Expresser, Hopfield, Library, Memory, Rows
+from asm_gym.scripts.reproduce.kit import Record
 
 RECALLED = {"Lift": 65, "Stack": 115, "PickPlaceCan": 145}
 """Steps recalled of the robosuite skills."""

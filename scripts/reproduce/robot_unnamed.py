@@ -11,8 +11,8 @@ from sklearn.metrics import adjusted_rand_score
 
 from asm_gym.episode import Episode
 from asm_gym.monitors.model import running
-from asm_gym.scripts.reproduce.common import Record
 from asm_gym.scripts.reproduce.expression import Memory, Rows
+from asm_gym.scripts.reproduce.kit import Record
 from asm_gym.scripts.reproduce.segments import judged, parted, share_near, unnamed
 
 KNOWN_BY = slice(0, None), slice(-20, None)

@@ -13,23 +13,21 @@ shown every other change too, and asked for the rest. One more row says what lim
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from asm_gym.episode import Episode
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
-from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import CRASH
-from asm_gym.scripts.command import at_least
-from asm_gym.scripts.reproduce.common import Common, Findings, Record, demonstrations, reproduce
+from asm_gym.scripts.options import option
+from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.kit import Findings, Record
+from asm_gym.scripts.reproduce.recordings import demonstrations
 from asm_gym.scripts.reproduce.skill_names import (
     Named,
     Right,
@@ -41,7 +39,8 @@ from asm_gym.scripts.reproduce.skill_names import (
     partings,
 )
 from asm_gym.scripts.reproduce.skill_recognition import AFTER_S, naming_figure, share_right
-from asm_gym.scripts.reproduce.skill_switch import NAMES, Switch, record_switch
+from asm_gym.scripts.reproduce.skill_switch import NAMES, Switch
+from asm_gym.scripts.reproduce.skill_switch import switches as recorded_switches
 
 FOLLOWED_S = 2.0
 """An alarm so long after a change is put down to it [s]."""
@@ -51,56 +50,49 @@ PARTED_S = (0.0, 0.5, 1.0)
 
 
 @dataclass(frozen=True)
-class Args(Common):
+class Config(kit.Config):
     """Episodes in which one skill follows another."""
 
-    tasks: tuple[str, ...] = ("Lift", "Stack", "Door", "PickPlaceCan", "PickPlaceMilk", "NutAssemblySquare")
+    tasks: tuple[str, ...] = option(
+        ("Lift", "Stack", "Door", "PickPlaceCan", "PickPlaceMilk", "NutAssemblySquare"), quick=tuple(NAMES.values())
+    )
     """Skills that are told apart."""
-    told: int = 20
+    told: int = option(20, quick=2, least=1)
     """Episodes of each skill whose name is told."""
-    nominal: int = 12
+    nominal: int = option(12, quick=1, least=1)
     """Other episodes of each skill."""
-    switches: int = 30
+    switches: int = option(30, quick=1, least=1)
     """Episodes with a change of skill."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(1, self, "told", "nominal", "switches")
         missing = set(NAMES.values()) - set(self.tasks)
         if missing:
             raise ValueError(f"tasks must hold those that are changed between, {', '.join(sorted(missing))} is missing")
 
-    def scaled(self) -> Args:
-        """With ``quick``, little of everything."""
-        return replace(self, tasks=tuple(NAMES.values()), told=2, nominal=1, switches=1) if self.quick else self
 
-
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Records, names, judges and sums up."""
-    args = args.scaled()
     memory = NeuralASM.pretrained("panda")
-    told = demonstrations(args, args.tasks, "fit", args.told, console, seconds)
-    nominal = demonstrations(args, args.tasks, "nominal", args.nominal, console, seconds)
-    with stage("changing skills", console, seconds) as progress:
-        wanted = [args.out / "switches" / f"{args.seed + n}.npz" for n in range(args.switches)]
-        paths = parallel_map(record_switch, wanted, args.workers, progress)
-    switches = [Switch.read(path, memory.spec) for path in paths]
-    with stage("learning", console, seconds):
-        learned = NeuralASM(memory.spec, seed=args.seed).fit(told)
-    with stage("naming", console, seconds):
+    told = demonstrations(config, config.tasks, "fit", config.told)
+    nominal = demonstrations(config, config.tasks, "nominal", config.nominal)
+    switches = [Switch.read(path, memory.spec) for path in recorded_switches(config, config.switches)]
+    with kit.stage("learning"):
+        learned = NeuralASM(memory.spec, seed=config.seed).fit(told)
+    with kit.stage("naming"):
         named = {
             "memory of the body": by_memory(memory, told, nominal, switches),
             "memory of the body, shown changes": by_memory_shown(memory, told, nominal, switches),
             "memory that learned from them": by_memory(learned, told, nominal, switches),
-            "random forest on the rows": by_forest(told, nominal, switches, args.seed),
-            "random forest, shown changes": by_forest_shown(told, nominal, switches, args.seed),
+            "random forest on the rows": by_forest(told, nominal, switches, config.seed),
+            "random forest, shown changes": by_forest_shown(told, nominal, switches, config.seed),
             "the nearer place of the hand": by_place(told, switches),
         }
-    with stage("judging", console, seconds):
+    with kit.stage("judging"):
         records = alarms(memory, nominal, switches)
     dt = nominal[0].spec.dt
     tables = [alarms_table(records), *named_tables(named, dt)]
-    if {"Lift", "Stack"} <= set(args.tasks):
+    if {"Lift", "Stack"} <= set(config.tasks):
         tables.append(parted_table(named, nominal))
     return Findings(records, tables, _drawn(named, dt), {"threshold": memory.threshold})
 
@@ -208,12 +200,3 @@ def for_good(right: Right, dt: float) -> float:
 
 def _drawn(named: dict[str, Named], dt: float) -> Figure:
     return naming_figure({name: found.switched for name, found in named.items()}, dt, since="a change of skill")
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Asks, and returns the exit code."""
-    return reproduce("skill_change", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -14,6 +14,7 @@ from asm_gym.episode import Episode, load_episode, save_episode
 from asm_gym.monitors.model import running
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
 from asm_gym.rollouts.trial import environment
+from asm_gym.scripts.reproduce import kit
 from asm_gym.spec import StreamSpec
 from asm_gym.wrappers import StreamRecorder
 
@@ -59,6 +60,12 @@ def record_switch(path: Path) -> Path:
     if not path.is_file():
         raise RuntimeError(f"none of 20 attempts sorted both things with seed {seed}")
     return path
+
+
+def switches(config: kit.Config, count: int, kind: str = "switches", first: int = 0) -> list[Path]:
+    """So many of them in the folder of a study, recorded where they are not there yet; ``first`` is added to seeds."""
+    wanted = [config.out / kind / f"{config.seed + first + n}.npz" for n in range(count)]
+    return kit.each("changing skills", record_switch, wanted, config)
 
 
 def _sort_both(seed: int) -> Episode | None:

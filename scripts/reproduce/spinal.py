@@ -25,7 +25,7 @@ from asm_gym.envs.backend import PHYSICS_FREQ
 from asm_gym.evaluation.scored import IDEAL, POLICY_ALONE
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.spinal import SpinalBand
+from asm_gym.monitors.contact_band import ContactBand
 from asm_gym.policies import rollout
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
@@ -79,7 +79,7 @@ class Felt(NamedTuple):
     force: float  # the largest on the arm from outside, from the onset on [N]
 
 
-def run(trial: Trial, config: RolloutConfig, memory: NeuralASM, band: SpinalBand, onset: int) -> Felt:
+def run(trial: Trial, config: RolloutConfig, memory: NeuralASM, band: ContactBand, onset: int) -> Felt:
     """Plays one trial under the band; ``"policy alone"`` and ``"ideal"`` are not touched by it."""
     felt: list[NDArray[np.float64]] = []
     left: list[float] = []
@@ -87,11 +87,11 @@ def run(trial: Trial, config: RolloutConfig, memory: NeuralASM, band: SpinalBand
     with staged(trial, config) as env:
         arm: Any = env.unwrapped
         act = "hold" if trial.acting == SPINAL else "monitor"
-        guarded: Any = NeuralASMSafety(env, memory, on_alarm=act, spinal=band, on_overrun="ignore")
+        guarded: Any = NeuralASMSafety(env, memory, on_alarm=act, band=band, on_overrun="ignore")
 
         def keep(info: dict[str, Any]) -> None:
-            if info["asm"]["spinal_s"] is not None:
-                left.append(len(felt) * band.spec.dt + info["asm"]["spinal_s"])
+            if not math.isnan(after := info["asm"]["severity"]["left_s"]):
+                left.append(len(felt) * band.spec.dt + after)
             felt.append(arm.felt)
             if len(felt) > onset:
                 forces.append(info["external_force"])
@@ -100,7 +100,7 @@ def run(trial: Trial, config: RolloutConfig, memory: NeuralASM, band: SpinalBand
     return Felt(np.concatenate(felt), tuple(left), max(forces, default=math.nan))
 
 
-def measured(seed: int, task: str, kind: str, memory: NeuralASM, band: SpinalBand) -> Record:
+def measured(seed: int, task: str, kind: str, memory: NeuralASM, band: ContactBand) -> Record:
     """One episode of a kind, with its twin."""
     config, trial = RolloutConfig(), Trial(env_id(task), seed, kind, SEVERITY, acting=POLICY_ALONE, after_s=AFTER_S)
     onset = trial.begins(environment(trial.env_id, config.settings))

@@ -15,7 +15,7 @@ from asm_gym.evaluation.metrics import placements
 from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
 from asm_gym.monitors import CalibratedMonitor, NeuralASM
 from asm_gym.rollouts.scoring import detectability_of, traces_of
-from asm_gym.scripts.reproduce.common import Record
+from asm_gym.scripts.reproduce.kit import Record
 from asm_gym.scripts.reproduce.transfer_watched import Watched
 from asm_gym.spec import StreamSpec
 

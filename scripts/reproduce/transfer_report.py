@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table, count
-from asm_gym.scripts.reproduce.common import Record
+from asm_gym.scripts.reproduce.kit import Record
 
 
 def chosen(records: Sequence[Record], **where: Any) -> list[Record]:
@@ -50,10 +50,10 @@ def memories(records: Sequence[Record]) -> list[str]:
     return list(dict.fromkeys(r["memory"] for r in records))
 
 
-def tables(records: Sequence[Record], senses: Sequence[Record], args: Any) -> list[Table]:
+def tables(records: Sequence[Record], senses: Sequence[Record], config: Any) -> list[Table]:
     """By memory, by policy, by what is found, and by what the stream lacks."""
     groups = list(dict.fromkeys(r["group"] for r in records))
-    rate = f"thresholds for {100 * args.false_alarm_rate:g} % of healthy episodes"
+    rate = f"thresholds for {100 * config.false_alarm_rate:g} % of healthy episodes"
     rows = [
         (
             name,
@@ -69,8 +69,8 @@ def tables(records: Sequence[Record], senses: Sequence[Record], args: Any) -> li
         Table(
             f"Healthy episodes with an alarm, apart those that solved the task, by what the memory of the body met, "
             f"and those that failed; alarms in an hour of solved episodes of what it never met; AUROC against the same "
-            f"steps of healthy episodes, and faults found within {args.window:g} s, of medium and strong severity that "
-            f"an ideal observer could see; {rate}. The first memory is of the experts, all others learned from "
+            f"steps of healthy episodes, and faults found within {config.window:g} s, of medium and strong severity "
+            f"that an ideal observer could see; {rate}. The first memory is of the experts, all others learned from "
             f"babbling, the shipped one from more of it, at a rate of its own. +evidence: under our detection.",
             heads,
             rows,

@@ -20,13 +20,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from rich.console import Console
 
 from asm_gym.checkpoint import kind_of, read_checkpoint
 from asm_gym.data.datasets import read_dataset
 from asm_gym.episode import load_episode
 from asm_gym.files import UNFINISHED
 from asm_gym.monitors import NeuralASM
-from asm_gym.scripts import cli
+from asm_gym.scripts import cli, train
 from tests.streams import sine_episodes, sine_spec
 
 FULL = 120 * 1024
@@ -62,16 +63,23 @@ def commands(out: Path) -> list[Work]:
     """What is killed, in folders of ``out``; the last goes on with what the evaluation before it left."""
     evaluate = """evaluate --tasks Lift --monitors kalman --faults push --severities strong --harmless touch --no-video
         --fit-episodes 2 --calibration-episodes 5 --nominal-episodes 1 --faulty-episodes 1 --harmless-episodes 1"""
-    train = """train Lift --demonstrations 1 --cloning-updates 40 --steps 60 --checkpoint-every 20
-        --evaluate-every 30 --evaluation-episodes 1 --final-episodes 1"""
-    react = "react --tasks Lift --reflexes hold --faults passing_push --episodes 1 --false-alarm-rate 0.2 --run"
+    react = """reproduce reflexes --tasks Lift --reflexes hold --faults passing_push --episodes 1
+        --false-alarm-rate 0.2 --run"""
     return [
         Work("save", save_for_ever, lambda folder: NeuralASM.load(folder / "x.asm").hidden_size in SIZES),
         Work("collect", command("collect Lift --episodes 3"), recorded),
         Work("evaluate", command(f"{evaluate} --false-alarm-rate 0.2"), tables),
-        Work("train", command(train), agent),
+        Work("train", trained, agent),
         Work("react", command(react, out / "evaluate" / "whole"), tables),
     ]
+
+
+def trained(folder: Path) -> int:
+    """An agent of few steps, by one worker, into a folder."""
+    few = {"demonstrations": 1, "cloning_updates": 40, "steps": 60, "checkpoint_every": 20, "evaluate_every": 30}
+    args = train.Args(**few, evaluation_episodes=1, final_episodes=1, seed=3, out=folder)  # type: ignore[arg-type]
+    train.train_and_report(args, Console())
+    return 0
 
 
 def command(line: str, *more: Path) -> Callable[[Path], int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from asm_gym.wrappers.learners import EpisodeSafety, SafetyCounter
+from asm_gym.wrappers.logging import EpisodeSafety, SafetyCounter
 
 
 class SafetyCallback(BaseCallback):

@@ -46,7 +46,7 @@ ANCHOR, ANCHOR_RATE = 2, 1e-3
 
 @dataclass(frozen=True)
 class Setting:
-    """What all runs of a comparison share; the names are those of ``asm-gym train-safely``'s options."""
+    """What all runs of a comparison share; the names are those of ``asm-gym reproduce safe_training``'s options."""
 
     env_id: str
     steps: int

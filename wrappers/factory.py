@@ -8,6 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 
+from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection.adaptive import AdaptiveThreshold, RunningThreshold
 from asm_gym.monitors import ExpectsActions, ExplainsItself, Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
@@ -15,7 +16,7 @@ from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract, nea
 from asm_gym.protocols import SensesWithinSteps
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.validation import check_number, shown
-from asm_gym.wrappers.patience import Patience
+from asm_gym.wrappers.arbiter import ReleaseRule
 
 LOG = logging.getLogger("asm_gym.safety")
 
@@ -29,6 +30,8 @@ REFLEXES: dict[str, Callable[[gym.Env[Any, Any]], Policy]] = {
 """Reflexes by name: policies that act after an alarm."""
 ON_ALARM = ("monitor", *REFLEXES, "terminate")
 """Names that ``on_alarm`` takes."""
+OnAlarm = str | Policy | Callable[[gym.Env[Any, Any]], Policy]
+"""What ``on_alarm`` takes."""
 
 
 @runtime_checkable
@@ -38,6 +41,14 @@ class Watches(Protocol):
     def initial_state(self, batch: int = 1) -> Any: ...
 
     def observe(self, state: Any, stream: Any) -> Any: ...
+
+
+@runtime_checkable
+class KnowsHealthyForces(Protocol):
+    """A monitor whose calibration episodes have shown what healthy motion feels like."""
+
+    healthy_: tuple[float, ...]
+    """(N,) the most that it reached, of each number that an arm feels [N m], [N]; empty where nobody knows."""
 
 
 @runtime_checkable
@@ -68,11 +79,17 @@ def fitted_to(monitor: Monitor, watched: StreamSpec) -> Monitor:
     return fewer
 
 
-def running(adapt: AdaptiveThreshold | None, threshold: float) -> RunningThreshold | None:
+def running(adaptive: AdaptiveThreshold | None, threshold: float) -> RunningThreshold | None:
     """The threshold that follows a policy, where it is to. Raises TypeError."""
-    if adapt is not None and not isinstance(adapt, AdaptiveThreshold):
-        raise TypeError(f"adapt must be an AdaptiveThreshold, got {shown(adapt)}")
-    return None if adapt is None else adapt.start(threshold)
+    if adaptive is not None and not isinstance(adaptive, AdaptiveThreshold):
+        raise TypeError(f"adaptive_threshold must be an AdaptiveThreshold, got {shown(adaptive)}")
+    return None if adaptive is None else adaptive.start(threshold)
+
+
+def fitted_parts(monitor: Monitor) -> tuple[Any, ...]:
+    """What of a monitor ``fit`` replaces; compared by identity."""
+    diagnosis = monitor.diagnosis_ if isinstance(monitor, ExplainsItself) else None
+    return monitor, diagnosis, monitor.network_ if isinstance(monitor, NeuralASM) else None
 
 
 def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
@@ -105,31 +122,73 @@ def body_memory(env: gym.Env[Any, Any], watched: StreamSpec) -> NeuralASM:
     return memory
 
 
-def make_reflex(on_alarm: str | Policy, env: gym.Env[Any, Any]) -> Policy | None:
-    """The policy that acts during an alarm; None where none does."""
-    if not isinstance(on_alarm, str):
-        if not callable(getattr(on_alarm, "predict", None)):
-            raise ValueError(f"on_alarm must be one of {', '.join(ON_ALARM)} or have a predict(), got {on_alarm!r}")
-        return on_alarm
-    if on_alarm not in ON_ALARM:
-        raise ValueError(f"unknown on_alarm {shown(on_alarm)}; known: {', '.join(ON_ALARM)}, or any policy")
-    return REFLEXES[on_alarm](env) if on_alarm in REFLEXES else None
+def make_reflex(on_alarm: OnAlarm, env: gym.Env[Any, Any]) -> Policy | None:
+    """The policy that acts during an alarm in ``env``; None where none does.
+
+    Args:
+        on_alarm: a name, a policy, or what makes one for an environment: a class such as ``BackOff``, or a function.
+
+    Raises:
+        ValueError: an unknown name, no policy, or a reflex that was made for another environment, whose arm it would
+            move.
+    """
+    if isinstance(on_alarm, str):
+        if on_alarm not in ON_ALARM:
+            raise ValueError(f"unknown on_alarm {shown(on_alarm)}; known: {', '.join(ON_ALARM)}, or any policy")
+        return REFLEXES[on_alarm](env) if on_alarm in REFLEXES else None
+    made: Any = on_alarm
+    if isinstance(on_alarm, type) or (callable(on_alarm) and not hasattr(on_alarm, "predict")):
+        made = on_alarm(env)
+    if not callable(getattr(made, "predict", None)):
+        raise ValueError(f"on_alarm must be one of {', '.join(ON_ALARM)} or have a predict(), got {shown(made)}")
+    if isinstance(made, Hold) and not made.explicit and made.env.unwrapped is not env.unwrapped:
+        name = type(made).__name__
+        raise ValueError(
+            f"this {name} was made for another environment, and would move that: give the class, on_alarm={name}, "
+            "or a function of the environment that makes it"
+        )
+    policy: Policy = made
+    return policy
 
 
-def make_patience(
+def make_rule(
     reflex: Policy | None,
     env: gym.Env[Any, Any],
     release_after: int,
     release_below: float,
     max_override: int | None,
     try_after: int | None,
-) -> Patience:
+) -> ReleaseRule:
     """When control is handed back, in control steps; ``Graded`` has limits of its own where none are given."""
-    if isinstance(reflex, Graded):
-        dt = control_period(env)
-        try_after = max(1, round(reflex.TRY_AFTER_S / dt)) if try_after is None else try_after
-        max_override = max(1, round(reflex.GIVE_UP_AFTER_S / dt)) if max_override is None else max_override
-    return Patience(release_after, release_below, max_override, try_after)
+    if not isinstance(reflex, Graded):
+        return ReleaseRule(release_after, release_below, max_override, try_after)
+    dt = control_period(env)
+
+    def steps(seconds: float) -> int:
+        return max(1, round(seconds / dt))
+
+    return ReleaseRule(
+        release_after,
+        release_below,
+        steps(reflex.GIVE_UP_AFTER_S) if max_override is None else max_override,
+        steps(reflex.TRY_AFTER_S) if try_after is None else try_after,
+        strikes=reflex.STRIKES,
+        impulse=reflex.IMPULSE,
+        go_on=steps(reflex.GO_ON_S),
+    )
+
+
+def limits_of(contact_limits: ContactLimits | str | None, monitor: Monitor) -> ContactLimits | None:
+    """The limits themselves, or those that the memory's healthy range makes of the usual ones.
+
+    Raises:
+        ValueError: neither.
+    """
+    if contact_limits is None or isinstance(contact_limits, ContactLimits):
+        return contact_limits
+    if not isinstance(contact_limits, str) or contact_limits != "memory":
+        raise ValueError(f'contact_limits must be ContactLimits, "memory" or None, got {shown(contact_limits)}')
+    return ContactLimits(healthy=monitor.healthy_ if isinstance(monitor, KnowsHealthyForces) else ())
 
 
 def make_fallback(env: gym.Env[Any, Any]) -> Hold:

@@ -11,7 +11,7 @@ from asm_gym.faults import Fault
 from asm_gym.policies.holding import Begun, Hold
 
 
-class IdealReflex(gym.Wrapper[Any, Any, Any, Any]):
+class OracleReflex(gym.Wrapper[Any, Any, Any, Any]):
     """Stays in every step in which one of ``faults`` acts, from its first physics substep on; no monitor is as quick.
 
     Args:

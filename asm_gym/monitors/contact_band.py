@@ -97,7 +97,7 @@ class SentDown(NamedTuple):
         return found[:N], self.wide * np.exp(levels) + self.noise
 
 
-class SpinalBand:
+class ContactBand:
     """A band on external torques and forces at the wrist, from a memory.
 
     Args:

@@ -19,7 +19,7 @@ STILL = 0.02
 """A joint that turns by no more than this does not [rad/s]."""
 
 
-class Touch:
+class ContactEstimator:
     """Feels what presses, by one completion of all that a contact shows in.
 
     Args:

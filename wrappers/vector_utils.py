@@ -9,10 +9,14 @@ from typing import Any, Protocol, runtime_checkable
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
+from gymnasium.wrappers.vector import NormalizeObservation
 from numpy.typing import NDArray
 
 Mask = NDArray[np.bool_]
-ATTRIBUTES = ("stream_spec", "gripper_actions", "controller", "dt", "holding")
+ATTRIBUTES = (
+    *("stream_spec", "gripper_actions", "controller", "dt", "holding", "keeps_holding"),
+    *("felt_channels", "contact_limits", "observation_layout", "laid_out_space"),
+)
 """What monitors and reflexes ask an environment for."""
 
 
@@ -59,6 +63,18 @@ class Member(gym.Env[Any, Any]):
         action: NDArray[np.float32] = self._envs.call("action_for", turns)[self._index]
         return action
 
+    def slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(A,) what is commanded in the place of ``action``, by the speed that contact limits allow."""
+        slow: NDArray[np.float32] = self._envs.call("slowed", action)[self._index]
+        return slow
+
+    def force_behind(self, torques: NDArray[np.floating[Any]]) -> tuple[str, NDArray[np.float64]]:
+        """The link that is pressed, and the force on it; nowhere, where the members do not know."""
+        if not hasattr(self, "felt_channels"):
+            return "", np.zeros(3)
+        link, force = self._envs.call("force_behind", torques)[self._index]
+        return link, force
+
 
 def members(envs: VectorEnv[Any, Any, Any]) -> list[Member]:
     """The environments of a vector environment.
@@ -96,6 +112,26 @@ def refuse_changes(envs: VectorEnv[Any, Any, Any]) -> None:
                 "outside of VectorNeuralASMSafety"
             )
         envs = envs.env
+
+
+def refuse_running_statistics(envs: VectorEnv[Any, Any, Any]) -> None:
+    """Raises ValueError for a wrapper around all of them that makes more and more else of the same sense."""
+    while isinstance(envs, VectorWrapper):
+        if isinstance(envs, NormalizeObservation) and envs.update_running_mean:
+            raise ValueError(
+                "NormalizeObservation changes what it makes of the same sense as it goes on: put it outside, as in "
+                "NormalizeObservation(VectorNeuralASMSafety(envs, monitor)), or set its update_running_mean to False"
+            )
+        envs = envs.env
+
+
+def put(batch: Any, i: int, value: Any) -> Any:
+    """A copy of a batch, an array or a dict of such, with ``value`` at ``i``."""
+    if isinstance(batch, dict):
+        return {key: put(part, i, value[key]) for key, part in batch.items()}
+    changed = np.array(batch)
+    changed[i] = value
+    return changed
 
 
 def choose(mask: Mask, new: Any, old: Any) -> Any:

@@ -17,7 +17,7 @@ from asm_gym.protocols import LaysOutObservations
 from asm_gym.spec import StreamSpec
 from asm_gym.stream_source import StreamSource
 from asm_gym.validation import check_number, shown, typed
-from asm_gym.wrappers.arguments import check_monitor
+from asm_gym.wrappers.factory import check_monitor
 from asm_gym.wrappers.observer import Observer
 
 WELL_AFTER_S = 1.0
@@ -31,6 +31,15 @@ UNTOLD = 0.5
 
 TRUST_S = 1.0
 """Such a sense is completed by its last good value, and for so long at most [s]."""
+
+LONGEST_S = 20.0
+"""No sense is completed for longer than this [s]."""
+
+MOST_MISSING = 0.5
+"""Where more than this share of the senses is missing, what is left tells too little of them."""
+
+FARTHEST = 6.0
+"""No completed number goes further than so many of its spreads from its mean."""
 
 
 class Repair:
@@ -46,7 +55,7 @@ class Repair:
         self._completion, spec = completion, completion.spec
         self._read = np.ones(spec.size, bool) if read is None else read
         self._spec, self._patience = spec, round(check_number("trust_s", trust_s, low=0) / spec.dt)
-        self._well_after = max(1, round(WELL_AFTER_S / spec.dt))
+        self._well_after, self._longest = max(1, round(WELL_AFTER_S / spec.dt)), round(LONGEST_S / spec.dt)
         self._settle = 2 * completion.senses.lag + 1  # rows in which changes are taken from what was not yet repaired
         self.reset()
 
@@ -55,7 +64,12 @@ class Repair:
         self.missing = np.zeros(self._spec.size, bool)
         """(D,) which columns are completed."""
         self.settling = 0
-        """Rows until the monitor has seen nothing but repaired rows."""
+        """Rows until the monitor has seen nothing but repaired rows of a sense that was found at fault."""
+        self.lost = np.zeros(self._spec.size, bool)
+        """(D,) which numbers of the last row were not finite."""
+        self._returned = np.zeros(self._spec.size, np.int64)  # (D,) rows until its changes are those of the sense again
+        self._gone: set[str] = set()  # of those that are missing, which said nothing, and are believed when they do
+        self._since: dict[str, int] = {}  # rows for which each has been missing
         self._good: NDArray[np.float64] | None = None  # (D,) the last row before something was missing
         self._before: NDArray[np.float64] | None = None  # (D,) repaired
         self._raw = self._earlier = np.zeros(self._spec.size)
@@ -80,21 +94,35 @@ class Repair:
 
     @property
     def trusted(self) -> bool:
-        """Whether the policy can rely on it: False once a sense that nothing else tells of is missing for long."""
-        return self._unchecked <= self._patience
+        """Whether the policy can rely on it.
+
+        False once a sense that nothing else tells of is missing for long, any for very long, or too many at a time.
+        """
+        sensory = self._spec.sensory
+        few = self.missing[sensory].mean() <= MOST_MISSING if len(sensory) else True
+        return bool(few and self._unchecked <= self._patience and max(self._since.values(), default=0) <= self._longest)
+
+    @property
+    def unjudged(self) -> NDArray[np.bool_]:
+        """(D,) at which numbers nobody is surprised: those that are missing, or were so recently that their changes are
+        taken from what was completed."""
+        return self.missing | (self._returned > 0)
 
     def read(self, row: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """(D,) the next row, as it should be."""
         self._earlier, self._raw = self._raw, np.array(row, np.float64)
         self.settling = max(0, self.settling - 1)
+        self._returned = np.maximum(self._returned - 1, 0)
         finite = np.isfinite(self._raw)
+        self.lost = ~finite
         if not self._calm and finite.all():  # as nearly always
             self._good = self._before = self._raw
             return row.astype(np.float32)
+        self._since = {name: self._since.get(name, 0) + 1 for name in self._calm}
         lost = ~finite & ~self.missing
         lost[self._spec.motor] = False
         if lost.any() and not lost[self._spec.sensory].all():
-            self._doubt(lost)
+            self._gone |= self._doubt(lost)
         repaired = self._repaired()
         if self._calm:
             self._judge(repaired)
@@ -109,15 +137,17 @@ class Repair:
         wanted[columns] = True
         if wanted[self._spec.sensory].all() or not (wanted & ~self.missing).any():
             return None
-        self._doubt(wanted)
+        self._gone -= self._doubt(wanted)
+        self.settling = self._settle
         self._before = repaired = self._repaired()
         return repaired.astype(np.float32)
 
-    def _doubt(self, columns: NDArray[np.bool_]) -> None:
-        for name, own in self._completion.sensors:
-            if columns[own].any():
-                self._calm[name] = 0
+    def _doubt(self, columns: NDArray[np.bool_]) -> set[str]:
+        """Believes the sensors of ``columns`` (D,) no more; which those are."""
+        names = {name for name, own in self._completion.sensors if columns[own].any()}
+        self._calm |= dict.fromkeys(names, 0)
         self._choose()
+        return names
 
     def _choose(self) -> None:
         """Takes up which sensors are missing."""
@@ -125,12 +155,10 @@ class Repair:
         for name, own in self._completion.sensors:
             if name in self._calm:
                 self.missing[own] = True
-        self.settling = self._settle
         self._filling: Filling = self._completion.filling(self.missing)
         spread = self._completion.senses.spread[self._filling.columns]
         self._untold = self._filling.error > UNTOLD * spread  # (M,)
         self._guessed = self._untold & self._read[self._filling.columns]  # (M,)
-        self._unchecked = 0
 
     def _repaired(self) -> NDArray[np.float64]:
         if not self._calm:
@@ -141,7 +169,8 @@ class Repair:
         if self._guessed.any():
             last = self._completion.senses.mean if self._good is None else self._good
             value = np.where(self._guessed, last[columns], value)
-        repaired[columns] = value
+        mean, spread = self._completion.senses.mean[columns], self._completion.senses.spread[columns]
+        repaired[columns] = np.clip(value, mean - FARTHEST * spread, mean + FARTHEST * spread)
         return repaired
 
     def _judge(self, repaired: NDArray[np.float64]) -> None:
@@ -150,14 +179,22 @@ class Repair:
         self._unchecked = self._unchecked + 1 if self._guessed.any() else 0
         close = np.abs(self._raw[columns] - repaired[columns]) <= limit  # False for what is not finite
         repeats = (self._raw[columns] == self._earlier[columns]) & (self._spec.noise[columns] > 0)
+        back = np.isfinite(self._raw[columns]) & (close | self._untold)
         fine = dict(zip(columns.tolist(), (close & ~repeats & ~self._untold).tolist(), strict=True))
+        there = dict(zip(columns.tolist(), back.tolist(), strict=True))
+        well = []
         for name, own in self._completion.sensors:
             if name in self._calm:
                 self._calm[name] = self._calm[name] + 1 if all(fine[int(c)] for c in own) else 0
-        well = [name for name, rows in self._calm.items() if rows >= self._well_after]
+                # What said nothing, and says what is expected again, is believed at once; what was wrong is not.
+                if self._calm[name] >= self._well_after or (name in self._gone and all(there[int(c)] for c in own)):
+                    well.append(name)
+                    self._returned[own] = self._settle
+                    repaired[own] = self._raw[own]
         if well:
-            for name in well:
-                del self._calm[name]
+            self._gone -= set(well)
+            self._calm = {name: rows for name, rows in self._calm.items() if name not in well}
+            self._since = {name: rows for name, rows in self._since.items() if name in self._calm}
             self._choose()
 
 
@@ -183,8 +220,10 @@ class ObservationMap:
     def __init__(self, env: gym.Env[Any, Any], spec: StreamSpec) -> None:
         self._space, inner = env.observation_space, env.unwrapped
         if isinstance(inner, LaysOutObservations) and env.has_wrapper_attr("stream_spec"):
-            if self._space != inner.observation_space:
-                raise ValueError(f"a wrapper inside has changed the observation, which was {inner.observation_space}")
+            # One of many environments has the space of all, wrapped, and says what its own was.
+            own = getattr(inner, "laid_out_space", env.unwrapped.observation_space)
+            if self._space != own:
+                raise ValueError(f"a wrapper inside has changed the observation, which was {own}")
             self._places = _laid_out(inner.observation_layout, spec, self._space)
         elif not env.has_wrapper_attr("stream_spec") and isinstance(self._space, spaces.Box):
             self._places = [Place("", spec.sensory, np.arange(len(spec.sensory)))]

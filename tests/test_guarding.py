@@ -1,0 +1,377 @@
+"""What a guard promises at its edges: to copy, to be bound to its robot, to see its monitor change, and to hold."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import SyncVectorEnv
+
+from asm_gym.contact_limits import ContactLimits
+from asm_gym.monitors import NeuralASM
+from asm_gym.policies.reflexes import Hold, Retract
+from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
+from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
+from tests.test_completion import Judge
+from tests.test_responses import ACT as ARM_ACT
+from tests.test_responses import Acting, infos
+
+ACT = np.array([0.5, -0.5, 1.0], np.float32)
+
+
+# ---------------------------------------------------------------- missing numbers
+
+
+def blinks(every, since=20):
+    """One number is lost every so many rows, another each time."""
+
+    def broken(t, row):
+        if t >= since and t % every == 0:
+            row[(t // every) % 5] = np.nan
+
+    return broken
+
+
+class Finite(Judge):
+    """Surprised in the steps of ``cue``, and at what is not finite."""
+
+    def observe(self, state, stream):
+        state, surprise = super().observe(state, stream)
+        return state, surprise._replace(value=np.where(np.isfinite(stream).all(axis=1), surprise.value, np.inf))
+
+
+def test_a_number_that_is_missing_is_an_alarm_that_says_so_and_the_policy_goes_on():
+    said = infos(NeuralASMSafety(Acting(blinks(1000, 0)), Finite(()), "graded"), 5)
+    assert not any(s["alarm"] for s in said)
+    said = infos(NeuralASMSafety(Acting(blinks(30)), Finite(())), 40)
+    missing = [t for t, s in enumerate(said) if s["alarm"]]
+    assert missing == [29]
+    assert said[29]["reason"] == "missing"
+    assert said[29]["lost"] == ("observation[1]",)
+    assert said[29]["surprise"] < said[29]["threshold"]
+    assert said[29]["transition"] == "complete"
+    assert not any(s["intervened"] for s in said)
+    assert said[31]["completed"] == ()  # it says what is expected again, and is believed at once
+
+
+class Everywhere(Finite):
+    """Surprised at all senses alike."""
+
+    def observe(self, state, stream):
+        state, surprise = super().observe(state, stream)
+        shares = np.where(np.arange(self.spec.size) < 5, surprise.attribution.sum() / 5, 0.0)[None]
+        return state, surprise._replace(attribution=shares)
+
+
+@pytest.mark.parametrize("every", [2, 3, 10])
+def test_numbers_that_are_lost_in_turn_hide_no_surprise(every):
+    """Surprise went to 0 for three rows at each number that was lost, so that one every 150 ms hid everything."""
+    for step in range(25, 35):
+        said = infos(NeuralASMSafety(Acting(blinks(every)), Everywhere({step}, "contact"), "graded"), step + 2)
+        assert said[step]["reason"] == "surprise"
+        assert 3.9 < said[step]["surprise"] <= 10.0  # three of five senses are judged at least
+        assert said[step + 1]["intervened"]
+
+
+def test_where_most_senses_are_missing_the_robot_holds_and_says_why():
+    def broken(t, row):
+        row[:3] = np.nan if t >= 20 else row[:3]
+
+    env = NeuralASMSafety(Acting(broken), Finite(()), "graded")
+    with pytest.warns(UserWarning, match="too much is missing"):
+        said = infos(env, 30)
+    assert said[20]["alarm"]
+    assert all(s["intervened"] for s in said[21:])
+
+
+# ---------------------------------------------------------------- whose reflex
+
+
+class BackOff(Hold):
+    """A reflex of a user's."""
+
+
+def test_a_reflex_of_another_environment_is_refused_and_a_class_is_bound():
+    env = FakeEnv()
+    for reflex in (Hold, BackOff):
+        with pytest.raises(
+            ValueError, match=f"this {reflex.__name__} was made for another environment.*on_alarm={reflex.__name__}"
+        ):
+            NeuralASMSafety(env, CueMonitor([1]), on_alarm=reflex(FakeEnv()))
+        assert NeuralASMSafety(env, CueMonitor([1]), on_alarm=reflex(env)).reset(seed=0)
+        assert NeuralASMSafety(env, CueMonitor([1]), on_alarm=reflex).reset(seed=0)
+    made = []
+    NeuralASMSafety(env, CueMonitor([1]), on_alarm=lambda e: made.append(e) or BackOff(e))
+    assert made == [env]
+
+
+def test_what_a_spec_makes_anew_is_guarded_by_a_reflex_of_its_own():
+    gym.register("asm_gym_tests/Fake-v0", entry_point=FakeEnv)
+    try:
+        guarded = NeuralASMSafety(gym.make("asm_gym_tests/Fake-v0"), CueMonitor([1]), on_alarm=BackOff)
+        again = gym.make(guarded.spec)
+        again.reset(seed=0)
+        for _ in range(4):
+            again.step(ACT)
+        np.testing.assert_array_equal(again.unwrapped.actions, [ACT, ACT, [0, 0, 1], [0, 0, 1]])
+        bound = NeuralASMSafety(
+            gym.make("asm_gym_tests/Fake-v0"), CueMonitor([1]), on_alarm=Hold(FakeEnv(), np.zeros(3))
+        )
+        assert gym.make(bound.spec).reset(seed=0)  # an action of one's own belongs to no environment
+    finally:
+        del gym.registry["asm_gym_tests/Fake-v0"]
+
+
+# ---------------------------------------------------------------- copies
+
+
+def test_a_policy_that_uses_one_buffer_changes_nothing_that_was_said_or_kept():
+    env = FakeEnv()
+    guarded = NeuralASMSafety(env, CueMonitor([3]), on_alarm="hold")
+    guarded.reset(seed=0)
+    buffer, said = np.zeros(3, np.float32), []
+    for t in range(6):
+        buffer[:] = [0.1 * t, 0.0, 1.0 if t < 4 else -1.0]
+        said.append(guarded.step(buffer)[4]["asm"]["executed_action"])
+    np.testing.assert_allclose([s[0] for s in said], [0, 0.1, 0.2, 0.3, 0, 0], atol=1e-6)
+    np.testing.assert_allclose([s[2] for s in said], 1.0)  # the grip of before the alarm, whatever came into the buffer
+
+
+def test_going_back_undoes_what_was_done_whatever_became_of_the_buffer(lift):
+    reflex = Retract(lift, steps=3)
+    buffer = np.zeros(7, np.float32)
+    for x in (0.1, 0.2, 0.3):
+        buffer[0] = x
+        reflex.feel(np.zeros(1), buffer, acting=False)
+    np.testing.assert_allclose([reflex.move()[0] for _ in range(3)], [-0.3, -0.2, -0.1])
+
+
+class Driver(FakeEnv):
+    """Writes every row into one array, and every answer into one dict."""
+
+    def __init__(self):
+        super().__init__()
+        self.row, self.info = np.zeros(5, np.float32), {}
+
+    def _out(self, action):
+        sensed, info = super()._out(action)
+        self.row[:] = info["stream"]
+        self.info["stream"] = self.row
+        return sensed, self.info
+
+
+def test_a_recorder_keeps_what_a_driver_said_though_it_uses_its_arrays_again():
+    env = StreamRecorder(Driver())
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(ACT)
+    np.testing.assert_array_equal(env.finish().stream[:, 0], [1, 2, 3, 4])
+
+
+def test_an_info_that_an_environment_uses_again_says_nothing_of_steps_before():
+    env = NeuralASMSafety(Driver(), CueMonitor([1]), on_alarm="hold", release_after=2)
+    env.reset(seed=0)
+    assert [env.step(ACT)[4]["overridden"] for _ in range(6)] == [False, False, True, True, False, False]
+    assert set(env.unwrapped.info) == {"stream"}
+
+
+# ---------------------------------------------------------------- a monitor that changes
+
+
+class Changing(CueMonitor):
+    """Can be calibrated anew."""
+
+    def calibrate(self, episodes, false_alarm_rate=0.01):
+        self._threshold = 20.0
+        return self
+
+
+def test_a_threshold_that_was_set_anew_is_in_force_from_the_next_episode_on():
+    monitor = Changing([1])
+    env = NeuralASMSafety(FakeEnv(), monitor, on_alarm="hold")
+    env.reset(seed=0)
+    monitor.calibrate([])
+    assert env.threshold == 1.0
+    assert [env.step(ACT)[4]["asm"]["alarm"] for _ in range(3)] == [False, True, False]
+    env.reset(seed=0)
+    assert env.threshold == 20.0
+    assert [env.step(ACT)[4]["asm"]["alarm"] for _ in range(3)] == [False, False, False]
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_a_monitor_that_is_assigned_watches_from_the_next_episode_on(many):
+    inner = SyncVectorEnv([FakeEnv, FakeEnv]) if many else FakeEnv()
+    env = (VectorNeuralASMSafety if many else NeuralASMSafety)(inner, FadingMonitor([2]), on_alarm="hold")
+    act = np.stack([ACT, ACT]) if many else ACT
+
+    def alarms():
+        env.reset(seed=0)
+        return [bool(np.all(env.step(act)[4]["asm"]["alarm"])) for _ in range(5)]
+
+    assert alarms() == [False, True, False, False, False]
+    env.monitor = FadingMonitor([4])
+    assert alarms() == [False, False, False, True, False]
+    with pytest.raises(RuntimeError, match="not calibrated"):
+        env.monitor = CueMonitor(threshold=None)
+
+
+def test_a_memory_that_is_fitted_while_it_watches_is_an_alarm_until_it_is_taken_over():
+    monitor = Judge(())
+    env = NeuralASMSafety(Acting(), monitor, "hold")
+    assert not any(s["alarm"] for s in infos(env, 5))
+    monitor.diagnosis_ = Judge(()).diagnosis_  # as ``fit`` does
+    with pytest.warns(UserWarning, match="fitted while it watched"):
+        said = env.step(ARM_ACT)[4]["asm"]
+    assert said["alarm"]
+    assert said["reason"] == "failure"
+    assert not any(s["alarm"] for s in infos(env, 5))
+
+
+# ---------------------------------------------------------------- the box
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_no_action_leaves_the_box(many):
+    inner = SyncVectorEnv([FakeEnv, FakeEnv]) if many else FakeEnv()
+    env = (VectorNeuralASMSafety if many else NeuralASMSafety)(inner, FadingMonitor(), on_alarm="hold")
+    env.reset(seed=0)
+    wide = np.array([50.0, -50.0, 0.5], np.float32)
+    env.step(np.stack([wide, wide]) if many else wide)
+    inside = inner.envs[0] if many else inner
+    np.testing.assert_array_equal(inside.unwrapped.actions, [[1.0, -1.0, 0.5]])
+
+
+@pytest.mark.parametrize(
+    "action",
+    [np.ones(3) + 1j, np.ma.masked_array(np.ones(3), [0, 1, 0]), np.array(["1", "0", "0"]), ["1", "0", "0"]],
+)
+def test_what_would_lose_what_it_is_is_no_action(action):
+    env = NeuralASMSafety(FakeEnv(), CueMonitor())
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="an action must be numbers"):
+        env.step(action)
+
+
+def test_statistics_that_go_on_are_refused_around_many_environments_too():
+    many = gym.wrappers.vector.NormalizeObservation(SyncVectorEnv([FakeEnv, FakeEnv]))
+    with pytest.raises(ValueError, match="NormalizeObservation changes what it makes of the same sense"):
+        VectorNeuralASMSafety(many, FadingMonitor())
+    many.update_running_mean = False
+    VectorNeuralASMSafety(many, FadingMonitor())
+
+
+# ---------------------------------------------------------------- limits, on the arm
+
+
+def down(env, steps, seed=0):
+    """The largest contact force of a hand that is driven down [N], and what was said."""
+    env.reset(seed=seed)
+    action = np.array([0, 0, -1, 0, 0, 0, -1], np.float32)
+    forces, said = [], []
+    for _ in range(steps):
+        *_, terminated, truncated, info = env.step(action)
+        forces.append(info["contact_force"])
+        said.append(info)
+        if terminated or truncated:
+            break
+    return max(forces), said
+
+
+def test_a_hand_that_rams_the_table_is_stopped_by_default(lift):
+    alone, _ = down(lift, 60)
+    guarded = NeuralASMSafety(lift, NeuralASM.pretrained("panda"), on_overrun="ignore")
+    force, said = down(guarded, 100)
+    assert alone > 500.0
+    assert force < 0.5 * alone
+    assert said[-1]["asm"]["gave_up"]
+    assert any(i["asm"]["reason"] == "contact" for i in said)
+    speeds = [i["asm"]["severity"]["speed"] for i in said]
+    assert max(speeds) < 0.19
+    assert np.isnan(lift.unwrapped.measured).sum() == 0
+
+
+def test_limits_are_forgotten_by_reset_and_change_nothing_of_gentle_motion(lift):
+    gentle = np.array([0.2, 0.1, 0.1, 0, 0, 0, -1], np.float32)
+
+    def rows(limits):
+        lift.reset(seed=3)
+        lift.unwrapped.contact_limits = limits
+        return np.stack([lift.step(gentle)[4]["stream"] for _ in range(10)])
+
+    np.testing.assert_array_equal(rows(ContactLimits()), rows(None))
+    lift.reset(seed=3)
+    assert lift.unwrapped.contact_limits is None
+
+
+def test_who_only_watches_is_told_of_limits_and_neither_slowed_nor_stopped(lift):
+    alone, _ = down(lift, 40)
+    watched, said = down(NeuralASMSafety(lift, NeuralASM.pretrained("panda"), "monitor", on_overrun="ignore"), 40)
+    assert watched == alone
+    assert any(i["asm"]["reason"] == "contact" and i["cost"] for i in said)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"wrist_force": 0.0}, "wrist_force must be a number above 0, got 0.0"),
+        ({"hand_speed": float("nan")}, "hand_speed must be a number above 0, got nan"),
+        ({"healthy": (1.0, -2.0)}, "healthy must be a number of at least 0, got -2.0"),
+    ],
+)
+def test_limits_that_are_none_are_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        ContactLimits(**given)
+
+
+def test_limits_of_another_arm_are_refused_at_construction(lift):
+    with pytest.raises(ValueError, match="healthy must say 10 numbers"):
+        NeuralASMSafety(lift, NeuralASM.pretrained("panda"), contact_limits=ContactLimits(healthy=(1.0, 2.0)))
+    with pytest.raises(ValueError, match="contact_limits must be ContactLimits"):
+        NeuralASMSafety(lift, NeuralASM.pretrained("panda"), contact_limits="none")
+
+
+def test_what_healthy_motion_was_seen_to_reach_counts_where_it_is_more(lift):
+    felt = lift.unwrapped.felt_channels
+    most = ContactLimits(healthy=(50.0, *[1.0] * 9)).most(felt)
+    np.testing.assert_array_equal(most, [50, *[40] * 6, 80, 80, 80])
+
+
+def test_side_by_side_robots_are_stopped_as_each_alone():
+    envs = VectorNeuralASMSafety(
+        SyncVectorEnv([lambda: gym.make("asm_gym/Lift-v0")] * 2), NeuralASM.pretrained("panda")
+    )
+    envs.reset(seed=[0, 1])
+    action = np.array([[0, 0, -1, 0, 0, 0, -1], [0, 0, 0.2, 0, 0, 0, -1]], np.float32)
+    forces, alarms = np.zeros(2), np.zeros(2, bool)
+    for _ in range(40):
+        *_, info = envs.step(action)
+        forces = np.maximum(forces, info["contact_force"])
+        alarms |= info["asm"]["reason"] == "contact"
+    assert forces[0] < 400.0
+    assert forces[1] < 20.0
+    assert alarms.tolist() == [True, False]
+    envs.close()
+
+
+def test_a_wrapper_inside_that_skips_frames_is_held_in_every_one(lift):
+    env = NeuralASMSafety(
+        gym.wrappers.MaxAndSkipObservation(lift, skip=4),
+        CueMonitor(range(3, 500), spec=lift.unwrapped.stream_spec),
+        on_alarm="hold",
+        contact_limits=None,
+    )
+    env.reset(seed=1)
+    action = np.array([1, 1, 1, 1, -1, 1, 1], np.float32)
+    for _ in range(5):
+        env.step(action)
+    start = lift.unwrapped.simulation.data.qpos[:7].copy()
+    for _ in range(12):
+        env.step(action)
+    assert np.abs(lift.unwrapped.simulation.data.qpos[:7] - start).max() < 0.05
+
+
+def test_steps_in_alarm_are_counted_for_wrappers_outside_that_skip_some():
+    env = NeuralASMSafety(FakeEnv(), CueMonitor([1, 2, 6]), on_alarm="monitor")
+    env.reset(seed=0)
+    infos = [env.step(ACT)[4] for _ in range(8)]
+    assert [i["cost_sum"] for i in infos] == [0, 1, 2, 2, 2, 2, 3, 3]
+    assert infos[-1]["asm"]["alarms"] == 3
+    assert env.reset(seed=0)[1]["cost_sum"] == 0

@@ -1,0 +1,191 @@
+"""What guards one environment, by itself or among many: from a row and its surprise to who acts next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.contact_limits import ContactLimits
+from asm_gym.monitors import Monitor, Surprise
+from asm_gym.monitors.contact_band import ContactBand
+from asm_gym.validation import check_flag, shown
+from asm_gym.wrappers.arbiter import NOTHING, Arbiter, Sensed
+from asm_gym.wrappers.factory import (
+    OnAlarm,
+    check_expectation,
+    limits_of,
+    make_fallback,
+    make_reflex,
+    make_rule,
+    names_causes,
+)
+from asm_gym.wrappers.observer import joined
+from asm_gym.wrappers.reports import CONTACT, FAILURE, MISSING, SURPRISE, RowReport
+from asm_gym.wrappers.responses import NO_RESPONSE, Responder, responses_from
+from asm_gym.wrappers.severity import Severity, SeverityEstimator
+from asm_gym.wrappers.substeps import Beneath, SubstepGuard
+
+
+@dataclass(frozen=True)
+class GuardOptions:
+    """What the safety wrappers take beside environment and monitor; see ``NeuralASMSafety``.
+
+    Raises:
+        ValueError: responses for another reflex than ``"graded"``, or such as would let a pressing arm go on.
+    """
+
+    on_alarm: OnAlarm | None = None
+    release_after: int = 10
+    release_below: float = 0.8
+    max_override: int | None = None
+    try_after: int | None = None
+    truncate: bool = False
+    responses: Mapping[str, str] | None = None
+    contact_limits: ContactLimits | str | None = "memory"
+    band: ContactBand | None = None
+
+    def __post_init__(self) -> None:
+        check_flag("truncate", self.truncate)
+        responses_from(self.responses)
+
+    def reaction(self, monitor: Monitor) -> OnAlarm:
+        """``on_alarm``, or what the monitor makes of None."""
+        chosen: OnAlarm = self.on_alarm or ("graded" if names_causes(monitor) else "hold")
+        if self.responses is not None and chosen != "graded":
+            raise ValueError(f"responses are those of on_alarm='graded', got on_alarm={shown(chosen)}")
+        return chosen
+
+
+class Guard:
+    """Guards one environment.
+
+    Args:
+        env: what it acts in; one of many, as far as it can be asked.
+        monitor: fitted and calibrated.
+        options: of the wrapper.
+        threshold: what surprise must exceed for an alarm.
+        box: of the actions; None where no reflex can act.
+        rows_per_step: of the stream.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        monitor: Monitor,
+        options: GuardOptions,
+        threshold: float,
+        box: gym.spaces.Box | None,
+        rows_per_step: int = 1,
+    ) -> None:
+        chosen = options.reaction(monitor)
+        reflex = make_reflex(chosen, env)
+        self.reflex = reflex
+        self.recalls = check_expectation(reflex, monitor)
+        """The monitor is to be asked what it expects to be commanded."""
+        self.ends_on_alarm = chosen == "terminate"
+        graded, acts = chosen == "graded", chosen != "monitor" and box is not None
+        self.responder = Responder(env, monitor, responses_from(options.responses), repairs=graded)
+        rule = make_rule(
+            reflex, env, options.release_after, options.release_below, options.max_override, options.try_after
+        )
+        fallback = None if box is None else make_fallback(env)
+        self.substeps = SubstepGuard(env, limits_of(options.contact_limits, monitor), acts, options.band, monitor)
+        self.arbiter = Arbiter(reflex, threshold, rule.in_rows(rows_per_step), fallback, box)
+        self._severity = SeverityEstimator(monitor.spec)
+        self.largest: float | None = None
+        """Surprise in this episode, while the policy acted."""
+
+    def begin(self) -> None:
+        """A new episode has begun in the environment."""
+        self.arbiter.reset()
+        self.responder.reset()
+        self.substeps.begin()
+        self._severity.reset()
+        self.largest = None
+
+    def read(self, row: NDArray[np.float32], failure: str) -> tuple[NDArray[np.float32], str]:
+        """(D,) the next row as the monitor is to see it, and what failed so far."""
+        row = self.responder.read(row)
+        return row, joined(failure, self.responder.doubt)
+
+    def heard(self, surprise: Surprise, failed: bool) -> Surprise:
+        """What counts of the surprise at that row, one in a batch."""
+        surprise = surprise.without(self.responder.unjudged)
+        if self.responder.settling and not failed:
+            surprise = surprise.silenced(np.ones(1, np.bool_))
+        return surprise
+
+    def judge(
+        self,
+        surprise: Surprise,
+        row: NDArray[np.float32],
+        executed: NDArray[np.float32],
+        failure: str,
+        beneath: Beneath | None,
+        expected: NDArray[np.float32] | None = None,
+        latency: float = 0.0,
+    ) -> RowReport:
+        """Who acts next, and what is to be said of the row.
+
+        Args:
+            surprise: as ``heard``, one in a batch.
+            row: (D,) as ``read``.
+            executed: (A,).
+            failure: what failed; empty where nothing did.
+            beneath: what came of the control step that the row ends; None where it ends none.
+            expected: (A,) what the monitor expects to be commanded next.
+            latency: of the monitor [s].
+        """
+        arbiter, value = self.arbiter, float(surprise.value[0])
+        if failure:
+            arbiter.warn(failure, "which counts as an alarm")
+        held = arbiter.overriding
+        load, left_s = Beneath() if beneath is None else beneath
+        severity = self._severity.of(row, load, left_s, held)
+        over, lost = not value <= arbiter.threshold, self.responder.lost
+        alarm = over or bool(lost) or severity.presses
+        if alarm and lost and not (over or severity.presses or failure or severity.fast):
+            response = self.responder.missed()
+        else:
+            response = self.responder.respond(
+                alarm, bool(failure), surprise.attribution[0], severity, arbiter.may_go_on
+            )
+        sensed = Sensed(
+            surprise=value,
+            row=row,
+            executed=executed,
+            alarm=alarm,
+            presses=severity.presses,
+            impulse=severity.impulse,
+            response=response.name,
+            touched=response.touched,
+            why=response.why,
+            expected=expected,
+            ends_step=beneath is not None,
+        )
+        decision = arbiter.decide(sensed)
+        if not decision.intervened:
+            self.largest = max(self.largest or 0.0, value)
+            if severity.presses:
+                self.substeps.pressed()
+            elif beneath is not None:
+                self.substeps.acted()
+        reasons = {CONTACT: severity.presses, FAILURE: bool(failure), SURPRISE: over, MISSING: bool(lost)}
+        reason = next((name for name, holds in reasons.items() if holds), "")
+        failure = joined(failure, decision.failure)
+        return RowReport(surprise, decision, latency, failure, response, severity, reason)
+
+    @property
+    def forgets(self) -> bool:
+        """Whether the evidence so far is of rows that were not what they should have been."""
+        return self.responder.settling
+
+
+def nothing(surprise: Surprise) -> RowReport:
+    """Of a row in which there was nothing to decide."""
+    return RowReport(surprise, NOTHING, 0.0, "", NO_RESPONSE, Severity(), "")

@@ -1,0 +1,147 @@
+"""What is watched beneath a control step: the contact limits of an episode, and a learned band for the coming step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.contact_limits import ContactLimits
+from asm_gym.monitors import Monitor, NeuralASM
+from asm_gym.monitors.contact_band import UNJUDGED, Band, ContactBand
+from asm_gym.monitors.monitor import MonitorState
+from asm_gym.protocols import FeelsWithinSteps, LimitsContact
+from asm_gym.spec import control_period
+from asm_gym.validation import shown
+
+CAREFUL = 1.0 / 3.0
+"""Share of the speed limit that a hand has after it has pressed too hard."""
+
+CAREFUL_S = 1.0
+"""For so long [s], counted while the policy acts."""
+
+
+class Beneath(NamedTuple):
+    """What came of a control step beneath it.
+
+    Attributes:
+        load: the largest share of a contact limit that was felt; not a number where nobody feels within steps.
+        left_s: when, after the step began, a limit was passed or a band left [s]; not a number where none was.
+    """
+
+    load: float = np.nan
+    left_s: float = np.nan
+
+
+def limits_for(limits: ContactLimits | None, acts: bool) -> ContactLimits | None:
+    """What an environment is told: where nothing ``acts``, limits are only compared with."""
+    return limits if limits is None or acts else replace(limits, stays=False, hand_speed=np.inf)
+
+
+class SubstepGuard:
+    """What connects a guard with one environment's physics substeps.
+
+    Limits go to the environment once an episode, and it compares them in every substep. Where it does not, nobody knows
+    what presses between rows.
+
+    Args:
+        env: wrapped or not.
+        limits: None for none.
+        acts: the arm stays from the substep after a limit was passed, and its hand is slowed down.
+        band: calibrated; what the arm should feel in the coming step, sent down before each. None for none. Where
+            the environment does not feel within steps, it is compared with the row that ends a step, and a warning says
+            so.
+        monitor: what watches; the memory of the band, or one with its weights.
+
+    Raises:
+        ValueError: the band is of another memory, or ``env`` has other arms; limits of another arm.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        limits: ContactLimits | None,
+        acts: bool,
+        band: ContactBand | None,
+        monitor: Monitor,
+    ) -> None:
+        inner = env.unwrapped
+        self._limited = inner if isinstance(inner, LimitsContact) else None
+        self._limits = limits_for(limits, acts)
+        if limits is not None and self._limited is not None:
+            limits.most(self._limited.felt_channels)
+        self._band, self._acts = band, acts
+        self._arm = inner if isinstance(inner, FeelsWithinSteps) else None
+        if band is not None:
+            self._check(band, monitor, inner)
+        self._careful_steps = max(1, round(CAREFUL_S / control_period(env)))
+        self._careful = 0  # steps of the policy for which its hand is slower still
+        self._sent: Band | None = None
+        self._unjudged = 0  # steps of the policy for which there is no band
+
+    def _check(self, band: ContactBand, monitor: Monitor, inner: Any) -> None:
+        if not isinstance(band, ContactBand):
+            raise TypeError(f"band must be a ContactBand, got {shown(band)}")
+        if not isinstance(monitor, NeuralASM) or monitor.network_ is not band.memory.network_:
+            raise ValueError("the band is of another memory than the one that watches: make it with that")
+        _ = band.promise  # raises before anything runs where it was never calibrated
+        if self._arm is None:
+            gym.logger.warn(f"{inner} does not feel within control steps: the band is compared once a step, at its end")
+        elif (names := tuple(c.name for c in self._arm.felt_channels)) != band.names:
+            raise ValueError(f"the band is for {', '.join(band.names)}, and this arm feels {', '.join(names)}")
+
+    def begin(self) -> None:
+        """A new episode has begun in the environment."""
+        self._sent, self._unjudged, self._careful = None, 0, 0
+        self._limit(self._limits)
+
+    def pressed(self) -> None:
+        """The policy has pressed too hard: from now on its hand goes slower for a while."""
+        self._careful = self._careful_steps
+        if self._limits is not None:
+            self._limit(replace(self._limits, hand_speed=CAREFUL * self._limits.hand_speed))
+
+    def acted(self) -> None:
+        """The policy has acted in a step."""
+        if self._careful:
+            self._careful -= 1
+            if not self._careful:
+                self._limit(self._limits)
+
+    def _limit(self, limits: ContactLimits | None) -> None:
+        if self._limited is not None:
+            self._limited.contact_limits = limits
+
+    def send(self, state: MonitorState, action: NDArray[np.floating[Any]], overridden: bool) -> None:
+        """Says what is expected of a step that is about to be made.
+
+        Args:
+            state: of the monitor, after the last row.
+            action: (A,) that is about to be commanded.
+            overridden: something else than the policy acts, from which the memory expects nothing that a nominal
+                episode shows.
+        """
+        self._sent = None
+        if self._band is None:
+            return
+        if overridden or self._unjudged:
+            self._unjudged = UNJUDGED if overridden else self._unjudged - 1
+            return
+        if self._limited is not None:
+            action = self._limited.slowed(np.asarray(action, np.float32))
+        self._sent = self._band.expect(state.model, action)
+        if self._arm is not None and self._sent is not None:
+            self._arm.expect(*self._sent, self._acts)
+
+    def came(self, row: NDArray[np.floating[Any]], info: dict[str, Any]) -> Beneath:
+        """What came of the step that ended with ``row`` (D,), of which the environment said ``info``."""
+        load, left = float(info.get("contact_load", np.nan)), float(info.get("contact_left_s", np.nan))
+        if self._sent is None or self._band is None:
+            return Beneath(load, left)
+        if self._arm is None:
+            outside = bool((self._sent.times(self._band.felt_in(row)) > 1.0).any())
+            return Beneath(load, self._band.spec.dt if outside else left)
+        return Beneath(load, np.nan if self._arm.left_band_s is None else self._arm.left_band_s)
