@@ -40,5 +40,5 @@ def require_sight(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, th
         named = ", ".join(blind[:SHOWN]) + (f" and {len(blind) - SHOWN} more" if len(blind) > SHOWN else "")
         raise ValueError(
             f"the threshold came to {threshold:.3g}, which no fault of {named} could pass, however strong: an episode "
-            "to calibrate on is unlike those learned from, or a channel hardly moved in them: learn from more, or leave it out"
+            "to calibrate on is unlike those learned from, or a channel hardly moved in them: learn from more"
         )
