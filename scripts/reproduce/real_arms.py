@@ -1,8 +1,8 @@
 """What is found in recordings of real arms: faults put into them, and faults that happened, with false alarms beside.
 
 Recordings are of others, and must lie in a folder; what is missing is named, with where it is published. An arm that
-did nothing wrong is cut into pieces. A quarter of them is tested, in turn; of the others half is learned from, and half
-sets the threshold, their greatest surprise. Each tested piece is watched as it is, and once with each fault, put into
+did nothing wrong is cut into pieces. A quarter of them is tested, in turn; of the others two in three are learned from,
+and one sets the threshold, their greatest surprise. Each tested piece is watched as it is, and once with each fault, put into
 its middle. Pieces are of the same trajectory: nothing here says how a monitor fares on another.
 
 The UR3 of CobotOps stopped and lost its grip by itself; the executions of Camarinha-Matos and others failed or did not.
@@ -180,7 +180,7 @@ def parted(count: int, job: Job, config: Config) -> tuple[list[int], list[int], 
     others = [int(i) for i in order if i not in set(tested.tolist())]
     if len(others) < 4:
         raise ValueError(f"{job.experiment} has {count} pieces of {config.piece:g} s: too few")
-    return sorted(tested.tolist()), others[::2], others[1::2]
+    return sorted(tested.tolist()), [i for n, i in enumerate(others) if n % 3], others[::3]
 
 
 def fitted(job: Job, episodes: Sequence[Episode]) -> Any:
