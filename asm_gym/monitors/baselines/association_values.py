@@ -92,7 +92,7 @@ class ValueAssociation(StreamModel):
     def error_columns(self) -> NDArray[np.intp]:
         if not self.learned_:
             return self.spec.sensory
-        return self.spec.sensory[np.concatenate([self.learned_["judged_values"], self.learned_["judged_changes"]])]
+        return self.spec.sensory[np.concatenate([self._told, self._certain])]
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams = [e.stream for e in episodes]
@@ -119,13 +119,19 @@ class ValueAssociation(StreamModel):
             {
                 **{"mean": senses.mean, "spread": senses.spread, "change": senses.change},
                 **{"derived_mean": middle, "derived_spread": width},
-                **{"judged_values": told, "judged_changes": certain, "R2_values": given.told, "R2_changes": moved.told},
+                **{
+                    "judged_values": told * 1.0,
+                    "judged_changes": certain * 1.0,
+                    "R2_values": given.told,
+                    "R2_changes": moved.told,
+                },
                 **{"D": given.weights[told], "E": moved.weights[certain], "remainder": np.maximum(left, FAINTEST)},
             }
         )
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         self.senses_ = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
+        self._told, self._certain = (learned[f"judged_{what}"].astype(np.intp) for what in ("values", "changes"))
         return super().restore(learned, skills)
 
     def start(self, batch: int, told: Sequence[Told] = ()) -> Lagged:
@@ -137,8 +143,8 @@ class ValueAssociation(StreamModel):
         found = self.learned_
         derived = (derived - found["derived_mean"]) / found["derived_spread"]
         inputs = np.hstack([values, steps, before, derived, commands])
-        told, certain = found["judged_values"], found["judged_changes"]
-        errors = np.hstack([values[:, told] - inputs @ found["D"].T, steps[:, certain] - inputs @ found["E"].T])
+        values, steps = values[:, self._told], steps[:, self._certain]
+        errors = np.hstack([values - inputs @ found["D"].T, steps - inputs @ found["E"].T])
         return state, ModelOutput(known * errors / found["remainder"], no_context(rows))
 
     def _read(self, read: ScaledRows) -> tuple[Floats, Floats, Floats, Floats, Floats]:
@@ -197,7 +203,8 @@ class Derived(NamedTuple):
         S, J = len(moving), len(columns)
         pairs = np.array(np.triu_indices(2 * J), np.intp) if J else np.zeros((2, 0), np.intp)
         own = np.eye(J, dtype=np.bool_)
-        sums = np.array([[1 <= k <= n for k in range(J)] for n in range(2, min(J, CHAIN + 1))], np.bool_).reshape(-1, J)
+        ends = range(2, min(J, CHAIN + 1))
+        sums = np.array([[1 <= k <= n for k in range(J)] for n in ends], np.bool_).reshape(len(ends), J)
         single = np.vstack([own, own])
         of_angles = np.vstack([single, sums, sums, single[pairs[0]] | single[pairs[1]]])
         sources = np.zeros((S * len(WIDTHS) + len(of_angles), len(spec.sensory)), np.bool_)
