@@ -2,8 +2,8 @@
 
 Recordings are of others, and must lie in a folder; what is missing is named, with where it is published. An arm that
 did nothing wrong is cut into pieces. A quarter of them is tested, in turn; of the others two in three are learned from,
-and one sets the threshold, their greatest surprise. Each tested piece is watched as it is, and once with each fault, put into
-its middle. Pieces are of the same trajectory: nothing here says how a monitor fares on another.
+and one sets the threshold, their greatest surprise. Each tested piece is watched as it is, and with each fault, put
+into its middle. Pieces are of the same trajectory: nothing here says how a monitor fares on another.
 
 The UR3 of CobotOps stopped and lost its grip by itself; the executions of Camarinha-Matos and others failed or did not.
 """
