@@ -1,8 +1,9 @@
 """Says when a recording is surprising, where, and how much; or watches rows as they come.
 
 A recording gives a table, figures and a report. A live source is - for standard input, tail:FILE for a file that grows,
-or udp:PORT for datagrams from this machine: JSON lines (a list of numbers, or an object by channel, one a row), or CSV
-with a header; every alarm is printed as it is raised, in constant memory. Exit code 1: there was an alarm.
+udp:PORT for datagrams from this machine, or rtde:HOST for a UR controller: JSON lines (a list of numbers, or an object
+by channel, one a row), or CSV with a header; every alarm is printed as it is raised, in constant memory. Exit code 1:
+there was an alarm.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class Args:
     """Watches a recording, or rows as they come."""
 
     source: str = option(positional=True, metavar="SOURCE")
-    """What asm-gym fit reads; or what is live: -, tail:FILE or udp:PORT."""
+    """What asm-gym fit reads; or what is live: -, tail:FILE, udp:PORT or rtde:HOST."""
     monitor: Path = option(metavar="FILE.asm")
     """A calibrated monitor, such as asm-gym fit writes."""
     out: Path = option(Path("runs/watch"), metavar="FOLDER")
@@ -224,7 +225,7 @@ def watch(args: Args, console: Console) -> int:
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
     if is_live(args.source):
-        return follow(lines_from(args.source, sys.stdin, args.silence), monitor, console, args.bridge)
+        return follow(lines_from(args.source, sys.stdin, args.silence, monitor.spec), monitor, console, args.bridge)
     return review(args, monitor, console)
 
 

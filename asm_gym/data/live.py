@@ -1,4 +1,4 @@
-"""Rows as they come: from standard input, a file that grows, or UDP on this machine; as JSON lines or as CSV.
+"""Rows as they come: from standard input, a file that grows, UDP, or a controller; as JSON lines or as CSV.
 
 A JSON line is a list of numbers, or an object by channel or by number. CSV begins with a header. Where there is a time,
 rows that are missing by it are said. A source that falls silent has died, which is for the reader to say.
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.channels import bare_name, label_of
 from asm_gym.data.clock import Clock, clock_among
+from asm_gym.data.rtde import rtde_lines
 from asm_gym.data.text import Dialect, header_of
 from asm_gym.files import regular_file
 from asm_gym.spec import StreamSpec
@@ -32,7 +33,7 @@ POLL_S = 0.002
 LARGEST = 65_535
 """Bytes of a datagram, and more than a row of any robot."""
 
-SOURCES = ("-", "tail:FILE", "udp:PORT")
+SOURCES = ("-", "tail:FILE", "udp:PORT", "rtde:HOST")
 
 
 class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
@@ -41,16 +42,17 @@ class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
 
 def is_live(source: str) -> bool:
     """Whether it is followed, and no recording."""
-    return source == "-" or source.startswith(("tail:", "udp:"))
+    return source == "-" or source.startswith(("tail:", "udp:", "rtde:"))
 
 
-def lines_from(source: str, stdin: TextIO, silence: float) -> Iterator[str]:
+def lines_from(source: str, stdin: TextIO, silence: float, spec: StreamSpec | None = None) -> Iterator[str]:
     """The lines of a live source, as they come.
 
     Args:
         source: ``-`` for standard input, ``tail:FILE`` for a file that grows, ``udp:PORT`` for datagrams sent to this
-            machine from itself, of which an empty one is the end.
+            machine from itself, of which an empty one is the end, ``rtde:HOST`` for a controller of Universal Robots.
         silence: seconds without a line, after the first one, from which on the source has died.
+        spec: of the memory that is to read them: a controller is asked for its channels, at its rate.
 
     Raises:
         SourceDied: it has.
@@ -64,6 +66,8 @@ def lines_from(source: str, stdin: TextIO, silence: float) -> Iterator[str]:
         return _growing(Path(place), silence)
     if kind == "udp":
         return _datagrams(place, silence)
+    if kind == "rtde" and spec is not None:
+        return _controller(place, spec, silence)
     raise ValueError(f"unknown source {source!r}; known: {', '.join(SOURCES)}")
 
 
@@ -112,6 +116,18 @@ def _datagrams(place: str, silence: float) -> Iterator[str]:
             return found.rstrip(b"\n") + b"\n" if found else b""
 
         yield from _cut(more, silence)
+
+
+def _controller(place: str, spec: StreamSpec, silence: float) -> Iterator[str]:
+    heard = False
+    try:
+        for line in rtde_lines(place, [channel.name for channel in spec.channels], 1 / spec.dt, silence):
+            heard = True
+            yield line
+    except TimeoutError as error:
+        if not heard:
+            raise OSError(f"no row came from the controller at {place}: {error}") from error
+        raise SourceDied(str(error)) from error
 
 
 def _cut(more: Callable[[], bytes | None], silence: float) -> Iterator[str]:
@@ -208,7 +224,8 @@ class RowReader:
         said: Any = json.loads(line)
         if not isinstance(said, dict):
             return np.asarray(said, np.float64), None
-        self._clock = self._clock or clock_among(said)
+        if self.line == 1:
+            self._clock = clock_among(said)
         stamp = said.get(self._clock.column) if self._clock else None
         return self._by_name(said), None if stamp is None or self._clock is None else self._clock.moment(str(stamp))
 
