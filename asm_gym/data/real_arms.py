@@ -145,7 +145,8 @@ ARMS = {
 COBOT = "ur3_cobotops/dataset_02052023.csv"
 COBOT_SOURCE = "UCI 963, doi 10.24432/C5J891 (CC BY 4.0)"
 COBOT_EVENTS = ("Robot_ProtectiveStop", "grip_lost")
-COBOT_LEFT_OUT = ("Num", "cycle")
+COBOT_LEFT_OUT = re.compile("Num|cycle|Temperature_.*")
+"""What only says how long it has been running: it warmed up by ten degrees."""
 
 EXECUTIONS = "uci_robot_execution_failures"
 EXECUTIONS_SOURCE = "HongminWu/UCI-RobotExecutionFaliuresDataSet @ 02d958ea (UCI, CC BY 4.0)"
@@ -159,7 +160,7 @@ def read_cobot(folder: Path) -> tuple[Columns, dict[str, NDArray[np.bool_]]]:
         raise FileNotFoundError(f"{path} is missing: it is {COBOT_SOURCE}")
     columns = read_table(path)
     events = {name: np.nan_to_num(columns.pop(name)) > 0 for name in COBOT_EVENTS}
-    return {n: v for n, v in columns.items() if n not in COBOT_LEFT_OUT}, events
+    return {n: v for n, v in columns.items() if not COBOT_LEFT_OUT.fullmatch(n)}, events
 
 
 def read_executions(folder: Path) -> Iterator[tuple[str, str, NDArray[np.float64]]]:

@@ -42,8 +42,6 @@ from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.scripts.reproduce.pushed import FAULTS
 
 RULE = "friction_rule"
-RULES = (RULE,)
-FORCE_ONLY = "no torque and speed"
 EXPERIMENTS = (*ARMS, "cobot", "executions")
 AROUND_S = 5.0
 """An alarm so long before or after an event of the cobot belongs to it."""
@@ -68,7 +66,7 @@ class Config(kit.Config):
         ),
         quick=("association_values+evidence", RULE),
         least=1,
-        known=(*MONITORS, *RULES),
+        known=(*MONITORS, RULE),
     )
     """Names of monitors, and friction_rule."""
     piece: float = fixed(1.0)
@@ -230,6 +228,7 @@ def on_the_cobot(job: Job, config: Config) -> list[Record]:
         strict=True,
     ):
         alarm[a:b] = score.value > threshold
+    begins = alarm & ~np.concatenate([[False], alarm[:-1]])  # what was in alarm before has found nothing
     watched = np.zeros(rows, np.bool_)
     for a, b in parts:
         watched[a:b] = True
@@ -237,7 +236,7 @@ def on_the_cobot(job: Job, config: Config) -> list[Record]:
         for a, b in spans(marks[name] & mine):
             around = slice(max(0, a - near), b + near)
             if watched[around].any():
-                over = np.flatnonzero(alarm[around])
+                over = np.flatnonzero(begins[around])
                 delay = None if not len(over) else (around.start + int(over[0]) - a) * dt
                 records.append({"kind": name, "found": bool(len(over)), "delay": delay})
     quiet = watched & ~close

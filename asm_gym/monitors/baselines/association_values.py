@@ -92,7 +92,8 @@ class ValueAssociation(StreamModel):
     def error_columns(self) -> NDArray[np.intp]:
         if not self.learned_:
             return self.spec.sensory
-        return self.spec.sensory[np.concatenate([self._told, self._certain])]
+        found: NDArray[np.intp] = self.spec.sensory[np.concatenate([self._told, self._certain])]
+        return found
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams = [e.stream for e in episodes]
@@ -232,7 +233,9 @@ def _named(spec: StreamSpec, pattern: re.Pattern[str]) -> NDArray[np.intp]:
     """Columns of senses whose channel is called so."""
     named = zip(spec.channels, spec.slices.values(), strict=True)
     found = [np.arange(s.start, s.stop) for c, s in named if pattern.fullmatch(c.name.lower())]
-    return np.intersect1d(np.concatenate([*found, np.zeros(0, np.intp)]), spec.sensory).astype(np.intp)
+    every = np.concatenate([*found, np.zeros(0, np.intp)])
+    own: NDArray[np.intp] = np.intersect1d(every, spec.sensory).astype(np.intp)
+    return own
 
 
 def speeds(spec: StreamSpec) -> tuple[NDArray[np.intp], bool]:
@@ -247,9 +250,11 @@ def speeds(spec: StreamSpec) -> tuple[NDArray[np.intp], bool]:
 def _folds(lengths: Sequence[int]) -> NDArray[np.intp]:
     """(N,) the fold of each row: whole episodes, or blocks where they are few."""
     if len(lengths) >= FOLDS:
-        return np.concatenate([np.full(length, n % FOLDS) for n, length in enumerate(lengths)]).astype(np.intp)
+        whole = [np.full(length, n % FOLDS, np.intp) for n, length in enumerate(lengths)]
+        return np.concatenate(whole)
     total = sum(lengths)
-    return (np.arange(total) * FOLDS // max(total, 1)).astype(np.intp)
+    blocks: NDArray[np.intp] = np.arange(total, dtype=np.intp) * FOLDS // max(total, 1)
+    return blocks
 
 
 def _crossfitted(

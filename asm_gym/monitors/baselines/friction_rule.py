@@ -53,11 +53,12 @@ class FrictionRule(StreamModel):
             for c, s in zip(spec.channels, spec.slices.values(), strict=True)
             if _TORQUE.fullmatch(c.name.lower()) and not _TOLD.fullmatch(c.name.lower())
         ]
-        self._torques = np.concatenate([*found, np.zeros(0, np.intp)]).astype(np.intp)
+        self._torques: NDArray[np.intp] = np.concatenate([*found, np.zeros(0, np.intp)]).astype(np.intp)
         self._speeds, self.derived = speeds(spec)
-        if not len(self._torques) or len(self._speeds) < len(self._torques):
+        joints = min(len(self._torques), len(self._speeds))
+        if not joints:
             raise ValueError(f"a rule of friction needs a torque and a speed of each joint; there are: {spec.slices}")
-        self._speeds = self._speeds[: len(self._torques)]
+        self._torques, self._speeds = self._torques[:joints], self._speeds[:joints]
         self.lag = rows_apart(spec.dt)
         self.window = max(1, round(OVER / spec.dt))
         self.shortest = self.lag + self.window
