@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import DAMAGE, read_checkpoint, write_checkpoint
-from asm_gym.data.channels import stream_of
+from asm_gym.data.channels import read_recorded
 from asm_gym.files import regular_file
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32, typed
@@ -127,13 +127,15 @@ class Episode:
         channels: StreamSpec | Mapping[str, str | Sequence[str]] | Sequence[str] | None = None,
         rate: float | None = None,
         action: Sequence[str] = (),
+        labels: Sequence[str] = (),
         **fields: Any,
     ) -> Episode:
         """An episode from a log: a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
 
-        The arguments are those of ``asm_gym.data.channels.stream_of``, and whatever else an episode has.
+        The arguments are those of ``asm_gym.data.channels.read_recorded``, and whatever else an episode has.
         """
-        return cls(*stream_of(frame, channels, rate, action), **fields)
+        found = read_recorded(frame, channels, rate, action, labels)
+        return cls(found.stream, found.spec, **{"faults": found.faults} | fields)
 
 
 def check_recorded(episode: Episode) -> None:

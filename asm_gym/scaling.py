@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
+from asm_gym.readings import resolution
 from asm_gym.spec import StreamSpec
 
 Floats = NDArray[np.float64]
@@ -33,6 +34,12 @@ SLOW = 0.3
 
 LAPSE = 0.05
 """Over how long a change is taken, where rows come faster [s]."""
+
+FEW_VALUES = 5
+"""A channel of fewer different values is a flag or a mode."""
+
+MOST_SHOWN = 10_000
+"""Rows from which the resolution of channels is told."""
 
 FARTHEST = 1e3
 """Where standardised numbers are cut off, so that no finite row can overflow.
@@ -78,7 +85,7 @@ class StreamScaler:
         steps = np.concatenate([s[lag:].astype(np.float64) - s[:-lag] for s in streams])
         mean = rows.mean(axis=0)
         spread = _spread(rows, mean, spec.noise)
-        change = steps.std(axis=0)
+        change = np.maximum(steps.std(axis=0), _least_change(streams, spec.noise))
         return cls(spec, mean, spread, np.where(change > 0, change, spread), lag)
 
     @cached_property
@@ -197,4 +204,16 @@ def _spread(rows: NDArray[np.float64], mean: NDArray[np.float64], noise: NDArray
     spread = rows.std(axis=0)
     constant = spread <= 1e-6 * np.abs(mean)  # the rounding of float32 is not a signal
     fallback: NDArray[np.float64] = np.where(noise > 0, noise, 1.0)
-    return np.where(constant, fallback, spread)
+    return np.where(constant, fallback, np.maximum(spread, noise))
+
+
+def _least_change(streams: Sequence[NDArray[np.float32]], noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(D,) below which no change is told from noise and rounding: √2 of half the one, and of the spread of the other.
+
+    A channel that moves by one of its steps in a thousand rows has a spread of a thirtieth of that, and each step would
+    be thirty of them. Flags and other channels of few values are no rounded ones.
+    """
+    shown = [s[:MOST_SHOWN] for s in streams[: max(1, MOST_SHOWN // max(1, len(streams[0])))]]
+    rounded = [[resolution(c) if len(np.unique(c)) >= FEW_VALUES else 0.0 for c in s.T] for s in shown]  # (N, D)
+    least: NDArray[np.float64] = np.sqrt(2.0) * np.maximum(noise / 2, np.max(rounded, axis=0) / np.sqrt(12.0))
+    return least

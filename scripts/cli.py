@@ -24,6 +24,7 @@ GROUPS: dict[str, dict[str, Command]] = {
         "demo": Command("asm_gym.scripts.demo", "a robot that notices when something is wrong"),
         "collect": Command("asm_gym.scripts.collect", "record episodes of a policy, as a Minari dataset"),
         "import": Command("asm_gym.scripts.import_demonstrations", "read robosuite's or robomimic's HDF5 likewise"),
+        "inspect": Command("asm_gym.scripts.inspect_log", "what a log holds, and what would be done about it"),
         "fit": Command("asm_gym.scripts.fit", "a memory from recorded episodes or logs"),
         "babble": Command("asm_gym.scripts.babble", "one memory of a body, for any policy"),
         "evaluate": Command("asm_gym.scripts.evaluate", "tasks x monitors x faults: who notices what"),

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from asm_gym.data.gaps import filled
 from asm_gym.data.logs import Layout, read_logs
-from asm_gym.data.selection import divided, normal_episodes, pieces, unbroken
+from asm_gym.data.notes import noted
+from asm_gym.data.selection import declared_by_all, divided, normal_episodes, pieces, unbroken
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.episode import Episode
@@ -39,7 +41,7 @@ class Args:
 
     data: Path = option(positional=True, metavar="DATA")
     """A run folder of collect, import or evaluate, a Minari or LeRobot dataset, or logs (a file, or a folder): .csv,
-    .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS."""
+    .tsv, .txt, .jsonl, .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS."""
     out: Path = option(Path("runs/fit/memory.asm"), metavar="FILE")
     """File to write the memory to."""
     monitor: str = option("neural_asm", check=check_monitor, listed=MONITORS)
@@ -52,6 +54,16 @@ class Args:
     """Columns of logs that were commanded and not sensed: names, or patterns such as 'cmd*'."""
     rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
     """Rows of logs a second; by default their column called time says it."""
+    channels: tuple[str, ...] = option((), metavar="COLUMN")
+    """Columns of logs that are read: names, or patterns; by default all of numbers."""
+    label: tuple[str, ...] = option((), metavar="COLUMN")
+    """Columns that say what is wrong, beside those called so; rows that they mark are not learned from."""
+    columns: tuple[str, ...] = option((), metavar="NAME")
+    """Names of the columns of files without a header."""
+    join: bool = False
+    """The files of a folder are parts of one recording: join them by their clocks."""
+    bridge: float = option(0.0, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
+    """Gaps up to so long are filled, on the line between their ends, such as 0.05; a log is cut at others."""
     split: float | None = option(None, check=partial(check_number, "split", above=0), metavar="SECONDS")
     """Length of the pieces that long logs are cut into; each then counts as an episode."""
     keep_failures: bool = False
@@ -116,14 +128,15 @@ def fit(args: Args, console: Console) -> None:
     """Reads, learns, calibrates, saves, and says what came of it."""
     start = time.perf_counter()
     with stage("reading", console, {}) as progress:
-        kept = normal_episodes(
-            read_logs(args.data, Layout(rate=args.rate, action=args.action)), args.keep_failures, progress
-        )
+        layout = Layout(None, args.rate, args.action, args.channels, args.label, args.columns, args.join)
+        with noted() as notes:
+            kept = normal_episodes(read_logs(args.data, layout), args.keep_failures, progress)
     left_out = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
     if not kept.episodes:
         hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
-    whole = [part for episode in kept.episodes for part in unbroken(episode)]
+    bridged = [replace(e, stream=filled(e.stream, e.spec.dt, args.bridge)) for e in declared_by_all(kept.episodes)]
+    whole = [part for episode in bridged for part in unbroken(episode)]
     episodes = whole if args.split is None else [p for e in whole for p in pieces(e, args.split)]
     fitting, calibration = parted(args, episodes)
     fitting = fitting[: args.most]
@@ -133,11 +146,16 @@ def fit(args: Args, console: Console) -> None:
     spec = fitting[0].spec
     rows = sum(map(len, fitting))
     say = partial(console.print, soft_wrap=True, highlight=False)
+    for line in notes:
+        say(f"Note: {line}.", markup=False)
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
     if left_out:
         say(f"Left out: {left_out}.")
     if len(whole) != len(kept.episodes):
-        say(f"Rows were lost: {len(kept.episodes)} episodes were cut there, into {len(whole)} parts.")
+        say(
+            f"Rows were lost: {len(kept.episodes)} episodes were cut there, into {len(whole)} parts."
+            + ("" if args.bridge else " --bridge 0.05 fills gaps up to 0.05 s.")
+        )
     say(f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: {promised(args, calibration)}.")
     seconds = time.perf_counter() - start
     say(f"Wrote {args.out} after {seconds:.0f} s. Watch with it: asm-gym watch LOG --monitor {args.out}")

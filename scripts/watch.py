@@ -1,8 +1,9 @@
 """Says when a recording is surprising, where, and how much; or watches rows as they come.
 
 A recording gives a table, figures and a report. A live source is - for standard input, tail:FILE for a file that grows,
-or udp:PORT for datagrams from this machine: JSON lines (a list of numbers, or an object by channel, one a row), or CSV
-with a header; every alarm is printed as it is raised, in constant memory. Exit code 1: there was an alarm.
+udp:PORT for datagrams from this machine, or rtde:HOST for a UR controller: JSON lines (a list of numbers, or an object
+by channel, one a row), or CSV with a header; every alarm is printed as it is raised, in constant memory. Exit code 1:
+there was an alarm.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
 from asm_gym.data.live import RowReader, SourceDied, is_live, lines_from
 from asm_gym.data.logs import Layout, Log, read_logs
+from asm_gym.data.notes import noted
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, traces_of
 from asm_gym.evaluation.report import write_report
@@ -47,6 +50,9 @@ MOMENTS = 6
 SHOWN_ROWS = 20
 """Alarms printed; the file holds them all."""
 
+MOST_LOST = 1000
+"""Lost rows that a bridge is asked about one by one."""
+
 LATENCIES = 10_000
 """Newest rows whose latency is kept."""
 
@@ -56,13 +62,19 @@ class Args:
     """Watches a recording, or rows as they come."""
 
     source: str = option(positional=True, metavar="SOURCE")
-    """What asm-gym fit reads; or what is live: -, tail:FILE or udp:PORT."""
+    """What asm-gym fit reads; or what is live: -, tail:FILE, udp:PORT or rtde:HOST."""
     monitor: Path = option(metavar="FILE.asm")
     """A calibrated monitor, such as asm-gym fit writes."""
     out: Path = option(Path("runs/watch"), metavar="FOLDER")
     """Folder of the table, the figures and the report of a recording."""
     rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
     """Rows of logs a second; by default their column called time says it, or else the memory."""
+    columns: tuple[str, ...] = option((), metavar="NAME")
+    """Names of the columns of files without a header."""
+    join: bool = False
+    """The files of a folder are parts of one recording: join them by their clocks."""
+    bridge: float = option(0.0, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
+    """For how long a number may be missing without an alarm, such as 0.05; such rows are not judged."""
     silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
     """Without a row for so long a live source has died, which is an alarm."""
     rerun: Path | None = option(None, metavar="FILE.rrd")
@@ -86,9 +98,10 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     alarms: list[Alarm] = []
     worst: list[ScoredEpisode] = []
     episodes = 0
-    with stage("watching", console, {}) as progress:
-        for group in in_groups(read_logs(args.source, Layout(monitor.spec, args.rate)), AT_ONCE):
-            traces = traces_of(group, monitor)
+    layout = Layout(monitor.spec, args.rate, columns=args.columns, join=args.join)
+    with stage("watching", console, {}) as progress, noted() as notes:
+        for group in in_groups(read_logs(args.source, layout), AT_ONCE):
+            traces = traces_of(group, monitor, args.bridge)
             alarms += [alarm for trace in traces for alarm in alarms_of(trace)]
             worst = sorted([*worst, *traces], key=lambda trace: -float(trace.surprise.max()))[: args.figures]
             episodes += len(group)
@@ -98,12 +111,14 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     if args.rerun is not None:
         write_rerun(args.rerun, worst, monitor)
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
+    for line in notes:
+        say(f"Note: {line}.")
     shown = sorted(alarms, key=lambda alarm: -alarm.excess)[:SHOWN_ROWS]
     say(said + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} greatest:"))
     width = max((len(alarm.channel) for alarm in shown), default=0)
     for cells in [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []:
-        log, start, end, channel, excess = cells
-        say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {log}")
+        log, start, end, channel, why, excess = cells
+        say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
     say(f"Wrote {args.out / 'report.html'} and alarms.csv")
     return BAD_NEWS if alarms else DONE
 
@@ -153,8 +168,12 @@ def write_rerun(path: Path, traces: Sequence[ScoredEpisode], monitor: Any) -> No
                 view.row(seconds, row, float(surprise), trace.threshold, shares)
 
 
-def follow(lines: Iterable[str], monitor: Any, console: Console) -> int:
-    """Watches rows as they come, in constant memory: prints every alarm as it is raised."""
+def follow(lines: Iterable[str], monitor: Any, console: Console, seconds: float = 0.0) -> int:
+    """Watches rows as they come, in constant memory: prints every alarm as it is raised, and why.
+
+    Args:
+        seconds: that something may be missing without an alarm.
+    """
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     spec: StreamSpec = monitor.spec
     state = monitor.initial_state(1)
@@ -162,21 +181,28 @@ def follow(lines: Iterable[str], monitor: Any, console: Console) -> int:
     latencies: deque[float] = deque(maxlen=LATENCIES)
     rows = alarms = 0
     before = False
+    bridge = Bridge(seconds, spec.dt, spec.size)
     try:
         for (row, lost), came in RowReader(spec).rows(lines):
             if lost:
-                state, _ = monitor.observe(state, np.full((1, spec.size), np.nan))
-                say(f"{(rows + 1) * spec.dt:.3f} s  {lost} row{'s' * (lost != 1)} lost: an alarm")
-                alarms += 1
+                nothing = np.full(spec.size, np.nan)
+                over = [bridge.over(np.isnan(nothing)) for _ in range(min(lost, MOST_LOST))]
+                for _ in over if all(over) else over[:1]:
+                    state, _ = monitor.observe(state, nothing[None])
+                if not all(over):
+                    say(f"{(rows + 1) * spec.dt:.3f} s  {lost} row{'s' * (lost != 1)} lost: an alarm ({LATE})")
+                    alarms += 1
             rows += 1 + lost
             state, surprise = monitor.observe(state, row[None])
-            value = float(surprise.value[0])
+            value = 0.0 if bridge.over(np.isnan(row)) else float(surprise.value[0])
             latencies.append(1e3 * (time.perf_counter() - came))
             if value > monitor.threshold and not before:
                 alarms += 1
-                channel = spec.labels[int(np.argmax(surprise.attribution[0]))]
+                at, why = blamed(row, surprise.attribution[0]), reason(row)
+                channel = "" if at is None else spec.labels[at] + "  "
                 late = f"{latencies[-1]:.2f} ms after the row came"
-                say(f"{rows * spec.dt:.3f} s  {channel}  {value / monitor.threshold:.2f} thresholds  {late}")
+                because = "" if why == SURPRISING else f"  ({why})"
+                say(f"{rows * spec.dt:.3f} s  {channel}{value / monitor.threshold:.2f} thresholds  {late}{because}")
             before = value > monitor.threshold
     except SourceDied as error:
         alarms += 1
@@ -199,7 +225,7 @@ def watch(args: Args, console: Console) -> int:
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
     if is_live(args.source):
-        return follow(lines_from(args.source, sys.stdin, args.silence), monitor, console)
+        return follow(lines_from(args.source, sys.stdin, args.silence, monitor.spec), monitor, console, args.bridge)
     return review(args, monitor, console)
 
 

@@ -13,9 +13,11 @@ import pytest
 
 from asm_gym.data.lerobot import write_lerobot
 from asm_gym.data.logs import Layout, read_logs
-from asm_gym.data.tabular import as_array, read_parquet, read_table
-from asm_gym.data.timing import noise_of, regular
+from asm_gym.data.tabular import as_array, read_parquet
+from asm_gym.data.text import read_table
+from asm_gym.data.timing import regular
 from asm_gym.episode import Episode
+from asm_gym.readings import noise_of
 from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR
 from tests.needs import needs
@@ -87,9 +89,13 @@ def test_units_stand_behind_names_and_must_be_those_of_the_memory():
     columns = {"time [s]": arm(0)["time"], "q_0 [rad]": arm(0)["q"][:, 0], "q_1 [rad]": arm(0)["q"][:, 1]}
     spec = Episode.from_table(columns).spec
     assert [(c.name, c.size, c.unit) for c in spec.channels] == [("q", 2, "rad")]
-    in_degrees = {name.replace("rad", "deg"): values for name, values in columns.items()}
-    with pytest.raises(ValueError, match="q_0 is in deg, and the memory reads rad"):
-        Episode.from_table(in_degrees, channels=spec)
+    in_degrees = {n.replace("rad", "deg"): np.rad2deg(v) if "rad" in n else v for n, v in columns.items()}
+    np.testing.assert_allclose(
+        Episode.from_table(in_degrees, channels=spec).stream, Episode.from_table(columns).stream, rtol=1e-6
+    )
+    in_volts = {name.replace("rad", "V"): values for name, values in columns.items()}
+    with pytest.raises(ValueError, match="q_0 is in V, and the memory reads rad"):
+        Episode.from_table(in_volts, channels=spec)
     with pytest.raises(ValueError, match="'q' is of several units: deg, rad"):
         Episode.from_table({**columns, "q_2 [deg]": arm(0)["time"]})
     with pytest.raises(ValueError, match="'q_0' twice"):

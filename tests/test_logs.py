@@ -212,7 +212,7 @@ def test_a_damaged_file_among_logs_is_named(tmp_path):
 def test_a_file_of_any_kind_that_is_none_is_named(suffix, tmp_path):
     (tmp_path / f"no{suffix}").write_bytes(b"\x00\xff no file of this kind \x00")
     with pytest.raises(ValueError, match=rf"no\{suffix}: ."):
-        list(read_logs(tmp_path))
+        list(read_logs(tmp_path / f"no{suffix}"))
 
 
 def test_only_normal_episodes_are_learned_from():

@@ -145,3 +145,21 @@ def test_a_memory_of_before_sensors_had_a_resolution_loads(asm):
     for damaged in (np.full((3, 2), -1.0), np.zeros((1, 2)), np.full((3, len(asm.spec.sensory)), np.nan)):
         with pytest.raises(ValueError, match="repetition of evidence"):
             old.restore(learned | {"repetition": damaged})
+
+
+def test_an_arm_that_rests_repeats_its_digits_and_is_healthy():
+    rng = np.random.default_rng(0)
+
+    def moving(seed: int) -> np.ndarray:
+        t = np.arange(400) / 50
+        phase = np.random.default_rng(seed).uniform(0, 6)
+        encoder = np.rint((np.sin(2 * t + phase) + 1e-5 * rng.normal(size=400)) / 1e-3) * 1e-3
+        current = np.cos(2 * t + phase) + 0.05 * rng.normal(size=400)
+        return np.stack([encoder, current], axis=1)
+
+    counted = count_repetitions([moving(seed) for seed in range(10)], np.array([True, True]))
+    rest = np.stack([np.full(500, 0.5), 0.05 * rng.normal(size=500)], axis=1)
+    assert max(s.unlikely.max() for s in run(rest, counted)) < REPETITION_OFFSET
+    stuck = rest.copy()
+    stuck[:, 1] = 0.3  # what has noise does not rest
+    assert run(stuck[:20], counted)[-1].unlikely[0, 1] > REPETITION_OFFSET

@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from asm_gym.monitors.contact_band import ContactBand
 from gymnasium import spaces
 
 from asm_gym.checkpoint import read_checkpoint
@@ -27,6 +26,7 @@ from asm_gym.memory.settling_learning import (
 )
 from asm_gym.memory.temporal import unassociated
 from asm_gym.monitors import NeuralASM, load_monitor
+from asm_gym.monitors.contact_band import ContactBand
 from asm_gym.policies import NeuralASMPolicy
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety

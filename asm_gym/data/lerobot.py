@@ -10,6 +10,7 @@ The library itself is not asked by any test: it cannot be installed beside robos
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -23,6 +24,8 @@ from asm_gym.episode import Episode
 from asm_gym.extras import require
 
 INFO = Path("meta") / "info.json"
+CHECKSUMS = "SHA256SUMS"
+"""What our exports carry beside what LeRobot reads; ``sha256sum --check SHA256SUMS`` asks it."""
 VERSION = "v2.1"
 DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 CHUNK = 1000
@@ -36,8 +39,10 @@ def read_lerobot(folder: Path) -> Iterator[tuple[dict[str, NDArray[Any]], float,
     """The columns of each episode, its rate [Hz], and whether it succeeded (where nobody says, it did).
 
     Raises:
-        ValueError: what the folder says of itself cannot be read, is of another version, or is not in its files.
+        ValueError: what the folder says of itself cannot be read, is of another version, or is not in its files; a
+            file is not as it was written.
     """
+    _check_whole(folder)
     try:
         info = json.loads((folder / INFO).read_text(encoding="utf-8"))
         version, rate, features = info["codebase_version"], float(info["fps"]), dict(info["features"])
@@ -151,7 +156,26 @@ def write_lerobot(folder: Path, episodes: Sequence[Episode], task: str, robot: s
     for name, rows in lines.items():
         text = "".join(json.dumps(row) + "\n" for row in rows)
         (folder / "meta" / f"{name}.jsonl").write_text(text, encoding="utf-8")
+    written = sorted(f for f in folder.rglob("*") if f.is_file())
+    sums = "".join(f"{_digest(file)}  {file.relative_to(folder).as_posix()}\n" for file in written)
+    (folder / CHECKSUMS).write_text(sums, encoding="utf-8")
     return folder
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def _check_whole(folder: Path) -> None:
+    """Raises ValueError unless the files are those that were written; datasets of others have no checksums."""
+    if not (folder / CHECKSUMS).is_file():
+        return
+    for line in (folder / CHECKSUMS).read_text(encoding="utf-8").splitlines():
+        digest, _, name = line.partition("  ")
+        file = folder / name
+        if ".." in Path(name).parts or Path(name).is_absolute() or not file.is_file() or _digest(file) != digest:
+            raise ValueError(f"{file} is not as it was written (where it was changed on purpose, remove {CHECKSUMS})")
 
 
 def _stats(values: NDArray[Any]) -> dict[str, list[float]]:

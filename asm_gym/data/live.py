@@ -1,4 +1,4 @@
-"""Rows as they come: from standard input, a file that grows, or UDP on this machine; as JSON lines or as CSV.
+"""Rows as they come: from standard input, a file that grows, UDP, or a controller; as JSON lines or as CSV.
 
 A JSON line is a list of numbers, or an object by channel or by number. CSV begins with a header. Where there is a time,
 rows that are missing by it are said. A source that falls silent has died, which is for the reader to say.
@@ -6,7 +6,6 @@ rows that are missing by it are said. A source that falls silent has died, which
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import select
@@ -20,8 +19,10 @@ from typing import Any, NamedTuple, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.channels import TIME, bare_name, label_of
-from asm_gym.data.tabular import header_of
+from asm_gym.data.channels import bare_name, label_of
+from asm_gym.data.clock import Clock, clock_among
+from asm_gym.data.rtde import rtde_lines
+from asm_gym.data.text import Dialect, header_of
 from asm_gym.files import regular_file
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number
@@ -32,7 +33,7 @@ POLL_S = 0.002
 LARGEST = 65_535
 """Bytes of a datagram, and more than a row of any robot."""
 
-SOURCES = ("-", "tail:FILE", "udp:PORT")
+SOURCES = ("-", "tail:FILE", "udp:PORT", "rtde:HOST")
 
 
 class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
@@ -41,16 +42,17 @@ class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
 
 def is_live(source: str) -> bool:
     """Whether it is followed, and no recording."""
-    return source == "-" or source.startswith(("tail:", "udp:"))
+    return source == "-" or source.startswith(("tail:", "udp:", "rtde:"))
 
 
-def lines_from(source: str, stdin: TextIO, silence: float) -> Iterator[str]:
+def lines_from(source: str, stdin: TextIO, silence: float, spec: StreamSpec | None = None) -> Iterator[str]:
     """The lines of a live source, as they come.
 
     Args:
         source: ``-`` for standard input, ``tail:FILE`` for a file that grows, ``udp:PORT`` for datagrams sent to this
-            machine from itself, of which an empty one is the end.
+            machine from itself, of which an empty one is the end, ``rtde:HOST`` for a controller of Universal Robots.
         silence: seconds without a line, after the first one, from which on the source has died.
+        spec: of the memory that is to read them: a controller is asked for its channels, at its rate.
 
     Raises:
         SourceDied: it has.
@@ -64,6 +66,8 @@ def lines_from(source: str, stdin: TextIO, silence: float) -> Iterator[str]:
         return _growing(Path(place), silence)
     if kind == "udp":
         return _datagrams(place, silence)
+    if kind == "rtde" and spec is not None:
+        return _controller(place, spec, silence)
     raise ValueError(f"unknown source {source!r}; known: {', '.join(SOURCES)}")
 
 
@@ -114,6 +118,18 @@ def _datagrams(place: str, silence: float) -> Iterator[str]:
         yield from _cut(more, silence)
 
 
+def _controller(place: str, spec: StreamSpec, silence: float) -> Iterator[str]:
+    heard = False
+    try:
+        for line in rtde_lines(place, [channel.name for channel in spec.channels], 1 / spec.dt, silence):
+            heard = True
+            yield line
+    except TimeoutError as error:
+        if not heard:
+            raise OSError(f"no row came from the controller at {place}: {error}") from error
+        raise SourceDied(str(error)) from error
+
+
 def _cut(more: Callable[[], bytes | None], silence: float) -> Iterator[str]:
     """Lines of what ``more`` hands out: bytes, none at the end, or None where there are none yet."""
     rest, heard = b"", None
@@ -151,7 +167,9 @@ class RowReader:
     def __init__(self, spec: StreamSpec) -> None:
         self.spec, self.line = spec, 0
         self._order: list[int] | None = None  # of CSV: where each number of a row stands
-        self._clock: int | None = None
+        self._how = Dialect(",", comma=False)
+        self._clock: Clock | None = None
+        self._clock_at = 0
         self._width = 0
         self._before: float | None = None
 
@@ -167,7 +185,8 @@ class RowReader:
             came = time.perf_counter()
             self.line += 1
             if self.line == 1 and line.lstrip()[0] not in "[{":
-                self._begin(next(csv.reader([line])))
+                self._how = Dialect.of(line)
+                self._begin(next(self._how.cells(iter([line]))))
                 continue
             try:
                 numbers, stamp = self._cells(line) if self._order is not None else self._json(line)
@@ -189,22 +208,26 @@ class RowReader:
         except ValueError as error:
             raise ValueError(f"line 1 is no row of numbers, and no header: {error}") from error
         self._order, self._width = [places[label] for label in self.spec.labels], len(names)
-        self._clock = next((names.index(name) for name in TIME if name in names), None)
+        headed = [name.strip() for name in header]
+        self._clock = clock_among(headed)
+        self._clock_at = headed.index(self._clock.column) if self._clock else 0
 
     def _cells(self, line: str) -> tuple[NDArray[np.float64], float | None]:
-        cells = next(csv.reader([line]))
-        if len(cells) != self._width:
+        cells = next(self._how.cells(iter([line])))
+        if len(cells) < self._width or any(cell.strip() for cell in cells[self._width :]):
             raise ValueError(f"it has {len(cells)} cells, the header {self._width}")
         assert self._order is not None
-        numbers = np.array([float(cells[k] or "nan") for k in self._order])
-        return numbers, None if self._clock is None else float(cells[self._clock])
+        numbers = np.array([self._how.number(cells[k]) for k in self._order])
+        return numbers, None if self._clock is None else self._clock.moment(cells[self._clock_at])
 
     def _json(self, line: str) -> tuple[NDArray[np.float64], float | None]:
         said: Any = json.loads(line)
         if not isinstance(said, dict):
             return np.asarray(said, np.float64), None
-        stamp = next((float(said[name]) for name in TIME if name in said), None)
-        return self._by_name(said), stamp
+        if self.line == 1:
+            self._clock = clock_among(said)
+        stamp = said.get(self._clock.column) if self._clock else None
+        return self._by_name(said), None if stamp is None or self._clock is None else self._clock.moment(str(stamp))
 
     def _by_name(self, said: dict[str, Any]) -> NDArray[np.float64]:
         """The numbers (D,) by the names of channels or of single numbers; the first row has to hold them all."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,8 @@ from asm_gym.data.logs import Log
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode
 from asm_gym.evaluation.scored import spans
+from asm_gym.readings import noise_of
+from asm_gym.spec import MOTOR
 
 SHORTEST_S = 0.5
 """Least length of a part between lost rows that is worth learning from [s]."""
@@ -50,6 +53,20 @@ def _abnormal(episode: Episode) -> str:
     if episode.label is not None and episode.label.role == "harmless":
         return "under a harmless variation"
     return "" if episode.success else "failed"
+
+
+def declared_by_all(episodes: list[Episode]) -> list[Episode]:
+    """The same, of logs, with the noise of each channel as all of them show it, and not as the first one does."""
+    spec = episodes[0].spec
+    if spec.source != "table" or len(episodes) == 1:
+        return episodes
+    noise = np.array([[noise_of(column) for column in e.stream.T] for e in episodes])  # (N, D)
+    channels = [
+        channel if channel.group == MOTOR else replace(channel, noise=float(np.median(noise[:, place])))
+        for channel, place in zip(spec.channels, spec.slices.values(), strict=True)
+    ]
+    whole = replace(spec, channels=tuple(channels))
+    return [replace(episode, spec=whole) for episode in episodes]
 
 
 def pieces(episode: Episode, seconds: float) -> list[Episode]:

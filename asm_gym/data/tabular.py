@@ -1,10 +1,8 @@
-"""Columns of numbers from files: CSV, Parquet and NumPy, looked at before they are read."""
+"""Columns of numbers from binary files, Parquet and NumPy, looked at before they are read; text is read by ``text``."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterator, Sequence
-from itertools import islice
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,77 +12,6 @@ from numpy.typing import NDArray
 from asm_gym.data.hdf5 import MOST_EXPANDED, SMALL
 from asm_gym.extras import require
 from asm_gym.files import regular_file
-
-AT_ONCE = 4096
-"""Lines of text held at a time."""
-
-
-def read_table(path: Path) -> dict[str, NDArray[Any]]:
-    """The columns of numbers of a ``.csv`` file with a header: text is left out, an empty cell is NaN.
-
-    Text is held a few thousand lines at a time; what is kept are numbers.
-
-    Raises:
-        ValueError: no header or no row, a name that stands twice, rows of several lengths, a column of numbers that
-            holds something else.
-    """
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        lines = (line for line in csv.reader(file) if line)
-        header = header_of(next(lines, []), str(path))
-        parts: list[list[NDArray[Any] | None]] = [[] for _ in header]
-        wrong: list[tuple[int, str] | None] = [None] * len(header)
-        done = 0
-        for block in _blocks(lines):
-            for n, line in enumerate(block, done + 2):
-                if len(line) != len(header):
-                    raise ValueError(f"{path}, line {n} has {len(line)} cells, its header {len(header)}")
-            for k, cells in enumerate(zip(*block, strict=True)):
-                values, bad, words = _numbers(cells)
-                if bad is not None and wrong[k] is None:
-                    wrong[k] = done + bad + 2, cells[bad]
-                parts[k].append(None if words else values)
-            done += len(block)
-    if not done:
-        raise ValueError(f"{path} needs a header and at least one row, got {int(bool(header))} lines")
-    columns = {}
-    for name, found, bad_cell in zip(header, parts, wrong, strict=True):
-        if all(part is None for part in found):
-            continue  # of words alone
-        if bad_cell is not None:
-            raise ValueError(f"{path}, {name}, line {bad_cell[0]} must be a number, got {bad_cell[1]!r}")
-        columns[name] = np.concatenate([part for part in found if part is not None])
-    return columns
-
-
-def header_of(cells: Sequence[str], where: str) -> list[str]:
-    """The names of columns. Raises ValueError where there are none, or one stands twice."""
-    names = [name.strip() for name in cells]
-    if not names:
-        raise ValueError(f"{where} needs a header and at least one row, got 0 lines")
-    doubled = sorted({name for name in names if names.count(name) > 1})
-    if doubled:
-        raise ValueError(f"{where} has columns of the same name: {', '.join(map(repr, doubled))}")
-    return names
-
-
-def _blocks(lines: Iterator[list[str]]) -> Iterator[list[list[str]]]:
-    while block := list(islice(lines, AT_ONCE)):
-        yield block
-
-
-def _numbers(cells: Sequence[str]) -> tuple[NDArray[np.float64], int | None, bool]:
-    """Text as numbers, NaN where there is none; the first that is none; and whether all of it are words."""
-    try:
-        return np.array([float(cell or "nan") for cell in cells]), None, False
-    except ValueError:
-        pass
-    values, wrong = np.full(len(cells), np.nan), []
-    for n, cell in enumerate(cells):
-        try:
-            values[n] = float(cell or "nan")
-        except ValueError:
-            wrong.append(n)
-    return values, wrong[0], len(wrong) == sum(bool(cell) for cell in cells)
 
 
 def read_parquet(path: Path) -> dict[str, NDArray[Any]]:
@@ -123,11 +50,27 @@ def as_array(column: Any) -> NDArray[Any]:
     return array
 
 
-def read_array(path: Path) -> dict[str, NDArray[Any]]:
-    """The array of a ``.npy`` file, (T,) or (T, k), as the column ``value``. Raises ValueError where it is damaged."""
+def read_array(path: Path, columns: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
+    """The array of a ``.npy`` file, (T,) or (T, k), as columns of these names, or as the one column ``value``.
+
+    Raises:
+        ValueError: it is damaged, or has not as many columns as are named.
+    """
     if not regular_file(path):
         raise ValueError(f"{path} is empty")
-    array = np.load(path, mmap_mode="r", allow_pickle=False)  # which refuses a file shorter than it declares
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)  # which refuses a file shorter than it declares
+    except Exception as error:  # its header is Python, and whatever reading that may raise, damage raises
+        raise ValueError(
+            f"{path} is damaged: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
+        ) from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+        raise ValueError(f"{path} must hold rows of numbers, got {getattr(array, 'dtype', type(array).__name__)}")
     if array.ndim not in (1, 2):
         raise ValueError(f"{path} must hold rows of numbers, got an array of shape {array.shape}")
+    if columns:
+        rows = array.reshape(len(array), -1)
+        if rows.shape[1] != len(columns):
+            raise ValueError(f"{len(columns)} columns are named, and {path} has {rows.shape[1]}")
+        return {name: np.array(rows[:, k]) for k, name in enumerate(columns)}
     return {"value": np.array(array)}

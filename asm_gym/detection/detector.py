@@ -167,6 +167,16 @@ class Detector:
             ratios = (most / self.ceiling) ** self.tail  # (G, X)
             return float(pool(ratios.reshape(1, -1))[0][0] / np.exp(self.context_quantile[-1]))
 
+    @property
+    def reach_of_errors(self) -> NDArray[np.float64]:
+        """(X,) what the value comes to where least is usual, one error alone at ν for ever, and the others at 0."""
+        most = (self.bound * self.whitening) ** 2  # (X of the error, X)
+        with np.errstate(over="ignore", divide="ignore"):
+            ratios = (most[:, None, :] * ((2.0 - self.gains) / self.gains)[:, None] / self.ceiling) ** self.tail
+            pooled = pool(ratios.reshape(len(most), -1))[0]
+            found: NDArray[np.float64] = pooled / np.exp(min(self.context_quantile[-1], self.context_range[0]))
+        return found
+
     def start(self, batch: int) -> Evidence:
         """No evidence yet."""
         gains, size = self.ceiling.shape
@@ -312,6 +322,11 @@ class EvidenceDetection:
         assert self.detector_ is not None
         # Repetitions add to it, in senses that have noise.
         return self.detector_.reach
+
+    def reach_of(self, errors: NDArray[np.intp]) -> NDArray[np.float64]:
+        """What some of the errors (N,) alone can make of surprise (N,)."""
+        assert self.detector_ is not None
+        return self.detector_.reach_of_errors[errors]
 
     def start(self, batch: int, errors: int) -> EvidenceState:
         assert self.detector_ is not None

@@ -11,6 +11,10 @@ evidence for "it repeats itself with probability ρ" against "with p", begun ane
 Biometrika 41, 100-115). A sense that repeats itself as often as not, being read more slowly than the stream or coarsely
 rounded, then counts for little or nothing, and none for more than it came to in nominal episodes. Where nobody
 declared the noise of any sense, those are watched that never repeated themselves in any of them.
+
+An arm that stands still repeats its digits, and is healthy: a sense whose noise does not carry it from one of its
+readings to the next (σ < δ/2, see ``readings``), or that went on repeating itself in nominal episodes, is not watched
+here. If such a sense is stuck, the others say so: what they do asks for a change that does not come.
 """
 
 from __future__ import annotations
@@ -23,12 +27,22 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.detection.tails import TAIL_INDEX
+from asm_gym.readings import noise_of, resolution
 
 STUCK = 0.9
 """ρ: below 1, for a cable that is loose lets a reading through now and then."""
 
 REPETITION_OFFSET = 12.0
 """n_0: one in 160,000, which among a hundred senses happens once in some thousand steps."""
+
+UNMOVED = 0.5
+"""Noise of fewer steps than this leaves a reading where it is."""
+
+RESTS = 0.5
+"""A sense that repeats itself again as often as that, once it has begun to, stands still now and then."""
+
+MOST_READ = 20_000
+"""Rows from which noise and resolution are told."""
 
 MOST_BEYOND = 24.0
 """How far n may pass n_0: what is stuck for an hour is no more stuck than what is stuck for a second."""
@@ -48,6 +62,23 @@ def unrepeated(batch: int, size: int) -> Repetition:
     return Repetition(np.full(shape, np.nan), np.zeros(shape, np.bool_), np.zeros(shape))
 
 
+def stands_still(streams: Sequence[NDArray[np.floating[Any]]]) -> NDArray[np.bool_]:
+    """(X,) which senses repeat themselves where the robot is at rest, by their readings in nominal episodes (T, X)."""
+    enough: list[NDArray[np.floating[Any]]] = []
+    for stream in streams:
+        enough.append(stream)
+        if sum(map(len, enough)) >= MOST_READ:
+            break
+    X = streams[0].shape[1]
+    found = np.zeros(X, np.bool_)
+    for i in range(X):
+        steps = [resolution(stream[:, i]) for stream in enough]
+        step = float(np.median([s for s in steps if s])) if any(steps) else 0.0
+        if step and sum(s > 0 for s in steps) >= len(steps) / 2:
+            found[i] = np.median([noise_of(stream[:, i]) for stream in enough]) < UNMOVED * step
+    return found
+
+
 def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArray[np.bool_]) -> NDArray[np.float64]:
     """(3, X) -log p of a repetition, after none and after one, 0 for senses that may well stand still; and n_0.
 
@@ -65,7 +96,7 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
     first = (happened[0] + 0.5) / (chances[0] + 1.0)
     # As rare after a repetition as after none, until seen to be otherwise.
     p = np.array([first, (happened[1] + first) / (chances[1] + 1.0)])
-    watched = noisy if noisy.any() else happened.sum(axis=0) == 0
+    watched = (noisy & ~stands_still(streams) & (p[1] < RESTS)) if noisy.any() else happened.sum(axis=0) == 0
     counted = np.where(watched, -np.log(p), 0.0)
     offset, steps = np.full(len(noisy), REPETITION_OFFSET), evidence_steps(counted)
     ordered = sorted(streams, key=len, reverse=True)

@@ -29,10 +29,15 @@ TAIL_PRIOR_COUNT = 10
 SMALLEST = 1e-9
 """Lower bound of q."""
 
+LEAST_SHARE = 1e-3
+"""q is at least this share of what is common among all numbers: one that never erred in a few episodes may do so yet,
+and its first small error is not a thousand million times what is usual."""
+
 
 def worst_case(maxima: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """q and κ, of the shape of one episode's maxima, from those of N nominal episodes (N, …)."""
     ceiling = np.maximum(np.quantile(maxima, NOMINAL_QUANTILE, axis=0), SMALLEST)
+    ceiling = np.maximum(ceiling, LEAST_SHARE * np.median(ceiling))
     beyond = np.log(np.maximum(maxima / ceiling, 1.0))
     total, count = beyond.sum(axis=0), (beyond > 0).sum(axis=0)
     common = np.median(total / np.maximum(count, 1))  # Hill's estimate of ξ is total / count

@@ -77,8 +77,13 @@ class Calibrated:
         """By what was made of nominal episodes. Raises ValueError, and changes nothing, where they are too few."""
         maxima = np.array([s.value.max() for s in scores])
         blocks = Blocks.of([s.value for s in scores], self.spec.dt)
-        self.threshold_ = asked.threshold(maxima, blocks)
+        threshold = asked.threshold(maxima, blocks)
+        self._check_threshold(threshold)
+        self.threshold_ = threshold
         self.maxima_, self.blocks_, self.promised_ = maxima, blocks, asked.per
+
+    def _check_threshold(self, threshold: float) -> None:
+        """Raises ValueError where it is none that will do."""
 
     def _uncalibrate(self) -> None:
         self.threshold_ = self.maxima_ = self.blocks_ = None

@@ -24,6 +24,7 @@ from asm_gym.monitors.fresh import Marks, check_fresh, sketch
 from asm_gym.monitors.model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.nominal import check_nominal
 from asm_gym.monitors.saved import SavedMonitor, calibration_arrays
+from asm_gym.monitors.sighted import require_sight
 from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
 
 
@@ -198,6 +199,10 @@ class CalibratedMonitor(Calibrated):
         self.healthy_ = healthy_forces(streams, self.spec)
         self.familiar_ = FamiliarSpeed.learned(streams, self.spec)
         return self
+
+    def _check_threshold(self, threshold: float) -> None:
+        """Raises ValueError where no fault of some channel could pass it."""
+        require_sight(self.detection, self.model.error_columns, self.spec, threshold)
 
     @typed
     def initial_state(self, batch: int = 1, told: Sequence[Told] = ()) -> MonitorState:

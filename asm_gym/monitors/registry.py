@@ -104,6 +104,7 @@ _BASELINES = {
     "gru": _row("gru:GRU", "mahalanobis"),
     "kalman": _row("kalman:Kalman", "mahalanobis"),
     "association_linear": _row("association_linear:LinearAssociation", "mahalanobis"),
+    "association_values": _row("association_values:ValueAssociation", "mahalanobis"),
     "association_boosted": _row("association_boosted:BoostedAssociation", "mahalanobis"),
     "association_mlp": _row("association_mlp:MLPAssociation", "mahalanobis"),
     "window_pca": _row("window_pca:WindowPCA", "squares"),
@@ -127,6 +128,7 @@ MONITORS: dict[str, MonitorKind] = registry(
         },
         "external_torque_limit": _row("limits:ExternalTorqueLimit", "largest"),
         "force_limit": _row("limits:ForceLimit", "squares"),
+        "channel_limit": _row("friction_rule:ChannelLimit", "largest"),
         **PARTS,
     },
 )

@@ -42,6 +42,8 @@ STUDIES = {
     "completion": Study("what a faulty sense should say, from all others", needs_a_run=True),
     "diagnosis": Study("what is wrong, of kinds of faults that were never seen", needs_a_run=True),
     "repertoire": Study("one memory of all skills against one for each", needs_a_run=True),
+    "real_arms": Study("faults in recordings of real arms, once downloaded", needs_a_run=True),
+    "actprobe": Study("does surprise tell that GR00T will fail, on logs of others", needs_a_run=True),
     "public": Study("AUROC by kind on voraus-AD or AURSAD, once downloaded", needs_a_run=True),
 }
 INDEPENDENT = tuple(name for name, study in STUDIES.items() if not study.needs_a_run)

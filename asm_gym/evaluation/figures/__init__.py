@@ -2,6 +2,7 @@
 
 from asm_gym.evaluation.figures.detection import delay_figure, heat_map, maxima_figure, roc_figure, severity_curves
 from asm_gym.evaluation.figures.episodes import attribution_figure, stream_figure, surprise_figure
+from asm_gym.evaluation.figures.logs import log_figure
 from asm_gym.evaluation.figures.moments import moments_figure, moments_of
 from asm_gym.evaluation.figures.style import figure, look, save
 
@@ -10,6 +11,7 @@ __all__ = [
     "delay_figure",
     "figure",
     "heat_map",
+    "log_figure",
     "look",
     "maxima_figure",
     "moments_figure",

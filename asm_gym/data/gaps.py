@@ -1,0 +1,77 @@
+"""Short gaps: numbers that are missing for a moment, which are bridged, and for longer, which is an alarm.
+
+    spent_i    + dt while number i is missing, - 0.1 dt while it is there, at least 0     [s]
+    bridged    spent_i <= ``seconds`` for all that are missing in a row
+
+A memory runs on without a number that is not there, expecting what it knows; a row that is bridged is not judged. What
+is missing now and then counts in the end: a cable that is loose is no short gap.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.evaluation.scored import spans
+from asm_gym.validation import check_number
+
+PAID_BACK = 0.1
+"""Of a second that is whole, how much may be missing for good: a tenth of all rows."""
+
+SURPRISING, MISSING, NOT_FINITE, LATE = "surprise", "missing data", "not finite", "late"
+"""Why there is an alarm."""
+
+
+class Bridge:
+    """Says of rows as they come which are bridged.
+
+    Args:
+        seconds: that a number may be missing; 0 bridges nothing.
+        dt: from row to row [s].
+        size: D.
+    """
+
+    def __init__(self, seconds: float, dt: float, size: int) -> None:
+        self.seconds, self.dt = check_number("bridge", seconds, low=0.0), dt
+        self._spent = np.zeros(size)
+
+    def over(self, missing: NDArray[np.bool_]) -> bool:
+        """Whether the next row (D,) lacks something, and not for longer than may be."""
+        paid = np.maximum(self._spent - PAID_BACK * self.dt, 0.0)
+        self._spent = np.where(missing, self._spent + self.dt, paid)
+        return bool(missing.any() and (self._spent[missing] <= self.seconds * (1 + 1e-9)).all())
+
+
+def bridged(stream: NDArray[np.floating[Any]], dt: float, seconds: float) -> NDArray[np.bool_]:
+    """(T,) which rows of a recording (T, D) a bridge of so many seconds goes over."""
+    bridge = Bridge(seconds, dt, stream.shape[1])
+    return np.array([bridge.over(missing) for missing in np.isnan(stream)], np.bool_)
+
+
+def filled(stream: NDArray[np.float32], dt: float, seconds: float) -> NDArray[np.float32]:
+    """A recording (T, D) to learn from: gaps of at most so many seconds lie on the line between their neighbours."""
+    most, out = int(seconds / dt + 1e-9), stream.copy()
+    for column in out.T:
+        missing = np.isnan(column)
+        for start, stop in spans(missing):
+            if start and stop < len(column) and stop - start <= most:
+                ends = (start - 1, stop)
+                column[start:stop] = np.interp(np.arange(start, stop), ends, column[list(ends)])
+    return out
+
+
+def reason(row: NDArray[np.floating[Any]]) -> str:
+    """Why a row (D,) whose surprise is over the threshold is an alarm."""
+    if np.isnan(row).any():
+        return MISSING
+    return SURPRISING if np.isfinite(row).all() else NOT_FINITE
+
+
+def blamed(row: NDArray[np.floating[Any]], shares: NDArray[np.floating[Any]]) -> int | None:
+    """The number of a row (D,) that an alarm points to, by their shares (D,); none where all of the row is missing."""
+    if np.isnan(row).all():
+        return None
+    broken = ~np.isfinite(row)
+    return int(np.argmax(broken)) if broken.any() else int(np.argmax(shares))

@@ -1,0 +1,44 @@
+"""No threshold that a strong fault could not pass: a monitor that is blind to a channel is refused, and says to which.
+
+One channel that hardly moved while learning, and moved while calibrating, can set a threshold that nothing else comes
+up to. Asked of each sense: would its own errors, at the bound where they count no more, and for ever, raise an alarm?
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.spec import StreamSpec
+
+SHOWN = 6
+"""Channels that a message names."""
+
+
+def blind_to(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, threshold: float) -> list[str]:
+    """Labels of the senses whose errors alone could never pass the threshold, where the detection knows.
+
+    Args:
+        detection: one that may say what each error can reach.
+        errors: (X,) where each error belongs in the stream; -1 for none.
+    """
+    if not hasattr(detection, "reach_of"):
+        return []
+    reach = np.zeros(spec.size)
+    own = np.flatnonzero(errors >= 0)
+    np.maximum.at(reach, errors[own], detection.reach_of(own))
+    judged = np.unique(errors[own])
+    return [spec.labels[i] for i in judged if not reach[i] > threshold]
+
+
+def require_sight(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, threshold: float) -> None:
+    """Raises ValueError where no fault of a channel could pass the threshold; it names them."""
+    blind = blind_to(detection, errors, spec, threshold)
+    if blind:
+        named = ", ".join(blind[:SHOWN]) + (f" and {len(blind) - SHOWN} more" if len(blind) > SHOWN else "")
+        raise ValueError(
+            f"the threshold came to {threshold:.3g}, which no fault of {named} could pass, however strong: an episode "
+            "to calibrate on is unlike those learned from, or a channel hardly moved in them: learn from more"
+        )

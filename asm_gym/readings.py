@@ -1,0 +1,57 @@
+"""What readings show of a sensor: its white noise, and the steps in which it speaks.
+
+    σ    the median of third differences / (0.6745 √20)
+    δ    the smallest change between two rows, if nearly all other changes are whole multiples of it, else 0
+
+A quantised channel at rest repeats itself, and is healthy; noise below δ cannot be seen in it. Its rounding has the
+spread δ/√12 (Widrow and Kollar 2008, Quantization noise).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FEWEST = 10
+"""Changes from which a step can be told."""
+
+MOSTLY = 0.95
+"""Share of changes that must be whole multiples of a step."""
+
+NEARLY = 0.1
+"""How far from a whole multiple, in steps."""
+
+COARSE = 200.0
+"""A step that most changes are further apart than says nothing: every number is near a multiple of a small one."""
+
+
+def resolution(values: NDArray[Any]) -> float:
+    """δ of readings (T,), in their unit; 0 where they speak in no steps that can be told."""
+    known = values[np.isfinite(values)].astype(np.float64)
+    changes = np.abs(np.diff(known))
+    rounding = np.spacing(np.float32(np.abs(known).max())) if len(known) else 0.0
+    changes = changes[changes > 2 * float(rounding)]
+    if len(changes) < FEWEST:
+        return 0.0
+    step = float(np.median(changes[changes < 1.5 * changes.min()]))
+    ratios = changes / step
+    if np.median(ratios) > COARSE:
+        return 0.0
+    tolerance = NEARLY + 2 * float(rounding) / step + 1e-3 * ratios
+    near = np.abs(ratios - np.rint(ratios)) <= np.minimum(tolerance, 0.25)
+    return float(f"{step:.4g}") if near.mean() >= MOSTLY else 0.0
+
+
+def noise_of(values: NDArray[Any]) -> float:
+    """Standard deviation of what is white in a signal (T,), from its third differences; 0 where most repeat.
+
+    Third differences of white noise have 20 times its variance, those of a smooth signal are small. Source: Gasser,
+    Sroka and Jennen-Steinmetz 1986 for noise by differences.
+    """
+    known = values[np.isfinite(values)].astype(np.float64)
+    if len(known) < 8:
+        return 0.0
+    third = np.abs(np.diff(known, 3))
+    return float(f"{np.median(third) / 0.6745 / np.sqrt(20):.3g}")

@@ -1,0 +1,261 @@
+"""The study of real arms, on files of the same shape; and its kinematics, against finite differences and energy."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from asm_gym.data.real_arms import ARMS, read_cobot, read_executions
+from asm_gym.data.selection import pieces
+from asm_gym.detection import EvidenceDetection
+from asm_gym.detection.scores import Largest
+from asm_gym.episode import Episode
+from asm_gym.monitors import CalibratedMonitor, load_monitor, make_monitor
+from asm_gym.monitors.baselines.association_values import ValueAssociation, speeds
+from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.scripts.cli import main
+from asm_gym.scripts.reproduce.pushed import FAULTS, NEWTONS, SLIP, TABLES, _about_x, _about_z, jacobian
+from asm_gym.scripts.reproduce.real_arms import Config, Job, on_an_arm
+
+REAL = Path(os.environ.get("ASM_GYM_REAL", "/nowhere"))
+real = pytest.mark.skipif(not REAL.is_dir(), reason="ASM_GYM_REAL names no folder of recordings of real arms")
+
+
+def arm(rows: int = 6000, rate: float = 100.0, seed: int = 0) -> dict[str, np.ndarray]:
+    """A pendulum of two joints: friction with a sign, weight, inertia, noise."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(rows) / rate
+    w = np.array([[1.1, 2.3], [0.7, 1.9]])
+    q = sum(np.sin(np.outer(t, w[:, k]) + k) for k in range(2))
+    dq = sum(w[:, k] * np.cos(np.outer(t, w[:, k]) + k) for k in range(2))
+    ddq = -sum(w[:, k] ** 2 * np.sin(np.outer(t, w[:, k]) + k) for k in range(2))
+    effort = 5 * np.sin(q) + 2 * np.tanh(dq / 0.02) + 0.3 * dq + 0.2 * ddq
+    return {
+        "time": t,
+        "position": q + 1e-4 * rng.normal(size=q.shape),
+        "velocity": dq + 1e-3 * rng.normal(size=q.shape),
+        "effort": effort + 0.05 * rng.normal(size=q.shape),
+    }
+
+
+def tiago(folder: Path, rows: int = 1500) -> Path:
+    """Three files, as TIAGo's."""
+    columns = arm(rows)
+    (folder / "tiago_figaroh").mkdir(parents=True)
+    for kind in ("position", "velocity", "effort"):
+        lines = [f"{t},{a},{b}" for t, (a, b) in zip(columns["time"], columns[kind], strict=True)]
+        text = "\n".join([f"t,- arm_1_joint_{kind},- arm_2_joint_{kind}", *lines])
+        (folder / "tiago_figaroh" / f"tiago_{kind}.csv").write_text(text + "\n")
+    return folder
+
+
+@pytest.mark.parametrize("model", TABLES)
+def test_a_jacobian_is_the_change_of_the_hand_by_each_joint(model):
+    table = TABLES[model]
+
+    def hand(q: np.ndarray) -> np.ndarray:
+        pose = np.eye(4)
+        for a, d, alpha, angle in zip(table.a, table.d, table.alpha, q, strict=True):
+            turn, link = _about_z(angle, d), _about_x(alpha, a)
+            pose = pose @ link @ turn if table.modified else pose @ turn @ link
+        return pose[:3, 3]
+
+    q = np.random.default_rng(0).uniform(-1.5, 1.5, len(table.a))
+    h = 1e-6
+    numeric = np.stack([(hand(q + h * e) - hand(q - h * e)) / (2 * h) for e in np.eye(len(q))], axis=1)
+    np.testing.assert_allclose(jacobian(table, q), numeric, atol=1e-8)
+
+
+def test_a_panda_that_is_stretched_out_reaches_as_far_as_its_data_sheet_says():
+    # At q = 0 the flange of a Panda stands 0.088 m before its base; its shoulder is 0.333 m up.
+    table = TABLES["panda"]
+    pose = np.eye(4)
+    for a, d, alpha in zip(table.a, table.d, table.alpha, strict=True):
+        pose = pose @ _about_x(alpha, a) @ _about_z(0.0, d)
+    np.testing.assert_allclose(pose[:3, 3], [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107 - 0.1034], atol=1e-9)
+
+
+def test_faults_change_what_they_say_from_the_onset_on_and_nothing_else():
+    whole = Episode.from_table(arm(200))
+    piece = replace(whole, info={"effort_range": [5.0, 5.0]})
+    without = replace(ARMS["tiago"], model="")
+    rng = np.random.default_rng(0)
+    slices = piece.spec.slices
+    for kind, channel in (("frozen", "position"), ("slipped", "position"), ("late", "effort"), ("step", "effort")):
+        found = FAULTS[kind](piece, 100, without, rng)
+        changed = found.stream != piece.stream
+        assert not changed[:100].any()
+        assert changed[100:, slices[channel]].any(axis=0).sum() == 1
+        assert not np.delete(changed, np.arange(piece.spec.size)[slices[channel]], axis=1).any()
+        np.testing.assert_array_equal(found.faults, np.arange(200) >= 100)
+    assert FAULTS["push"](piece, 100, without, rng) is None
+    slid = FAULTS["slipped"](piece, 100, without, rng).stream - piece.stream
+    assert np.abs(slid).max() == pytest.approx(SLIP, rel=1e-3)
+
+
+def test_a_push_does_the_work_of_its_force():
+    q = np.tile(np.array([0.3, -0.4, 0.2, -1.8, 0.1, 1.5, 0.6]), (100, 1)) + 0.01 * np.arange(100)[:, None]
+    columns = {"position": q, "velocity": q, "effort": np.zeros_like(q)}
+    piece = Episode.from_table(columns, rate=50.0)
+    found = FAULTS["push"](piece, 50, ARMS["panda"], np.random.default_rng(0))
+    torque = found.stream[-1, piece.spec.slices["effort"]].astype(float)
+    J = jacobian(TABLES["panda"], q[-1])
+    force = np.linalg.lstsq(J.T, torque, rcond=None)[0]
+    assert np.linalg.norm(force) == pytest.approx(NEWTONS, rel=1e-4)
+    assert force[2] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_values_are_told_from_the_others_with_friction_and_sines_and_not_without():
+    whole = Episode.from_table(arm())
+    cut = pieces(whole, 1.0)
+    effort = slice(4, 6)
+
+    def told(**options: bool) -> np.ndarray:
+        model = ValueAssociation(whole.spec, **options)
+        model.fit(cut, np.random.default_rng(0), lambda done, total: None)
+        return model.learned_["R2_values"][effort]
+
+    assert told().min() > 0.99
+    assert told(friction=False).max() < told().min()
+    assert told(body=False).max() < told().min()
+
+
+def test_a_held_push_is_found_by_values_and_explained_away_by_changes():
+    whole = Episode.from_table(arm())
+    cut = pieces(whole, 1.0)
+    pushed = []
+    for piece in cut[45:]:
+        stream = piece.stream.copy()
+        stream[50:, 4] += np.minimum(1.0, np.arange(50) / 20) * 1.0
+        pushed.append(Episode.from_stream(stream, piece.spec))
+    found = {}
+    for name in ("association_values+evidence", "association_linear+evidence"):
+        monitor = make_monitor(name, whole.spec).fit(cut[:30]).calibrate(cut[30:45], 0.07)
+        scores = monitor.score_episodes(pushed)
+        found[name] = np.mean([(s.value[90:] > monitor.threshold).any() for s in scores])
+    assert found["association_values+evidence"] > 0.9
+    assert found["association_linear+evidence"] < found["association_values+evidence"]
+
+
+def test_it_is_saved_and_says_the_same_again(tmp_path):
+    cut = pieces(Episode.from_table(arm(3000)), 1.0)
+    monitor = make_monitor("association_values+evidence", cut[0].spec).fit(cut)
+    monitor.save(tmp_path / "x.asm")
+    again = load_monitor(tmp_path / "x.asm")
+    np.testing.assert_array_equal(again.score(cut[3]).value, monitor.score(cut[3]).value)
+    assert isinstance(monitor.detection, EvidenceDetection)
+
+
+def test_speeds_are_known_by_name_or_are_changes_of_positions():
+    spec = Episode.from_table(arm(100)).spec
+    assert speeds(spec)[0].tolist() == [2, 3]
+    columns = {"position": np.zeros((9, 2)), "current": np.zeros((9, 2))}
+    assert speeds(Episode.from_table(columns, rate=10).spec) == (pytest.approx([0, 1]), True)
+
+
+def test_the_rule_takes_friction_from_torque_and_needs_a_speed():
+    columns = arm()
+    columns["effort"] -= 5 * np.sin(columns["position"])  # gravity is none of its business
+    whole = Episode.from_table(columns)
+    cut = pieces(whole, 1.0)
+    monitor = CalibratedMonitor(FrictionRule(whole.spec), Largest(whole.spec)).fit(cut[:30])
+    quiet = max(float(s.value.max()) for s in monitor.score_episodes(cut[30:]))
+    stream = cut[40].stream.copy()
+    stream[50:, 4] += 5.0
+    score = monitor.score(Episode.from_stream(stream, whole.spec))
+    assert score.value[:50].max() <= quiet < score.value[70:].min()
+    assert np.argmax(score.attribution[-1]) == 4
+    with pytest.raises(ValueError, match="a rule of friction needs a torque and a speed of each joint"):
+        FrictionRule(Episode.from_table({"q": np.zeros((9, 2))}, rate=10).spec)
+
+
+def test_the_study_runs_on_files_of_the_same_shape_and_names_what_is_missing(tmp_path, capsys):
+    folder = tiago(tmp_path / "arms")
+    out = ["--out", str(tmp_path / "out"), "--monitors", "association_values+evidence", "friction_rule"]
+    assert main(["reproduce", "real_arms", str(folder), *out, "--experiments", "tiago", "tx40"]) == 0
+    text = (tmp_path / "out" / "real_arms.md").read_text()
+    assert "PAL TIAGo" in text
+    assert "tx40" in text
+    assert "is missing: it is thanhndv212/figaroh-examples @ c0b5c7f0" in text
+    assert main(["reproduce", "real_arms", str(tmp_path), *out]) == 2
+    assert "is missing: it is unisa-acg/inverse-dynamics-solver" in capsys.readouterr().err
+
+
+def test_every_monitor_meets_the_same_faults(tmp_path):
+    folder = tiago(tmp_path / "arms")
+    config = Config(folder=folder)
+
+    def kinds(monitor: str) -> list[tuple[str, int]]:
+        records = on_an_arm(Job("tiago", monitor, 0, 1), ARMS["tiago"], config)
+        return [(r["kind"], r["piece"]) for r in records]
+
+    assert kinds("channel_limit") == kinds("friction_rule")
+    assert {"step", "frozen", "slipped", "late", ""} == {kind for kind, _ in kinds("channel_limit")}
+
+
+def test_executions_are_read_and_damaged_ones_refused(tmp_path):
+    rows = "\n".join("\t" + "\t".join(str(k) for k in range(6)) for _ in range(15))
+    place = tmp_path / "uci_robot_execution_failures"
+    place.mkdir()
+    (place / "lp1.data").write_text(f"normal\n{rows}\n\n\ncollision\n{rows}\n\n")
+    found = list(read_executions(tmp_path))
+    assert [(problem, kind, a.shape) for problem, kind, a in found] == [
+        *(("lp1", "normal", (15, 6)), ("lp1", "collision", (15, 6))),
+    ]
+    (place / "lp2.data").write_text("normal\n\t1\t2\n")
+    with pytest.raises(ValueError, match=r"lp2\.data: an execution must be of 15 rows of 6"):
+        list(read_executions(tmp_path))
+    with pytest.raises(FileNotFoundError, match="UCI 963"):
+        read_cobot(tmp_path)
+
+
+def test_failures_of_a_policy_are_told_by_what_grows_in_them_and_not_by_their_length(tmp_path, capsys):
+    place = tmp_path / "actprobe_groot_robocasa"
+    place.mkdir()
+    rng = np.random.default_rng(0)
+
+    def line(failed: bool) -> str:
+        hand = np.cumsum(0.01 * rng.normal(size=(90 if failed else 30, 3)), axis=0)
+        steps = [
+            {
+                **{"t": t, "action_norm": rng.random(), "denoising_curvature": rng.random()},
+                "chunk_mse": rng.random() + (2.0 if failed and t > 12 else 0.0),
+                "physics_info": {
+                    **{"state.end_effector_position_absolute": xyz.tolist(), "state.gripper_qpos": [0.0, 0.0]},
+                },
+            }
+            for t, xyz in enumerate(hand)
+        ]
+        return json.dumps({"success": not failed, "length": len(steps), "steps": steps})
+
+    for task in ("Open", "Close"):
+        text = "\n".join(line(n % 5 == 0) for n in range(40))
+        (place / f"{task}_PandaOmron_Env.jsonl").write_text(text + "\n")
+    out = tmp_path / "out"
+    monitors = ["--monitors", "magnitude alone", "inconsistency alone", "--seeds", "1"]
+    assert main(["reproduce", "actprobe", str(tmp_path), "--out", str(out), *monitors]) == 0
+    text = (out / "actprobe.md").read_text()
+    assert "80 episodes of which 16 failed" in text
+    rows = {row.split("|")[1].strip(): row.split("|")[2:4] for row in text.splitlines() if row.startswith("|")}
+    ten, twenty = (float(cell.split("±")[0]) for cell in rows["inconsistency alone"])
+    assert twenty == 1.0
+    assert 0.2 < ten < 0.8
+    assert main(["reproduce", "actprobe", str(out), "--out", str(out)]) == 2
+    assert "they are air-embodied-brain/actprobe @ d5dfbcc9" in capsys.readouterr().err
+
+
+@real
+@pytest.mark.parametrize("name", ARMS)
+def test_recordings_of_arms_are_streams_of_position_speed_and_effort(name):
+    if not (REAL / ARMS[name].place).exists():
+        pytest.skip(f"{ARMS[name].place} is not there")
+    episode = ARMS[name].episode(REAL)
+    assert {"position", "effort"} <= set(episode.spec.slices)
+    sizes = {s.stop - s.start for s in episode.spec.slices.values()}
+    assert len(sizes) == 1
+    assert np.isfinite(episode.stream).all()
