@@ -57,8 +57,8 @@ class ContactLimits:
     stays: bool = True
 
     def __post_init__(self) -> None:
-        check_number("wrist_force", self.wrist_force, above=0)
-        check_number("external_torque", self.external_torque, above=0)
+        check_number("wrist_force", self.wrist_force, above=0, infinite=True)
+        check_number("external_torque", self.external_torque, above=0, infinite=True)
         check_number("hand_speed", self.hand_speed, above=0, infinite=True)
         for value in self.healthy:
             check_number("healthy", value, low=0)
@@ -83,6 +83,10 @@ class ContactLimits:
     def limits_speed(self) -> bool:
         """Whether there is a limit of speed."""
         return math.isfinite(self.hand_speed)
+
+
+NO_LIMITS = ContactLimits(math.inf, math.inf, math.inf, stays=False)
+"""Which nothing passes."""
 
 
 def healthy_forces(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> tuple[float, ...]:

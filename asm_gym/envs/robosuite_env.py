@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.contact_limits import ContactLimits
+from asm_gym.contact_limits import NO_LIMITS, ContactLimits
 from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.cameras import RENDER_MODES, Pictures
@@ -139,6 +139,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """What the arms may feel and how fast they may go in this episode; ``reset`` forgets it. ``info`` then holds
         ``contact_load``, the largest share of a limit that was felt within the step, ``contact_left_s``, when in it a
         limit was passed [s], not a number where none was, and ``contact_felt``, the step's mean of what was felt."""
+        self._most: tuple[ContactLimits | None, NDArray[np.float64]] = NO_LIMITS, np.zeros(0)
         self._band: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._stays = False
         self.substeps = backend.PHYSICS_FREQ // control_freq
@@ -357,8 +358,9 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         band, self._band, limits = self._band, None, self.contact_limits
         if band is None and limits is None:
             return None
-        N = sum(c.size for c in self.felt_channels)
-        most = np.full(N, np.inf) if limits is None else limits.most(self.felt_channels)
+        if limits is not self._most[0]:
+            self._most = limits, (limits or NO_LIMITS).most(self.felt_channels)
+        most = self._most[1]
         low, high = (-most, most) if band is None else (np.maximum(band[0], -most), np.minimum(band[1], most))
         stays = (band is not None and self._stays) or (limits is not None and limits.stays)
         return Expected(low, high, most, stays)
