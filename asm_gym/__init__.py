@@ -15,11 +15,14 @@ from asm_gym.tasks import TASKS
 
 if TYPE_CHECKING:
     from asm_gym.episode import Episode
-    from asm_gym.monitors import NeuralASM, make_monitor
+    from asm_gym.faults.suite import register_fault
+    from asm_gym.monitors import NeuralASM, make_monitor, register_monitor
     from asm_gym.policies import make_policy
+    from asm_gym.policies.registry import register_policy
     from asm_gym.rollouts.collect import collect
     from asm_gym.rollouts.pretraining.healthy import harmless
     from asm_gym.spec import Channel, StreamSpec
+    from asm_gym.tasks import register_task
     from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
 
 __all__ = [
@@ -35,17 +38,24 @@ __all__ = [
     "harmless",
     "make_monitor",
     "make_policy",
+    "register_fault",
+    "register_monitor",
+    "register_policy",
+    "register_task",
 ]
 
 __version__ = "0.1.0"
 
 _HOME = {
-    **dict.fromkeys(("NeuralASM", "make_monitor"), "monitors"),
+    **dict.fromkeys(("NeuralASM", "make_monitor", "register_monitor"), "monitors"),
     **dict.fromkeys(("FaultInjection", "NeuralASMSafety", "StreamRecorder", "VectorNeuralASMSafety"), "wrappers"),
     **dict.fromkeys(("collect", "harmless"), "rollouts"),
     **dict.fromkeys(("Channel", "StreamSpec"), "spec"),
     "Episode": "episode",
     "make_policy": "policies",
+    "register_fault": "faults.suite",
+    "register_policy": "policies.registry",
+    "register_task": "tasks",
 }
 """Which room a name comes from."""
 

@@ -11,12 +11,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.spec import Channel
+from asm_gym.spec import Channel, StreamSpec
 from asm_gym.validation import check_flag, check_number
+
+FELT = "external_torque", "wrist_force"
+"""Ends of the names of the channels that limits are about."""
+
+LEFT_OUT = 0.05
+"""Share of healthy episodes, those that pressed hardest, that say nothing of what healthy motion needs: a knock in one
+of twenty is a knock."""
+
+MOST = 2.5
+"""What was seen counts up to so many times the usual limits: 200 N, 100 N m."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +39,8 @@ class ContactLimits:
         external_torque: of each joint [N m].
         hand_speed: a command that would move the hand faster is scaled down to it [m/s]; infinite for none. Of
             OSC_POSE and JOINT_POSITION, whose actions are changes of where the arm is; others are not scaled.
+        by_place: the hand goes no faster than healthy episodes of this body and task did near where it is, and slowly
+            where they never were; ``hand_speed`` is the most. That needs a monitor that was calibrated since.
         healthy: the most that healthy motion of this body and task was seen to reach, (N,) in the order of
             ``RobosuiteEnv.felt_channels``; where that is more, it counts. Empty where nobody knows.
         stays: the arm stays from the physics substep on after a limit was passed; else it is only said.
@@ -39,6 +52,7 @@ class ContactLimits:
     wrist_force: float = 80.0
     external_torque: float = 40.0
     hand_speed: float = 0.15
+    by_place: bool = False
     healthy: tuple[float, ...] = ()
     stays: bool = True
 
@@ -48,6 +62,7 @@ class ContactLimits:
         check_number("hand_speed", self.hand_speed, above=0, infinite=True)
         for value in self.healthy:
             check_number("healthy", value, low=0)
+        check_flag("by_place", self.by_place)
         check_flag("stays", self.stays)
 
     def most(self, felt: Sequence[Channel]) -> NDArray[np.float64]:
@@ -68,3 +83,28 @@ class ContactLimits:
     def limits_speed(self) -> bool:
         """Whether there is a limit of speed."""
         return math.isfinite(self.hand_speed)
+
+
+def healthy_forces(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> tuple[float, ...]:
+    """The most that healthy motion was seen to reach, (N,) of each number that an arm feels [N m], [N].
+
+    Args:
+        streams: (T, D) of healthy episodes; peaks within rows count where they are sensed.
+
+    Returns:
+        Empty where the stream senses no such forces. See ``LEFT_OUT`` and ``MOST``.
+    """
+    felt = [c for c in spec.channels if c.name.endswith(FELT)]
+    if not streams or not felt:
+        return ()
+    columns = np.concatenate([np.arange(spec.size)[_peaks(spec, c)] for c in felt])
+    reached = np.stack([np.nanmax(np.abs(stream[:, columns].astype(np.float64)), axis=0) for stream in streams])
+    usual = ContactLimits().most(felt)
+    shares = (reached / usual).max(axis=1)
+    kept = shares <= np.quantile(shares, 1.0 - LEFT_OUT, method="higher" if len(shares) < 1.0 / LEFT_OUT else "lower")
+    return tuple(np.minimum(reached[kept].max(axis=0), MOST * usual).tolist())
+
+
+def _peaks(spec: StreamSpec, channel: Channel) -> slice:
+    """Where the peaks of a channel stand, or else the channel."""
+    return spec.slices.get(f"{channel.name}_peak", spec.slices[channel.name])

@@ -76,6 +76,14 @@ class Episode:
         contact_force: (T,) float32, between the robot and everything else [N].
         label: what it was recorded as; None where nobody said.
         info: whatever else is worth keeping; JSON-serialisable.
+
+    Example:
+        >>> import numpy as np
+        >>> from asm_gym import Channel, Episode, StreamSpec
+        >>> spec = StreamSpec((Channel("position", 2, "m"),), dt=0.01)
+        >>> episode = Episode.from_stream(np.zeros((50, 2)), spec, success=True, info={"skill": "wait"})
+        >>> len(episode), episode.stream.shape
+        (50, (50, 2))
     """
 
     stream: NDArray[np.float32]

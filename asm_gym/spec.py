@@ -36,6 +36,12 @@ class Channel:
         elements: a name for each number; ``0, 1, …`` where empty.
         resolution: the step between two readings that the sensor tells apart [unit]; 0 where it is not known, or where
             the numbers are computed from several sensors.
+
+    Example:
+        >>> from asm_gym import Channel
+        >>> wrist = Channel("wrench", 3, "N", noise=0.5, elements=("x", "y", "z"))
+        >>> wrist.labels
+        ('wrench[x]', 'wrench[y]', 'wrench[z]')
     """
 
     name: str
@@ -72,6 +78,12 @@ class StreamSpec:
         dt: control period [s].
         source: what made the stream, for example ``Panda``. A name for people: two specs with the same channels and
             rate are compatible whatever their source.
+
+    Example:
+        >>> from asm_gym import Channel, StreamSpec
+        >>> spec = StreamSpec((Channel("position", 2, "m"), Channel("command", 1, "m/s", group="action")), dt=0.01)
+        >>> spec.size, spec.labels
+        (3, ('position[0]', 'position[1]', 'command'))
     """
 
     channels: tuple[Channel, ...]

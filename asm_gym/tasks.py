@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from asm_gym.extras import needed_for
-from asm_gym.validation import check_choice, check_text
+from asm_gym.registries import add, registry
+from asm_gym.validation import check_choice, check_number, check_text
 
 ROBOTS = ("Panda", "Sawyer", "UR5e", "Kinova3", "IIWA", "Jaco")
 """Arms that the tasks are tested with."""
@@ -80,6 +83,36 @@ TASKS = {
 """Every task by its name."""
 
 
+OWN: dict[str, EnvSpec] = registry("asm_gym.tasks:OWN", {})
+"""What ``register_task`` added, by name."""
+
+
+def register_task(name: str, make: Callable[..., gym.Env[Any, Any]] | str, horizon: int) -> None:
+    """Makes an environment of one's own known as a task, here and in worker processes.
+
+    Args:
+        name: the Gymnasium id is ``asm_gym/<name>-v0``.
+        make: a class of environments with Box spaces or a function that makes one; or ``module:name`` of it.
+        horizon: control steps before an episode is truncated.
+
+    Raises:
+        ValueError: the name is taken.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from asm_gym import register_task
+        >>> register_task("Waving", "asm_gym.synthetic_arm:SyntheticArm", horizon=50)
+        >>> gym.make("asm_gym/Waving-v0").spec.max_episode_steps
+        50
+    """
+    if name in TASKS:
+        raise ValueError(f"there is a task {name!r} already")
+    check_number("horizon", horizon, low=1, whole=True)
+    spec = EnvSpec(f"asm_gym/{name}-v0", entry_point=make, max_episode_steps=horizon)
+    add("task", OWN, name, spec)
+    gym.registry[spec.id] = spec
+
+
 def task(name: str) -> TaskSpec:
     """The row of ``name``, which may also be written as a Gymnasium id.
 
@@ -87,7 +120,7 @@ def task(name: str) -> TaskSpec:
         ValueError: there is no such task; the message lists those that exist.
     """
     short = check_text("task", name).removeprefix("asm_gym/").removesuffix("-v0")
-    check_choice("task", short, TASKS)
+    check_choice("task", short, (*TASKS, *OWN))
     return TASKS[short]
 
 
@@ -98,6 +131,9 @@ def env_id(name: str) -> str:
         ValueError: neither is known; the message lists the tasks.
         ImportError: the module of ``module:id`` is not installed; the message says what brings it.
     """
+    if name in OWN:
+        gym.registry[OWN[name].id] = OWN[name]  # which a worker has not done yet
+        return OWN[name].id
     try:
         env_spec(check_text("task", name))
     except gym.error.Error:

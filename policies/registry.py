@@ -25,6 +25,7 @@ from asm_gym.policies.scripted.tool_hang import ToolHangExpert
 from asm_gym.policies.scripted.transport import TransportExpert
 from asm_gym.policies.scripted.two_arm_lift import TwoArmLiftExpert
 from asm_gym.policies.scripted.wipe import WipeExpert
+from asm_gym.registries import add, registry, target
 from asm_gym.tasks import TaskSpec
 from asm_gym.validation import typed
 
@@ -47,8 +48,30 @@ POLICIES = ("scripted", "hold", "sway")
 """Names that ``make_policy`` knows, besides agents."""
 
 
+REGISTERED: dict[str, Callable[..., Policy]] = registry("asm_gym.policies.registry:REGISTERED", {})
+"""What ``register_policy`` added."""
+
 SHIPPED = Path(__file__).resolve().parent / "agents"
 """Trained agents that come with the package."""
+
+
+def register_policy(name: str, make: Callable[..., Policy] | str) -> None:
+    """Makes a policy of one's own known, here and in worker processes.
+
+    Args:
+        make: is called as ``make(env, seed=seed)``, with whatever else ``make_policy`` is given; or ``module:name``.
+
+    Raises:
+        ValueError: the name is taken.
+        ImportError: there is no such module.
+
+    Example:
+        >>> from asm_gym import make_policy, register_policy
+        >>> register_policy("calm", lambda env, seed=None: make_policy("sway", env, seed=seed))
+    """
+    if name in (*POLICIES, *agents()):
+        raise ValueError(f"there is a policy {name!r} already")
+    add("policy", REGISTERED, name, target(make))
 
 
 def agents() -> tuple[str, ...]:
@@ -89,7 +112,19 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
         ValueError: an unknown name, a task without an expert, or an agent that was trained in another environment; the
             message lists what exists, or what differs.
         FileNotFoundError: there is no such agent.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from asm_gym import make_policy
+        >>> env = gym.make("asm_gym/SyntheticArm-v0")
+        >>> policy = make_policy("sway", env, seed=0)
+        >>> observation, info = env.reset(seed=0)
+        >>> action, state = policy.predict(observation)
+        >>> env.action_space.contains(action)
+        True
     """
+    if name in REGISTERED:
+        return REGISTERED[name](env, seed=seed, **kwargs)
     if name == "scripted":
         task, elsewhere = getattr(env.unwrapped, "task", None), env.spec.id if env.spec else ""
         if elsewhere in ELSEWHERE:
@@ -109,5 +144,5 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
         return NeuralASMPolicy.load(name, env)
     if name.endswith(".npz") or name in agents():
         return NetworkPolicy.load(_agent_file(name)).fit_to(env, name)
-    known = ", ".join((*POLICIES, *agents()))
+    known = ", ".join((*POLICIES, *REGISTERED, *agents()))
     raise ValueError(f"unknown policy {name!r}; known: {known}, or the path of an agent (.npz, .zip, .asm)")

@@ -19,7 +19,7 @@ from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import EpisodeLabel, load_episode
-from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
+from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_S
 from asm_gym.evaluation.tables import console_table, markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
@@ -30,9 +30,11 @@ from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
 from asm_gym.rollouts.pretraining.healthy import healthy, held_out, learn_body
 from asm_gym.rollouts.pretraining.model_card import Exam, Marks, at_rates, card, examine, usual_force
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.record import record
 from asm_gym.rollouts.run_folder import claimed, labelled, make_missing, versions
 from asm_gym.rollouts.scoring import code_digest
-from asm_gym.rollouts.trial import RolloutConfig, environment, record
+from asm_gym.rollouts.staging import environment
+from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.tasks import ROBOTS, TASKS
@@ -41,7 +43,7 @@ from asm_gym.validation import check_choice, check_number
 
 SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
-RATES = 0.01, 0.05
+RATES = REPORTED_RATE, FALSE_ALARM_RATE
 """Rates at which an examination is also told."""
 LEARNING = (
     *("memory", "detection", "scaling.py", "spec.py", "rollouts/pretraining/healthy.py"),

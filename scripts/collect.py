@@ -15,7 +15,7 @@ from rich.console import Console
 
 from asm_gym.data.datasets import require_minari, write_dataset
 from asm_gym.episode import Episode, load_episode
-from asm_gym.rollouts.collect import check, collect, collect_to
+from asm_gym.rollouts.collect import check, collect_to
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, versions
@@ -23,16 +23,14 @@ from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, option
-from asm_gym.tasks import ROBOTS, env_id
-
-__all__ = ["collect", "episode_seeds"]  # which were here before there was a room for them
+from asm_gym.tasks import ROBOTS, TASKS, env_id
 
 
 @dataclass(frozen=True)
 class Args:
     """Episodes of a policy, as a Minari dataset."""
 
-    task: str = option("Lift", positional=True, check=env_id, metavar="TASK")
+    task: str = option("Lift", positional=True, check=env_id, listed=TASKS, metavar="TASK")
     """Name of a task, or any Gymnasium id whose spaces are numbers, such as Pusher-v5."""
     policy: str = "scripted"
     """What acts: scripted, hold, sway, a shipped agent, or the path of one."""

@@ -24,7 +24,7 @@ from rich.console import Console
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
-from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, false_alarms_per_hour, typical
+from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, hourly_alarms, typical
 from asm_gym.evaluation.report import write_json, write_report
 from asm_gym.evaluation.scored import NOMINAL
 from asm_gym.evaluation.statistics import Share, binomial_interval
@@ -42,11 +42,13 @@ from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged, watch_pair
+from asm_gym.rollouts.staging import play, staged
+from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
+from asm_gym.rollouts.watch import watch_pair
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, fixed, option
-from asm_gym.tasks import env_id
+from asm_gym.tasks import TASKS, env_id
 from asm_gym.validation import check_choice
 from asm_gym.wrappers import NeuralASMSafety
 
@@ -55,7 +57,7 @@ from asm_gym.wrappers import NeuralASMSafety
 class Args:
     """Collect, fit, calibrate, break things, and see who notices."""
 
-    task: str = option("Lift", positional=True, check=env_id, metavar="TASK")
+    task: str = option("Lift", positional=True, check=env_id, listed=TASKS, metavar="TASK")
     """Name of a task."""
     on_alarm: Literal["graded", "hold", "terminate"] = option("graded")
     """What the wrapper does on an alarm: graded does what the cause asks for."""
@@ -211,7 +213,7 @@ def as_json(m: DetectionMetrics) -> dict[str, Any]:
         "condition": m.name,
         "episodes": len(m.watched),
         "false_alarm_episodes": false_alarms(m.watched),
-        "false_alarms_per_hour": false_alarms_per_hour(m.watched),
+        "false_alarms_per_hour": hourly_alarms(m.watched).value,
         "detected": m.detected,
         "delays": m.delays,
         "auroc": m.auroc,

@@ -34,10 +34,11 @@ from asm_gym.monitors.registry import check_monitor, model_of
 from asm_gym.policies import make_policy
 from asm_gym.rollouts.parallel import ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.record import record
 from asm_gym.rollouts.run_folder import claimed, make_missing
 from asm_gym.rollouts.scoring import benchmark, calibrated
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
-from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, horizon_of, record
+from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, horizon_of
 from asm_gym.rollouts.video import Clip, can_record_video, record_video
 from asm_gym.scripts.command import one_line, run
 from asm_gym.scripts.options import check_options, fixed, option
@@ -80,7 +81,7 @@ class Args:
     """Names of monitors; any model goes under any detection, as in external_torque_limit+evidence."""
     settings: tuple[str, ...] = option((), metavar="MONITOR.NAME=VALUE")
     """Hyperparameters of these monitors that are not their own, as in gru.learning_rate=0.0003."""
-    faults: tuple[str, ...] = option((), metavar="KIND")
+    faults: tuple[str, ...] = option((), listed=KINDS, metavar="KIND")
     """Kinds of fault, by default all that there are; development or test for robosuite's to choose by, or to report."""
     severities: tuple[str, ...] = option(SEVERITIES, quick=("strong",), least=1, known=SEVERITIES)
     """How bad each is."""

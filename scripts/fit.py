@@ -12,21 +12,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from asm_gym.data.logs import Layout, read_logs
 from asm_gym.data.selection import divided, normal_episodes, pieces, unbroken
 from asm_gym.detection import conformal_episodes
+from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.episode import Episode
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
-from asm_gym.monitors import make_monitor, monitor_class
+from asm_gym.monitors import MONITORS, make_monitor, monitor_class
+from asm_gym.monitors.asked import Asked
 from asm_gym.monitors.registry import check_monitor
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.validation import check_number
+
+ANY_EPISODE = 0.5
+"""A rate that one episode can promise: by the hour it is hours that count."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +42,12 @@ class Args:
     .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS."""
     out: Path = option(Path("runs/fit/memory.asm"), metavar="FILE")
     """File to write the memory to."""
-    monitor: str = option("neural_asm", check=check_monitor)
+    monitor: str = option("neural_asm", check=check_monitor, listed=MONITORS)
     """Name of the monitor."""
     false_alarm_rate: float = option(FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of normal episodes that may raise an alarm."""
+    false_alarms_per_hour: float | None = option(None, metavar="X")
+    """Alarms in an hour of normal episodes; promised in place of a share of them."""
     action: tuple[str, ...] = option((), metavar="COLUMN")
     """Columns of logs that were commanded and not sensed: names, or patterns such as 'cmd*'."""
     rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
@@ -63,8 +69,15 @@ class Args:
 
     def __post_init__(self) -> None:
         check_options(self)
+        _ = self.asked  # refuses a rate that is none
         if self.out.is_dir():
             raise ValueError(f"out must be a file, and {self.out} is a folder")
+
+    @property
+    def asked(self) -> Asked:
+        """The promise of the threshold."""
+        hourly = self.false_alarms_per_hour
+        return Asked.of(self.false_alarm_rate if hourly is None else None, hourly)
 
 
 def learned(args: Args, fitting: list[Episode], calibration: list[Episode], progress: Progress) -> Any:
@@ -73,7 +86,30 @@ def learned(args: Args, fitting: list[Episode], calibration: list[Episode], prog
     if args.epochs is not None and "epochs" in monitor_class(args.monitor).hyperparameters:
         settings["epochs"] = args.epochs
     monitor: Any = make_monitor(args.monitor, fitting[0].spec, **settings)
-    return monitor.fit(fitting, progress).calibrate(calibration, args.false_alarm_rate)
+    return monitor.fit(fitting, progress).calibrate(calibration, **args.asked.named)
+
+
+def parted(args: Args, episodes: list[Episode]) -> tuple[list[Episode], list[Episode]]:
+    """Those to learn from, and those to calibrate on. Raises ValueError where they are too few for the promise."""
+    if args.asked.per == EPISODE:
+        return divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
+    fitting, calibration = divided(episodes, ANY_EPISODE, args.calibration_share, args.seed)
+    args.asked.check_hours(hours_of(calibration))
+    return fitting, calibration
+
+
+def promised(args: Args, calibration: list[Episode]) -> str:
+    """How often the threshold lets normal operation alarm, in words."""
+    if args.asked.per == HOUR:
+        return f"at most {args.asked.rate:g} alarms an hour of normal ones, from {hours_of(calibration):.3g} of them"
+    hourly = args.false_alarm_rate * len(calibration) / hours_of(calibration)
+    at_their_length = f"{hourly:.{0 if hourly >= 10 else 1}f} an hour at their length"
+    return f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones, {at_their_length}"
+
+
+def hours_of(episodes: list[Episode]) -> float:
+    """How long they are together [h]."""
+    return sum(len(e) * e.spec.dt for e in episodes) / 3600
 
 
 def fit(args: Args, console: Console) -> None:
@@ -89,24 +125,20 @@ def fit(args: Args, console: Console) -> None:
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
     whole = [part for episode in kept.episodes for part in unbroken(episode)]
     episodes = whole if args.split is None else [p for e in whole for p in pieces(e, args.split)]
-    fitting, calibration = divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
+    fitting, calibration = parted(args, episodes)
     fitting = fitting[: args.most]
     with stage("learning", console, {}) as progress:
         monitor = learned(args, fitting, calibration, progress)
     monitor.save(args.out)
     spec = fitting[0].spec
     rows = sum(map(len, fitting))
-    hourly = args.false_alarm_rate * 3600 / (spec.dt * float(np.mean([len(e) for e in calibration])))
     say = partial(console.print, soft_wrap=True, highlight=False)
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
     if left_out:
         say(f"Left out: {left_out}.")
     if len(whole) != len(kept.episodes):
         say(f"Rows were lost: {len(kept.episodes)} episodes were cut there, into {len(whole)} parts.")
-    say(
-        f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: an alarm in at most "
-        f"{args.false_alarm_rate:.1%} of normal ones, {hourly:.{0 if hourly >= 10 else 1}f} an hour at their length."
-    )
+    say(f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: {promised(args, calibration)}.")
     seconds = time.perf_counter() - start
     say(f"Wrote {args.out} after {seconds:.0f} s. Watch with it: asm-gym watch LOG --monitor {args.out}")
 

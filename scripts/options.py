@@ -22,8 +22,6 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import tyro
-
 from asm_gym.validation import check_choice
 
 T = TypeVar("T")
@@ -39,6 +37,7 @@ def option(
     quick: T = _SAME,
     least: float | None = None,
     known: Iterable[str] | Callable[[], Iterable[str]] = (),
+    listed: Iterable[str] | Callable[[], Iterable[str]] = (),
     check: Callable[[Any], object] | None = None,
     metavar: str = "",
     positional: bool = False,
@@ -50,11 +49,12 @@ def option(
         quick: with ``--quick``, where nothing else was asked for.
         least: of a number; of a tuple, of how many there are.
         known: names that will do, or what tells them.
+        listed: names that the help lists, beside which others may do.
         check: is called with the value, or with each of a tuple's, and raises where it will not do.
         metavar: what stands for the value in the help.
         positional: given without its name.
     """
-    about = {"quick": quick, "least": least, "known": known, "check": check, "metavar": metavar}
+    about = {"quick": quick, "least": least, "known": known, "listed": listed, "check": check, "metavar": metavar}
     made: T = field(default=default, metadata={**about, "positional": positional, "typed": True})
     return made
 
@@ -96,20 +96,27 @@ def read(kind: type[Any], argv: Sequence[str], prog: str) -> dict[str, Any]:
     Raises:
         SystemExit: they make no sense; standard error says what.
     """
+    import tyro
+
     hurried = "--quick" in argv
     hints = get_type_hints(kind, include_extras=True)
     defaults = {each.name: _default(each, hurried) for each in fields(kind)}
+    annotated: Any = Annotated
+    positional: Any = tyro.conf.Positional
     made: list[Any] = []
     for each in fields(kind):
         if not each.metadata.get("typed", True):
             continue
         hint = hints[each.name]
-        hint = tyro.conf.Positional[hint] if each.metadata.get("positional") else hint
+        if metavar := each.metadata.get("metavar"):
+            hint = annotated[hint, tyro.conf.arg(metavar=metavar)]
+        hint = positional[hint] if each.metadata.get("positional") else hint
         default = defaults[each.name]
         made.append((each.name, hint, field(default=tyro.MISSING if default is MISSING else default)))
     flat = make_dataclass(kind.__name__, made, frozen=True)
-    typed = tyro.cli(flat, args=list(argv), prog=prog)
-    return {name: value for name, value in defaults.items() if value is not MISSING} | vars(typed)
+    typed: Any = tyro.cli(flat, args=list(argv), prog=prog)
+    values: dict[str, Any] = {name: value for name, value in defaults.items() if value is not MISSING} | vars(typed)
+    return values
 
 
 def shortened(options: Any) -> str:
@@ -131,6 +138,7 @@ class Row(NamedTuple):
     name: str  # as typed
     said: str
     positional: bool
+    required: bool
 
 
 def rows(kind: type[Any]) -> Iterator[Row]:
@@ -139,21 +147,25 @@ def rows(kind: type[Any]) -> Iterator[Row]:
     yield from sorted(found, key=lambda row: not row.positional)
 
 
-def _rows(kind: type[Any]) -> Iterator[Row]:
+def _rows(kind: Any) -> Iterator[Row]:
     hints, said = get_type_hints(kind, include_extras=True), docstrings(kind)
     for each in fields(kind):
         about = each.metadata
         if not about.get("typed", True):
             continue
-        hint, extras = hints[each.name], ()
+        hint: Any = hints[each.name]
+        extras: Sequence[Any] = ()
         if get_origin(hint) is Annotated:
-            hint, *extras = get_args(hint)  # type: ignore[assignment]
+            hint, *extras = get_args(hint)
         if is_dataclass(hint):
-            yield from _rows(hint)  # type: ignore[arg-type]
+            nested: Any = hint
+            yield from _rows(nested)
             continue
         metavar = about.get("metavar") or next((m for e in extras if (m := getattr(e, "metavar", ""))), "")
         positional = bool(about.get("positional")) or any("POSITIONAL" in str(e).upper() for e in extras)
-        yield Row(_typed(each, hint, metavar, positional), _said(each, kind, said.get(each.name, "")), positional)
+        required = each.default is MISSING and each.default_factory is MISSING
+        told = _said(each, kind, said.get(each.name, ""))
+        yield Row(_typed(each, hint, metavar, positional), told, positional, required)
 
 
 def _typed(each: Field[Any], hint: Any, metavar: str, positional: bool) -> str:
@@ -171,8 +183,9 @@ def _typed(each: Field[Any], hint: Any, metavar: str, positional: bool) -> str:
 
 def _said(each: Field[Any], kind: type[Any], text: str) -> str:
     about, parts = each.metadata, [" ".join(text.split())]
-    if known := about.get("known"):
-        parts.append(f"One of {', '.join(known() if callable(known) else known)}.")
+    for how, said in (("known", "One of"), ("listed", "There are")):
+        if names := about.get(how):
+            parts.append(f"{said} {', '.join(names() if callable(names) else names)}.")
     if each.name == "quick":
         changed = [
             f"{other.name.replace('_', ' ')} {_words(value) or 'none'}"
@@ -191,7 +204,8 @@ def help_text(prog: str, kind: type[Any], about: str) -> str:
     """Usage, what the command does, and a paragraph an option, as wide as the terminal."""
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     every = list(rows(kind))
-    usage = " ".join(["usage:", prog, *(row.name for row in every if row.positional)])
+    given = (row.name if row.required else f"[{row.name}]" for row in every if row.positional)
+    usage = " ".join(["usage:", prog, *given])
     named = any(not row.positional for row in every)
     lines = [f"{usage} [OPTIONS]" if named else usage]
     for paragraph in about.split("\n\n"):
@@ -209,7 +223,7 @@ def _laid_out(paragraph: str) -> bool:
 
 
 @cache
-def docstrings(kind: type[Any]) -> dict[str, str]:
+def docstrings(kind: Any) -> dict[str, str]:
     """What is said under each field, or under ``Args:``, in the source of a class and of those it comes from."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__):

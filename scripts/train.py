@@ -34,7 +34,7 @@ from asm_gym.rollouts.training.run import BEST, CLONE, Plan, TrainingRun, succes
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, fixed, option
-from asm_gym.tasks import ROBOTS, env_id
+from asm_gym.tasks import ROBOTS, TASKS, env_id
 
 KEPT = ("env_id", "algorithm", "robot", "demonstrations", "dataset", "cloning_updates", "seed")
 """What must not change while a run goes on."""
@@ -49,7 +49,7 @@ Curve = tuple[tuple[int, float], ...]
 class Args:
     """An agent for a task."""
 
-    task: str = option("Lift", positional=True, check=env_id, metavar="TASK")
+    task: str = option("Lift", positional=True, check=env_id, listed=TASKS, metavar="TASK")
     """Name of a task, or any Gymnasium id with Box spaces."""
     algorithm: str = option("sac", known=(*ALGORITHMS, RECURRENT))
     """How it learns; gru is a recurrent clone, and takes no steps of its own."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from asm_gym.memory.association import Association, association_shapes
+from asm_gym.memory.precision import unbounded
 
 CHANGES = slice(5, 10)
 """Where the changes of five senses stand among the inputs."""
@@ -23,4 +24,4 @@ def problem(seed: int, batch: int = 3, hidden: int = 8, sensory: int = 5, scale:
 def some_association(rng: np.random.Generator, inputs: int, units: int, changes: int) -> Association:
     shapes = association_shapes(inputs, units, changes).values()
     drawn = Association(*(rng.normal(scale=0.3, size=s).astype(np.float32) for s in shapes))
-    return drawn._replace(remainder=np.exp(drawn.remainder))
+    return drawn._replace(remainder=np.exp(drawn.remainder), span_S=unbounded(changes))

@@ -1,7 +1,9 @@
 """Who acts next: one table of transitions, searched by a machine that tries whatever rows there may be."""
 
 import math
+import warnings
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -129,7 +131,9 @@ class Episodes(RuleBasedStateMachine):
         if self.arbiter.state is State.ENDED:
             return
         acts = self.arbiter.state in ACTING and np.isfinite(action).all()
-        done = self.arbiter.command(action, np.zeros(2, np.float32))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that such an action is none is said, which other tests ask for
+            done = self.arbiter.command(action, np.zeros(2, np.float32))
         assert self.env.action_space.contains(done.action)
         np.testing.assert_array_equal(done.action, np.clip(action, -1, 1) if acts else [0, 0, done.action[2]])
 
@@ -146,3 +150,16 @@ class Episodes(RuleBasedStateMachine):
 
 TestEpisodes = Episodes.TestCase
 TestEpisodes.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
+
+
+def test_the_documentation_has_every_transition_in_order():
+    page = (Path(__file__).parents[1] / "docs" / "guides" / "the_guard.md").read_text(encoding="utf-8")
+    rows = [
+        line.strip("| ").split(" | ")
+        for line in page.splitlines()
+        if line.startswith(("| policy", "| trial", "| reflex"))
+    ]
+    assert [row[1] for row in rows] == [t.why for t in TRANSITIONS]
+    for row, t in zip(rows, TRANSITIONS, strict=True):
+        assert row[0].split(", ") == [str(state) for state in t.within]
+        assert row[2] == ("the same" if t.to is None else str(t.to))

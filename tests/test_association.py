@@ -13,13 +13,22 @@ from asm_gym.memory.association import (
     hidden_units,
     learn_association,
     synapses,
-    trust,
 )
+from asm_gym.memory.crossfit import trust
 from asm_gym.memory.energy import energy
 from asm_gym.memory.inference import direct_synapses
 from asm_gym.memory.learning import hebbian_change
 from asm_gym.memory.network import Network, initial_weights
-from asm_gym.memory.precision import BATCH, BATCHES, LARGEST, SMALLEST, learn_precision, log_variance
+from asm_gym.memory.precision import (
+    BATCH,
+    BATCHES,
+    LARGEST,
+    SMALLEST,
+    learn_precision,
+    log_variance,
+    unbounded,
+    usual_span,
+)
 from asm_gym.scaling import ScaledRows
 from tests.problems import CHANGES, some_association
 
@@ -32,7 +41,7 @@ def test_precision_recovers_noise_that_depends_on_context(rows):
     error = rng.normal(size=truth.shape) * np.exp(truth / 2)
     f, W_S, b_S = context.astype(np.float32), np.ones((2, 6), np.float32), np.zeros(2, np.float32)
     learn_precision(f, error.astype(np.float32), W_S, b_S, rng, rate=3e-3)
-    learned = log_variance(f, W_S, b_S)
+    learned = log_variance(f, W_S, b_S, unbounded(2))
     np.testing.assert_allclose(learned.mean(axis=0), truth.mean(axis=0), atol=0.1)
     assert np.sqrt(np.mean((learned - truth) ** 2)) < 0.15  # against 1.15 and 0.8 for the best constant
 
@@ -41,7 +50,19 @@ def test_log_variance_stays_in_bounds():
     f = np.ones((2, 3), np.float32)
     for sign, bound in ((1, LARGEST), (-1, SMALLEST)):
         W_S = np.full((2, 3), sign * 100, np.float32)
-        assert np.all(log_variance(f, W_S, np.zeros(2, np.float32)) == bound)
+        assert np.all(log_variance(f, W_S, np.zeros(2, np.float32), unbounded(2)) == bound)
+
+
+def test_no_context_makes_errors_more_usual_than_nominal_ones_did():
+    rng = np.random.default_rng(0)
+    f = np.tanh(rng.normal(size=(20_000, 3))).astype(np.float32)
+    W_S, b_S = np.array([[1.0, 0, 0], [0, 2.0, -1.0]], np.float32), np.array([0.5, -1.0], np.float32)
+    span = usual_span(f, W_S, b_S)
+    driven = f @ W_S.T + b_S
+    np.testing.assert_allclose(np.mean(driven < span[0], axis=0), 0.0005, atol=1e-4)
+    np.testing.assert_allclose(np.mean(driven > span[1], axis=0), 0.0005, atol=1e-4)
+    beyond = log_variance(np.array([[9.0, 9.0, -9.0], [-9.0, -9.0, 9.0]], np.float32), W_S, b_S, span)
+    np.testing.assert_array_equal(beyond, span[::-1])
 
 
 def test_network_reports_the_errors_of_association_in_the_spread_that_is_expected_of_them():
@@ -53,7 +74,7 @@ def test_network_reports_the_errors_of_association_in_the_spread_that_is_expecte
     seen[1, 3] = 0
     whole = seen.min(axis=1, keepdims=True)
     found, units = network.associate(ScaledRows(x, seen, u, inputs, inputs[:, CHANGES], whole, np.ones((2, 7), bool)))
-    V, U, D, W_S, b_S, remainder = association
+    V, U, D, W_S, b_S, _, remainder = association
     f = np.tanh(inputs @ V.T)
     error = (inputs[:, CHANGES] - f @ U.T - inputs @ D.T) / remainder
     np.testing.assert_allclose(units, f, atol=1e-5)
@@ -160,7 +181,7 @@ def test_association_learns_what_ties_the_senses_together_and_how_sure_that_is()
     w = learn_association(inputs, delta, np.array([0, 0, 1, 1]), slice(0, 4), 32, rng)
     f = hidden_units(inputs, w.V)
     error = (delta - complete(f, inputs, w.U, w.D))[:, 2:]
-    deviation = (w.remainder * np.exp(0.5 * log_variance(f, w.W_S, w.b_S)))[:, 2:]
+    deviation = (w.remainder * np.exp(0.5 * log_variance(f, w.W_S, w.b_S, w.span_S)))[:, 2:]
     assert error.std() < 0.25  # 0.15 is the noise alone, 0.66 the best that a line could do
     rough = cause[:, 0] > 0.5
     calm = cause[:, 0] < -0.5

@@ -13,7 +13,8 @@ from stable_baselines3 import SAC
 from asm_gym.rollouts import collect
 from asm_gym.rollouts.collect import record_episode
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.trial import Latest, RolloutConfig
+from asm_gym.rollouts.staging import Latest
+from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts import collect as script
 from asm_gym.tasks import env_spec
 from tests.fakes import FakeEnv

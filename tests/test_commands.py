@@ -91,6 +91,23 @@ def test_help_says_what_will_do_and_what_is_shortened(capsys):
     assert "--on-alarm {graded,hold,terminate}" in capsys.readouterr().out
 
 
+def test_the_shell_completes_commands_studies_and_options(capsys):
+    assert cli.main(["completion"]) == 0
+    script = capsys.readouterr().out
+
+    def completed(*typed: str) -> list[str]:
+        ask = f"{script}\nCOMP_WORDS=({' '.join(map(repr, typed))}); COMP_CWORD={len(typed) - 1}; _asm_gym; "
+        ask += 'printf "%s " "${COMPREPLY[@]}"'
+        done = subprocess.run(["/bin/bash", "-c", ask], capture_output=True, text=True, check=True)
+        return done.stdout.split()
+
+    assert completed("asm-gym", "do") == ["doctor"]
+    assert completed("asm-gym", "reproduce", "ret") == ["retention"]
+    assert completed("asm-gym", "reproduce", "retention", "--bl") == ["--blocks"]
+    assert completed("asm-gym", "evaluate", "--mon") == ["--monitors"]
+    assert completed("asm-gym", "evaluate", "--monitors", "--no") == ["--nominal-episodes", "--no-video"]
+
+
 def test_the_commands_fit_a_terminal(capsys):
     for asked in (["--help"], ["reproduce", "--help"]):
         assert cli.main(asked) == 0

@@ -60,7 +60,7 @@ def test_scores_are_means_over_the_kinds_that_can_be_seen():
     assert (asm.found[0.01].k, asm.found[0.05].k, asm.found[0.05].n) == (1, 2, 2)
     assert asm.delays == pytest.approx((50.0, math.inf, 1, 1))
     assert metrics.false_alarms(asm.nominal).value == 0.25
-    assert metrics.false_alarms_per_hour(asm.nominal) == pytest.approx(1 / (40 * 0.05 / 3600))
+    assert metrics.hourly_alarms(asm.nominal).value == pytest.approx(1 / (40 * 0.05 / 3600))
     assert metrics.balanced_accuracy(asm.faulty, asm.nominal, 1.0) == pytest.approx((0.5 + 0.75) / 2)
     assert metrics.attribution_accuracy(asm.faulty) == (1, 1)
 

@@ -64,7 +64,7 @@ class Persistence(StreamModel):
 
 @pytest.fixture
 def persistence():
-    register_monitor(Persistence, detection="mahalanobis")
+    register_monitor("persistence", Persistence, detection="mahalanobis")
     yield
     del MONITORS["persistence"], MONITORS["persistence+evidence"]
 
@@ -124,7 +124,9 @@ def test_a_model_of_ones_own_is_registered_by_one_call(persistence, tmp_path):
     episode = sine_episodes(1, 2)[0]
     np.testing.assert_array_equal(loaded.score(episode).value, monitor.score(episode).value)
     with pytest.raises(ValueError, match="'persistence' already"):
-        register_monitor(Persistence)
+        register_monitor("persistence", Persistence)
+    with pytest.raises(ValueError, match="of the kind 'persistence', got the name 'other'"):
+        register_monitor("other", Persistence)
     with pytest.raises(ValueError, match=r"'margins'.*did you mean 'margin'"):
         make_monitor("persistence", sine_spec(), margins=1.0)
 

@@ -87,7 +87,9 @@ SAID = [
 ONE_IMPORT = {
     **dict.fromkeys(("NeuralASM", "NeuralASMSafety", "VectorNeuralASMSafety", "StreamRecorder"), None),
     **dict.fromkeys(("Channel", "Episode", "StreamSpec", "make_monitor", "make_policy"), None),
+    **dict.fromkeys(("register_monitor", "register_policy", "register_task"), None),
     "FaultInjection": SAID[0],
+    "register_fault": SAID[0].replace("a robosuite environment or a fault in one", "register_fault"),
     **dict.fromkeys(("collect", "harmless"), "running episodes needs loky: pip install 'asm-gym[report]'"),
 }
 """What a core install answers for each name of the package."""

@@ -18,13 +18,13 @@ import pytest
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
+from asm_gym import collect
 from asm_gym.data.datasets import read_dataset, write_dataset
 from asm_gym.episode import load_episode, save_episode
 from asm_gym.files import UNFINISHED
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy, rollout
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.collect import collect
 from asm_gym.wrappers import StreamRecorder
 from tests.streams import sine_episodes
 

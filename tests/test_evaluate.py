@@ -16,8 +16,9 @@ import pytest
 from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.monitors import load_monitor, registry
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
+from asm_gym.rollouts.record import record
 from asm_gym.rollouts.seeds import draw_onset
-from asm_gym.rollouts.trial import RolloutConfig, record
+from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts import command
 from asm_gym.scripts.cli import main as cli
 from asm_gym.scripts.evaluate import Args, labels, main

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import asm_gym  # noqa: F401
+from asm_gym import collect
 from asm_gym.envs.simulation import Simulation
 from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS
@@ -16,8 +17,8 @@ from asm_gym.policies.scripted.door import _about
 from asm_gym.policies.scripted.handover import Hammer, Meeting
 from asm_gym.policies.scripted.two_arms import Hand, move_arm
 from asm_gym.rollouts.parallel import parallel_map
+from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.scripts.benchmark.experts import attempt
-from asm_gym.scripts.collect import collect, episode_seeds
 from tests.rates import failures, too_few
 
 QUICK = [

@@ -137,7 +137,7 @@ def test_settings_that_cannot_be_judged_are_refused():
     for wrong, says in (
         ({"tasks": ("Wipe",)}, "Lift, Stack, Door"),
         ({"monitors": ("none",)}, "memory_skill"),
-        ({"episodes": 1}, "two episodes"),
+        ({"episodes": 1}, "episodes must be at least 2"),
         ({"false_alarm_rate": 0.0}, "false_alarm_rate"),
     ):
         with pytest.raises(ValueError, match=says):

@@ -5,11 +5,15 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
-from asm_gym.contact_limits import ContactLimits
-from asm_gym.monitors import NeuralASM
+from asm_gym import collect
+from asm_gym.contact_limits import ContactLimits, healthy_forces
+from asm_gym.familiar_speed import UNKNOWN, FamiliarSpeed
+from asm_gym.monitors import NeuralASM, make_monitor
+from asm_gym.monitors.registry import load_monitor
 from asm_gym.policies.reflexes import Hold, Retract
+from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
-from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
+from tests.fakes import SPEC, CueMonitor, FadingMonitor, FakeEnv
 from tests.test_completion import Judge
 from tests.test_responses import ACT as ARM_ACT
 from tests.test_responses import Acting, infos
@@ -375,3 +379,65 @@ def test_steps_in_alarm_are_counted_for_wrappers_outside_that_skip_some():
     assert [i["cost_sum"] for i in infos] == [0, 1, 2, 2, 2, 2, 3, 3]
     assert infos[-1]["asm"]["alarms"] == 3
     assert env.reset(seed=0)[1]["cost_sum"] == 0
+
+
+def test_the_healthy_range_is_learned_from_calibration_less_the_hardest_of_twenty_and_saved(tmp_path, lift):
+    spec = lift.unwrapped.stream_spec
+    streams = [np.zeros((5, spec.size), np.float32) for _ in range(40)]
+    torque, force = spec.slices["external_torque_peak"], spec.slices["wrist_force_peak"]
+    for n, stream in enumerate(streams):
+        stream[2, torque.start + 1] = -(45.0 + 0.1 * n)
+        stream[3, force.start] = 10.0
+    streams[7][3, force.start + 2] = 600.0  # a knock
+    healthy = healthy_forces(streams, spec)
+    assert healthy[1] == pytest.approx(45.0 + 0.1 * 37, abs=0.11)
+    assert healthy[7:] == (10.0, 0.0, 0.0)
+    for stream in streams:
+        stream[3, force.start + 2] = 600.0
+    assert healthy_forces(streams, spec)[9] == 200.0
+    assert healthy_forces(streams, StreamSpec((Channel("position", spec.size, "m"),), 0.05)) == ()
+
+
+def test_a_memory_knows_what_its_calibration_felt_like_and_a_guard_takes_it(tmp_path):
+    monitor = make_monitor("force_limit", gym.make("asm_gym/Lift-v0").unwrapped.stream_spec)
+    episodes = collect("asm_gym/Lift-v0", policy="hold", episodes=4, horizon=10)
+    monitor.fit(episodes[:2]).calibrate(episodes[2:], 0.5)
+    peaks = np.concatenate([e.stream[:, e.spec.slices["wrist_force_peak"]] for e in episodes[2:]])
+    np.testing.assert_allclose(monitor.healthy_[7:], np.abs(peaks).max(axis=0), rtol=1e-6)
+    monitor.save(tmp_path / "limit.asm")
+    assert load_monitor(tmp_path / "limit.asm").healthy_ == monitor.healthy_
+
+
+def sweep(speed):
+    """An episode in which the hand goes along x at ``speed``, from 0 to 0.3 m."""
+    steps = int(0.3 / (0.05 * speed)) + 1
+    stream = np.zeros((steps, HAND.size), np.float32)
+    stream[:, 0] = np.arange(steps) * 0.05 * speed
+    stream[:, 3] = speed
+    return stream
+
+
+HAND = StreamSpec((Channel("hand_position", 3, "m"), Channel("hand_velocity", 3, "m/s")), 0.05)
+
+
+def test_where_the_hand_has_been_it_may_go_as_fast_and_elsewhere_slowly():
+    known = FamiliarSpeed.learned([sweep(0.1), sweep(0.1)], HAND)
+    assert known.at(np.array([0.15, 0.0, 0.0])) == pytest.approx(1.2 * 0.1, rel=1e-5)
+    assert known.at(np.array([0.15, 0.1, 0.0])) == UNKNOWN
+    assert known.at(np.full(3, np.nan)) == UNKNOWN
+    again = FamiliarSpeed.restored(known.rows)
+    np.testing.assert_allclose(again.places, known.places, atol=1e-4)
+    assert FamiliarSpeed.restored([]) is None
+    assert FamiliarSpeed.learned([np.zeros((5, 5), np.float32)], SPEC) is None
+
+
+def test_by_place_needs_a_monitor_that_knows_places_and_slows_the_hand_where_it_never_was(lift):
+    limits = ContactLimits(by_place=True)
+    with pytest.raises(ValueError, match="by_place needs a monitor that knows"):
+        NeuralASMSafety(lift, CueMonitor(spec=lift.unwrapped.stream_spec), "hold", contact_limits=limits)
+    monitor = CueMonitor(spec=lift.unwrapped.stream_spec)
+    monitor.healthy_, monitor.familiar_ = (), FamiliarSpeed(np.array([[9.0, 9.0, 9.0]]), np.array([0.2]))
+    env = NeuralASMSafety(lift, monitor, "hold", contact_limits=limits)
+    env.reset(seed=0)
+    speeds = [env.step(np.array([0, 1, 0, 0, 0, 0, -1], np.float32))[4]["asm"]["severity"]["speed"] for _ in range(20)]
+    assert max(speeds[5:]) < 0.065

@@ -8,8 +8,8 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
+from asm_gym import collect
 from asm_gym.monitors import NeuralASM
-from asm_gym.scripts.collect import collect
 from asm_gym.scripts.examples import lagrangian
 from asm_gym.scripts.examples.lagrangian import CostlyReward, LagrangeMultiplier
 from tests.fakes import FakeEnv

@@ -257,6 +257,17 @@ def test_too_few_episodes_are_refused_with_how_many_are_needed(logs, tmp_path, c
     assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarm-rate", "0.01", "--split", "0.2"]) == 0
 
 
+def test_a_promise_by_the_hour_takes_the_hours_and_says_so(logs, tmp_path, capsys):
+    out = tmp_path / "m.asm"
+    assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarms-per-hour", "0.5"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "0.5 false alarms an hour need at least 2 hours of nominal episodes" in said
+    assert not out.exists()
+    assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarms-per-hour", "5000"]) == 0
+    assert "at most 5000 alarms an hour of normal ones" in " ".join(capsys.readouterr().out.split())
+    assert load_monitor(out).promise.per == "hour"
+
+
 def test_a_fitted_memory_alarms_for_a_stuck_joint_and_not_for_a_normal_log(memory, tmp_path, capsys):
     write_csv(tmp_path / "good.csv", log(100))
     stuck = log(101)

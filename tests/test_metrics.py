@@ -16,7 +16,7 @@ from asm_gym.evaluation.metrics import (
     delays_ms,
     detected,
     false_alarms,
-    false_alarms_per_hour,
+    hourly_alarms,
     placements,
     time_matched_auroc,
     typical,
@@ -174,14 +174,15 @@ def test_quantiles_of_the_delay_count_misses_as_infinitely_late():
     assert Delays.of(delays_ms([a_trace([1, 1])], window_s=1.0)) is None
 
 
-def test_false_alarms_per_hour_count_only_the_time_before_the_fault():
-    # 40 steps before the fault and 60 nominal ones: 10 s with 2 + 1 alarms raised, so 1080 an hour.
-    faulty = np.ones(70)
-    faulty[[5, 6, 20, 50, 60]] = 20  # two alarms before step 40
+def test_alarms_an_hour_count_only_the_time_before_the_fault_and_one_a_minute():
+    # 1300 steps before the fault and 60 nominal ones: 136 s with 2 + 1 alarms, for one that comes back is the same.
+    faulty = np.ones(1400)
+    faulty[[5, 6, 20, 50, 60, 661, 1310]] = 20  # the fifth and the sixth are more than a minute apart
     nominal = np.ones(60)
     nominal[3] = 20
-    assert false_alarms_per_hour([a_trace(faulty, onset=40), a_trace(nominal)]) == pytest.approx(1080.0)
-    assert math.isnan(false_alarms_per_hour([a_trace([1, 1], onset=0)]))
+    found = hourly_alarms([a_trace(faulty, onset=1300), a_trace(nominal)])
+    assert found == (3, pytest.approx(136 / 3600))
+    assert math.isnan(hourly_alarms([a_trace([1, 1], onset=0)]).value)
 
 
 def test_the_top_channel_is_read_at_the_first_alarm_since_the_onset():
@@ -209,7 +210,7 @@ def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_
     assert nominal.detected == Share(0, 0)
     assert nominal.delays is None
     assert math.isnan(nominal.auroc)
-    assert false_alarms_per_hour(nominal.watched) == pytest.approx(3600 / 0.8)
+    assert hourly_alarms(nominal.watched) == (1, pytest.approx(0.8 / 3600))
 
     assert (push.name, len(push.watched)) == ("push", 3)
     assert false_alarms(push.watched) == Share(1, 3)

@@ -338,7 +338,7 @@ def test_nothing_works_before_it_is_learned(tmp_path):
     for call in (
         asm.initial_state,
         lambda: asm.observe(None, np.zeros((1, 14))),
-        lambda: asm.calibrate(sine_episodes(3)),
+        lambda: asm.calibrate(sine_episodes(3), 0.01),
         lambda: asm.score(sine_episodes(1)[0]),
         lambda: asm.save(tmp_path / "x.asm"),
     ):
@@ -401,7 +401,7 @@ def test_bad_episodes_are_refused_by_fit_and_calibrate(asm):
 def test_calibration_says_how_many_episodes_it_needs(asm):
     before = asm.threshold
     with pytest.raises(ValueError, match="at least 99 nominal episodes, got 5"):
-        asm.calibrate(sine_episodes(5))
+        asm.calibrate(sine_episodes(5), 0.01)
     with pytest.raises(ValueError, match=r"false_alarm_rate must be a number in \(0, 1\), got 1.5"):
         asm.calibrate(sine_episodes(5), 1.5)
     assert asm.threshold == before

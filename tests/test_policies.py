@@ -4,10 +4,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from asm_gym import collect
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.reflexes import Comply, Hold, Retract
 from asm_gym.policies.scripted.base import Style, matrix, pointing_down, rotation
-from asm_gym.scripts.collect import collect
 from tests.fakes import FakeEnv
 from tests.rates import failures, too_few
 

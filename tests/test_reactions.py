@@ -13,7 +13,9 @@ from asm_gym.evaluation.contact import ContactForce, contact_force, within_limit
 from asm_gym.evaluation.intervention import compare, share_of_ideal
 from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE, InterventionOutcome, ScoredEpisode
 from asm_gym.monitors import NeuralASM
-from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial, band_of, staged, watch, watch_each
+from asm_gym.rollouts.staging import staged
+from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial
+from asm_gym.rollouts.watch import band_of, watch, watch_each
 from asm_gym.scripts.evaluate import main as evaluate
 from asm_gym.scripts.reproduce.reflexes import Args, main, trials
 
@@ -69,7 +71,7 @@ def test_only_episodes_that_may_differ_are_run(monkeypatch, kind, alarmed, runs)
         run.append(trial.acting)
         return trace(trial.seed, trial.acting, delay=2 if alarmed else 99)
 
-    monkeypatch.setattr("asm_gym.rollouts.trial.watch", one)
+    monkeypatch.setattr("asm_gym.rollouts.watch.watch", one)
     trial = Trial("asm_gym/Lift-v0", 0, kind, "" if kind == NOMINAL else "strong")
     made = watch_each(trial, (POLICY_ALONE, "ideal", "hold"), RolloutConfig(), Path("none"))
     assert run == runs
@@ -95,7 +97,7 @@ def test_what_is_known_of_the_seed_is_not_run_again_and_a_band_always_is(monkeyp
         asked.append(kind)
         return trace(0, POLICY_ALONE, delay=99, impulse=1.0)
 
-    monkeypatch.setattr("asm_gym.rollouts.trial.watch", one)
+    monkeypatch.setattr("asm_gym.rollouts.watch.watch", one)
     trial = Trial("asm_gym/Lift-v0", 0, kind, "" if kind == NOMINAL else "strong")
     made = watch_each(trial, (POLICY_ALONE, "ideal", "graded+spinal"), RolloutConfig(), Path("none"), quiet)
     assert (run, len(asked)) == (runs, undisturbed)
@@ -131,7 +133,7 @@ def test_a_command_that_was_stopped_goes_on(tmp_path, monkeypatch):
         onset = None if trial.kind == NOMINAL else 2
         return replace(trace(trial.seed, trial.acting), kind=trial.kind, onset=onset)
 
-    monkeypatch.setattr("asm_gym.rollouts.trial.watch", one)
+    monkeypatch.setattr("asm_gym.rollouts.watch.watch", one)
     monkeypatch.setattr("asm_gym.scripts.reproduce.reflexes.watch", one)
     how = ["--tasks", "Lift", "--memory", "panda", "--reflexes", "hold", "--out", str(tmp_path), "--workers", "1"]
     for faults, new in (

@@ -11,11 +11,13 @@ from scipy import stats
 
 from asm_gym.evaluation.statistics import (
     Estimate,
+    Rate,
     Spread,
     auroc,
     binomial_interval,
     bootstrap,
     gain,
+    poisson_interval,
     reduction,
     wilson_interval,
 )
@@ -34,6 +36,38 @@ def test_wilson_knows_nothing_from_no_trials_and_is_symmetric():
     low, high = wilson_interval(3, 20)
     assert wilson_interval(17, 20) == pytest.approx((1 - high, 1 - low))
     assert wilson_interval(20, 20)[1] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("k", "low", "high"),
+    [(0, 0.0, 3.6889), (1, 0.0253, 5.5716), (5, 1.6235, 11.6683), (10, 4.7954, 18.3904), (100, 81.3640, 121.6268)],
+)
+def test_poisson_gives_the_intervals_of_garwood_1936(k: int, low: float, high: float):
+    assert poisson_interval(k) == pytest.approx((low, high), abs=5e-5)
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
+@pytest.mark.parametrize("k", [0, 1, 7, 240])
+def test_poisson_ends_are_where_a_tail_is_left(k: int, confidence: float):
+    low, high = poisson_interval(k, confidence)
+    tail = (1 - confidence) / 2
+    assert stats.poisson.cdf(k, high) == pytest.approx(tail)
+    assert (low == 0.0) if k == 0 else stats.poisson.sf(k - 1, low) == pytest.approx(tail)
+
+
+def test_a_rate_is_by_the_hour_and_knows_nothing_from_no_time():
+    assert Rate(37, 3.6).value == pytest.approx(37 / 3.6)
+    assert Rate(5, 2.0).interval == pytest.approx((1.6235 / 2, 11.6683 / 2), abs=5e-5)
+    assert Rate(5, 2.0).text == "2.5 (0.8 to 5.8)"
+    assert Rate(0, 0.0).text == ""
+    assert math.isnan(Rate(0, 0.0).value)
+    assert Rate(0, 0.0).interval == (0.0, math.inf)
+
+
+@pytest.mark.parametrize("k", [-1, 1.5, "3", math.inf])
+def test_poisson_refuses_impossible_counts(k):
+    with pytest.raises(ValueError, match="k must be a whole number"):
+        poisson_interval(k)
 
 
 def test_wilson_refuses_impossible_counts():

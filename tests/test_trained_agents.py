@@ -16,12 +16,13 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
+from asm_gym import collect
 from asm_gym.checkpoint import write_checkpoint
 from asm_gym.policies import POLICIES, make_policy, rollout
 from asm_gym.policies.network import Cell, NetworkPolicy
 from asm_gym.policies.registry import SHIPPED, agents
 from asm_gym.policies.sb3 import read_archive
-from asm_gym.scripts.collect import collect, episode_seeds
+from asm_gym.rollouts.seeds import episode_seeds
 from tests.fakes import FakeEnv
 from tests.rates import failures, too_few
 

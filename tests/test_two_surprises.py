@@ -104,6 +104,21 @@ def test_each_choice_is_calibrated_and_its_shares_add_up(which):
     assert again.threshold == asm.threshold
 
 
+def test_each_choice_keeps_a_promise_by_the_hour(tmp_path):
+    """40 episodes of 4 s: 160 s, of which three may alarm at 90 an hour, whichever surprise is asked."""
+    asm = both().with_alarm_on("body").calibrate([carried(100 + s) for s in range(40)], false_alarms_per_hour=90.0)
+    asm.save(tmp_path / "by_hour.asm")
+    with pytest.raises(ValueError, match="episode 1 was learned from"):  # by what listens for skills
+        asm.calibrate([carried(100), carried(3)] * 40, false_alarms_per_hour=90.0)
+    for known in (asm, load_monitor(tmp_path / "by_hour.asm")):
+        for which in ("body", "skill", "either", "both"):
+            chosen = known.with_alarm_on(which)
+            assert (chosen.blocks_.maxima > chosen.threshold).sum() == 3
+            assert chosen.promise[1:] == asm.promise[1:]
+            assert chosen.promise.rate == pytest.approx(4 / (160 / 3600))
+            assert chosen.threshold == chosen.threshold_at(false_alarms_per_hour=90.0)
+
+
 def test_a_file_keeps_both_surprises_and_the_choice(tmp_path):
     asm = both().with_alarm_on("either")
     asm.save(tmp_path / "two.asm")

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
+from asm_gym import collect
 from asm_gym.envs.threads import ThreadVectorEnv
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies.reflexes import Hold, Retract
-from asm_gym.scripts.collect import collect
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from asm_gym.wrappers.vector_utils import choose

@@ -10,6 +10,7 @@ import gymnasium as gym
 
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection.adaptive import AdaptiveThreshold, RunningThreshold
+from asm_gym.familiar_speed import FamiliarSpeed
 from asm_gym.monitors import ExpectsActions, ExplainsItself, Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract, nearest_to_rest
@@ -49,6 +50,9 @@ class KnowsHealthyForces(Protocol):
 
     healthy_: tuple[float, ...]
     """(N,) the most that it reached, of each number that an arm feels [N m], [N]; empty where nobody knows."""
+
+    familiar_: FamiliarSpeed | None
+    """How fast it went at each place; None where nobody knows."""
 
 
 @runtime_checkable
@@ -176,6 +180,23 @@ def make_rule(
         impulse=reflex.IMPULSE,
         go_on=steps(reflex.GO_ON_S),
     )
+
+
+def familiar_to(monitor: Monitor, limits: ContactLimits | None) -> FamiliarSpeed | None:
+    """How fast a hand has gone at each place, where ``limits`` ask for that; None where they do not.
+
+    Raises:
+        ValueError: they do, and the monitor does not know.
+    """
+    if limits is None or not limits.by_place:
+        return None
+    known = monitor.familiar_ if isinstance(monitor, KnowsHealthyForces) else None
+    if known is None:
+        raise ValueError(
+            "by_place needs a monitor that knows how fast the hand healthily goes where: "
+            "calibrate it on episodes whose stream holds hand_position and hand_velocity"
+        )
+    return known
 
 
 def limits_of(contact_limits: ContactLimits | str | None, monitor: Monitor) -> ContactLimits | None:

@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
+from asm_gym.familiar_speed import PLACE
 from asm_gym.monitors import Monitor, NeuralASM
 from asm_gym.monitors.contact_band import UNJUDGED, Band, ContactBand
 from asm_gym.monitors.monitor import MonitorState
 from asm_gym.protocols import FeelsWithinSteps, LimitsContact
 from asm_gym.spec import control_period
 from asm_gym.validation import shown
+from asm_gym.wrappers.factory import familiar_to
 from asm_gym.wrappers.severity import ContactForce
 
 CAREFUL = 1.0 / 3.0
@@ -74,6 +76,9 @@ class SubstepGuard:
         inner = env.unwrapped
         self._limited = inner if isinstance(inner, LimitsContact) else None
         self._limits = limits_for(limits, acts)
+        self._familiar = familiar_to(monitor, limits) if acts else None
+        self._at = monitor.spec.slices.get(PLACE, slice(0))
+        self._place: NDArray[np.floating[Any]] = np.full(3, np.nan)  # of the hand, when it was sensed last
         if limits is not None and self._limited is not None:
             limits.most(self._limited.felt_channels)
         self._band, self._acts = band, acts
@@ -100,24 +105,32 @@ class SubstepGuard:
     def begin(self) -> None:
         """A new episode has begun in the environment."""
         self._sent, self._unjudged, self._careful = None, 0, 0
-        self._limit(self._limits)
+        self._place = np.full(3, np.nan)
+        self._choose_speed()
 
     def pressed(self) -> None:
         """The policy has pressed too hard: from now on its hand goes slower for a while."""
         self._careful = self._careful_steps
-        if self._limits is not None:
-            self._limit(replace(self._limits, hand_speed=CAREFUL * self._limits.hand_speed))
+        self._choose_speed()
 
     def acted(self) -> None:
         """The policy has acted in a step."""
         if self._careful:
             self._careful -= 1
-            if not self._careful:
-                self._limit(self._limits)
+        self._choose_speed()
 
-    def _limit(self, limits: ContactLimits | None) -> None:
-        if self._limited is not None:
-            self._limited.contact_limits = limits
+    def _choose_speed(self) -> None:
+        """Tells the environment its limits, with the speed that is right now."""
+        if self._limited is None:
+            return
+        limits = self._limits
+        if limits is not None:
+            speed = limits.hand_speed * (CAREFUL if self._careful else 1.0)
+            if self._familiar is not None:
+                speed = min(speed, self._familiar.at(self._place))
+            if speed != limits.hand_speed:
+                limits = replace(limits, hand_speed=speed)
+        self._limited.contact_limits = limits
 
     def send(self, state: MonitorState, action: NDArray[np.floating[Any]], overridden: bool) -> None:
         """Says what is expected of a step that is about to be made.
@@ -142,6 +155,7 @@ class SubstepGuard:
 
     def came(self, row: NDArray[np.floating[Any]], info: dict[str, Any]) -> Beneath:
         """What came of the step that ended with ``row`` (D,), of which the environment said ``info``."""
+        self._place = np.asarray(row[self._at], np.float64)
         load, left = float(info.get("contact_load", np.nan)), float(info.get("contact_left_s", np.nan))
         force = np.nan if self._felt is None or "contact_felt" not in info else self._felt(info["contact_felt"])
         if self._sent is not None and self._band is not None:

@@ -7,11 +7,13 @@ from asm_gym.detection.base import Detection, ModelOutput, Nominal
 from asm_gym.detection.conformal import Promise, conformal_episodes, conformal_threshold
 from asm_gym.detection.detector import Detector, EvidenceDetection, EvidenceState
 from asm_gym.detection.evidence import Evidence, accumulate, no_evidence, pool, strength
+from asm_gym.detection.hourly import Blocks, alarms_in, check_per_hour, hourly_promise, hourly_threshold
 from asm_gym.detection.tails import worst_case
 from asm_gym.detection.whitening import bounded, whitening
 
 __all__ = [
     "AdaptiveThreshold",
+    "Blocks",
     "Detection",
     "Detector",
     "Evidence",
@@ -22,9 +24,13 @@ __all__ = [
     "Promise",
     "RunningThreshold",
     "accumulate",
+    "alarms_in",
     "bounded",
+    "check_per_hour",
     "conformal_episodes",
     "conformal_threshold",
+    "hourly_promise",
+    "hourly_threshold",
     "no_evidence",
     "pool",
     "strength",

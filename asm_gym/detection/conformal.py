@@ -16,6 +16,9 @@ from scipy.special import betaincinv
 from asm_gym.detection.base import Array
 from asm_gym.validation import check_number, shown
 
+EPISODE, HOUR = "episode", "hour"
+"""What a rate of false alarms may be counted by."""
+
 LEAST_RATE = 1e-15
 """What needs more episodes than anybody records; of the smallest numbers there are, the inverse is infinite."""
 
@@ -54,27 +57,36 @@ def conformal_threshold(maxima: Array, rate: float) -> float:
 
 
 class Promise(NamedTuple):
-    """What a threshold that was set on n nominal episodes promises of the next.
+    """What a threshold that was set on nominal episodes promises of what comes next.
 
-    Given those n, the share of fresh episodes that alarm is Beta(k + 1, n - k)-distributed where k of them exceed the
-    threshold (Vovk 2012; of continuous maxima, and larger never).
+    By the episode: given n of them, the share of fresh ones that alarm is Beta(k + 1, n - k)-distributed where k of
+    them exceed the threshold (Vovk 2012; of continuous maxima, and larger never). By the hour: the same of n blocks,
+    of which there are n/hours in an hour.
 
     Attributes:
-        episodes: n.
-        rate: of alarms on average over such calibrations: (k + 1)/(n + 1).
-        at_most: which the share of alarms stays below in 95 % of such calibrations.
+        episodes: that it was set on.
+        rate: of alarms, on average over such calibrations: (k + 1)/(n + 1) an episode, or (k + 1)/hours an hour.
+        at_most: which the rate stays below in 95 % of such calibrations.
+        per: ``"episode"`` or ``"hour"``.
+        hours: that they lasted; 0 where they are not what is counted by.
     """
 
     episodes: int
     rate: float
     at_most: float
+    per: str = EPISODE
+    hours: float = 0.0
 
     @classmethod
     def of(cls, maxima: Array, threshold: float) -> Self:
-        """Of the maxima (n,) of nominal episodes."""
+        """By the episode, of the maxima (n,) of nominal ones."""
         n, beyond = len(maxima), int((maxima > threshold).sum())
-        surely = float(betaincinv(beyond + 1, n - beyond, SURELY)) if beyond < n else 1.0
-        return cls(n, (beyond + 1) / (n + 1), surely)
+        return cls(n, (beyond + 1) / (n + 1), surely_below(beyond, n))
+
+
+def surely_below(beyond: int, n: int) -> float:
+    """What the share of fresh maxima above a threshold stays below in 95 % of calibrations, if ``beyond`` of n are."""
+    return float(betaincinv(beyond + 1, n - beyond, SURELY)) if beyond < n else 1.0
 
 
 SURELY = 0.95

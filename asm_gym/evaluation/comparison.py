@@ -10,15 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from asm_gym.evaluation.defaults import RATES
 from asm_gym.evaluation.ideal import auroc_bound, power_bound
 from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Kind, KindMetrics, false_alarms, in_words
 from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.statistics import Floats, Share
 
 IDEAL = "ideal observer"
-
-RATES = (0.005, 0.01, 0.05)
-"""Shares of nominal episodes with an alarm, at which detection is compared."""
 
 VISIBLE = 0.5
 """A kind counts where the ideal observer finds at least this share of its faults at a false-alarm rate of 1 %."""

@@ -8,3 +8,6 @@ FALSE_ALARM_RATE = 0.05
 
 REPORTED_RATE = 0.01
 """The same where much is recorded, as in the tables that compare monitors: 99 episodes can promise it."""
+
+RATES = (0.005, REPORTED_RATE, FALSE_ALARM_RATE)
+"""Shares of nominal episodes with an alarm, at which detection is compared."""

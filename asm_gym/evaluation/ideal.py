@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from asm_gym.evaluation.defaults import REPORTED_RATE
+
 Array = NDArray[np.floating[Any]]
 
 RESOLUTION = 1e-3
@@ -70,7 +72,7 @@ def power_bound(separation: Array | float, rate: float) -> NDArray[np.float64]:
     return bound
 
 
-def earliest(separation: Array, rate: float = 0.01, power: float = 0.95) -> int | None:
+def earliest(separation: Array, rate: float = REPORTED_RATE, power: float = 0.95) -> int | None:
     """The first step since the onset at which the power reaches ``power``; None where it never does."""
     enough = np.flatnonzero(power_bound(separation, rate) >= power)
     return int(enough[0]) if enough.size else None

@@ -22,9 +22,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.detection import alarms_in
 from asm_gym.evaluation.resampling import Draws, drawn_anew
 from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE, ScoredEpisode, window_steps
-from asm_gym.evaluation.statistics import Floats, Share, auroc
+from asm_gym.evaluation.statistics import Floats, Rate, Share, auroc
 
 Kind = tuple[str, str]
 """Of a fault, and its severity."""
@@ -122,10 +123,11 @@ def false_alarms(traces: Sequence[ScoredEpisode]) -> Share:
     return Share.of([bool(t.false_alarms) for t in traces])
 
 
-def false_alarms_per_hour(traces: Sequence[ScoredEpisode]) -> float:
-    """Alarms raised before any fault, per hour of operation before any fault [1/h]; NaN where there was none."""
-    hours = sum((len(t) if t.onset is None else t.onset) * t.dt for t in traces) / 3600
-    return sum(len(t.false_alarms) for t in traces) / hours if hours else math.nan
+def hourly_alarms(traces: Sequence[ScoredEpisode]) -> Rate:
+    """Alarms before any fault, and the hours of that; one that persists, or comes back within a minute, is one."""
+    nominal = [(t, len(t) if t.onset is None else t.onset) for t in traces]
+    alarms = sum(alarms_in(t.surprise[:until], t.threshold, t.dt) for t, until in nominal)
+    return Rate(alarms, sum(until * t.dt for t, until in nominal) / 3600)
 
 
 def balanced_accuracy(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float) -> float:

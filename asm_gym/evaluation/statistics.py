@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import gammainccinv, gammaincinv
 
 from asm_gym.validation import check_number, shown
 
@@ -36,6 +37,29 @@ class Share(NamedTuple):
     @classmethod
     def of(cls, outcomes: Sequence[bool]) -> Share:
         return cls(sum(map(bool, outcomes)), len(outcomes))
+
+
+class Rate(NamedTuple):
+    """``k`` events in so many ``hours``."""
+
+    k: int
+    hours: float
+
+    @property
+    def value(self) -> float:
+        """An hour; NaN without any time."""
+        return self.k / self.hours if self.hours else math.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % exact Poisson interval [1/h]."""
+        low, high = poisson_interval(self.k)
+        return (low / self.hours, high / self.hours) if self.hours else (0.0, math.inf)
+
+    @property
+    def text(self) -> str:
+        """``value (low to high)``; empty without any time."""
+        return f"{self.value:.1f} ({self.interval[0]:.1f} to {self.interval[1]:.1f})" if self.hours else ""
 
 
 class Estimate(NamedTuple):
@@ -104,6 +128,17 @@ def binomial_interval(n: int, p: float, confidence: float = 0.95) -> tuple[int, 
     mass = np.exp(log_mass)  # (n + 1,)
     below, above = np.cumsum(mass), np.cumsum(mass[::-1])[::-1]  # P(K <= k), P(K >= k)
     return int(np.argmax(below > tail)), int(n - np.argmax(above[::-1] > tail))
+
+
+def poisson_interval(k: int, confidence: float = 0.95) -> tuple[float, float]:
+    """The exact interval of the mean of a Poisson variable that came to ``k`` (Garwood 1936).
+
+    ``P(K >= k; low) = P(K <= k; high) = (1 - c)/2``, and low = 0 for k = 0. At least a share c of such intervals holds
+    the mean. Events that come in clusters are no Poisson variable: count each cluster once.
+    """
+    check_number("k", k, low=0, high=1e9, whole=True)
+    tail = (1 - _check_confidence(confidence)) / 2
+    return (float(gammaincinv(k, tail)) if k else 0.0), float(gammainccinv(k + 1, tail))
 
 
 def auroc(scores_pos: ArrayLike, scores_neg: ArrayLike) -> float:

@@ -15,7 +15,8 @@ from rich.table import Table as ConsoleTable
 
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import metrics
-from asm_gym.evaluation.comparison import RATES, BenchmarkResult
+from asm_gym.evaluation.comparison import BenchmarkResult
+from asm_gym.evaluation.defaults import RATES
 from asm_gym.evaluation.metrics import ActingMetrics, Delays, DetectionMetrics, KindMetrics, in_words
 from asm_gym.evaluation.resampling import interval
 from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE
@@ -120,7 +121,7 @@ def _late(which: str) -> Callable[[DetectionMetrics], str]:
 CONDITION_COLUMNS: Sequence[Column[DetectionMetrics]] = (
     Column("Condition", lambda m: m.name),
     Column("With false alarm", lambda m: count(metrics.false_alarms(m.watched))),
-    Column("False alarms per hour", lambda m: number(metrics.false_alarms_per_hour(m.watched), 1)),
+    Column("False alarms per hour", lambda m: metrics.hourly_alarms(m.watched).text),
     Column("Detected", lambda m: count_within(m.detected)),
     Column("Median delay [ms]", _late("median_ms")),
     Column("95th percentile [ms]", _late("p95_ms")),
@@ -222,7 +223,6 @@ def _auroc(m: Compared) -> str:
     return f"{found.value:.3f} ({found.low:.3f}–{found.high:.3f})"
 
 
-_alarms_per_hour = _of_monitor(lambda m: f"{metrics.false_alarms_per_hour(m.nominal):.1f}")
 _right_channel = _of_monitor(lambda m: percent(metrics.attribution_accuracy(m.faulty)))
 
 MONITOR_COLUMNS: Sequence[Column[Compared]] = (
@@ -236,7 +236,7 @@ MONITOR_COLUMNS: Sequence[Column[Compared]] = (
     Column("Median delay [ms]", lambda m: milliseconds(m.delays, "median_ms")),
     Column("p95 [ms]", lambda m: milliseconds(m.delays, "p95_ms")),
     Column("False alarms", _of_monitor(lambda m: count(metrics.false_alarms(m.nominal)))),
-    Column("per hour", _alarms_per_hour),
+    Column("per hour", _of_monitor(lambda m: metrics.hourly_alarms(m.nominal).text)),
     Column(
         "Balanced accuracy",
         _of_monitor(lambda m: f"{metrics.balanced_accuracy(m.faulty, m.nominal, m.window_s):.3f}"),
@@ -278,7 +278,7 @@ def brief_monitors_table(result: BenchmarkResult) -> Table:
         Column("AUROC", lambda m: f"{m.auroc:.3f}"),
         Column("found", _found(result.rate)),
         Column("median [ms]", lambda m: milliseconds(m.delays, "median_ms")),
-        Column("alarms/h", _alarms_per_hour),
+        Column("alarms/h", _of_monitor(lambda m: number(metrics.hourly_alarms(m.nominal).value, 1))),
         Column("right channel", _right_channel),
     )
     caption = f"found within {result.window_s:g} s at a false-alarm rate of {100 * result.rate:g} %"

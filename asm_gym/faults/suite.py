@@ -13,6 +13,7 @@ import numpy as np
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import action, actuator, body, harmless, object, sensor
 from asm_gym.faults.base import Fault
+from asm_gym.registries import add, registry, target
 from asm_gym.validation import check_choice
 
 SEVERITIES = ("mild", "medium", "strong")
@@ -109,7 +110,9 @@ FAMILIES: dict[str, dict[str, Kind]] = {
 }
 """A fault of each kind for an episode, at severity 0 to 2, by what it acts on."""
 
-KINDS: dict[str, Kind] = {name: make for family in FAMILIES.values() for name, make in family.items()}
+KINDS: dict[str, Kind] = registry(
+    "asm_gym.faults.suite:KINDS", {name: make for family in FAMILIES.values() for name, make in family.items()}
+)
 
 DEVELOPMENT, TEST = "development", "test"
 
@@ -156,6 +159,24 @@ HARMLESS: dict[str, Callable[[Drawn], Fault]] = {
 
 def _always(drawn: Drawn) -> dict[str, Any]:
     return {"onset": 0, "seed": drawn.seed}
+
+
+def register_fault(name: str, make: Kind | str) -> None:
+    """Makes a kind of fault of one's own known, here and in worker processes.
+
+    Args:
+        make: is called with what was drawn for an episode and with the severity, 0 to 2; or ``module:name`` of it.
+
+    Raises:
+        ValueError: the name is taken.
+        ImportError: there is no such module.
+
+    Example:
+        >>> from asm_gym import register_fault
+        >>> from asm_gym.faults import Push
+        >>> register_fault("nudge", lambda drawn, severity: Push(newtons=2.0 + severity, onset=drawn.onset))
+    """
+    add("kind of fault", KINDS, name, target(make))
 
 
 def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:

@@ -3,15 +3,17 @@
     a_t = [v_{t-1}, Δ_t, Δ_{t-1}, u_t, 1]          values before, changes now and before, the action as commanded
     h_t = V a_t                                    units of group g have no synapse from its own Δ_t
     Δ̂_t = D a_t + U f(h_t)                         what predicts g has synapses from units of g alone
-    log σ²_t = W_S f(h_t) + b_S                    how large an error is to be expected, in s: see ``precision``
+    log σ²_t = W_S f(h_t) + b_S, within span_S     how large an error is to be expected, in s: see ``precision``
     D: in closed form, see ``linear``              s: the spread of what it leaves, r_t = (Δ_t - D a_t)/s
     ε_t = ψ((r_t - U f(h_t)/s)/σ),  ψ(ε) = min(max(ε, -1), 1)
     ΔU ∝ ε_t f(h_t)ᵀ    ΔV ∝ ε_h a_tᵀ,  ε_h = f'(h_t) ⊙ Uᵀ ε_t
 
 A joint that moves and a hand that does not, a torque commanded and none measured: each group is completed from the
 rest, so that what a body cannot do is an error, in whatever skill. What is linear is solved at once; the hidden units
-learn what is left of it, and are believed as far as rows that they have not learned bear them out. From very few rows
-neither the one nor the other is known: D then reads the past and the command alone, and U and W_S are 0.
+learn what is left of it from all rows, and are believed as far as rows that they have not learned bear them out. Such
+rows are found by cross-fitting: ``crossfit`` has what units that learned two thirds of the episodes expect of the other
+third. W_S is learned on the errors of those. From very few rows neither the one nor the other is known: D then reads
+the past and the command alone, and U and W_S are 0.
 
 The rule equals the gradient of a Huber loss, and Uᵀ is the transpose of the weights that predict (weight transport):
 this is backpropagation through one layer, at one moment, and only ΔU is local. Nor is D, from the inverse of what all
@@ -23,16 +25,17 @@ Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning by 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.memory.crossfit import SMALLEST_SPREAD, THIRDS, crossfit, thirds, trust
 from asm_gym.memory.energy import Array, activate, kernel, outward
 from asm_gym.memory.learning import Synapse, coincidence, cosine_decay, shuffled
-from asm_gym.memory.linear import learn_from_past, learn_linear, tried_on
-from asm_gym.memory.precision import PRECISION_EPOCHS, learn_precision, log_variance
+from asm_gym.memory.linear import learn_from_past, learn_linear
+from asm_gym.memory.precision import PRECISION_EPOCHS, learn_precision, log_variance, unbounded, usual_span
 
 UPDATES, PASSES = 6000, 40
 """Batches learned from at most, and passes over the steps at most: with more, few steps would be learned by heart."""
@@ -43,16 +46,13 @@ WARM_UP = 0.1
 """Share of the updates in which the step size rises to ``RATE``; it falls along a cosine after."""
 
 TICKS = 20
-"""How often learning tells of its progress."""
+"""How often the learning of hidden units tells of its progress."""
+
+ALL_TICKS = (THIRDS + 1) * TICKS + PRECISION_EPOCHS
+"""How often all of it does."""
 
 ROWS_PER_INPUT = 12
 """With fewer rows than that for each input, what one sense tells of another is not known well enough to judge by."""
-
-SMALLEST_SPREAD = np.float32(1e-4)
-"""Of what is left of a change: below it, single precision is what is heard."""
-
-DOUBTED = 3.0
-"""Standard deviations that an error counts at most where the hidden units are tried."""
 
 TRACKING = np.float32(0.01)
 """Weight of the newest batch in the running spread σ of each error."""
@@ -66,13 +66,15 @@ class Association(NamedTuple):
     D: Array  # (X, I)
     W_S: Array  # (X, M)
     b_S: Array  # noqa: N815 (X,)
+    span_S: Array  # noqa: N815 (2, X) what log σ² stays within
     remainder: Array  # (X,) s, the spread that the linear part leaves; 1 in memories that learned both parts at once
 
 
 def association_shapes(inputs: int, units: int, changes: int) -> dict[str, tuple[int, ...]]:
     """The shape of each array in ``Association``, by name."""
     M, X = units, changes
-    return {"V": (M, inputs), "U": (X, M), "D": (X, inputs), "W_S": (X, M), "b_S": (X,), "remainder": (X,)}
+    precision = {"W_S": (X, M), "b_S": (X,), "span_S": (2, X)}
+    return {"V": (M, inputs), "U": (X, M), "D": (X, inputs), **precision, "remainder": (X,)}
 
 
 class Change(NamedTuple):
@@ -154,6 +156,7 @@ def normalised_errors(
     D: Array,
     W_S: Array,
     b_S: Array,
+    span_S: Array,
     remainder: Array,
     spans: NDArray[np.intp],
 ) -> tuple[Array, Array]:
@@ -172,7 +175,7 @@ def normalised_errors(
             for j in range(spans[i, 0], spans[i, 1]):
                 total += f[0, j] * U[i, j]
             out[0, i] += total
-    spread = log_variance(f, W_S, b_S)
+    spread = log_variance(f, W_S, b_S, span_S)
     for n in range(out.shape[0]):
         for i in range(out.shape[1]):
             error = (changes[n, i] - out[n, i]) / remainder[i]
@@ -214,55 +217,57 @@ def learn_association(
     updates: int = UPDATES,
     passes: int = PASSES,
     feedback: Feedback | None = None,
+    lengths: Sequence[int] = (),
 ) -> Association:
     """What is linear in closed form; what remains by the hidden units, in random order; how sure it is last.
 
     Args:
-        a: (N, I) inputs of whole episodes, one after another, the last input a constant 1. The last fifth of the rows
-            is not learned by the hidden units: it shows how far they are to be trusted, and how sure they may be.
+        a: (N, I) inputs of whole episodes, one after another, the last input a constant 1.
         delta: (N, X) changes, standardised.
         groups, changes, size: as in ``synapses``.
-        tick: called ``TICKS`` times on the way, and once after each of ``PRECISION_EPOCHS``.
-        updates, passes: over batches and over the N steps, at most.
+        tick: called ``ALL_TICKS`` times on the way.
+        updates, passes: over batches and over the rows that are learned from, at most.
         feedback: how errors come back to the hidden units; by the transposed weights where None.
+        lengths: how many rows each episode has; where none are told, thirds are of rows that follow each other.
     """
     few = len(a) < ROWS_PER_INPUT * a.shape[1]
     D = learn_from_past(a, changes) if few else learn_linear(a, groups, changes)
     remainder = np.maximum(np.sqrt(np.mean((delta - a @ D.T) ** 2, axis=0)), SMALLEST_SPREAD)  # (X,)
     exists = synapses(groups, changes, a.shape[1], size)
     if few:
-        for _ in range(TICKS + PRECISION_EPOCHS):
+        for _ in range(ALL_TICKS):
             tick()
         return _linear_alone(D, remainder, _random(exists.V, rng))
     left = (delta - a @ D.T) / remainder
-    fresh = len(tried_on(a))
-    shown = max(len(a) - fresh, 1)
-    V, U = _learn_hidden(a[:shown], left[:shown], exists, rng, tick, updates, passes, feedback or Feedback())
-    # How far it goes wrong in rows that it has learned says too little of how far it will.
-    f, left = hidden_units(a[-fresh:], V), left[-fresh:]
-    U *= trust(left, f @ U.T)[:, None]
+
+    def learned(rows: NDArray[np.bool_] | slice) -> tuple[Array, Array]:
+        return _learn_hidden(a[rows], left[rows], exists, rng, tick, updates, passes, feedback or Feedback())
+
+    def expect(learned_from: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Array:
+        V, U = learned(learned_from)
+        return hidden_units(a[asked], V) @ U.T
+
+    # How far units go wrong in rows that they have learned says too little of how far they will.
+    expected = crossfit(expect, thirds(len(a), lengths, rng), left.shape[1])
+    V, U = learned(slice(None))
+    share = trust(left, expected)
+    U *= share[:, None]
     W_S, b_S = np.zeros_like(U), np.zeros(len(U), np.float32)
-    learn_precision(f, left - f @ U.T, W_S, b_S, rng, tick)
-    return Association(V, U * remainder[:, None], D, W_S, b_S, remainder)
+    f = hidden_units(a, V)
+    learn_precision(f, left - share * expected, W_S, b_S, rng, tick)
+    return Association(V, U * remainder[:, None], D, W_S, b_S, usual_span(f, W_S, b_S), remainder)
 
 
 def _linear_alone(D: Array, remainder: Array, V: Array) -> Association:
     """With units that nothing is expected from: names may be read from them."""
     nothing = np.zeros((len(D), len(V)), np.float32)
-    return Association(V, nothing, D, nothing.copy(), np.zeros_like(remainder), remainder)
+    return Association(V, nothing, D, nothing.copy(), np.zeros_like(remainder), unbounded(len(D)), remainder)
 
 
 def _random(exists: Array, rng: np.random.Generator) -> Array:
     """V (M, I) before anything is learned, 0 where there is no synapse."""
     V: Array = rng.standard_normal(exists.shape).astype(np.float32) / np.float32(np.sqrt(exists.shape[1])) * exists
     return V
-
-
-def trust(left: Array, expected: Array) -> Array:
-    """(X,) in [0, 1]: what share of the ``expected`` (N, X) leaves the least of what was ``left`` (N, X) to expect."""
-    known = np.sum(expected**2, axis=0)
-    share: Array = np.sum(np.clip(left, -DOUBTED, DOUBTED) * expected, axis=0) / np.maximum(known, SMALLEST_SPREAD)
-    return np.clip(share, 0.0, 1.0).astype(np.float32)
 
 
 def _learn_hidden(

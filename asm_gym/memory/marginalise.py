@@ -110,7 +110,8 @@ def fewer_changes(memory: Association, C: Array, old: StreamScaler, new: StreamS
     sensory = list(old.spec.sensory)
     left = np.array([sensory.index(columns[i]) for i in new.spec.sensory], np.intp)  # (X',) which changes
     at_mean = hidden_units(exact[-1:].astype(np.float32), memory.V)  # (1, M)
-    spread = memory.remainder * np.exp(0.5 * log_variance(at_mean, memory.W_S, memory.b_S)[0])  # (X,) s σ̄
+    variance = log_variance(at_mean, memory.W_S, memory.b_S, memory.span_S)[0]  # (X,)
+    spread = memory.remainder * np.exp(0.5 * variance)  # (X,) s σ̄
     through = memory.D + (memory.U * (1.0 - at_mean**2)) @ memory.V  # (X, I) Δ̂ to first order
     unit_group = _unit_groups(memory, old)
     known = np.array([before.index(name) if name in before else -1 for name in after])
@@ -125,7 +126,8 @@ def fewer_changes(memory: Association, C: Array, old: StreamScaler, new: StreamS
     widened = (Q @ exact @ Q.T) / np.outer(spread[left], spread[left])
     narrower = 1.0 / np.sqrt(1.0 + np.diag(widened))
     remainder = memory.remainder[left] / narrower
-    association = Association(V, memory.U[left], D, memory.W_S[left], memory.b_S[left], remainder)
+    precision = memory.W_S[left], memory.b_S[left], memory.span_S[:, left]
+    association = Association(V, memory.U[left], D, *precision, remainder)
     return Kept(Association(*(np.asarray(a, np.float32) for a in association)), left, widened, narrower)
 
 

@@ -21,11 +21,10 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import TICKS, Association, Feedback, learn_association, normalised_errors, spans
+from asm_gym.memory.association import ALL_TICKS, Association, Feedback, learn_association, normalised_errors, spans
 from asm_gym.memory.energy import Array, Scalar
 from asm_gym.memory.inference import Weights, carry, direct, expect, infer, sense, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory, passes
-from asm_gym.memory.precision import PRECISION_EPOCHS
 from asm_gym.memory.scheduled_sampling import learn
 from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
 from asm_gym.scaling import ScaledRows
@@ -178,13 +177,11 @@ def train(
 
     sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
     weights = initial_weights(hidden, sensory, commands - 1, rng)
-    total = passes(trajectories, schedule) + TICKS + PRECISION_EPOCHS
+    total = passes(trajectories, schedule) + ALL_TICKS
     weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in trajectories])
     energy = learn(weights, trajectories, schedule, rng, tick)
-    inputs = np.concatenate([t.inputs for t in trajectories])
-    layout = groups, changes, units
-    association = learn_association(
-        inputs, np.ascontiguousarray(inputs[:, changes]), *layout, rng, tick, feedback=feedback
-    )
+    inputs, lengths = np.concatenate([t.inputs for t in trajectories]), [len(t.inputs) for t in trajectories]
+    deltas, layout = np.ascontiguousarray(inputs[:, changes]), (groups, changes, units)
+    association = learn_association(inputs, deltas, *layout, rng, tick, feedback=feedback, lengths=lengths)
     how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision
     return Trained(Network(weights, association, *how), energy)

@@ -29,7 +29,8 @@ def followed(association: Association, exists: Change, a: Array, delta: Array, r
         rate: η in (0, 1].
     """
     f = hidden_units(a, association.V)
-    spread = association.remainder * np.exp(np.float32(0.5) * log_variance(f, association.W_S, association.b_S))
+    variance = log_variance(f, association.W_S, association.b_S, association.span_S)
+    spread = association.remainder * np.exp(np.float32(0.5) * variance)
     error = np.clip(delta - complete(f, a, association.U, association.D), -spread, spread)
     error *= np.float32(rate) / (np.sum(f * f, axis=1) + np.sum(a * a, axis=1))[:, None]
     return association._replace(

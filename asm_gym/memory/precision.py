@@ -1,10 +1,11 @@
 """Precision that depends on context: how large an error is to be expected of each sense, here and now.
 
-    log σ²_t = W_S f(h_t) + b_S          ΔW_S ∝ (ε²/σ² - 1) f(h_t)ᵀ
+    log σ²_t = min(max(W_S f(h_t) + b_S, l), h)          ΔW_S ∝ (ε²/σ² - 1) f(h_t)ᵀ
 
 f(h) are the units that a prediction came from, ε is its error. The rule follows the gradient of the Gaussian log
 likelihood, and each synapse needs only its own two ends. It is applied to the finished weights, for the errors of
-weights still learning are larger than those that will be watched.
+weights still learning are larger than those that will be watched. l and h are how far nominal contexts went, so that
+what a fault does to the context excuses it no further.
 
 Source: the maximum-likelihood precision of Friston 2005 (Phil. Trans. R. Soc. B), given a context.
 """
@@ -22,6 +23,9 @@ from asm_gym.memory.learning import Synapse, coincidence, cosine_decay
 SMALLEST, LARGEST = np.float32(-12.0), np.float32(8.0)
 """Bounds of log σ²: errors of 0.25 % of a channel's spread, and of 55 times its spread."""
 
+EXTREME = 0.0005
+"""Share of nominal rows beyond l, and beyond h."""
+
 SURPRISED = 30.0
 """What ε²/σ² is cut off at while learning (5.5 σ), so that one contact does not undo what a thousand steps taught."""
 
@@ -34,18 +38,30 @@ RATE = 1e-3
 
 
 @kernel
-def log_variance(f: Array, W_S: Array, b_S: Array) -> Array:
-    """log σ² (B, X) in the context ``f`` (B, H)."""
+def log_variance(f: Array, W_S: Array, b_S: Array, span_S: Array) -> Array:
+    """log σ² (B, X) in the context ``f`` (B, H), within ``span_S`` (2, X)."""
     out = outward(f, W_S)
     for n in range(out.shape[0]):
         for i in range(out.shape[1]):
-            out[n, i] = min(max(out[n, i] + b_S[i], SMALLEST), LARGEST)
+            out[n, i] = min(max(out[n, i] + b_S[i], span_S[0, i]), span_S[1, i])
     return out
+
+
+def unbounded(size: int) -> Array:
+    """(2, X) of ``size`` X: all that log σ² may be."""
+    return np.repeat(np.array([[SMALLEST], [LARGEST]]), size, axis=1)
+
+
+def usual_span(f: Array, W_S: Array, b_S: Array) -> Array:
+    """(2, X) l and h, how far log σ² goes in nominal contexts (N, H)."""
+    found: Array = np.quantile(log_variance(f, W_S, b_S, unbounded(len(b_S))), (EXTREME, 1.0 - EXTREME), axis=0)
+    return found.astype(np.float32)
 
 
 def precision_change(f: Array, error: Array, W_S: Array, b_S: Array) -> tuple[Array, Array]:
     """The local rule for ``W_S`` (X, H) and ``b_S`` (X,), from contexts ``f`` (B, H) and errors (B, X)."""
-    excess = np.minimum(error**2 * np.exp(-log_variance(f, W_S, b_S)), np.float32(SURPRISED)) - np.float32(1.0)
+    excess = np.minimum(error**2 * np.exp(-log_variance(f, W_S, b_S, unbounded(len(b_S)))), np.float32(SURPRISED))
+    excess -= np.float32(1.0)
     return coincidence(excess, f), excess.mean(axis=0)
 
 

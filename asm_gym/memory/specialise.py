@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from asm_gym.memory.association import Association, complete, hidden_units, synapses
 from asm_gym.memory.energy import Array
 from asm_gym.memory.linear import PENALTIES, tried_on
-from asm_gym.memory.precision import log_variance
+from asm_gym.memory.precision import LARGEST, SMALLEST, log_variance
 
 WORST = 3.0
 """Standard deviations that an error counts at most where penalties are tried."""
@@ -48,9 +48,10 @@ def specialise(
     f, a, delta = f[-fresh:], a[-fresh:], delta[-fresh:]
     error = (delta - complete(f, a, U, D)) / known.remainder
     # How much an error counts for in a context is the body's to say; how large errors are at all is the policy's.
-    scale = np.mean(error**2 * np.exp(-log_variance(f, known.W_S, known.b_S)), axis=0)
-    b_S = known.b_S + np.log(np.maximum(scale, 1e-6)).astype(np.float32)
-    return known._replace(D=D, U=U, b_S=b_S)
+    scale = np.mean(error**2 * np.exp(-log_variance(f, known.W_S, known.b_S, known.span_S)), axis=0)
+    larger = np.log(np.maximum(scale, 1e-6)).astype(np.float32)
+    span_S = np.clip(known.span_S + larger, SMALLEST, LARGEST)
+    return known._replace(D=D, U=U, b_S=known.b_S + larger, span_S=span_S)
 
 
 def _towards_known(inputs: Array, left: Array) -> NDArray[np.float32]:

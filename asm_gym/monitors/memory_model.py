@@ -24,6 +24,7 @@ from asm_gym.memory.marginalise import MOST_INPUTS, Kept, fewer_changes, fewer_t
 from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
 from asm_gym.memory.network import Network, train
 from asm_gym.memory.online import followed
+from asm_gym.memory.precision import unbounded
 from asm_gym.memory.readout import add_up, learn_readout
 from asm_gym.memory.recall import continued
 from asm_gym.memory.recurrent import RecurrentNetwork, RecurrentWeights, recurrent_shapes
@@ -132,6 +133,8 @@ class MemoryModel(StreamModel):
         X, A = len(self.spec.sensory), len(self.spec.motor)
         if "remainder" not in learned:  # saved before it was known apart what is linear
             learned = {**learned, "remainder": np.ones(X, np.float32)}
+        if "span_S" not in learned:  # saved before what it had shown bounded it
+            learned = {**learned, "span_S": unbounded(X)}
         units = len(learned["V"])
         older = "W_H" in learned  # saved before there were traces
         temporal = (recurrent_shapes if older else weight_shapes)(self.hidden_size, senses.size, A)

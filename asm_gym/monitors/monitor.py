@@ -12,12 +12,18 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint, write_checkpoint
-from asm_gym.detection import Detection, ModelOutput, Nominal, Promise, conformal_episodes, conformal_threshold
+from asm_gym.contact_limits import healthy_forces
+from asm_gym.detection import Detection, ModelOutput, Nominal
+from asm_gym.detection.conformal import HOUR
 from asm_gym.episode import Episode
+from asm_gym.familiar_speed import FamiliarSpeed
+from asm_gym.monitors.asked import Asked
 from asm_gym.monitors.base import Model, Progress, Specialises, State, Surprise, Told
+from asm_gym.monitors.calibrated import Calibrated
+from asm_gym.monitors.fresh import Marks, check_fresh, sketch
 from asm_gym.monitors.model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.nominal import check_nominal
-from asm_gym.monitors.saved import MAXIMA, SavedMonitor
+from asm_gym.monitors.saved import SavedMonitor, calibration_arrays
 from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
 
 
@@ -29,7 +35,7 @@ class MonitorState(NamedTuple):
     skill: State = ()  # of what listens for skills, where there is one
 
 
-class CalibratedMonitor:
+class CalibratedMonitor(Calibrated):
     """Any model under any detection, with a threshold that is conformal on the maxima of nominal episodes.
 
     Args:
@@ -39,7 +45,12 @@ class CalibratedMonitor:
 
     Attributes:
         threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
+        healthy_: (N,) the most that an arm felt in the calibration episodes, in the order of ``felt_channels`` [N m],
+            [N]; contact limits are no less. Empty before, and where the stream senses no such forces.
+        familiar_: how fast the hand went at each place in them; None before, and where the stream tells of no hand.
         maxima_: (n,) largest surprise in each episode that ``calibrate`` was given; None before.
+        blocks_: the same by the hour, as ``detection.hourly`` counts it; None before, and where it was not kept.
+        promised_: ``"episode"`` or ``"hour"``, what the threshold's promise counts by.
         about: whatever else is worth knowing, such as its ``name``; JSON-serialisable, and saved with it.
     """
 
@@ -51,8 +62,8 @@ class CalibratedMonitor:
         self.seed = check_number("seed", seed, low=0, whole=True)
         self.spec, self.model, self.detection = model.spec, model, detections[0]
         self.detections = {d.name: d for d in detections}
-        self.threshold_: float | None = None
-        self.maxima_: NDArray[np.float64] | None = None
+        self._uncalibrate()
+        self._learned_from: Marks | None = None
         self.about: dict[str, Any] = {}
 
     def __repr__(self) -> str:
@@ -74,41 +85,6 @@ class CalibratedMonitor:
         """Names of skills, where it was told any."""
         return self.model.skills_
 
-    @property
-    def threshold(self) -> float:
-        """What surprise must exceed for an alarm. Raises RuntimeError before ``calibrate``."""
-        if self.threshold_ is None:
-            raise RuntimeError(f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first")
-        return self.threshold_
-
-    @typed
-    def threshold_at(self, false_alarm_rate: float) -> float:
-        """What the threshold would be at another rate, from the episodes that ``calibrate`` was given.
-
-        Raises:
-            ValueError: there were too few of them for this rate; the message says how many it takes.
-            RuntimeError: it is not calibrated, or does not keep what this takes.
-        """
-        if self.maxima_ is None and self.threshold_ is not None:
-            raise RuntimeError(
-                f"this {self._name} keeps a threshold, but not the surprise of the nominal episodes that it was set "
-                "by: call calibrate(nominal_episodes) again"
-            )
-        if self.maxima_ is None:
-            raise RuntimeError(f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first")
-        return conformal_threshold(self.maxima_, false_alarm_rate)
-
-    @property
-    def promise(self) -> Promise:
-        """Which share of nominal episodes the threshold promises to stay without an alarm, and how surely.
-
-        Raises:
-            RuntimeError: it is not calibrated, or does not keep the nominal episodes' surprise.
-        """
-        if self.maxima_ is None:
-            raise RuntimeError(f"this {self._name} knows no calibration: call calibrate(nominal_episodes) first")
-        return Promise.of(self.maxima_, self.threshold)
-
     @typed
     def with_threshold(self, value: float) -> Self:
         """The same monitor with another threshold, ``inf`` for none that could be exceeded; this one keeps its own."""
@@ -126,7 +102,8 @@ class CalibratedMonitor:
         if isinstance(detection, str):
             check_choice(f"detection of this {self._name}", detection, self.detections)
             detection = other.detections[detection]
-        other.detection, other.threshold_, other.maxima_ = detection, None, None
+        other.detection = detection
+        other._uncalibrate()
         other.detections[detection.name] = detection
         return other
 
@@ -167,7 +144,10 @@ class CalibratedMonitor:
         order = rng.permutation(len(episodes)) if one_in else np.arange(len(episodes))
         kept = len(episodes) // one_in if one_in else 0
         held_out, learned = ([episodes[i] for i in part] for part in (order[:kept], order[kept:]))
-        self.threshold_ = self.maxima_ = None
+        self._uncalibrate()
+        if not warm_start:
+            self._learned_from = None
+        self._remember(episodes)
         # One thread: products this small are slowed down by several, and ruined by several that share a core.
         with threadpool_limits(1):
             if warm_start and isinstance(self.model, Specialises):
@@ -184,28 +164,40 @@ class CalibratedMonitor:
                 detection.fit(nominal, rng)
 
     @typed
-    def calibrate(self, episodes: Sequence[Episode], false_alarm_rate: float = 0.01) -> Self:
-        """Sets the threshold from nominal episodes that ``fit`` has not seen; P(any alarm in one) <= the rate.
+    def calibrate(
+        self,
+        episodes: Sequence[Episode],
+        false_alarm_rate: float | None = None,
+        *,
+        false_alarms_per_hour: float | None = None,
+    ) -> Self:
+        """Sets the threshold from nominal episodes that ``fit`` has not seen, for one of two promises.
 
         What it finds is kept, so that ``threshold_at`` knows the threshold of every other rate too.
 
         Args:
-            episodes: at least ``conformal_episodes(false_alarm_rate)`` of them: 99 for 0.01, 19 for 0.05.
+            episodes: at least ``conformal_episodes(false_alarm_rate)`` of them: 99 for 0.01, 19 for 0.05; or together
+                one hour for each false alarm in so many: 10 hours for 0.1 an hour.
             false_alarm_rate: P(any alarm in a nominal episode), at most; ``promise`` says how surely.
+            false_alarms_per_hour: alarms in an hour of nominal episodes, at most, on average. One that persists, or
+                comes back within a minute of the same episode, is one alarm.
 
         Raises:
-            ValueError: too few episodes for this rate (the message says which they can promise), or bad ones.
+            ValueError: too few episodes or hours for this rate (the message says which they can promise), or bad ones;
+                by the hour also episodes that overlap, or that ``fit`` has learned from. Or not one rate, but none or
+                both.
         """
         self._fitted()
-        conformal_episodes(false_alarm_rate)  # refuses a bad rate before the work begins
+        asked = Asked.of(false_alarm_rate, false_alarms_per_hour)  # refuses a bad rate before the work begins
         check_nominal(episodes, self.spec, self.model.shortest)
-        self._set_threshold(self.score_episodes(episodes), false_alarm_rate)
+        if asked.per == HOUR:
+            asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
+            check_fresh(episodes, self._learned_from)
+        self._set_threshold(self.score_episodes(episodes), asked)
+        streams = [episode.stream for episode in episodes]
+        self.healthy_ = healthy_forces(streams, self.spec)
+        self.familiar_ = FamiliarSpeed.learned(streams, self.spec)
         return self
-
-    def _set_threshold(self, scores: Sequence[Surprise], rate: float) -> None:
-        """By what was made of nominal episodes. Raises ValueError, and changes nothing, where they are too few."""
-        maxima = np.array([s.value.max() for s in scores])
-        self.threshold_, self.maxima_ = conformal_threshold(maxima, rate), maxima
 
     @typed
     def initial_state(self, batch: int = 1, told: Sequence[Told] = ()) -> MonitorState:
@@ -270,14 +262,17 @@ class CalibratedMonitor:
     def save(self, path: str | Path) -> None:
         """Writes everything learned to one file: arrays and JSON."""
         self._fitted()
-        arrays = self.learned_ | ({} if self.maxima_ is None else {MAXIMA: self.maxima_})
+        arrays = {**self.learned_, **calibration_arrays(self.maxima_, self.blocks_, self._learned_from)}
         header = {
             "spec": self.spec.to_json(),
             "hyperparameters": self.get_params(),
             "detection": self.detection.name,
             "threshold": self.threshold_,
+            "promised": self.promised_,
             "skills": list(self.skills_),
             "about": self.about,
+            "healthy": list(self.healthy_),
+            "familiar": [] if self.familiar_ is None else self.familiar_.rows,
             "shapes": {name: list(array.shape) for name, array in arrays.items()},
         }
         write_checkpoint(path, self.model.kind, header, arrays)
@@ -300,9 +295,12 @@ class CalibratedMonitor:
         for detection in self.detections.values():
             if found.arrays.keys() >= set(detection.arrays):
                 detection.restore({n: found.arrays[n] for n in detection.arrays})
-        self.about = found.about
+        self.about, self._learned_from = found.about, found.learned_from
+        self.familiar_ = FamiliarSpeed.restored(saved.header.get("familiar", []))
+        self.healthy_ = tuple(check_number("healthy", value, low=0.0) for value in saved.header.get("healthy", ()))
         if found.detection == self.detection.name:
-            self.threshold_, self.maxima_ = found.threshold_below(self.detection.reach), found.maxima
+            self.threshold_, self.promised_ = found.threshold_below(self.detection.reach), found.promised
+            self.maxima_, self.blocks_ = found.maxima, found.blocks
         return self
 
     @property
@@ -316,6 +314,11 @@ class CalibratedMonitor:
         other.detections = {name: copy.copy(d) for name, d in self.detections.items()}
         other.detection = other.detections[self.detection.name]
         return other
+
+    def _remember(self, episodes: Sequence[Episode]) -> None:
+        """That these were learned from, so that no promise by the hour is made of them."""
+        before = np.zeros(0) if self._learned_from is None else self._learned_from
+        self._learned_from = np.union1d(before, sketch(episodes))
 
     def _fitted(self) -> None:
         if not self.model.learned_ or (self.detection.arrays and not self.detection.learned_):

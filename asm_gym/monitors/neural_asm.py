@@ -21,6 +21,7 @@ from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
 from asm_gym.memory.network import Network
+from asm_gym.monitors.asked import Asked
 from asm_gym.monitors.base import Progress, Surprise, Told
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.fused import CompiledRow
@@ -69,7 +70,19 @@ class NeuralASM(CalibratedMonitor):
     Attributes:
         threshold_: what surprise must exceed for an alarm; None before ``calibrate``.
         maxima_: largest surprise in each episode that ``calibrate`` was given; None before.
+        blocks_: the same by the hour; None before, and in memories that were saved before it was kept.
         skill_: what listens for skills; None before ``learn_skills``.
+
+    Example:
+        >>> import numpy as np
+        >>> from asm_gym import Channel, Episode, NeuralASM, StreamSpec
+        >>> spec, rng = StreamSpec((Channel("position", 2, "m"),), dt=0.05), np.random.default_rng(0)
+        >>> healthy = [Episode.from_stream(rng.normal(size=(60, 2)).cumsum(0), spec) for _ in range(40)]
+        >>> memory = NeuralASM(spec, hidden_size=16, association_size=16, epochs=2).fit(healthy[:20])
+        >>> memory = memory.calibrate(healthy[20:], false_alarm_rate=0.05)
+        >>> knocked = Episode.from_stream(healthy[0].stream + 50.0 * (np.arange(60)[:, None] > 30), spec)
+        >>> bool((memory.score(knocked).value > memory.threshold).any())
+        True
     """
 
     kind = MemoryModel.kind
@@ -80,7 +93,7 @@ class NeuralASM(CalibratedMonitor):
         self,
         spec: StreamSpec,
         hidden_size: int = 256,
-        association_size: int = 960,
+        association_size: int = 240,
         iterations: int = 5,
         learning_rate: float = 3e-3,
         epochs: int = 40,
@@ -229,10 +242,10 @@ class NeuralASM(CalibratedMonitor):
         self.skill_ = None  # it was weighed against the memory as it was
         super()._learn(episodes, progress, warm_start)
 
-    def _set_threshold(self, scores: Sequence[Surprise], rate: float) -> None:
-        super()._set_threshold(scores, rate)
+    def _set_threshold(self, scores: Sequence[Surprise], asked: Asked) -> None:
+        super()._set_threshold(scores, asked)
         if self.skill_ is not None:
-            self.skill_ = self.skill_.heard(scores)
+            self.skill_ = self.skill_.heard(scores, self.spec.dt)
 
     @property
     def alarm_on(self) -> str:
@@ -256,6 +269,8 @@ class NeuralASM(CalibratedMonitor):
         body.skill_ = None
         self.skill_ = SkillSurprise.learned(episodes, body.score_episodes(episodes), self.seed)
         self.threshold_, self.maxima_, self.about = body.threshold_, body.maxima_, body.about
+        self.blocks_, self.promised_ = body.blocks_, body.promised_
+        self._remember(episodes)
         return self
 
     def with_alarm_on(self, which: str) -> Self:
@@ -276,7 +291,8 @@ class NeuralASM(CalibratedMonitor):
         if self.skill_ is None:
             raise RuntimeError(f"alarm_on={which!r} takes a skill surprise: call learn_skills(episodes) first")
         other.about = {**self.about, "alarm_on": which}
-        other.threshold_, other.maxima_ = self.skill_.calibrated(which, self.threshold_, self.maxima_)
+        known = self.threshold_, self.maxima_, self.blocks_, self.promised_
+        other.threshold_, other.maxima_, other.blocks_ = self.skill_.calibrated(which, *known)
         return other
 
     def for_stream(self, spec: StreamSpec) -> Self:

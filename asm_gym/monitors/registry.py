@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,9 @@ from asm_gym.extras import needed_for
 from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import CalibratedMonitor
 from asm_gym.monitors.saved import restored
+from asm_gym.registries import add, registry, target
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_choice, check_text, typed
+from asm_gym.validation import check_choice, typed
 
 EVIDENCE = "+evidence"
 """What the name of a monitor ends in where its errors are judged by the detection of the Neural ASM."""
@@ -48,13 +48,13 @@ class MonitorKind:
     @property
     def model_class(self) -> Any:
         """Of its model, or of the whole monitor."""
-        return _found(self.model)
+        return target(self.model)
 
     @property
     def detection_classes(self) -> list[Any]:
         """Of its detections, the one in use first."""
         check_choice("detection", self.detection, DETECTIONS)
-        return [_found(DETECTIONS[name]) for name in dict.fromkeys((self.detection, self.own, "evidence"))]
+        return [target(DETECTIONS[name]) for name in dict.fromkeys((self.detection, self.own, "evidence"))]
 
     @property
     def hyperparameters(self) -> tuple[str, ...]:
@@ -118,34 +118,46 @@ PARTS = {
 }
 """Of the Neural ASM, each alone: for an ablation."""
 
-MONITORS: dict[str, MonitorKind] = {
-    "neural_asm": MonitorKind("asm_gym.monitors.neural_asm:NeuralASM"),
-    **{n: k for name, row in _BASELINES.items() for n, k in ((name, row), (name + EVIDENCE, row.under("evidence")))},
-    "external_torque_limit": _row("limits:ExternalTorqueLimit", "largest"),
-    "force_limit": _row("limits:ForceLimit", "squares"),
-    **PARTS,
-}
+MONITORS: dict[str, MonitorKind] = registry(
+    "asm_gym.monitors.registry:MONITORS",
+    {
+        "neural_asm": MonitorKind("asm_gym.monitors.neural_asm:NeuralASM"),
+        **{
+            n: k for name, row in _BASELINES.items() for n, k in ((name, row), (name + EVIDENCE, row.under("evidence")))
+        },
+        "external_torque_limit": _row("limits:ExternalTorqueLimit", "largest"),
+        "force_limit": _row("limits:ForceLimit", "squares"),
+        **PARTS,
+    },
+)
 """Every monitor by name. A baseline's plain name scores as its authors did; with ``+evidence``, its errors are judged
 as those of the Neural ASM are. ``+`` and the name of any other detection will do as well."""
 
 
 @typed
-def register_monitor(model: type[Any], detection: str = "evidence") -> None:
-    """Makes a model of one's own known under its ``kind``, and under ``kind+evidence``.
+def register_monitor(name: str, model: type[Any] | str, detection: str = "evidence") -> None:
+    """Makes a model of one's own known, here and in worker processes, by its name and by ``name+evidence``.
 
     Args:
-        model: a class of models (see ``Model``), or of whole monitors.
+        name: the ``kind`` of the model, by which its files are known too.
+        model: a class of models (see ``Model``), or of whole monitors; or ``module:class``.
         detection: which judges it unless asked otherwise; a name in ``DETECTIONS``.
 
     Raises:
-        ValueError: the name is taken, or there is no such detection.
+        ValueError: the name is taken or is not that of the model's ``kind``, or there is no such detection.
+
+    Example:
+        >>> from asm_gym import NeuralASM, register_monitor
+        >>> class Watchman(NeuralASM):
+        ...     kind = "watchman"
+        >>> register_monitor("watchman", Watchman)
     """
     check_choice("detection", detection, DETECTIONS)
-    name = check_text(f"the kind of model {model.__name__}", getattr(model, "kind", None))
-    if name in MONITORS:
-        raise ValueError(f"there is a monitor {name!r} already")
+    if not isinstance(model, str) and getattr(model, "kind", None) != name:
+        raise ValueError(f"{model.__name__} is of the kind {getattr(model, 'kind', None)!r}, got the name {name!r}")
     row = MonitorKind(model, detection, detection)
-    MONITORS.update({name: row, name + EVIDENCE: row.under("evidence")})
+    add("monitor", MONITORS, name, row)
+    MONITORS[name + EVIDENCE] = row.under("evidence")
 
 
 def model_of(name: str) -> str:
@@ -154,8 +166,16 @@ def model_of(name: str) -> str:
 
 
 def check_monitor(name: str) -> None:
-    """Raises ValueError unless there is such a monitor, or such a model and detection; nothing is imported."""
+    """Raises ValueError unless there is such a monitor, or such a model and detection.
+
+    A model that goes by ``module:class`` is imported and registered by its kind, by which its files are known; nothing
+    else is imported.
+    """
     model, plus, detection = name.partition("+")
+    if ":" in model and model not in MONITORS:
+        own = target(model)
+        register_monitor(getattr(own, "kind", ""), own)
+        MONITORS[model] = MONITORS[own.kind]
     if plus and name not in MONITORS and model in MONITORS:
         check_choice("detection", detection, DETECTIONS)
     else:
@@ -192,6 +212,16 @@ def make_monitor(
 
     Raises:
         ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists.
+
+    Example:
+        >>> import numpy as np
+        >>> from asm_gym import Channel, Episode, StreamSpec, make_monitor
+        >>> spec, rng = StreamSpec((Channel("position", 3, "m"),), dt=0.05), np.random.default_rng(0)
+        >>> healthy = [Episode.from_stream(rng.normal(size=(60, 3)), spec) for _ in range(30)]
+        >>> monitor = make_monitor("kalman+evidence", spec, ridge=1e-3).fit(healthy[:10])
+        >>> monitor = monitor.calibrate(healthy[10:], false_alarm_rate=0.05)
+        >>> monitor.detection.name
+        'evidence'
     """
     kind = monitor_class(name if not isinstance(detection, str) else f"{model_of(name)}+{detection}")
     for parameter in hyperparameters:
@@ -211,11 +241,3 @@ def load_monitor(path: str | Path) -> CalibratedMonitor:
     kind = monitor_class(kind_of(path))
     saved = read_checkpoint(path, kind.model_class.kind)
     return restored(path, saved, kind.under(saved.header.get("detection", kind.detection)))
-
-
-def _found(target: Any) -> Any:
-    """The class that ``module:class`` stands for."""
-    if not isinstance(target, str):
-        return target
-    module, _, name = target.partition(":")
-    return getattr(importlib.import_module(module), name)

@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import Checkpoint
+from asm_gym.detection import Blocks
 from asm_gym.detection.base import Arrays
+from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_number
+from asm_gym.validation import check_choice, check_number
 
-MAXIMA = "nominal_maxima"
-"""Under which name a checkpoint keeps what ``calibrate`` has found."""
+MAXIMA, BLOCKS, LEARNED_FROM = "nominal_maxima", "nominal_blocks", "learned_from"
+"""Under which names a checkpoint keeps what ``calibrate`` has found, by the episode and by the hour, and the marks of
+what ``fit`` was given."""
 
 
 class SavedMonitor(NamedTuple):
@@ -24,6 +27,9 @@ class SavedMonitor(NamedTuple):
     Attributes:
         arrays: what its model and its detections have learned, by name.
         maxima: (n,) largest surprise in each episode of the calibration; None before it.
+        blocks: the same by the hour; None before it, and in files that were written before it was kept.
+        learned_from: marks of the episodes that were learned from, as ``fresh.sketch`` keeps them; None in such files.
+        promised: what the threshold's promise counts by.
         threshold: as it was written.
         detection: which the threshold is of.
         skills: names of those that the model knows.
@@ -32,6 +38,9 @@ class SavedMonitor(NamedTuple):
 
     arrays: Arrays
     maxima: NDArray[np.float64] | None
+    blocks: Blocks | None
+    learned_from: NDArray[np.float64] | None
+    promised: str
     threshold: object
     detection: str
     skills: tuple[str, ...]
@@ -45,9 +54,12 @@ class SavedMonitor(NamedTuple):
         if undeclared:
             raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
         arrays = {name: saved.array(name, *shape) for name, shape in header["shapes"].items()}
-        maxima = arrays.pop(MAXIMA, None)
-        about, skills = dict(header["about"]), tuple(header["skills"])
-        return cls(arrays, maxima, header["threshold"], header["detection"], skills, about)
+        maxima, blocks, learned_from = (arrays.pop(name, None) for name in (MAXIMA, BLOCKS, LEARNED_FROM))
+        promised = header.get("promised", EPISODE)
+        check_choice("promise", promised, (EPISODE, HOUR))
+        by_hour = None if blocks is None else Blocks.restored(blocks)
+        kept = maxima, by_hour, learned_from, promised, header["threshold"]
+        return cls(arrays, *kept, header["detection"], tuple(header["skills"]), dict(header["about"]))
 
     def threshold_below(self, reach: float) -> float | None:
         """The threshold, once it is a number that surprise can exceed, which never comes to ``reach``."""
@@ -57,6 +69,15 @@ class SavedMonitor(NamedTuple):
         if number >= reach:
             raise ValueError(f"threshold must be below {reach:g}, all that errors can add up to, got {number:g}")
         return number
+
+
+def calibration_arrays(
+    maxima: NDArray[np.float64] | None, blocks: Blocks | None, learned_from: NDArray[np.float64] | None
+) -> Arrays:
+    """What a checkpoint keeps of them, by name; of what there is."""
+    by_hour = None if blocks is None else np.stack(blocks)
+    found = {MAXIMA: maxima, BLOCKS: by_hour, LEARNED_FROM: learned_from}
+    return {name: array for name, array in found.items() if array is not None}
 
 
 class Restorable(Protocol):

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import Checkpoint
-from asm_gym.detection import EvidenceDetection, ModelOutput
+from asm_gym.detection import Blocks, EvidenceDetection, ModelOutput
 from asm_gym.detection.base import Arrays
+from asm_gym.detection.conformal import HOUR
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.memory.state import newest, past
@@ -145,11 +146,13 @@ class SkillSurprise:
         monitor: of skills, fitted.
         weight: what brings skill surprise to the scale of the body's, where the two are compared.
         maxima: (4, n) the largest surprise of each of ``ALARMS_ON`` in the n episodes of the calibration; None before.
+        blocks: (4, m) the same in the m blocks that are counted by the hour; None before, and where it was not kept.
     """
 
     monitor: CalibratedMonitor
     weight: float
     maxima: NDArray[np.float64] | None = None
+    blocks: NDArray[np.float64] | None = None
 
     @classmethod
     def learned(cls, episodes: Sequence[Episode], body: Sequence[Surprise], seed: int) -> Self:
@@ -172,40 +175,68 @@ class SkillSurprise:
         shares = np.where(first[:, None], body.attribution, scale * skill.attribution)
         return body._replace(value=value, attribution=shares, of_body=body.value, of_skill=skill.value)
 
-    def heard(self, scores: Sequence[Surprise]) -> Self:
-        """With the maxima of what was made of nominal episodes."""
-        return replace(self, maxima=np.array([self.ways(*s.parts).max(axis=1) for s in scores]).T)
+    def heard(self, scores: Sequence[Surprise], dt: float) -> Self:
+        """With the maxima of what was made of nominal episodes, a row each ``dt`` [s]."""
+        ways = [self.ways(*s.parts) for s in scores]  # (4, T) each
+        blocks = np.array([Blocks.of(own, dt).maxima for own in zip(*ways, strict=True)])
+        return replace(self, maxima=np.array([w.max(axis=1) for w in ways]).T, blocks=blocks)
 
     def calibrated(
-        self, which: str, threshold: float | None, maxima: NDArray[np.float64] | None
-    ) -> tuple[float | None, NDArray[np.float64] | None]:
-        """The threshold of one of ``ALARMS_ON``, and the maxima that it is one of; None where nobody can say.
+        self,
+        which: str,
+        threshold: float | None,
+        maxima: NDArray[np.float64] | None,
+        blocks: Blocks | None,
+        promised: str,
+    ) -> tuple[float | None, NDArray[np.float64] | None, Blocks | None]:
+        """The threshold of one of ``ALARMS_ON``, the maxima that it is one of, and blocks; None where nobody can say.
 
         Args:
             which: of ``ALARMS_ON``.
             threshold: of another of them, whose rate this is to have.
             maxima: (n,) the largest surprise in the episodes that it was set by.
+            blocks: the same by the hour.
+            promised: ``"episode"`` or ``"hour"``, which of the two it was set by.
         """
         if self.maxima is None or threshold is None or maxima is None:
-            return None, None
-        own, below = self.maxima[ALARMS_ON.index(which)], int((maxima <= threshold).sum())
-        return float(np.sort(own)[below - 1]) if below else 0.0, own
+            return None, None, None
+        row = ALARMS_ON.index(which)
+        own, by_hour = self.maxima[row], None
+        if blocks is not None and self.blocks is not None:
+            by_hour = Blocks(self.blocks[row], blocks.hours)
+        if promised == HOUR:
+            if blocks is None or by_hour is None:
+                return None, own, None
+            return same_rank(threshold, blocks.maxima, by_hour.maxima), own, by_hour
+        return same_rank(threshold, maxima, own), own, by_hour
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All that a checkpoint needs of it, by name."""
-        maxima = {} if self.maxima is None else {"maxima": self.maxima}
-        kept = {**self.monitor.learned_, **maxima, "weight": np.array(self.weight)}
+        heard = {"maxima": self.maxima, "blocks": self.blocks}
+        found = {name: array for name, array in heard.items() if array is not None}
+        kept = {**self.monitor.learned_, **found, "weight": np.array(self.weight)}
         return {PREFIX + name: array for name, array in kept.items()}
 
     @classmethod
     def found(cls, spec: StreamSpec, arrays: Arrays, seed: int) -> Self:
         """As arrays by their names without the prefix say. Raises ValueError or KeyError where they do not fit."""
         weight = check_number("the weight of skill surprise", float(arrays["weight"]), above=0.0)
-        learned = {n: a for n, a in arrays.items() if n not in ("maxima", "weight")}
+        learned = {n: a for n, a in arrays.items() if n not in ("maxima", "blocks", "weight")}
         shapes = {name: array.shape for name, array in learned.items()}
-        header = {"shapes": shapes, "skills": (), "threshold": None, "detection": EvidenceDetection.name}
-        return cls(_monitor(spec, seed).restore(Checkpoint(header, learned)), weight, arrays.get("maxima"))
+        header = {"shapes": shapes, "skills": (), "threshold": None, "detection": EvidenceDetection.name, "about": {}}
+        return cls(
+            _monitor(spec, seed).restore(Checkpoint(header, learned)),
+            weight,
+            arrays.get("maxima"),
+            arrays.get("blocks"),
+        )
+
+
+def same_rank(threshold: float, of: NDArray[np.float64], among: NDArray[np.float64]) -> float:
+    """The number ``among`` (n,) that as many do not exceed as do not exceed ``threshold`` in ``of`` (n,)."""
+    below = int((of <= threshold).sum())
+    return float(np.sort(among)[below - 1]) if below else 0.0
 
 
 def apart(saved: Checkpoint) -> tuple[Checkpoint, Arrays]:

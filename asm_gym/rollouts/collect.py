@@ -14,7 +14,8 @@ from asm_gym.episode import Episode, save_episode
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.trial import PolicySource, RolloutConfig, Trial, environment, play, policy_for, staged
+from asm_gym.rollouts.staging import environment, play, policy_for, staged
+from asm_gym.rollouts.trial import PolicySource, RolloutConfig, Trial
 from asm_gym.tasks import env_spec
 from asm_gym.validation import check_number, typed
 from asm_gym.wrappers import StreamRecorder
@@ -52,6 +53,12 @@ def collect(
     Raises:
         ValueError: fewer than one episode or worker; whatever the environment and the policy refuse.
         TypeError: spaces that are no numbers, or a policy that cannot be sent to another process.
+
+    Example:
+        >>> from asm_gym import collect
+        >>> episodes = collect("asm_gym/SyntheticArm-v0", "sway", episodes=2, seed=0, workers=1)
+        >>> len(episodes), episodes[0].stream.shape == (len(episodes[0]), episodes[0].spec.size)
+        (2, True)
     """
     check_number("episodes", episodes, low=1, whole=True)
     config = RolloutConfig(policy, env_kwargs=tuple(sorted(env_kwargs.items())))

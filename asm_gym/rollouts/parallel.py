@@ -22,6 +22,7 @@ from loky import get_reusable_executor
 from threadpoolctl import threadpool_limits
 
 from asm_gym.extras import require
+from asm_gym.registries import added, knowing
 from asm_gym.validation import check_choice, check_number, typed
 
 Item = TypeVar("Item")
@@ -121,7 +122,8 @@ def parallel_map(
 
 def _pickled(task: Callable[[Any], Any]) -> bytes:
     try:
-        made: bytes = cloudpickle.dumps(task)
+        rows = added()
+        made: bytes = cloudpickle.dumps(partial(knowing, rows, task) if rows else task)
     except Exception as error:  # whatever a foreign __reduce__ raises
         raise TypeError(
             f"the work cannot be sent to another process ({type(error).__name__}: {error}): make what it needs in the "

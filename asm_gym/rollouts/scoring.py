@@ -17,7 +17,8 @@ import numpy as np
 import asm_gym
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode, EpisodeLabel
-from asm_gym.evaluation.comparison import RATES, BenchmarkResult, Detectability, MonitorResult
+from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
+from asm_gym.evaluation.defaults import RATES
 from asm_gym.evaluation.ideal import earliest, noise_floor, separation
 from asm_gym.evaluation.metrics import typical
 from asm_gym.evaluation.scored import NOMINAL, InterventionOutcome, ScoredEpisode, TraceDetail, window_steps

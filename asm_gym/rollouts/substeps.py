@@ -13,7 +13,8 @@ from asm_gym.monitors.contact_band import ContactBand, FeltEpisode
 from asm_gym.policies import rollout
 from asm_gym.protocols import FeelsWithinSteps
 from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.trial import PolicySource, RolloutConfig, environment, policy_for
+from asm_gym.rollouts.staging import environment, policy_for
+from asm_gym.rollouts.trial import PolicySource, RolloutConfig
 from asm_gym.tasks import env_id
 
 

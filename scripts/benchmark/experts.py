@@ -16,7 +16,7 @@ from asm_gym.policies.registry import EXPERTS
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.trial import environment
+from asm_gym.rollouts.staging import environment
 from asm_gym.tasks import ROBOTS
 from asm_gym.validation import check_choice
 

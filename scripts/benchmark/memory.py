@@ -79,7 +79,7 @@ class PlainTorch:
         self.traces = self.decays[:, None] * self.traces + w["gains"][:, None] * torch.cat([senses, u])
         units = torch.tanh(a["V"] @ inputs)
         error = delta - a["U"] @ units - a["D"] @ inputs
-        error = error / a["remainder"] * torch.exp(-0.5 * (a["W_S"] @ units + a["b_S"]).clamp(-12.0, 8.0))
+        error = error / a["remainder"] * torch.exp(-0.5 * (a["W_S"] @ units + a["b_S"]).clamp(*a["span_S"]))
         again = x[self.sensory] == before[self.sensory]
         if self.before is None:
             error, again = torch.zeros_like(error), torch.zeros_like(again)

@@ -32,6 +32,7 @@ STUDIES = {
     "transfer": Study("one memory of a body, for policies and tasks never met"),
     "failure": Study("does surprise tell that a policy will fail"),
     "harm": Study("harm avoided against success kept, under any policy"),
+    "attack": Study("what can be hidden from the memory by who writes to the senses"),
     "spinal": Study("how soon an arm feels what it should not, in substeps"),
     "reflexes": Study("what acting on alarms is worth, reflex by fault", needs_a_run=True),
     "learning_curve": Study("detection by the number of episodes learned from", needs_a_run=True),
@@ -82,7 +83,7 @@ def everything(argv: list[str]) -> int:
     if command.parse("reproduce all", Config, argv, f"Runs {', '.join(INDEPENDENT)}.") is None:
         return DONE
     for name in INDEPENDENT:
-        command.parse(f"reproduce {name}", _options(_module(name)), argv)
+        command.parse(f"reproduce {name}", options_of(name), argv)
     code = DONE
     for name in INDEPENDENT:
         code = max(code, _run(name, argv))
@@ -100,7 +101,9 @@ def _run(name: str, argv: list[str]) -> int:
     return code
 
 
-def _options(module: Any) -> Any:
+def options_of(study: str) -> Any:
+    """The dataclass of a study's options."""
+    module = _module(study)
     return module.Config if hasattr(module, "Config") else module.Args
 
 

@@ -26,7 +26,7 @@ from asm_gym.policies import make_policy
 from asm_gym.policies.grip import Grip, Readout
 from asm_gym.policies.memory_policy import StreamReader, common_spec, require_motor
 from asm_gym.policies.scripted.base import Style
-from asm_gym.rollouts.trial import environment
+from asm_gym.rollouts.staging import environment
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.tables import Table
+from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import Rows
-from asm_gym.scripts.reproduce.kit import Record, over_seeds, shown
+from asm_gym.scripts.reproduce.kit import Record, over_seeds
 from asm_gym.scripts.reproduce.recordings import SKILLS
 
 SPLICE = 30
@@ -40,36 +41,23 @@ class Example(NamedTuple):
 def tables(records: Sequence[Record], skills: int) -> list[Table]:
     """Over time, cues begun late, switches, robosuite."""
 
-    def row(name: str, steps: Sequence[int], **where: Any) -> tuple[str, ...]:
-        return (name, *(shown(records, "right", step=t, **where) for t in steps))
-
-    late, since = (1, 2, 5, 10, 20), (0, 1, 2, 5, 10, 20)
+    named: dict[str, Record] = {label: {"how": "named", "source": s} for s, label in SOURCES.items()}
+    for source, label in (("state", "clusters of states, no label"), ("row", "clusters of rows, no label")):
+        named[label] = {"how": "clustered", "source": source}
+    middle = {SOURCES[s]: {"how": "one middle", "source": s} for s in ("state", "row")}
+    caption = f"Right skill [share] of {skills}, after so many steps; mean ± SD over seeds"
+    begun, switched = ({"state": {"how": how, "source": "state"}} for how in ("begun late", "switched"))
+    late, since = kit.by("step", (1, 2, 5, 10, 20)), kit.by("step", (0, 1, 2, 5, 10, 20))
+    parted = "Letters with one middle told apart [share], by step"
     made = [
-        Table(
-            f"Right skill [share] of {skills}, after so many steps; mean ± SD over seeds",
-            ("", *map(str, TIMES)),
-            [
-                *(row(label, TIMES, how="named", source=s) for s, label in SOURCES.items()),
-                row("clusters of states, no label", TIMES, how="clustered", source="state"),
-                row("clusters of rows, no label", TIMES, how="clustered", source="row"),
-            ],
-        ),
-        Table(
-            "Letters with one middle told apart [share], by step",
-            ("", *map(str, MIDDLE)),
-            [row(SOURCES[s], MIDDLE, how="one middle", source=s) for s in ("state", "row")],
-        ),
-        Table("Cue begun in mid-letter, by its length", ("", *map(str, late)), [row("state", late, how="begun late")]),
-        Table(
-            "The new skill named, so many steps after a switch",
-            ("", *map(str, since)),
-            [row("state", since, how="switched")],
-        ),
+        kit.grid(caption, records, "right", named, kit.by("step", TIMES)),
+        kit.grid(parted, records, "right", middle, kit.by("step", MIDDLE)),
+        kit.grid("Cue begun in mid-letter, by its length", records, "right", begun, late),
+        kit.grid("The new skill named, so many steps after a switch", records, "right", switched, since),
     ]
     if any(r["how"] == "robosuite" for r in records):
-        heads = ("", *map(str, ROBOT_TIMES))
-        own = [row(name, ROBOT_TIMES, how="robosuite", skill=name) for name in SKILLS]
-        made.append(Table("Robosuite skills named from the state [share], by step", heads, own))
+        caption, own = "Robosuite skills named from the state [share], by step", kit.by("skill", SKILLS)
+        made.append(kit.grid(caption, records, "right", own, kit.by("step", ROBOT_TIMES), how="robosuite"))
     return made
 
 

@@ -25,7 +25,7 @@ from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.base import Policy
 from asm_gym.policies.registry import EXPERTS
 from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.trial import environment
+from asm_gym.rollouts.staging import environment
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.apprentices import CONSISTENT, SETTINGS, Clone, demonstrate, stream_of

@@ -28,7 +28,8 @@ from asm_gym.evaluation.tables import Table, count
 from asm_gym.monitors import MONITORS
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
-from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged
+from asm_gym.rollouts.staging import play, staged
+from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.failure_rivals import NAMES, scored

@@ -39,7 +39,7 @@ from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.scripts.reproduce.recordings import RunConfig, in_turn
 from asm_gym.spec import StreamSpec
 
-UNITS = 960
+UNITS = 240
 """Of association, shared out among the groups, as in the memory."""
 
 LINEAR = "linear"
@@ -80,10 +80,12 @@ class FedAssociation(StreamModel):
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams = [e.stream for e in episodes]
         senses = StreamScaler.fit(self.spec, streams, self.lag)
-        a = np.concatenate([senses.read_episode(s).inputs[self.lag :] for s in streams])
+        rows = [senses.read_episode(s).inputs[self.lag :] for s in streams]
+        a = np.concatenate(rows)
         delta, each = np.ascontiguousarray(a[:, senses.changes]), UNITS // (int(senses.groups.max()) + 1)
         layout = senses.groups, senses.changes, max(1, each)
-        found = learn_association(a, delta, *layout, rng, feedback=FEEDBACK[self.way]())
+        lengths = [len(r) for r in rows]
+        found = learn_association(a, delta, *layout, rng, feedback=FEEDBACK[self.way](), lengths=lengths)
         standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change}
         return self.restore({**standard, **found._asdict()})
 

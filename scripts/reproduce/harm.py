@@ -24,7 +24,8 @@ from asm_gym.evaluation.tables import Column, Table, tabulate
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
 from asm_gym.policies.hostile import HOSTILE
-from asm_gym.rollouts.trial import RolloutConfig, Trial, environment, policy_for, staged
+from asm_gym.rollouts.staging import environment, policy_for, staged
+from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.tasks import env_id

@@ -21,7 +21,7 @@ from __future__ import annotations
 import csv
 import json
 import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field
@@ -137,6 +137,7 @@ def main(study: ModuleType, argv: Sequence[str] | None = None) -> int:
 
 def conduct(name: str, study: Callable[[Any], Findings], config: Any, console: Console) -> None:
     """Runs a study, writes what it found into its folder, and prints it."""
+    _ = getattr(config, "tasks", ())  # of a run: refused where there is none, before anything is written
     config.out.mkdir(parents=True, exist_ok=True)  # refused before the study, not after it
     sitting = Sitting(console)
     token = _NOW.set(sitting)
@@ -183,6 +184,28 @@ def over_seeds(records: Sequence[Record], value: str, **where: Any) -> Spread:
     chosen = [r for r in records if all(r.get(k) == v for k, v in where.items()) and r.get(value) is not None]
     means = [np.mean([r[value] for r in chosen if r["seed"] == s]) for s in dict.fromkeys(r["seed"] for r in chosen)]
     return Spread.of([float(mean) for mean in means]) if means else Spread(float("nan"), float("nan"))
+
+
+def by(name: str, values: Iterable[Any]) -> dict[str, Record]:
+    """What each row or column of a table is of: ``{"5": {"step": 5}, …}``."""
+    return {str(value): {name: value} for value in values}
+
+
+def grid(
+    caption: str,
+    records: Sequence[Record],
+    value: str,
+    rows: Mapping[str, Record],
+    columns: Mapping[str, Record],
+    digits: int = 2,
+    **where: Any,
+) -> Table:
+    """Means over seeds with their spread: a cell is of the records that are as its row and its column say."""
+
+    def cells(row: Record) -> Iterator[str]:
+        return (shown(records, value, digits, **where | row | column) for column in columns.values())
+
+    return Table(caption, ("", *columns), [(label, *cells(row)) for label, row in rows.items()])
 
 
 def shown(records: Sequence[Record], value: str, digits: int = 2, **where: Any) -> str:

@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import Any
 
 import numpy as np
 import torch
@@ -31,11 +30,11 @@ from asm_gym.memory.traces import fit_gains
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.curves import curve
+from asm_gym.scripts.reproduce.curves import curve, curves
 from asm_gym.scripts.reproduce.expression import trajectories
 from asm_gym.scripts.reproduce.gradients import COMPARED, CUE, Changes, cosine, exact, local
 from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire
-from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds, shown
+from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds
 from asm_gym.scripts.reproduce.recordings import wide_enough
 from asm_gym.validation import check_number
 
@@ -180,34 +179,37 @@ def tables(records: Sequence[Record], config: Config) -> list[Table]:
     """Angles over learning, by array, by iterations; errors; costs."""
     epochs = checkpoints(config.epochs)
 
-    def angle(value: str = "degrees", **where: Any) -> str:
-        return shown(records, value, 0, **{"array": "all", "iterations": usual(config), **where})
-
-    heads = ("", *map(str, epochs))
+    epochs_of = kit.by("epoch", epochs)
+    usually: Record = {"array": "all", "iterations": usual(config)}
+    targets = {label: {"target": t} for t, label in TARGETS.items()}
+    angles_of = partial(kit.grid, records=records, value="degrees", digits=0)
+    caption = (
+        f"Angle [°] between the local change and the exact one, before so many epochs, {usual(config)} iterations; "
+        "mean ± SD over seeds"
+    )
     return [
-        Table(
-            f"Angle [°] between the local change and the exact one, before so many epochs, {usual(config)} iterations; "
-            "mean ± SD over seeds",
-            heads,
-            [(label, *(angle(target=t, epoch=e) for e in epochs)) for t, label in TARGETS.items()],
-        ),
-        Table(
+        angles_of(caption, rows=targets, columns=epochs_of, **usually),
+        angles_of(
             "Of each array, to the gradient of the prediction error",
-            heads,
-            [(n, *(angle(target="error", array=n, epoch=e) for e in epochs)) for n in COMPARED],
+            rows=kit.by("array", COMPARED),
+            columns=epochs_of,
+            target="error",
+            iterations=usual(config),
         ),
-        Table(
+        angles_of(
             "By iterations, after learning",
-            ("", *map(str, config.iterations)),
-            [
-                (label, *(angle(target=t, epoch=config.epochs, iterations=k) for k in config.iterations))
-                for t, label in TARGETS.items()
-            ],
+            rows=targets,
+            columns=kit.by("iterations", config.iterations),
+            array="all",
+            epoch=config.epochs,
         ),
-        Table(
+        kit.grid(
             "Mean squared error of the next row [variance], before so many epochs",
-            heads,
-            [(how, *(shown(records, "mse", 3, learned_by=how, epoch=e) for e in epochs)) for how in RATES],
+            records,
+            "mse",
+            kit.by("learned_by", RATES),
+            epochs_of,
+            3,
         ),
         Table(
             "A change along a batch of 16: time [ms] / kept for the way back [KiB], by steps",
@@ -226,12 +228,11 @@ def drawn(records: Sequence[Record], config: Config) -> Figure:
     where = {"array": "all", "iterations": usual(config)}
     with figure(height=3.0, width=11) as fig:
         axes = fig.subplots(1, 4)
-        for i, (target, label) in enumerate(TARGETS.items()):
-            mean = [over_seeds(records, "degrees", target=target, epoch=e, **where) for e in epochs]
-            curve(axes[0], epochs, mean, i, label)
-            ends = {"target": target, "epoch": config.epochs, "array": "all"}
-            mean = [over_seeds(records, "degrees", **ends, iterations=k) for k in config.iterations]
-            curve(axes[1], config.iterations, mean, i, None)
+        targets = {label: {"target": t} for t, label in TARGETS.items()}
+        curves(axes[0], records, "degrees", ("epoch", epochs), targets, **where)
+        curves(
+            axes[1], records, "degrees", ("iterations", config.iterations), targets, array="all", epoch=config.epochs
+        )
         for i, how in enumerate(RATES):
             curve(axes[2], epochs, [over_seeds(records, "mse", learned_by=how, epoch=e) for e in epochs], i + 2, how)
             own = [r for r in records if r.get("cost_of") == how]

@@ -14,10 +14,11 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation import defaults
 from asm_gym.evaluation.comparison import Detectability
+from asm_gym.rollouts.record import record
 from asm_gym.rollouts.run_folder import make_missing, recorded, tasks_in
 from asm_gym.rollouts.scoring import detectability_of
 from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.trial import RolloutConfig, record
+from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.validation import check_number

@@ -29,11 +29,13 @@ from asm_gym.policies.registry import agents
 from asm_gym.rollouts.collect import check
 from asm_gym.rollouts.parallel import TWO_PROCESSES, ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.record import record
 from asm_gym.rollouts.run_folder import claimed, files_in, locked, make_missing, versions
 from asm_gym.rollouts.scoring import LEARNING, code_digest, fitted
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.substeps import band_of_task
-from asm_gym.rollouts.trial import PASSING, SPINAL, RolloutConfig, Trial, record, watch, watch_each
+from asm_gym.rollouts.trial import PASSING, SPINAL, RolloutConfig, Trial
+from asm_gym.rollouts.watch import watch, watch_each
 from asm_gym.scripts.command import at_least, run
 from asm_gym.scripts.reproduce.reflexes_report import comparisons, row, table
 from asm_gym.tasks import task as task_spec

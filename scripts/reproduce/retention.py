@@ -31,7 +31,7 @@ from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import Memory, mean_demonstrations, recalled
 from asm_gym.scripts.reproduce.handwriting import NAMES, NOISE, check_letters, copybook, pen_spec, repertoire
-from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds, shown
+from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds
 from asm_gym.scripts.reproduce.recordings import wide_enough
 
 WAYS = ("at once", "one after another", "replay from a cue", "replay from nothing")
@@ -121,20 +121,13 @@ def replayed(
 
 def tables(records: Sequence[Record], config: Config) -> list[Table]:
     """By way: what is left of each block after the last lesson."""
-    blocks = range(1, config.blocks + 1)
-    heads = ("", *(f"block {b}" for b in blocks), "all")
-
-    def rows(value: str) -> list[tuple[str, ...]]:
-        def last(way: str, **where: int) -> str:
-            return shown(records, value, way=way, last=True, **where)
-
-        return [(way, *(last(way, block=b) for b in blocks), last(way)) for way in WAYS]
-
+    blocks = {f"block {b}": {"block": b} for b in range(1, config.blocks + 1)} | {"all": {}}
+    ways = {way: {"way": way, "last": True} for way in WAYS}
     what = f"of {config.skills} letters in {config.blocks} blocks after the last lesson"
     what += f", cue of {CUE}; mean ± SD over seeds"
     return [
-        Table(f"Offline error [cm] {what}", heads, rows("error_cm")),
-        Table("Right letter recalled [share]", heads, rows("right")),
+        kit.grid(f"Offline error [cm] {what}", records, "error_cm", ways, blocks),
+        kit.grid("Right letter recalled [share]", records, "right", ways, blocks),
     ]
 
 

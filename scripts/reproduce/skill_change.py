@@ -41,6 +41,7 @@ from asm_gym.scripts.reproduce.skill_names import (
 from asm_gym.scripts.reproduce.skill_recognition import AFTER_S, naming_figure, share_right
 from asm_gym.scripts.reproduce.skill_switch import NAMES, Switch
 from asm_gym.scripts.reproduce.skill_switch import switches as recorded_switches
+from asm_gym.tasks import task as task_spec
 
 FOLLOWED_S = 2.0
 """An alarm so long after a change is put down to it [s]."""
@@ -54,7 +55,9 @@ class Config(kit.Config):
     """Episodes in which one skill follows another."""
 
     tasks: tuple[str, ...] = option(
-        ("Lift", "Stack", "Door", "PickPlaceCan", "PickPlaceMilk", "NutAssemblySquare"), quick=tuple(NAMES.values())
+        ("Lift", "Stack", "Door", "PickPlaceCan", "PickPlaceMilk", "NutAssemblySquare"),
+        quick=tuple(NAMES.values()),
+        check=task_spec,
     )
     """Skills that are told apart."""
     told: int = option(20, quick=2, least=1)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from asm_gym.episode import Episode, load_episode, save_episode
 from asm_gym.monitors.model import running
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
-from asm_gym.rollouts.trial import environment
+from asm_gym.rollouts.staging import environment
 from asm_gym.scripts.reproduce import kit
 from asm_gym.spec import StreamSpec
 from asm_gym.wrappers import StreamRecorder

@@ -29,8 +29,9 @@ from asm_gym.monitors.contact_band import ContactBand
 from asm_gym.policies import rollout
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.seeds import role_seeds
+from asm_gym.rollouts.staging import environment, policy_for, staged
 from asm_gym.rollouts.substeps import band_of_task
-from asm_gym.rollouts.trial import AFTER_S, PASSING, RolloutConfig, Trial, environment, policy_for, staged
+from asm_gym.rollouts.trial import AFTER_S, PASSING, RolloutConfig, Trial
 from asm_gym.scripts.command import at_least
 from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce
 from asm_gym.tasks import env_id

@@ -116,10 +116,10 @@ def labels(watched: Watched, config: Config) -> list[EpisodeLabel]:
 
 def recordings(config: Config) -> tuple[list[Episode], Own]:
     """Lessons of babbling, and the episodes of each policy that is watched; recorded where they are not there yet."""
-    folder, config = config.out.resolve(), RolloutConfig()
+    folder = config.out.resolve()
     with kit.stage("babbling") as progress:
         wanted = curriculum(config.tasks, config.lessons, 0)
-        make = partial(record_lesson, config=config, folder=folder)
+        make = partial(record_lesson, config=RolloutConfig(), folder=folder)
         files = make_missing(make, wanted, lambda lesson: folder / lesson.path, config.workers, progress)
     jobs = [(watched, label) for watched in config.watched for label in labels(watched, config)]
     with kit.stage("recording policies") as progress:

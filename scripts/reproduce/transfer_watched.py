@@ -14,8 +14,10 @@ from asm_gym.faults.suite import kinds_of, possible
 from asm_gym.policies import Policy
 from asm_gym.rollouts.pretraining.babbling import Babbler, Lesson
 from asm_gym.rollouts.pretraining.model_card import SEVERITIES
+from asm_gym.rollouts.record import record
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
-from asm_gym.rollouts.trial import RolloutConfig, environment, record
+from asm_gym.rollouts.staging import environment
+from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.tasks import task as task_spec
 
 KNOWN, POLICIES, TASKS = "experts it knows", "policies never met", "tasks never met"

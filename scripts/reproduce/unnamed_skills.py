@@ -22,10 +22,10 @@ from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.tables import Table
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit, robot_unnamed
-from asm_gym.scripts.reproduce.curves import curve
+from asm_gym.scripts.reproduce.curves import curves
 from asm_gym.scripts.reproduce.expression import Memory, Rows
 from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters, copybook, repertoire
-from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds, shown
+from asm_gym.scripts.reproduce.kit import Findings, Record, shown
 from asm_gym.scripts.reproduce.recordings import SENSED, demonstrations, wide_enough
 from asm_gym.scripts.reproduce.segments import NEAR, SOURCES, judged, parted, unnamed
 from asm_gym.scripts.reproduce.skill_switch import Switch, switches
@@ -102,22 +102,17 @@ def tables(records: Sequence[Record], config: Config) -> list[Table]:
     """Skills, beginnings and segments; of letters, and of robosuite."""
     made = []
     if config.repertoires:
-        heads = ("", *map(str, config.repertoires))
-
-        def rows(value: str, digits: int = 2) -> list[tuple[str, ...]]:
-            return [
-                (
-                    label,
-                    *(shown(records, value, digits, domain="letters", skills=n, source=s) for n in config.repertoires),
-                )
-                for s, label in SOURCES.items()
-            ]
-
+        counts = kit.by("skills", config.repertoires)
+        sources = {label: {"domain": "letters", "source": s} for s, label in SOURCES.items()}
+        captions = {
+            "skills_found": "Skills found, by how many there are; mean ± SD over seeds",
+            "index": "Adjusted Rand index of the segments",
+            "found": f"Beginnings found [share of those that are], within {NEAR} steps",
+            "true": f"Beginnings that are true [share of those found], within {NEAR} steps",
+        }
         made += [
-            Table("Skills found, by how many there are; mean ± SD over seeds", heads, rows("skills_found", 1)),
-            Table("Adjusted Rand index of the segments", heads, rows("index")),
-            Table(f"Beginnings found [share of those that are], within {NEAR} steps", heads, rows("found")),
-            Table(f"Beginnings that are true [share of those found], within {NEAR} steps", heads, rows("true")),
+            kit.grid(said, records, value, sources, counts, 1 if value == "skills_found" else 2)
+            for value, said in captions.items()
         ]
     if config.robot_episodes:
         asked = {
@@ -144,10 +139,10 @@ def drawn(records: Sequence[Record], config: Config) -> Figure:
         axes = fig.subplots(1, 2)
         letters = bool(config.repertoires)
         counts = config.repertoires if letters else (len(config.tasks),)
-        for i, (source, label) in enumerate(SOURCES.items()):
-            for ax, value in zip(axes, ("skills_found", "index"), strict=True):
-                of = {"domain": "letters" if letters else "robosuite", "source": source}
-                curve(ax, counts, [over_seeds(records, value, skills=n, **of) for n in counts], i, label)
+        domain = "letters" if letters else "robosuite"
+        sources = {label: {"domain": domain, "source": s} for s, label in SOURCES.items()}
+        for ax, value in zip(axes, ("skills_found", "index"), strict=True):
+            curves(ax, records, value, ("skills", counts), sources)
         axes[0].plot(counts, counts, color="#888888", linewidth=1, linestyle=look(0)[1])
         axes[0].set(xlabel="skills there are", ylabel="skills found", ylim=0)
         axes[1].set(xlabel="skills there are", ylabel="adjusted Rand index", ylim=(0, 1.02))

@@ -176,7 +176,7 @@ def public(good: Good) -> dict[str, Target]:
         "pretrained_for": (pretrained_for, lambda: {"spec": good.shipped.spec, "controller": "OSC_POSE"}),
         "register_monitor": (
             register_monitor,
-            lambda: {"model": good.own_monitor()},
+            lambda: (lambda model: {"name": model.kind, "model": model})(good.own_monitor()),
         ),
         "load_monitor": (load_monitor, lambda: {"path": good.memory_file}),
         "Episode.from_stream": (

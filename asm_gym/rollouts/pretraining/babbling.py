@@ -34,7 +34,8 @@ from asm_gym.policies.scripted.base import Style
 from asm_gym.rollouts.pretraining.healthy import held_out
 from asm_gym.rollouts.pretraining.reaching import Reaching
 from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.trial import RolloutConfig, Trial, environment, play, staged
+from asm_gym.rollouts.staging import environment, play, staged
+from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import StreamRecorder
 

@@ -86,6 +86,15 @@ def harmless(episodes: Sequence[Episode]) -> list[Episode]:
 
     Args:
         episodes: of one task, at least half of them harmless; where no contact force is known, joints alone tell.
+
+    Example:
+        >>> import numpy as np
+        >>> from asm_gym import Channel, Episode, StreamSpec, harmless
+        >>> spec = StreamSpec((Channel("external_torque_peak", 1, "N m"),), dt=0.05)
+        >>> calm, crash = np.ones((100, 1)), np.ones((100, 1))
+        >>> crash[50:] = 30.0
+        >>> [len(e) for e in harmless([Episode.from_stream(x, spec) for x in (calm, calm, crash)])]
+        [100, 100, 46]
     """
     torque = float(np.median([peak_torques(episode).max() for episode in episodes]))
     known = [float(np.nanmax(e.contact_force)) for e in episodes if len(e.contact_force)]

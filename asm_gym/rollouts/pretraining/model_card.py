@@ -11,7 +11,7 @@ import numpy as np
 
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.comparison import visible_kinds
-from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, false_alarms_per_hour
+from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, hourly_alarms
 from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Column, Table, count, milliseconds, percent, tabulate
@@ -120,7 +120,7 @@ def examine(memory: CalibratedMonitor, name: str, recordings: Sequence[Episode],
 COLUMNS: Sequence[Column[Marks]] = (
     Column("", lambda m: m.name),
     Column("healthy, alarm", lambda m: count(false_alarms(m.solved))),
-    Column("per hour", lambda m: f"{false_alarms_per_hour(m.solved):.1f}"),
+    Column("per hour", lambda m: hourly_alarms(m.solved).text),
     Column("crashed, alarm", lambda m: count(false_alarms(m.crashed)) if m.crashed else ""),
     Column("failed, alarm", lambda m: count(false_alarms(m.failed)) if m.failed else ""),
     Column("AUROC", lambda m: f"{m.metrics.auroc:.3f}" if m.metrics.faulty else ""),
@@ -136,7 +136,8 @@ def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Ta
     limit = f"threshold {memory.threshold:.3g} from {about['calibrated_on']} others at {about['false_alarm_rate']:g}"
     return tabulate(
         f"{about['name']}: {learned}, {limit}. Episodes with an alarm, apart those that solved the task, those that "
-        "solved it but pressed twice as hard as its expert usually does at most, and those that failed; faults of "
+        "solved it but pressed twice as hard as its expert usually does at most, and those that failed; alarms an hour "
+        "of the first, with a 95 % Poisson interval, one that comes back within a minute counted once; faults of "
         f"medium and strong severity that an ideal observer could see, found within {window:g} s.",
         COLUMNS,
         marks,

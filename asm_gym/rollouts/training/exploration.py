@@ -21,7 +21,8 @@ from asm_gym.episode import Episode, load_episode, save_episode
 from asm_gym.monitors.baselines.limits import columns
 from asm_gym.policies import make_policy
 from asm_gym.policies.base import Policy
-from asm_gym.rollouts.trial import RolloutConfig, Trial, play, staged
+from asm_gym.rollouts.staging import play, staged
+from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.wrappers import StreamRecorder
 
 SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
