@@ -148,14 +148,11 @@ def test_nothing_fitted_a_push_is_noticed_and_a_healthy_episode_is_quiet():
     ],
 )
 def test_a_sensor_that_the_expert_does_not_need_fails_and_nothing_else_is_done(fault, completed, unread):
-    done = {}
-    for on_alarm in ("monitor", "graded"):
-        infos = []
-        faulty = FaultInjection(gym.make("asm_gym/Lift-v0"), [fault])
-        env = NeuralASMSafety(faulty, on_alarm=on_alarm, on_overrun="ignore")
-        rollout(env, make_policy("scripted", env, seed=854111985), 854111985, infos.append, 60)
-        done[on_alarm] = np.array([info["asm"]["executed_action"] for info in infos])
-        env.close()
+    infos = []
+    faulty = FaultInjection(gym.make("asm_gym/Lift-v0"), [fault])
+    env = NeuralASMSafety(faulty, on_overrun="ignore")
+    rollout(env, make_policy("scripted", env, seed=854111985), 854111985, infos.append, 60)
+    env.close()
     assert any(info["asm"]["alarm"] for info in infos)
     assert (infos[-1]["asm"]["completed"], infos[-1]["asm"]["unread"]) == (completed, unread)
-    np.testing.assert_array_equal(done["graded"], done["monitor"])
+    assert not any(info["asm"]["intervened"] for info in infos)
