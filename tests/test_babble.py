@@ -341,7 +341,7 @@ def replace_weight(lesson):
         ({"guides": ("lift",)}, "unknown agent 'lift'"),
         ({"exam_faults": ("pushes",)}, "unknown kind of fault 'pushes'"),
         ({"exam_episodes": -1}, "exam_episodes must be at least 0, got -1"),
-        ({"window": 0.0}, "window must be > 0 s, got 0"),
+        ({"window": 0.0}, "window must be a number above 0, got 0"),
         ({"episodes": 18, "tasks": ("Lift",)}, "needs 19 undisturbed lessons .* hold 6$"),
     ],
 )
