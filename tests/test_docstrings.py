@@ -13,9 +13,6 @@ from asm_gym.monitors import MONITORS
 from asm_gym.policies.registry import REGISTERED
 from asm_gym.tasks import OWN
 
-ELSEWHERE = {"FaultInjection", "NeuralASMSafety", "StreamRecorder", "VectorNeuralASMSafety"}
-"""Names whose example is to come with the rewriting of the wrappers."""
-
 
 @pytest.fixture(autouse=True)
 def registries():
@@ -27,7 +24,7 @@ def registries():
         rows.update(before)
 
 
-@pytest.mark.parametrize("name", sorted(set(asm_gym.__all__) - ELSEWHERE))
+@pytest.mark.parametrize("name", sorted(asm_gym.__all__))
 def test_the_example_of_a_public_name_runs(name):
     thing = inspect.unwrap(getattr(asm_gym, name))
     examples = doctest.DocTestParser().get_doctest(inspect.getdoc(thing) or "", {}, name, None, 0)

@@ -29,6 +29,16 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         TypeError: the environment has other spaces, or ``faults`` is not a sequence of them.
         ValueError: a fault that this environment cannot have (an unknown body or joint, an onset past the horizon), or
             two that contradict each other.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from asm_gym import FaultInjection
+        >>> from asm_gym.faults import Push
+        >>> push = Push(body="robot0_link5", newtons=20.0, onset=1, duration=2)
+        >>> env = FaultInjection(gym.make("asm_gym/Lift-v0"), [push])
+        >>> observation, info = env.reset(seed=0)
+        >>> [env.step(0.0 * env.action_space.sample())[-1]["fault"] for _ in range(3)]
+        [(), ('Push',), ('Push',)]
     """
 
     @typed

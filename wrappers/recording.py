@@ -25,6 +25,16 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Args:
         env: an environment with a stream, or with spaces that can be read as numbers.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from asm_gym import StreamRecorder
+        >>> env = StreamRecorder(gym.make("Pendulum-v1", max_episode_steps=30))
+        >>> observation, info = env.reset(seed=0)
+        >>> for _ in range(30):
+        ...     *_, info = env.step(env.action_space.sample())
+        >>> env.episodes[0].stream.shape, len(env.stream_spec.labels)
+        ((30, 4), 4)
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:

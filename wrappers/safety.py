@@ -109,6 +109,15 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             fit, ``"recall"`` with a monitor that expects no action, or a wrapper inside that changes actions, where the
             reflex cannot know what reaches the robot. Nothing is changed then.
         RuntimeError: the monitor is not calibrated.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from asm_gym import NeuralASMSafety
+        >>> env = NeuralASMSafety(gym.make("asm_gym/Lift-v0"), on_overrun="ignore")  # the shipped memory of the Panda
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> info["asm"]["state"], bool(info["cost_sum"] >= info["cost"])
+        ('policy', True)
     """
 
     def __init__(

@@ -67,6 +67,15 @@ class VectorNeuralASMSafety(VectorWrapper):
             wrapper inside that changes actions, where the reflex cannot know what reaches the robot, or what it
             makes of the same sense as it goes on.
         RuntimeError: the monitor is not calibrated.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from asm_gym import VectorNeuralASMSafety
+        >>> envs = VectorNeuralASMSafety(gym.make_vec("asm_gym/Lift-v0", num_envs=2))
+        >>> observations, infos = envs.reset(seed=0)
+        >>> *_, infos = envs.step(0.1 * envs.action_space.sample())
+        >>> infos["asm"]["surprise"].shape, infos["asm"]["reason"].tolist()
+        ((2,), ['', ''])
     """
 
     def __init__(
