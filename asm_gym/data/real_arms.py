@@ -34,8 +34,7 @@ class RealArm:
         read: from its place to columns: time, position, velocity, effort (T, J) each, where they are there.
         rate: that it is read at [Hz]; None for its own.
         unit: of a position, 1 in radians.
-        model: whose kinematics it has; empty where a push is a step in one joint.
-        torque: N m in one of its effort.
+        model: whose kinematics it has, its effort being in N m; empty where a push is a step in one joint.
     """
 
     robot: str
@@ -46,7 +45,6 @@ class RealArm:
     rate: float | None = None
     unit: float = 1.0
     model: str = ""
-    torque: float = 1.0
 
     def episode(self, folder: Path) -> Episode:
         """The recording. Raises FileNotFoundError that says where it is published."""
@@ -112,7 +110,6 @@ ARMS = {
         "BSD-3-Clause",
         _bag,
         model="ur10",
-        torque=10.0,
     ),
     "panda_gaz2019": RealArm(
         "Franka Panda",

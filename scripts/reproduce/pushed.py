@@ -88,7 +88,7 @@ def _force(piece: Episode, onset: int, arm: RealArm, force: Floats) -> Floats:
     q = piece.stream[onset:, piece.spec.slices["position"]].astype(np.float64) / arm.unit
     rise = np.minimum(1.0, (1 + np.arange(len(q))) * piece.spec.dt / RISE_S)
     torque = np.array([jacobian(TABLES[arm.model], row).T @ force for row in q])
-    added: Floats = torque * rise[:, None] / arm.torque
+    added: Floats = torque * rise[:, None]
     return added
 
 
