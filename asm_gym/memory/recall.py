@@ -6,7 +6,7 @@
 
 Offline the predictions stand in for what is not sensed. An x̂_t that is fed back is what μ_t predicts, so that its error
 is 0 and inference leaves the state where it is: z_t = μ_t is the fixed point, not a short cut. (W_S, W_A are rows of
-W_F, and D_S, D_A of W_D: see ``inference``.) The same holds of the network that settles, which carries on z_t.
+W_F, and D_S, D_A of W_D: see ``inference``.) The same holds of the network that settles, which carries z_t on.
 
 Sources: Tang, Barron and Bogacz 2023 (NeurIPS) for online and offline recall by temporal predictive coding; Mahajan et
 al. 2025 (Neural Computation 38(1)) for skills.
