@@ -312,12 +312,15 @@ def sums_table(records: Sequence[kit.Record], guards: Sequence[str]) -> Table:
     return tabulate("Harm avoided, success kept", columns, guards)
 
 
+_LABEL: dict[str, Any] = {"textcoords": "offset points", "arrowprops": {"arrowstyle": "-", "lw": 0.5}}
+
+
 def frontier(records: Sequence[kit.Record], guards: Sequence[str]) -> Figure:
     """Success kept against harm avoided, a point for each way to guard."""
     figure = Figure(figsize=(5.5, 4.0), layout="constrained")
     axes = figure.subplots()
     hostile = [r for r in records if r["kind"] in ("hostile", "untrained")]
-    for guard in guards:
+    for n, guard in enumerate(guards):
         share = left(hostile, guard)
         own = [r["success"] for r in records if r["kind"] == "healthy" and r["guard"] == guard]
         if np.isnan(share) or not own:
@@ -325,8 +328,9 @@ def frontier(records: Sequence[kit.Record], guards: Sequence[str]) -> Figure:
         low, high = wilson_interval(sum(own), len(own))
         x, y = 100 * (1 - share), 100 * np.mean(own)
         axes.errorbar(x, y, yerr=[[y - 100 * low], [100 * high - y]], marker="o", capsize=3, color="C0")
-        axes.annotate(guard, (x, y), xytext=(-6, 8), textcoords="offset points", ha="right")
-    axes.set_xlabel("harm of hostile policies avoided [%]")
+        side, offset = ("left", 30) if x < 50 else ("right", -30)
+        axes.annotate(f"{guard}: {x:.1f}, {y:.1f}", (x, y), xytext=(offset, 8 - 14 * n), ha=side, **_LABEL)
+    axes.set_xlabel("harm of hostile and untrained policies avoided [%]")
     axes.set_ylabel("healthy episodes solved [%]")
     axes.set_xlim(-8, 106)
     return figure
