@@ -74,8 +74,8 @@ class Config(kit.Config):
 
     seeds: int = option(1, least=1)
     """How often it is done anew, with other seeds."""
-    memory: str = option("panda", metavar="NAME|FILE")
-    """A shipped memory, or the file of one."""
+    robot: str = option("Panda", known=("Panda", "Sawyer", "IIWA"))
+    """The arm, watched by its shipped memory."""
     episodes: int = option(10, quick=1, least=1)
     """Episodes of each hostile cell."""
     healthy: int = option(40, quick=1, least=0)
@@ -157,9 +157,9 @@ def policy_of(cell: Cell, env: gym.Env[Any, Any], seed: int) -> Policy:
 def measured(job: tuple[Cell, int], config: Config) -> list[kit.Record]:
     """One scene under every guard."""
     cell, seed = job
-    memory = NeuralASM.load(config.memory) if config.memory.endswith(".asm") else NeuralASM.pretrained(config.memory)
+    memory = NeuralASM.pretrained(config.robot.lower())
     trial = Trial(env_id(cell.task), seed, cell.fault, "" if cell.fault in (NOMINAL, "passing_push") else "medium")
-    rollouts = RolloutConfig()
+    rollouts = RolloutConfig(robot=config.robot)
     return [one(cell, trial, name, memory, rollouts) for name in config.guards]
 
 
