@@ -78,7 +78,7 @@ def target(found: Any) -> Any:
     if not isinstance(found, str):
         return found
     module, _, name = found.partition(":")
-    with needed_for(found):
+    with needed_for(name):
         home = import_module(module)
     if not hasattr(home, name):
         raise ValueError(f"module {module} has no {name!r}")

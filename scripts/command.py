@@ -128,7 +128,8 @@ def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None, about:
 
 
 def plain(text: str) -> str:
-    """A docstring without its markup."""
+    """A docstring without its markup, and without equations, which fit no terminal."""
+    text = "\n\n".join(part for part in text.split("\n\n") if not part.startswith("    "))
     return re.sub(r":\w+:`~?([^`]*)`|`+([^`]*)`+", lambda found: found[1] or found[2], textwrap.dedent(text)).strip()
 
 

@@ -15,7 +15,6 @@ from asm_gym.rollouts.collect import record_episode
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.staging import Latest
 from asm_gym.rollouts.trial import RolloutConfig
-from asm_gym.scripts import collect as script
 from asm_gym.tasks import env_spec
 from tests.fakes import FakeEnv
 
@@ -112,10 +111,6 @@ def test_discrete_actions_are_a_number_for_each():
     assert episode.stream.shape[1] == 4 + 2
     np.testing.assert_array_equal(episode.stream[:, 4:].sum(axis=1), 1)
     np.testing.assert_array_equal(episode.stream[1:, 5] > 0, episode.stream[:-1, 2] > 0)
-
-
-def test_the_old_name_is_the_same_function():
-    assert script.collect is collect
 
 
 @pytest.mark.slow  # 80 resets of robosuite

@@ -79,7 +79,7 @@ SAID = [
     "a robosuite environment or a fault in one needs mujoco: pip install 'asm-gym[robosuite]'",
     "a robosuite environment or a fault in one needs mujoco: pip install 'asm-gym[robosuite]'",
     "SurpriseOverlay needs matplotlib: pip install 'asm-gym[report]'",
-    "monitor gru needs torch: pip install 'asm-gym[agents]'",
+    "GRU needs torch: pip install 'asm-gym[agents]'",
     "a dataset needs h5py: pip install 'asm-gym[data]'",
     "gymnasium_robotics:FetchReach-v4 needs gymnasium_robotics: pip install 'asm-gym[environments]'",
 ]

@@ -123,7 +123,7 @@ def test_a_fault_that_is_accepted_runs_and_leaves_nothing_behind(stack, data):
 WRAPPERS = {
     "safety": (lambda **more: NeuralASMSafety(FakeEnv(), **({"monitor": CueMonitor()} | more)), (
         "monitor", "on_alarm", "release_after", "release_below", "max_override", "try_after", "truncate",
-        "learning_rate", "monitor_freq", "on_overrun",
+        "online_learning_rate", "monitor_freq", "on_overrun", "contact_limits", "responses",
     )),
     "many": (lambda **more: VectorNeuralASMSafety(
         gym.vector.SyncVectorEnv([FakeEnv]), **({"monitor": FadingMonitor()} | more)

@@ -141,10 +141,14 @@ def make_reflex(on_alarm: OnAlarm, env: gym.Env[Any, Any]) -> Policy | None:
             raise ValueError(f"unknown on_alarm {shown(on_alarm)}; known: {', '.join(ON_ALARM)}, or any policy")
         return REFLEXES[on_alarm](env) if on_alarm in REFLEXES else None
     made: Any = on_alarm
+    refused = f"on_alarm must be one of {', '.join(ON_ALARM)}, have a predict(), or make such a policy, got "
     if isinstance(on_alarm, type) or (callable(on_alarm) and not hasattr(on_alarm, "predict")):
-        made = on_alarm(env)
+        try:
+            made = on_alarm(env)
+        except TypeError as error:
+            raise ValueError(f"{refused}{shown(on_alarm)}: {error}") from error
     if not callable(getattr(made, "predict", None)):
-        raise ValueError(f"on_alarm must be one of {', '.join(ON_ALARM)} or have a predict(), got {shown(made)}")
+        raise ValueError(f"{refused}{shown(made)}")
     if isinstance(made, Hold) and not made.explicit and made.env.unwrapped is not env.unwrapped:
         name = type(made).__name__
         raise ValueError(

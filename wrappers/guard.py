@@ -55,8 +55,9 @@ class GuardOptions:
 
     def reaction(self, monitor: Monitor) -> OnAlarm:
         """``on_alarm``, or what the monitor makes of None."""
-        chosen: OnAlarm = self.on_alarm or ("graded" if names_causes(monitor) else "hold")
-        if self.responses is not None and chosen != "graded":
+        usual = "graded" if names_causes(monitor) else "hold"
+        chosen: OnAlarm = usual if self.on_alarm is None else self.on_alarm
+        if self.responses is not None and not (isinstance(chosen, str) and chosen == "graded"):
             raise ValueError(f"responses are those of on_alarm='graded', got on_alarm={shown(chosen)}")
         return chosen
 
@@ -87,8 +88,9 @@ class Guard:
         self.reflex = reflex
         self.recalls = check_expectation(reflex, monitor)
         """The monitor is to be asked what it expects to be commanded."""
-        self.ends_on_alarm = chosen == "terminate"
-        graded, acts = chosen == "graded", chosen != "monitor" and box is not None
+        named = chosen if isinstance(chosen, str) else ""
+        self.ends_on_alarm = named == "terminate"
+        graded, acts = named == "graded", named != "monitor" and box is not None
         self.responder = Responder(env, monitor, responses_from(options.responses), repairs=graded)
         rule = make_rule(
             reflex, env, options.release_after, options.release_below, options.max_override, options.try_after

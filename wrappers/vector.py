@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import Monitor, Surprise
-from asm_gym.policies.reflexes import Hold, Reflex, nearest_to_rest
+from asm_gym.policies.reflexes import Graded, Hold, Reflex, nearest_to_rest
 from asm_gym.protocols import HoldsItself, LimitsContact
 from asm_gym.stream_source import StreamSource
 from asm_gym.validation import as_float32
@@ -143,7 +143,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         guard = Guard(env, monitor, self._options, threshold, self._space)
         reflex = guard.reflex
         holds = type(reflex) is Hold and (reflex.explicit or isinstance(env, HoldsItself))
-        graded = self._options.reaction(monitor) == "graded" and isinstance(env, HoldsItself)
+        graded = isinstance(reflex, Graded) and isinstance(env, HoldsItself)
         if isinstance(reflex, Reflex) and not (holds or graded):
             refuse_changes(self.env)
         return guard

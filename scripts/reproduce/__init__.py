@@ -34,7 +34,7 @@ STUDIES = {
     "transfer": Study("one memory of a body, for policies and tasks never met"),
     "failure": Study("does surprise tell that a policy will fail"),
     "harm": Study("harm avoided against success kept, under any policy"),
-    "attack": Study("what can be hidden from the memory by who writes to the senses"),
+    "attack": Study("what who writes to the senses can hide"),
     "spinal": Study("how soon an arm feels what it should not, in substeps"),
     "reflexes": Study("what acting on alarms is worth, reflex by fault", needs_a_run=True),
     "learning_curve": Study("detection by the number of episodes learned from", needs_a_run=True),
@@ -43,7 +43,7 @@ STUDIES = {
     "diagnosis": Study("what is wrong, of kinds of faults that were never seen", needs_a_run=True),
     "repertoire": Study("one memory of all skills against one for each", needs_a_run=True),
     "real_arms": Study("faults in recordings of real arms, once downloaded", needs_a_run=True),
-    "actprobe": Study("does surprise tell that GR00T will fail, on logs of others", needs_a_run=True),
+    "actprobe": Study("will GR00T fail, by logs of others", needs_a_run=True),
     "public": Study("AUROC by kind on voraus-AD or AURSAD, once downloaded", needs_a_run=True),
 }
 INDEPENDENT = tuple(name for name, study in STUDIES.items() if not study.needs_a_run)

@@ -66,7 +66,7 @@ class Args(Common):
     seeds: int = 10
     """How often it repeats itself; the paper has 10."""
     steps: int = 2000
-    """Of the system."""
+    """Time steps of the system."""
     iterations: tuple[int, ...] = (1, 2, 4, 6, 10, 14, 20)
     """Steps of inference; the paper has 2 to 20."""
     lengths: tuple[float, ...] = (0.12, 0.16, 0.2, 0.24, 0.28, 0.32)
