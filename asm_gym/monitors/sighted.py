@@ -16,7 +16,7 @@ from asm_gym.spec import StreamSpec
 
 LOG = logging.getLogger("asm_gym.monitors")
 
-NEARLY_ALL = 0.75
+MOST = 0.6
 """A monitor that is blind to more than this share of the channels is refused."""
 
 SHOWN = 6
@@ -52,6 +52,6 @@ def require_sight(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, th
         f"the threshold came to {threshold:.3g}, which no fault of {named} could pass, however strong: an episode "
         "to calibrate on is unlike those learned from, or a channel hardly moved in them: learn from more"
     )
-    if len(blind) > NEARLY_ALL * len(np.unique(errors[errors >= 0])):
+    if len(blind) > MOST * len(np.unique(errors[errors >= 0])):
         raise ValueError(said)
     LOG.warning(said)
