@@ -10,9 +10,10 @@ from asm_gym.policies.reflexes import Graded
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.arbiter import Arbiter, ReleaseRule, Sensed
+from asm_gym.wrappers.arbiter import Arbiter, Sensed
 from asm_gym.wrappers.factory import make_fallback
 from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, responses_from
+from asm_gym.wrappers.transitions import ReleaseRule
 from tests.fakes import CueMonitor, FakeEnv
 from tests.needs import needs
 from tests.test_completion import MEMORY, SPEC, Arm, Judge, Named, offset

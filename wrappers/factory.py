@@ -17,7 +17,7 @@ from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract, nea
 from asm_gym.protocols import SensesWithinSteps
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.validation import check_number, shown
-from asm_gym.wrappers.arbiter import ReleaseRule
+from asm_gym.wrappers.transitions import ReleaseRule
 
 LOG = logging.getLogger("asm_gym.safety")
 

@@ -58,8 +58,8 @@ def report(
         where the monitor does not listen for it. ``threshold``. ``alarm``, and its ``reason``: ``"surprise"`` is over
         the threshold, a ``"contact"`` limit was passed, a number of the stream is ``"missing"``, or a ``"failure"``.
         ``intervened``: something else than the policy acted, in a part of this step at least.
-        ``state``: who acts next, one of ``asm_gym.wrappers.arbiter.State``. ``gave_up``: the episode ends.
-        ``transition``: the name in ``asm_gym.wrappers.arbiter.TRANSITIONS`` of what has led there, ``"override"``,
+        ``state``: who acts next, one of ``asm_gym.wrappers.transitions.State``. ``gave_up``: the episode ends.
+        ``transition``: the name in ``asm_gym.wrappers.transitions.TRANSITIONS`` of what has led there, ``"override"``,
         ``"release"``, ``"trial"``, ``"give_up"``, or how the policy goes on in alarm, ``"go on"``, ``"complete"``;
         empty where nothing changes. They go to the log
         ``asm_gym.safety`` with the cause. ``failure``: what failed in this step, ``policy: …``, ``stream: …``,

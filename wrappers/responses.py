@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from asm_gym.monitors import ExplainsItself, Monitor
 from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, as_info, averaged
 from asm_gym.validation import check_choice, shown
-from asm_gym.wrappers.arbiter import GOING_ON
 from asm_gym.wrappers.contact import ContactEstimator
 from asm_gym.wrappers.repair import ObservationMap, Repair
 from asm_gym.wrappers.severity import Severity
+from asm_gym.wrappers.transitions import GOING_ON
 
 _log = logging.getLogger("asm_gym.safety")
 
