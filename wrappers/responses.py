@@ -61,9 +61,6 @@ QUIET_S = 1.0
 SURE = 0.5
 """A family that is less probable is unknown."""
 
-SURE_ENOUGH = 0.7
-"""The policy goes on in alarm only where a family is as probable as this."""
-
 
 class Response(NamedTuple):
     """What is to be done after a row.
@@ -270,7 +267,7 @@ class Responder:
         """Whether the policy may go on in alarm."""
         if name == "complete":  # what is left judges on, and what is completed is bounded by itself
             return not severity.fast
-        sure = cause is not None and cause.probability >= SURE_ENOUGH
+        sure = cause is not None and cause.probability >= SURE
         return sure and may_go_on and severity.felt and not severity.fast
 
     def _held(self, case: str) -> str:
