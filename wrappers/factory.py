@@ -92,8 +92,8 @@ def running(adaptive: AdaptiveThreshold | None, threshold: float) -> RunningThre
 
 def fitted_parts(monitor: Monitor) -> tuple[Any, ...]:
     """What of a monitor ``fit`` replaces; compared by identity."""
-    diagnosis = monitor.diagnosis_ if isinstance(monitor, ExplainsItself) else None
-    return monitor, diagnosis, monitor.network_ if isinstance(monitor, NeuralASM) else None
+    # Asked for every row: whether an object has what a protocol asks for takes longer than all of this.
+    return monitor, getattr(monitor, "diagnosis_", None), monitor.network_ if isinstance(monitor, NeuralASM) else None
 
 
 def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:

@@ -190,13 +190,6 @@ class Simulation:
         found: NDArray[np.float64] = np.linalg.norm(forces, axis=2).max(axis=0)
         return found
 
-    @property
-    def strain(self) -> NDArray[np.float64]:
-        """(K,) the largest external torque in a joint in each substep since the row began [N m]."""
-        torques = self._samples[:, : self._done - self._row_began, kernels.EXTERNAL]
-        found: NDArray[np.float64] = np.abs(torques).max(axis=(0, 2))
-        return found
-
     def sense(self) -> NDArray[np.float64]:
         """What the arms' sensors read now, summarised over the substeps since the row began; noiseless."""
         if self._done > self._row_began:
