@@ -102,8 +102,8 @@ def test_the_shell_completes_commands_studies_and_options(capsys):
         return done.stdout.split()
 
     assert completed("asm-gym", "do") == ["doctor"]
-    assert completed("asm-gym", "reproduce", "ret") == ["retention"]
-    assert completed("asm-gym", "reproduce", "retention", "--bl") == ["--blocks"]
+    assert completed("asm-gym", "reproduce", "tra") == ["tracking"]
+    assert completed("asm-gym", "reproduce", "tracking", "--it") == ["--iterations"]
     assert completed("asm-gym", "evaluate", "--mon") == ["--monitors"]
     assert completed("asm-gym", "evaluate", "--monitors", "--no") == ["--nominal-episodes", "--no-video"]
 
@@ -115,7 +115,7 @@ def test_the_commands_fit_a_terminal(capsys):
 
 
 @pytest.mark.parametrize(
-    ("typed", "near"), [("docter", "doctor"), ("colect", "collect"), ("reproduce transfers", "transfer")]
+    ("typed", "near"), [("docter", "doctor"), ("colect", "collect"), ("reproduce trackin", "tracking")]
 )
 def test_a_slip_of_the_finger_is_told_what_was_meant(typed, near, capsys):
     assert cli.main(typed.split()) == 2
@@ -123,12 +123,12 @@ def test_a_slip_of_the_finger_is_told_what_was_meant(typed, near, capsys):
 
 
 def test_all_studies_check_the_options_of_all_before_the_first_runs(capsys, monkeypatch):
-    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{name}") for name in ("retention", "failure"))
+    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{name}") for name in ("tracking", "failure"))
     ran: list[str] = []
     for module in (first, last):
         monkeypatch.setattr(module, "run", lambda config, name=module.__name__: ran.append(name))
     monkeypatch.setattr(last, "Config", Options)  # which has no --seeds
-    monkeypatch.setattr(reproduce, "INDEPENDENT", ("retention", "failure"))
+    monkeypatch.setattr(reproduce, "INDEPENDENT", ("tracking", "failure"))
     assert cli.main(["reproduce", "all", "--seeds", "2"]) == 2
     assert "--seeds" in capsys.readouterr().err
     assert not ran

@@ -5,7 +5,8 @@ import pytest
 
 from asm_gym.faults.suite import KINDS
 from asm_gym.monitors.diagnosis import CLASSES, EVIDENCE, FAMILIES, Readout, averaged
-from asm_gym.scripts.reproduce.diagnosis import FAMILY, Examples, asked, class_of, main
+from asm_gym.scripts.cli import main
+from asm_gym.scripts.reproduce.diagnosis import FAMILY, Examples, asked, class_of
 
 
 def test_every_kind_of_the_suite_has_a_class_and_nothing_else_has():
@@ -50,7 +51,7 @@ def test_the_shipped_readout_fits_what_is_weighed():
 
 
 def test_a_run_without_recordings_is_refused(tmp_path, capsys):
-    assert main(["--run", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert main(["reproduce", "diagnosis", "--run", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "run asm-gym evaluate first" in capsys.readouterr().err.replace("\n", " ")
 
 

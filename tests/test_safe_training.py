@@ -9,7 +9,7 @@ import pytest
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from asm_gym.episode import Episode, save_episode
+from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.training.exploration import Explorer, Gentle, until_contact
 from asm_gym.rollouts.training.learners import NOVICE_LOG_STD, make_learner, make_novice
@@ -174,8 +174,7 @@ def test_a_novice_is_untrained_and_hesitant():
         (["--conditions", "hold"], "alone"),
         (["--conditions", "alone", "pray"], "terminate, hold"),
         (["--seeds", "0"], "seeds"),
-        (["--force-limit", "0"], "force_limit"),
-        (["--false-alarm-rate", "0.001"], "999"),
+        (["--harmless-torque", "0"], "harmless_torque"),
     ],
 )
 def test_what_makes_no_sense_is_refused(arguments, message, tmp_path, capsys):
@@ -186,15 +185,12 @@ def test_what_makes_no_sense_is_refused(arguments, message, tmp_path, capsys):
 
 def test_a_memory_that_is_there_already_watches_and_nothing_is_explored_for_it(tmp_path):
     spec = sine_spec()
-    expert = [save_episode(tmp_path / f"{n}.npz", e) for n, e in enumerate(sine_episodes(18, 0, spec))]
     body = tmp_path / "body.asm"
     NeuralASM(spec, 8, 8, epochs=1).fit(sine_episodes(10, 1, spec)).calibrate(sine_episodes(9, 2, spec), 0.1).save(body)
-    args = safe_training.Args(memory=str(body), quick=True, out=tmp_path / "out").scaled()
-    found = safe_training.memories(args, safe_training.Recorded(expert, [], []))
-    assert list(found) == ["the body", "the expert"]  # the first watches
-    assert found["the body"] == body
+    assert safe_training.memory_of(safe_training.Config(memory=str(body), out=tmp_path / "out")) == body
+    assert not (tmp_path / "out").exists()
     with pytest.raises(FileNotFoundError):
-        safe_training.Args(memory=str(tmp_path / "nothing.asm"))
+        safe_training.Config(memory=str(tmp_path / "nothing.asm"))
 
 
 @pytest.mark.slow
@@ -202,9 +198,9 @@ def test_a_comparison_runs_end_to_end_and_goes_on(tmp_path):
     how = ["reproduce", "safe_training", "--quick", "--workers", "2", "--out", str(tmp_path)]
     assert main(how) == 0
     written = {p.name for p in tmp_path.iterdir() if p.is_file()}
-    tables = {f"training.{kind}" for kind in ("md", "csv", "json", "png")}
-    assert written == {"train_safely.json", "exploration.asm", "expert.asm", *tables}
-    runs = json.loads((tmp_path / "training.json").read_text())["runs"]
+    tables = {f"safe_training.{kind}" for kind in ("md", "csv", "json", "png", "svg")}
+    assert written == {"train_safely.json", "exploration.asm", *tables}
+    runs = json.loads((tmp_path / "safe_training.json").read_text())["runs"]
     assert {(r["condition"], r["seed"]) for r in runs} == {
         (c, s) for c in ("alone", "terminate", "hold") for s in (0, 1)
     }
@@ -213,8 +209,8 @@ def test_a_comparison_runs_end_to_end_and_goes_on(tmp_path):
     # A run that is lost is made again, the same, and no other.
     stamps = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "outcomes").iterdir()}
     (tmp_path / "outcomes" / "hold-1.json").unlink()
-    before = (tmp_path / "training.csv").read_text()
+    before = (tmp_path / "safe_training.csv").read_text()
     assert main(how) == 0
     again = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "outcomes").iterdir()}
     assert {n for n in stamps if again[n] != stamps[n]} == {"hold-1.json"}
-    assert (tmp_path / "training.csv").read_text() == before
+    assert (tmp_path / "safe_training.csv").read_text() == before

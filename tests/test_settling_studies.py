@@ -61,7 +61,7 @@ def test_what_is_missing_from_predictive_coding_is_how_sure_it_was(run):
 
 
 def test_a_network_learns_what_is_observed_next_nearly_as_the_kalman_filter_knows_it():
-    rng, args = np.random.default_rng(0), tracking.Args(updates=8000)
+    rng, args = np.random.default_rng(0), tracking.Config(updates=8000)
     network, spread = tracking.learned([recording(tracking.LEARNED_STEPS, rng) for _ in range(64)], args, rng)
     fresh = [recording(tracking.LEARNED_STEPS, rng) for _ in range(8)]
     errors = [
@@ -76,7 +76,7 @@ def test_a_network_learns_what_is_observed_next_nearly_as_the_kalman_filter_know
 
 
 def test_one_that_settles_recalls_what_comes_twice_and_one_layer_cannot():
-    args, rng = sequences.Args(updates=1500), np.random.default_rng(0)
+    args, rng = sequences.Config(updates=1500), np.random.default_rng(0)
     sequence = sequences.patterns(3, 100, 0.0, rng)[list(sequences.ALIASED["A B C B A"])]
     found = sequences.by_network(sequence, "settling", args, rng)
     assert sequences.recalled(found, sequence)[0] == 1.0

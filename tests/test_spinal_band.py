@@ -1,6 +1,5 @@
 """What a memory expects an arm to feel: it knows the task, keeps its promise, and refuses what it cannot do."""
 
-import csv
 import json
 from functools import partial
 
@@ -14,7 +13,6 @@ from asm_gym.faults import Push
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.contact_band import UNJUDGED, ContactBand, FeltEpisode
 from asm_gym.rollouts.substeps import felt_episodes
-from asm_gym.scripts.reproduce.spinal import main, table
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety
 
@@ -302,32 +300,3 @@ def test_a_band_that_does_not_fit_is_refused(swaying, memory, nominal):
     quick.fit([Episode.from_stream(e.stream, fast) for e in nominal[:4]])
     with pytest.raises(ValueError, match="100 rows a second"):
         ContactBand(quick)
-
-
-@pytest.mark.slow  # records 17 episodes and plays 16: half a minute
-def test_the_study_prints_what_it_measured(tmp_path, capsys):
-    assert main(["--quick", "--tasks", "Lift", "--workers", "1", "--out", str(tmp_path)]) == 0
-    text = (tmp_path / "spinal.md").read_text()
-    assert "passing push" in text
-    assert "collision" in text
-    assert json.loads((tmp_path / "spinal_Lift.json").read_text())["promise"]["rate"] <= 0.1
-    rows = list(csv.DictReader((tmp_path / "spinal.csv").open()))
-    assert len(rows) == 4
-    for row in rows:
-        if row["latency_ms"]:
-            assert 0 < float(row["latency_ms"]) <= float(row["at_control_rate_ms"]) + 1e-6
-
-
-def test_its_table_counts_a_touch_that_was_never_felt_as_the_latest():
-    def one(seed, late):
-        forces = {"force_alone": 30.0, "force_spinal": 20.0, "force_ideal": 10.0}
-        slow = None if late is None else 50.0
-        times = {"touched_s": 1.0, "latency_ms": late, "at_control_rate_ms": slow}
-        return {"task": "Lift", "kind": "collision", "seed": seed, "false_alarm": seed == 0, **times, **forces}
-
-    records = [one(0, 4.0), one(1, None), one(2, 12.0), {**one(3, None), "touched_s": None}]
-    push = [{**r, "kind": "passing_push"} for r in records[:1]]
-    made = table(records + push, {"Lift": {"promise": {"rate": 0.01}}})
-    assert made.rows[1] == ("Lift", "collision", "1 of 4", "2 of 3", "1 of 3", "12", "50", "30", "20", "10")
-    none = table([one(0, None), one(1, None), *push], {"Lift": {"promise": {"rate": 0.01}}})
-    assert none.rows[1][5:7] == ("never", "never")

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from asm_gym.evaluation.contact import ContactForce
 
 Floats = NDArray[np.floating[Any]]
 
@@ -39,23 +36,11 @@ class InterventionOutcome(NamedTuple):
         success: the task was solved at some step.
         ended_by_alarm: the wrapper ended the episode.
         contact_force: the greatest contact force [N].
-        external_force: the greatest external force on an arm while the fault lasts, or would [N].
-        impulse: its time integral over the same time [N s].
-        acted_s: time in which the reflex acted [s].
-        contact: the greatest force of the first contact since the onset: at first, and after half a second.
-        cause: the family of causes that was named at the first alarm since the onset; empty without one.
-        part: the part that was named with it.
     """
 
     success: bool = False
     ended_by_alarm: bool = False
     contact_force: float = math.nan
-    external_force: float = math.nan
-    impulse: float = math.nan
-    acted_s: float = 0.0
-    contact: ContactForce = ContactForce(0.0, 0.0)
-    cause: str = ""
-    part: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,22 +109,6 @@ class ScoredEpisode:
     top_channel: str = ""
     outcome: InterventionOutcome = InterventionOutcome()  # noqa: RUF009  (immutable)
     detail: TraceDetail | None = None
-
-    def to_json(self) -> str:
-        """All of it but ``detail``."""
-        kept = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "detail"}
-        return json.dumps(
-            kept, default=lambda value: value.tolist() if isinstance(value, np.ndarray) else sorted(value)
-        )
-
-    @classmethod
-    def from_json(cls, text: str) -> Self:
-        """What ``to_json`` wrote, to the last bit."""
-        kept = json.loads(text)
-        outcome = InterventionOutcome(*kept.pop("outcome"))
-        outcome = outcome._replace(contact=ContactForce(*outcome.contact))
-        surprise, affected = np.array(kept.pop("surprise"), np.float64), frozenset(kept.pop("affected_channels"))
-        return cls(**kept, surprise=surprise, affected_channels=affected, outcome=outcome)
 
     def __post_init__(self) -> None:
         if self.surprise.ndim != 1 or not len(self.surprise):

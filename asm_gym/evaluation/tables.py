@@ -100,14 +100,6 @@ def percent(share: Share | None) -> str:
     return f"{100 * share.value:.0f} %" if share is not None and share.n else ""
 
 
-def percent_within(share: Share | None) -> str:
-    """With its interval."""
-    if share is None or not share.n:
-        return ""
-    low, high = share.interval
-    return f"{percent(share)} ({100 * low:.0f}–{100 * high:.0f})"
-
-
 def milliseconds(delays: Delays | None, which: str, otherwise: str = "missed") -> str:
     """The ``median_ms`` or ``p95_ms``; ``otherwise`` where it is infinite."""
     delay = math.inf if delays is None else getattr(delays, which)

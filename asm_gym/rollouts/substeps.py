@@ -8,14 +8,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.contact_band import ContactBand, FeltEpisode
+from asm_gym.monitors.contact_band import FeltEpisode
 from asm_gym.policies import rollout
 from asm_gym.protocols import FeelsWithinSteps
-from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.staging import environment, policy_for
-from asm_gym.rollouts.trial import PolicySource, RolloutConfig
-from asm_gym.tasks import env_id
+from asm_gym.rollouts.staging import policy_for
+from asm_gym.rollouts.trial import PolicySource
 
 
 def felt_episodes(
@@ -48,20 +45,3 @@ def felt_episodes(
         if solved or steps is not None:
             kept.append(FeltEpisode(np.stack(rows), np.stack(felt)))
     return kept
-
-
-def band_of_task(
-    memory: NeuralASM, task: str, config: RolloutConfig, counts: tuple[int, int], rate: float, seed: int
-) -> ContactBand:
-    """A band on one task, of as many nominal episodes to learn from and to calibrate on as ``counts`` says.
-
-    Args:
-        rate: of nominal episodes that may leave it.
-        seed: of the episodes; they are no other role's.
-    """
-    env = environment(env_id(task), config.settings)
-    seen, fresh = (
-        felt_episodes(env, role_seeds(seed, task, f"spinal {role}", count), config.policy)
-        for role, count in zip(("fit", "calibration"), counts, strict=True)
-    )
-    return ContactBand(memory).fit(seen).calibrate(fresh, rate)

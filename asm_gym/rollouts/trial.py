@@ -22,8 +22,6 @@ Settings = tuple[tuple[str, Any], ...]
 PolicySource = str | Path | Policy | Callable[[gym.Env[Any, Any]], Policy]
 """What ``make_policy`` takes, whatever has ``predict``, or what makes one for an environment."""
 
-SPINAL = "+spinal"
-"""Ends the name of a reflex under which the arm also stays as soon as it leaves the band of ``RolloutConfig``."""
 PASSING = "passing_push"
 """20 N for 0.3 s: a kind beside those of the suite."""
 EXECUTIONS = {"slower": 0.85, "faster": 1.15}
@@ -40,17 +38,13 @@ class RolloutConfig:
         policy: what acts.
         robot: the arm; the task's own by default.
         stream_freq: rows of the stream a second [Hz]; one each control step by default.
-        max_override_s: how long a reflex may act at a stretch before the episode is ended [s].
         env_kwargs: what ``gym.make`` is given besides.
-        band: file of a calibrated ``ContactBand`` of the memory that watches, for reflexes that are ``"+spinal"``.
     """
 
     policy: PolicySource = "scripted"
     robot: str | None = None
     stream_freq: int | None = None
-    max_override_s: float | None = None
     env_kwargs: Settings = ()
-    band: Path | None = None
 
     @property
     def settings(self) -> Settings:
@@ -72,7 +66,7 @@ class Trial:
         onset: when it begins [steps]; by default drawn from the seed, in the first half of the episode.
         faults: what goes wrong, in place of what ``kind`` names.
         acting: ``"policy alone"``, ``"ideal"`` for a reflex that is told what is wrong and when, or what ``on_alarm``
-            takes, which may end in ``"+spinal"``.
+            takes.
         after_s: where to leave the episode, counted from the onset [s]; at its end by default.
     """
 
@@ -100,7 +94,7 @@ class Trial:
     @property
     def on_alarm(self) -> str:
         """What the safety wrapper is told."""
-        return "monitor" if self.acting in (POLICY_ALONE, IDEAL) else self.acting.removesuffix(SPINAL)
+        return "monitor" if self.acting in (POLICY_ALONE, IDEAL) else self.acting
 
     def begins(self, env: gym.Env[Any, Any]) -> int:
         """When in ``env`` something goes wrong, or would [steps]."""

@@ -21,27 +21,18 @@ class Study(NamedTuple):
 STUDIES = {
     "memorise_and_recall": Study("one network learns skills, recalls each from a cue"),
     "contextual_inference": Study("the state says which skill is running, untold"),
-    "unnamed_skills": Study("how many skills a stream holds, and where each begins"),
-    "skill_change": Study("a change of skill is followed, and raises no alarm"),
     "express_skills": Study("one memory's own motor prediction drives the arm"),
     "tracking": Study("the settling network against the Kalman filter"),
     "sequences": Study("sequences of patterns, some of which come twice"),
     "local_learning": Study("local updates against backpropagation through time"),
-    "retention": Study("skills learned one after another, with replay"),
     "speed_accuracy": Study("more inference, or slower movements, for more accuracy"),
-    "fault_detection": Study("surprise, against a library that is told the skill"),
     "safe_training": Study("an agent trained alone, and under the safety wrapper"),
-    "transfer": Study("one memory of a body, for policies and tasks never met"),
     "failure": Study("does surprise tell that a policy will fail"),
     "harm": Study("harm avoided against success kept, under any policy"),
     "attack": Study("what who writes to the senses can hide"),
-    "spinal": Study("how soon an arm feels what it should not, in substeps"),
-    "reflexes": Study("what acting on alarms is worth, reflex by fault", needs_a_run=True),
     "learning_curve": Study("detection by the number of episodes learned from", needs_a_run=True),
     "feedback": Study("what local learning of association costs", needs_a_run=True),
-    "completion": Study("what a faulty sense should say, from all others", needs_a_run=True),
     "diagnosis": Study("what is wrong, of kinds of faults that were never seen", needs_a_run=True),
-    "repertoire": Study("one memory of all skills against one for each", needs_a_run=True),
     "real_arms": Study("faults in recordings of real arms, once downloaded", needs_a_run=True),
     "actprobe": Study("will GR00T fail, by logs of others", needs_a_run=True),
     "public": Study("AUROC by kind on voraus-AD or AURSAD, once downloaded", needs_a_run=True),
@@ -97,18 +88,14 @@ def everything(argv: list[str]) -> int:
 
 
 def _run(name: str, argv: list[str]) -> int:
-    """By the kit, or by itself where it was not moved onto it."""
     from asm_gym.scripts.reproduce import kit
 
-    module = _module(name)
-    code: int = kit.main(module, argv) if hasattr(module, "Config") else module.main(argv)
-    return code
+    return kit.main(_module(name), argv)
 
 
 def options_of(study: str) -> Any:
     """The dataclass of a study's options."""
-    module = _module(study)
-    return module.Config if hasattr(module, "Config") else module.Args
+    return _module(study).Config
 
 
 def _module(study: str) -> Any:

@@ -8,27 +8,26 @@ as ``causes.json``; ``asm_gym/monitors/causes.json`` is such a file.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import tyro
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.console import Console
 
 from asm_gym.episode import Episode, load_episode
 from asm_gym.evaluation.reliability import Reliability, reliability
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.diagnosis import CLASSES, FAMILIES, WINDOW, Diagnosis, Hypothesis, Readout, averaged
-from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import files_in
-from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce
+from asm_gym.scripts.options import option
+from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.kit import Findings, Record
+from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers.responses import SURE
 
 KINDS_OF = {
@@ -60,14 +59,16 @@ BINS = (SURE, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 
 
 @dataclass(frozen=True)
-class Args(Common):
+class Config(kit.Config):
     """Families of causes that are told apart, of kinds of faults that were left out."""
 
-    run: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("runs/evaluate")
+    seeds: int = option(1, least=1)
+    """It learns once."""
+    run: Path = option(Path("runs/evaluate"), metavar="FOLDER")
     """Folder of an evaluation, whose faulty episodes are learned from."""
-    memory: Path | None = None
-    """A calibrated memory, such as asm-gym react leaves; by default the one that ships with the Panda."""
-    tasks: tuple[str, ...] = ("Lift", "Stack", "Door")
+    memory: Path | None = option(None)
+    """A calibrated memory; by default the one that ships with the Panda."""
+    tasks: tuple[str, ...] = option(("Lift", "Stack", "Door"), check=task_spec, metavar="TASK")
     """Names of tasks."""
 
 
@@ -171,35 +172,37 @@ def learned(known: Examples) -> Readout:
     return Readout.fit(known.evidence, known.classes, known.weight, SHRINKAGE, STEPS, RATE)
 
 
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Leaves out every kind in turn, asks for it, and learns from all in the end."""
-    paths = files_in(args.run, args.tasks, "faulty", "harmless")
+    paths = files_in(config.run, config.tasks, "faulty", "harmless")
     if not paths:
-        raise ValueError(f"{args.run} has no faulty recordings of {', '.join(args.tasks)}: run asm-gym evaluate first")
-    memory = NeuralASM.pretrained("panda") if args.memory is None else NeuralASM.load(args.memory)
+        raise ValueError(
+            f"{config.run} has no faulty recordings of {', '.join(config.tasks)}: run asm-gym evaluate first"
+        )
+    memory = NeuralASM.pretrained("panda") if config.memory is None else NeuralASM.load(config.memory)
     own = memory.diagnosis_
     if own is None:
-        raise ValueError(f"{args.memory} was saved before there was completion: fit it anew")
-    with stage("weighing", console, seconds):
+        raise ValueError(f"{config.memory} was saved before there was completion: fit it anew")
+    with kit.stage("weighing"):
         known = examples(memory, own, [load_episode(path) for path in paths])
     faulty = known.kinds != "harmless"
     kinds = list(dict.fromkeys(known.kinds[faulty].tolist()))
     records: list[Record] = []
-    with stage("leaving seeds out", console, seconds):
-        for fold in range(1 if args.quick else FOLDS):
+    with kit.stage("leaving seeds out"):
+        for fold in range(1 if config.quick else FOLDS):
             out = known.folds == fold
-            records += asked(learned(known.of(~out)), known.of(out & faulty), SEEDS_OUT, args.seed)
-    with stage("leaving kinds out", console, seconds) as progress:
-        left = kinds[:: max(1, len(kinds) // 4)] if args.quick else kinds
+            records += asked(learned(known.of(~out)), known.of(out & faulty), SEEDS_OUT, config.seed)
+    with kit.stage("leaving kinds out") as tell:
+        left = kinds[:: max(1, len(kinds) // 4)] if config.quick else kinds
         for n, kind in enumerate(left):
             out = known.kinds == kind
-            records += asked(learned(known.of(~out)), known.of(out), KINDS_OUT, args.seed)
-            progress(n + 1, len(left))
+            records += asked(learned(known.of(~out)), known.of(out), KINDS_OUT, config.seed)
+            tell(n + 1, len(left))
     shipped = learned(known)
     saved = {name: np.round(getattr(shipped, name), 5).tolist() for name in ("mean", "spread", "weights", "bias")}
-    (args.out / "causes.json").write_text(json.dumps(saved), encoding="utf-8")
+    (config.out / "causes.json").write_text(json.dumps(saved), encoding="utf-8")
     found = {out: reliable(records, out) for out in (SEEDS_OUT, KINDS_OUT)}
-    return Findings(records, [table(records, kinds), promised(found)], figure(found), {})
+    return Findings(records, [table(records, kinds), promised(found)], figure(found))
 
 
 def table(records: Sequence[Record], kinds: Sequence[str]) -> Table:
@@ -264,12 +267,3 @@ def figure(found: dict[str, Reliability]) -> Figure:
     axes.set(xlabel="probability it gives", ylabel="share it has right")
     axes.legend()
     return drawn
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Runs the study, and returns the exit code."""
-    return reproduce("diagnosis", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

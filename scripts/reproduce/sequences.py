@@ -15,27 +15,24 @@ digits there. Sompolinsky and Kanter 1986 (PRL 57(22)) for the asymmetric Hopfie
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.console import Console
 
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import DYNAMICS
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.recall import follow, run_on
-from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import at_least
-from asm_gym.scripts.reproduce.common import Common, Findings, Record, over_seeds, reproduce, shown
+from asm_gym.scripts.options import option
+from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.curves import points
+from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds, shown
 from asm_gym.validation import check_number
 
 Patterns = NDArray[np.float64]
@@ -57,32 +54,23 @@ MODELS = {
 }
 
 
+_LENGTH = partial(check_number, "the length of a sequence", low=2, whole=True)
+
+
 @dataclass(frozen=True)
-class Args(Common):
+class Config(kit.Config):
     """Which sequences are recalled from their first pattern."""
 
-    lengths: tuple[int, ...] = (4, 8, 16, 32, 64)
+    lengths: tuple[int, ...] = option((4, 8, 16, 32, 64), quick=(4, 8), least=1, check=_LENGTH)
     """Patterns in a sequence."""
-    walks: tuple[int, ...] = (8, 16)
+    walks: tuple[int, ...] = option((8, 16), quick=(8,), check=_LENGTH)
     """Patterns in a sequence drawn from four."""
-    size: int = 100
+    size: int = option(100, least=1)
     """Bits of a pattern."""
-    hidden: int = 64
+    hidden: int = option(64, quick=16, least=1)
     """Hidden units."""
-    updates: int = 3000
+    updates: int = option(3000, quick=300, least=1)
     """Steps in which the synapses change, with 16 streams side by side."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        at_least(1, self, "lengths", "size", "hidden", "updates")
-        for count in (*self.lengths, *self.walks):
-            check_number("the length of a sequence", count, low=2, whole=True)
-
-    def scaled(self) -> Args:
-        """With ``quick``, little of everything."""
-        if not self.quick:
-            return self
-        return replace(self, seeds=min(self.seeds, 2), lengths=(4, 8), walks=(8,), hidden=16, updates=300)
 
 
 def patterns(count: int, size: int, alike: float, rng: np.random.Generator) -> Patterns:
@@ -91,15 +79,15 @@ def patterns(count: int, size: int, alike: float, rng: np.random.Generator) -> P
     return np.where(rng.random((count, size)) < (1 + alike) / 2, template, -template)
 
 
-def tasks(args: Args, rng: np.random.Generator) -> dict[tuple[str, int], Patterns]:
+def tasks(config: Config, rng: np.random.Generator) -> dict[tuple[str, int], Patterns]:
     """Every sequence (P, N), by kind and length."""
     made = {}
-    for (kind, alike), count in product((("random", 0.0), ("alike", ALIKE)), args.lengths):
-        made[kind, count] = patterns(count, args.size, alike, rng)
+    for (kind, alike), count in product((("random", 0.0), ("alike", ALIKE)), config.lengths):
+        made[kind, count] = patterns(count, config.size, alike, rng)
     for name, order in ALIASED.items():
-        made[name, len(order)] = patterns(4, args.size, 0.0, rng)[list(order)]
-    for count in args.walks:
-        made["of four", count] = patterns(4, args.size, 0.0, rng)[rng.integers(0, 4, count)]
+        made[name, len(order)] = patterns(4, config.size, 0.0, rng)[list(order)]
+    for count in config.walks:
+        made["of four", count] = patterns(4, config.size, 0.0, rng)[rng.integers(0, 4, count)]
     return made
 
 
@@ -120,13 +108,13 @@ def _stepped(sequence: Patterns, W: Patterns) -> Patterns:
     return np.array(found)
 
 
-def by_network(sequence: Patterns, dynamics: str, args: Args, rng: np.random.Generator) -> Patterns:
+def by_network(sequence: Patterns, dynamics: str, config: Config, rng: np.random.Generator) -> Patterns:
     """What a temporal network recalls, once it has learned by its local rules."""
     how, one = DYNAMICS[dynamics], np.ones((len(sequence), 1), np.float32)
     x = sequence.astype(np.float32)
-    epochs = max(1, round(16 * args.updates / len(x)))
+    epochs = max(1, round(16 * config.updates / len(x)))
     schedule = Schedule(epochs, 16, 3e-3, how.iterations, how.prior_precision, 1.0, 0.0)
-    network = how.learn([Trajectory(x, one, x)], args.hidden, schedule, rng, lambda: None).network
+    network = how.learn([Trajectory(x, one, x)], config.hidden, schedule, rng, lambda: None).network
     cued = follow(network, network.at_rest(1), x[:1, None], one[:1, None])
     alone = run_on(network, cued.traces, len(x) - 1).senses[:, 0]
     return np.vstack([sequence[:1], alone])
@@ -138,24 +126,24 @@ def recalled(found: Patterns, sequence: Patterns) -> tuple[float, float]:
     return float(np.mean(agree >= RIGHT)), float(np.mean((found[1:] - sequence[1:]) ** 2))
 
 
-def one_seed(seed: int, args: Args) -> list[Record]:
+def one_seed(seed: int, config: Config) -> list[Record]:
     """Every sequence by every model."""
     rng, records = np.random.default_rng(seed), []
-    for (kind, count), sequence in tasks(args, rng).items():
+    for (kind, count), sequence in tasks(config, rng).items():
         models = {"hopfield": by_correlation(sequence), "single": by_one_layer(sequence)}
-        models |= {name: by_network(sequence, name, args, rng) for name in DYNAMICS}
+        models |= {name: by_network(sequence, name, config, rng) for name in DYNAMICS}
         for model, found in models.items():
             right, mse = recalled(found, sequence)
             records.append({"seed": seed, "kind": kind, "length": count, "model": model, "right": right, "mse": mse})
     return records
 
 
-def tables(records: Sequence[Record], args: Args) -> list[Table]:
+def tables(records: Sequence[Record], config: Config) -> list[Table]:
     """Patterns recalled rightly, and errors."""
     asked = list(dict.fromkeys((r["kind"], r["length"]) for r in records))
     return [
         Table(
-            f"{title}, from the first alone; {args.size} bits, {args.hidden} units; mean ± SD over seeds",
+            f"{title}, from the first alone; {config.size} bits, {config.hidden} units; mean ± SD over seeds",
             ("sequence", "patterns", *MODELS.values()),
             [
                 (kind, str(count), *(shown(records, value, kind=kind, length=count, model=m) for m in MODELS))
@@ -166,7 +154,7 @@ def tables(records: Sequence[Record], args: Args) -> list[Table]:
     ]
 
 
-def drawn(records: Sequence[Record], args: Args) -> Figure:
+def drawn(records: Sequence[Record], config: Config) -> Figure:
     """Patterns recalled rightly, by length, of both kinds."""
     with figure(height=3.0, width=8) as fig:
         for ax, (kind, title) in zip(
@@ -175,27 +163,15 @@ def drawn(records: Sequence[Record], args: Args) -> Figure:
             strict=True,
         ):
             for i, (model, label) in enumerate(MODELS.items()):
-                found = [over_seeds(records, "right", kind=kind, length=n, model=model) for n in args.lengths]
-                points(ax, args.lengths, found, i, label)
+                found = [over_seeds(records, "right", kind=kind, length=n, model=model) for n in config.lengths]
+                points(ax, config.lengths, found, i, label)
             ax.set(xlabel="patterns in a sequence", xscale="log", title=title)
         fig.axes[0].set(ylabel="share recalled rightly")
         fig.axes[1].legend(fontsize=7)
     return fig
 
 
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Every seed."""
-    args = args.scaled()
-    with stage("learning sequences", console, seconds) as progress:
-        found = parallel_map(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
-    records = [r for own in found for r in own]
-    return Findings(records, tables(records, args), drawn(records, args), {})
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Runs the study, and returns the exit code."""
-    return reproduce("sequences", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    records = kit.together(kit.each("learning sequences", partial(one_seed, config=config), config.repetitions, config))
+    return Findings(records, tables(records, config), drawn(records, config))

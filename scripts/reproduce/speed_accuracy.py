@@ -21,28 +21,26 @@ Schmidt et al. 1979 (Psychological Review 86(5)) for error = a + b speed; Akaike
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from asm_gym.evaluation.statistics import auroc
 from asm_gym.memory.dynamics import DYNAMICS
 from asm_gym.memory.inference import direct, expect, infer, sense
 from asm_gym.memory.network import Network
 from asm_gym.memory.recall import follow
-from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import at_least
-from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce, wide_enough
+from asm_gym.scripts.options import fixed, option
+from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import Memory, Rows, read
 from asm_gym.scripts.reproduce.handwriting import NOISE, STEPS, Letter, check_letters, copybook, repertoire, written
+from asm_gym.scripts.reproduce.kit import Findings, Record
+from asm_gym.scripts.reproduce.recordings import wide_enough
 from asm_gym.scripts.reproduce.speed_accuracy_report import drawn, fits, tables
 from asm_gym.validation import check_number
 
@@ -63,51 +61,43 @@ TESTS = 8
 """Writings of each letter that are asked for."""
 
 
+_COUNT = partial(check_number, "iterations and budgets", low=1, whole=True)
+
+
 @dataclass(frozen=True)
-class Args(Common):
+class Config(kit.Config):
     """What accuracy costs."""
 
-    iterations: tuple[int, ...] = (1, 2, 3, 5, 8, 12, 20, 35, 60, 100)
+    iterations: tuple[int, ...] = option((1, 2, 3, 5, 8, 12, 20, 35, 60, 100), quick=(1, 3, 8, 20, 60), check=_COUNT)
     """Steps of inference."""
-    speeds: tuple[float, ...] = (0.6, 0.8, 1.0, 1.25, 1.6, 2.0)
+    speeds: tuple[float, ...] = option((0.6, 0.8, 1.0, 1.25, 1.6, 2.0), quick=(0.8, 1.25, 2.0))
     """Speeds of writing, as multiples of the usual one."""
-    budgets: tuple[int, ...] = (2, 100)
+    budgets: tuple[int, ...] = option((2, 100), check=_COUNT)
     """Short steps of inference a row, at every speed."""
-    skills: int = 4
+    skills: int = option(4, quick=2, check=check_letters)
     """Letters."""
-    hidden: int = 64
+    hidden: int = option(64, quick=32)
     """Hidden units."""
-    writings: int = 12
+    writings: int = fixed(12, quick=4, least=1)
     """Writings of each letter."""
-    steps: int = 16000
+    steps: int = option(16000, quick=1500, least=1)
     """Steps in which the synapses change."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_letters(self.skills)
-        at_least(1, self, "writings", "steps")
-        for count in (*self.iterations, *self.budgets):
-            check_number("iterations and budgets", count, low=1, whole=True)
         if len(set(self.iterations)) < 4:
             raise ValueError(f"a curve needs 4 different numbers of iterations, got {self.iterations}")
         if len(set(self.speeds)) < 3 or not all(0.2 <= s <= 4 for s in self.speeds):
             raise ValueError(f"a line needs 3 different speeds from 0.2 to 4, got {self.speeds}")
         wide_enough(self.hidden, 4)
 
-    def scaled(self) -> Args:
-        """With ``quick``, little of everything."""
-        if not self.quick:
-            return self
-        few = {"iterations": (1, 3, 8, 20, 60), "speeds": (0.8, 1.25, 2.0), "hidden": 32, "steps": 1500}
-        return replace(self, seeds=min(self.seeds, 2), skills=2, writings=4, **few)  # type: ignore[arg-type]
 
-
-def one_seed(seed: int, args: Args) -> list[Record]:
+def one_seed(seed: int, config: Config) -> list[Record]:
     """Both questions, of both dynamics, for one repertoire."""
     rng, records = np.random.default_rng(seed), []
-    letters = repertoire(args.skills, 2, rng)
+    letters = repertoire(config.skills, 2, rng)
     for name in DYNAMICS:
-        own = by_iterations(seed, letters, args, rng, name) + by_speed(seed, letters, args, rng, name)
+        own = by_iterations(seed, letters, config, rng, name) + by_speed(seed, letters, config, rng, name)
         records += [{"dynamics": name, **r} for r in own]
     return records
 
@@ -120,14 +110,16 @@ def asked(memory: Memory, iterations: int, shorter: int) -> Memory:
 
 
 def by_iterations(
-    seed: int, letters: Sequence[Letter], args: Args, rng: np.random.Generator, dynamics: str
+    seed: int, letters: Sequence[Letter], config: Config, rng: np.random.Generator, dynamics: str
 ) -> list[Record]:
     """What one memory makes of letters, and how long it takes, by steps of inference."""
-    memory = Memory.learned(copybook(letters, args.writings, 2, rng), args.hidden, rng, args.steps, dynamics=dynamics)
+    memory = Memory.learned(
+        copybook(letters, config.writings, 2, rng), config.hidden, rng, config.steps, dynamics=dynamics
+    )
     rows = np.stack([e.stream for e in copybook(letters, TESTS, 2, rng)], axis=1).astype(np.float64)
     slipped, onset = slips(rows, rng)
     records = []
-    for count, shorter in product(args.iterations, SHORTER):
+    for count, shorter in product(config.iterations, SHORTER):
         own = asked(memory, count, shorter)
         hand, online = own.express(rows, CUE)[CUE:, :, :2], own.express(rows, len(rows))[1:, :, :2]
         recalled, next_row = (float(np.linalg.norm(h - rows[-len(h) :, :, :2], axis=2).mean()) for h in (hand, online))
@@ -214,18 +206,20 @@ def _seconds_a_row(memory: Memory, rows: Rows) -> float:
     return float(np.median(taken))
 
 
-def by_speed(seed: int, letters: Sequence[Letter], args: Args, rng: np.random.Generator, dynamics: str) -> list[Record]:
+def by_speed(
+    seed: int, letters: Sequence[Letter], config: Config, rng: np.random.Generator, dynamics: str
+) -> list[Record]:
     """A memory of letters at all speeds: where it has the hand in the next row, and after a third of a letter."""
-    each = max(2, args.writings // 3)
+    each = max(2, config.writings // 3)
     memory = Memory.learned(
-        copybook(letters, each, 2, rng, args.speeds), args.hidden, rng, args.steps, dynamics=dynamics
+        copybook(letters, each, 2, rng, config.speeds), config.hidden, rng, config.steps, dynamics=dynamics
     )
     records = []
-    for speed in args.speeds:
+    for speed in config.speeds:
         tests = [written(letter, 2, rng, speed) for letter in letters for _ in range(TESTS)]
         rows = np.stack([e.stream for e in tests], axis=1).astype(np.float64)
         pace = float(np.linalg.norm(rows[:, :, 2:], axis=2).mean())
-        for budget in args.budgets:
+        for budget in config.budgets:
             own, third = asked(memory, budget, SHORTER[0]), len(rows) // 3
             hand, online = own.express(rows, third)[third:, :, :2], own.express(rows, len(rows))[1:, :, :2]
             path, ahead = (np.linalg.norm(h - rows[-len(h) :, :, :2], axis=2) for h in (hand, online))
@@ -235,21 +229,9 @@ def by_speed(seed: int, letters: Sequence[Letter], args: Args, rng: np.random.Ge
     return records
 
 
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Every seed."""
-    args = args.scaled()
-    with stage("learning letters", console, seconds) as progress:
-        found = parallel_map(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
-    records = [r for own in found for r in own]
+    records = kit.together(kit.each("learning letters", partial(one_seed, config=config), config.repetitions, config))
     laws = {", ".join(key): one._asdict() for key, one in fits(records).items()}
-    asked_for = f"{args.skills} letters, cue of {CUE}"
+    asked_for = f"{config.skills} letters, cue of {CUE}"
     return Findings(records, tables(records, asked_for), drawn(records), {"laws": laws, "letter_steps": STEPS})
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Runs the study, and returns the exit code."""
-    return reproduce("speed_accuracy", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.tables import Table
-from asm_gym.scripts.reproduce.common import Record, over_seeds, shown
 from asm_gym.scripts.reproduce.curves import points
+from asm_gym.scripts.reproduce.kit import Record, over_seeds, shown
 from asm_gym.scripts.reproduce.laws import LAWS, Fit, fit
 
 MEASURES = {

@@ -16,15 +16,13 @@ Source: Millidge et al. 2024 (PLOS Comput Biol 20(4), e1011183), Figs 3 and 4, a
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from scipy.linalg import solve_discrete_are
 
 from asm_gym.memory.inference import STRIDE
@@ -32,11 +30,11 @@ from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.settling import SettlingNetwork, SettlingWeights
 from asm_gym.memory.settling_learning import learn_settling
 from asm_gym.memory.temporal import unassociated
-from asm_gym.rollouts.parallel import parallel_map
-from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import at_least
-from asm_gym.scripts.reproduce.common import Common, Findings, Record, reproduce
+from asm_gym.scripts.options import option
+from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.scripts.reproduce.tracking_report import drawn, tables
+from asm_gym.validation import check_number
 
 Floats = NDArray[np.float64]
 
@@ -59,37 +57,31 @@ FAINT = 5.0
 """Spreads of an observation that are read as 1, so that what is learned stays where tanh is nearly linear."""
 
 
+def _converges(length: float) -> None:
+    if not 0 < length < 0.4:
+        raise ValueError(f"lengths must be in (0, 0.4), beyond which inference diverges, got {length}")
+
+
 @dataclass(frozen=True)
-class Args(Common):
+class Config(kit.Config):
     """How near predictive coding comes to the Kalman filter."""
 
-    seeds: int = 10
+    seeds: int = option(10, quick=2, least=1)
     """How often it repeats itself; the paper has 10."""
-    steps: int = 2000
+    steps: int = option(2000, least=600)  # up to which the figure shows them
     """Time steps of the system."""
-    iterations: tuple[int, ...] = (1, 2, 4, 6, 10, 14, 20)
+    iterations: tuple[int, ...] = option(
+        (1, 2, 4, 6, 10, 14, 20), quick=(1, 2, 6, 20), least=1, check=partial(check_number, "iterations", low=1)
+    )
     """Steps of inference; the paper has 2 to 20."""
-    lengths: tuple[float, ...] = (0.12, 0.16, 0.2, 0.24, 0.28, 0.32)
+    lengths: tuple[float, ...] = option(
+        (0.12, 0.16, 0.2, 0.24, 0.28, 0.32), quick=(0.12, 0.32), least=1, check=_converges
+    )
     """Lengths of a step of inference; the paper has 0.12 to 0.32."""
-    hidden: int = 16
+    hidden: int = option(16, least=1)
     """Hidden units of the network that learns."""
-    updates: int = 12000
+    updates: int = option(12000, quick=500, least=1)
     """Steps in which its synapses change."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        at_least(1, self, "hidden", "updates")
-        at_least(600, self, "steps")  # up to which the figure shows them
-        if not self.iterations or min(self.iterations) < 1:
-            raise ValueError(f"iterations must be at least 1 each, got {self.iterations}")
-        if not self.lengths or not all(0 < length < 0.4 for length in self.lengths):
-            raise ValueError(f"lengths must be in (0, 0.4), beyond which inference diverges, got {self.lengths}")
-
-    def scaled(self) -> Args:
-        """With ``quick``, little of everything."""
-        if not self.quick:
-            return self
-        return replace(self, seeds=min(self.seeds, 2), iterations=(1, 2, 6, 20), lengths=(0.12, 0.32), updates=500)
 
 
 class Recording(NamedTuple):
@@ -171,13 +163,13 @@ def tracked(network: SettlingNetwork, run: Recording) -> Floats:
     return found * SCALE
 
 
-def learned(runs: Sequence[Recording], args: Args, rng: np.random.Generator) -> tuple[SettlingNetwork, Floats]:
+def learned(runs: Sequence[Recording], config: Config, rng: np.random.Generator) -> tuple[SettlingNetwork, Floats]:
     """A network that knows what these recordings observed, and what (3,) they are divided by to be read."""
     spread = FAINT * np.concatenate([r.observed for r in runs]).std(axis=0)
     episodes = [_read(run, spread) for run in runs]
     rows = sum(len(e.senses) for e in episodes)
-    schedule = Schedule(max(1, round(args.updates * 64 / rows)), 64, 1e-2, 20, 1.0, 1.0, 0.0)
-    network = learn_settling(episodes, args.hidden, schedule, rng, lambda: None).network
+    schedule = Schedule(max(1, round(config.updates * 64 / rows)), 64, 1e-2, 20, 1.0, 1.0, 0.0)
+    network = learn_settling(episodes, config.hidden, schedule, rng, lambda: None).network
     assert isinstance(network, SettlingNetwork)
     return network, spread
 
@@ -203,10 +195,10 @@ def squared(a: Floats, b: Floats) -> float:
     return float(np.mean((a - b) ** 2))
 
 
-def one_seed(seed: int, args: Args) -> list[Record]:
+def one_seed(seed: int, config: Config) -> list[Record]:
     """Every estimate of one recording."""
     rng = np.random.default_rng(seed)
-    run = recording(args.steps, rng)
+    run = recording(config.steps, rng)
     best, expected = kalman(run)
     floor = squared(best, run.states)
     records: list[Record] = [
@@ -216,19 +208,19 @@ def one_seed(seed: int, args: Args) -> list[Record]:
         {"seed": seed, "by": "observation", "mse": squared(run.observed @ np.linalg.inv(C).T, run.states)},
         {"seed": seed, "by": "last", "observed": squared(run.observed[:-1], run.observed[1:])},
     ]
-    for count in (*args.iterations, SETTLED):
+    for count in (*config.iterations, SETTLED):
         where = {"seed": seed, "iterations": count}
         found = tracked(informed(count), run)
         away = squared(found, settled(run))
         records.append({**where, "by": "own", "more": squared(found, run.states) - floor, "from_settled": away})
-        for length in args.lengths if count != SETTLED else ():
+        for length in config.lengths if count != SETTLED else ():
             for by, estimate in (
                 ("ours", tracked(informed(count, length), run)),
                 ("theirs", as_published(run, count, length)),
             ):
                 records.append({**where, "by": by, "length": length, "more": squared(estimate, run.states) - floor})
     shown_to = [recording(LEARNED_STEPS, rng) for _ in range(64)]
-    network, spread = learned(shown_to, args, rng)
+    network, spread = learned(shown_to, config, rng)
     for fresh in [recording(LEARNED_STEPS, rng) for _ in range(8)]:
         asked = {"learned": observations(network, spread, fresh), "kalman_fresh": kalman(fresh)[1]}
         asked["last_fresh"] = np.vstack([np.zeros(3), fresh.observed[:-1]])
@@ -238,29 +230,21 @@ def one_seed(seed: int, args: Args) -> list[Record]:
     return records
 
 
-def example(args: Args) -> dict[str, Floats]:
+def example(config: Config) -> dict[str, Floats]:
     """(T,) acceleration in the first recording, and estimates of it."""
-    run, few, many = recording(args.steps, np.random.default_rng(args.seed)), min(args.iterations), max(args.iterations)
+    run, few, many = (
+        recording(config.steps, np.random.default_rng(config.seed)),
+        min(config.iterations),
+        max(config.iterations),
+    )
     found = {"true": run.states, "Kalman filter": kalman(run)[0]}
-    found[f"{few} steps"] = tracked(informed(few, args.lengths[0]), run)
-    found[f"{many} steps"] = tracked(informed(many, args.lengths[-1]), run)
+    found[f"{few} steps"] = tracked(informed(few, config.lengths[0]), run)
+    found[f"{many} steps"] = tracked(informed(many, config.lengths[-1]), run)
     return {name: states[:, 2] for name, states in found.items()}
 
 
-def study(args: Args, console: Console, seconds: dict[str, float]) -> Findings:
+def run(config: Config) -> Findings:
     """Every seed."""
-    args = args.scaled()
-    with stage("tracking", console, seconds) as progress:
-        found = parallel_map(partial(one_seed, args=args), list(args.repetitions), args.workers, progress)
-    records = [r for own in found for r in own]
-    asked = args.iterations, args.lengths
-    return Findings(records, tables(records, *asked), drawn(records, *asked, example(args)), {"C": C.tolist()})
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Runs the study, and returns the exit code."""
-    return reproduce("tracking", study, Args, __doc__, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    records = kit.together(kit.each("tracking", partial(one_seed, config=config), config.repetitions, config))
+    asked = config.iterations, config.lengths
+    return Findings(records, tables(records, *asked), drawn(records, *asked, example(config)), {"C": C.tolist()})

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.tables import Table
-from asm_gym.scripts.reproduce.common import Record, over_seeds, shown
+from asm_gym.scripts.reproduce.kit import Record, over_seeds, shown
 
 SHOWN = slice(560, 600)
 """Steps that Fig 3C of the paper shows."""

@@ -97,7 +97,7 @@ def killed(args: Args, console: Console) -> bool:
     if not args.kills:
         return True
     rng, found, out = np.random.default_rng(args.seed), [], args.out.resolve()
-    works = [work for work in kills.commands(out) if work.name in args.works]
+    works = [work for work in kills.commands() if work.name in args.works]
     for k, work in enumerate(works):
         share = args.kills // len(works) + (k < args.kills % len(works))
         found.append(kills.killed_and_begun_again(work, out / work.name, share, rng))

@@ -59,18 +59,15 @@ class Outcome(NamedTuple):
         return self.what, str(self.times), ended, "yes" if self.same else "NO"
 
 
-def commands(out: Path) -> list[Work]:
-    """What is killed, in folders of ``out``; the last goes on with what the evaluation before it left."""
+def commands() -> list[Work]:
+    """What is killed."""
     evaluate = """evaluate --tasks Lift --monitors kalman --faults push --severities strong --harmless touch --no-video
         --fit-episodes 2 --calibration-episodes 5 --nominal-episodes 1 --faulty-episodes 1 --harmless-episodes 1"""
-    react = """reproduce reflexes --tasks Lift --reflexes hold --faults passing_push --episodes 1
-        --false-alarm-rate 0.2 --run"""
     return [
         Work("save", save_for_ever, lambda folder: NeuralASM.load(folder / "x.asm").hidden_size in SIZES),
         Work("collect", command("collect Lift --episodes 3"), recorded),
         Work("evaluate", command(f"{evaluate} --false-alarm-rate 0.2"), tables),
         Work("train", trained, agent),
-        Work("react", command(react, out / "evaluate" / "whole"), tables),
     ]
 
 
@@ -82,9 +79,9 @@ def trained(folder: Path) -> int:
     return 0
 
 
-def command(line: str, *more: Path) -> Callable[[Path], int]:
+def command(line: str) -> Callable[[Path], int]:
     """``asm-gym`` with these options, by one worker, into a folder."""
-    argv = [*line.split(), *map(str, more), "--workers", "1", "--seed", "3"]
+    argv = [*line.split(), "--workers", "1", "--seed", "3"]
     return lambda folder: cli.main([*argv, "--out", str(folder)])
 
 
