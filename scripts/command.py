@@ -47,15 +47,6 @@ class Terminated(KeyboardInterrupt):
     """The process was told to end (SIGTERM): workers are stopped as after Ctrl-C."""
 
 
-def at_least(least: int, args: object, *names: str) -> None:
-    """Raises ValueError where one of the arguments of those names is smaller, or a sequence that is shorter."""
-    for name in names:
-        value = getattr(args, name)
-        said, number = (f"the number of {name}", len(value)) if isinstance(value, Sequence) else (name, value)
-        if number < least:
-            raise ValueError(f"{said} must be at least {least}, got {number}")
-
-
 def run(
     name: str,
     kind: type[Args],

@@ -52,7 +52,7 @@ SHOWN = 2
 
 _QUICK = (
     *("neural_asm", "association_linear+evidence", "window_pca+evidence", "kalman+evidence"),
-    *("logpzo", "autoregression", "external_torque_limit", "force_limit"),
+    *("logpzo", "external_torque_limit", "force_limit"),
 )
 """Monitors that are fitted in seconds."""
 

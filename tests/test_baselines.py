@@ -103,30 +103,10 @@ def test_bad_episodes_and_order_are_refused(monitor):
     broken[3, 1] = np.inf
     with pytest.raises(ValueError, match=r"episode 0, step 3, external_torque_peak\[1\]"):
         new.fit([Episode.from_stream(broken, SPEC)])
-    if monitor.model.kind == "autoregression":
-        with pytest.raises(ValueError, match="3 steps"):
-            new.fit([Episode.from_stream(broken[:2], SPEC)])
     with pytest.raises(ValueError, match="at least 19"):
         monitor.calibrate(episodes(3), 0.05)
     with pytest.raises(ValueError, match="numbers a step"):
         monitor.observe(monitor.initial_state(1), np.zeros((1, 3)))
-
-
-def test_autoregression_recovers_the_coefficients_of_a_linear_system():
-    """x_t = 0.5 x_{t-1} + 0.3 x_{t-2} + 2 u_t + 0.1 noise: what is left is the noise, and white."""
-    spec = StreamSpec((Channel("x", 1), Channel("u", 1, group=MOTOR)), 0.1)
-    rng = np.random.default_rng(0)
-    made = []
-    for _ in range(20):
-        u, x = rng.standard_normal(200), np.zeros(200)
-        for t in range(2, 200):
-            x[t] = 0.5 * x[t - 1] + 0.3 * x[t - 2] + 2.0 * u[t] + 0.1 * rng.standard_normal()
-        made.append(Episode.from_stream(np.column_stack([x, u])[2:], spec))
-    model = make_monitor("autoregression", spec).fit(made)
-    spread = float(model.learned_["spread"][0])
-    a1, a2, b, _ = model.learned_["weights"][:, 0]
-    assert (a1, a2, b * spread) == pytest.approx((0.5, 0.3, 2.0), abs=0.01)
-    assert float(model.learned_["deviation"][0]) * spread == pytest.approx(0.1, rel=0.05)
 
 
 def test_limits_are_what_they_say():

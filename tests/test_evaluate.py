@@ -25,7 +25,7 @@ from asm_gym.scripts.evaluate import Args, labels, main
 from asm_gym.scripts.options import shortened
 from asm_gym.spec import Channel, StreamSpec
 
-MONITORS = ("neural_asm", "kalman+evidence", "autoregression", "force_limit")
+MONITORS = ("neural_asm", "kalman+evidence", "window_pca", "force_limit")
 SMALL = [
     *("--tasks", "Lift", "--faults", "push", "frozen_encoder", "gripper_opens", "--severities", "mild", "strong"),
     *("--harmless", "touch", "slower", "--fit-episodes", "4", "--calibration-episodes", "24"),

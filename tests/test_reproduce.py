@@ -13,7 +13,6 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from asm_gym.episode import Episode
 from asm_gym.scripts.cli import main as cli
 from asm_gym.scripts.options import rows
 from asm_gym.scripts.reproduce import (
@@ -24,7 +23,6 @@ from asm_gym.scripts.reproduce import (
     kit,
     local_learning,
     memorise_and_recall,
-    robot_recall,
     speed_accuracy,
 )
 from asm_gym.scripts.reproduce.apprentices import DISTURBANCE, demonstrate, stream_of
@@ -45,7 +43,6 @@ from asm_gym.scripts.reproduce.handwriting import (
 )
 from asm_gym.scripts.reproduce.kit import Config, over_seeds, shown
 from asm_gym.scripts.reproduce.laws import LAWS, fit
-from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 
 def letters_of(count: int, each: int = 6, seed: int = 0) -> tuple[list, list]:
@@ -193,8 +190,7 @@ def test_spread_is_over_seeds_and_not_over_measurements():
         ("express_skills", ["--units", "10"], "at least the number of channels, 75, got 10"),
         ("express_skills", ["--trials", "0"], "trials must be at least 1, got 0"),
         ("express_skills", ["--tasks", "Lift", "Lift"], "named twice: Lift, Lift"),
-        ("memorise_and_recall", ["--robot-episodes", "-1"], "robot_episodes must be at least 0, got -1"),
-        ("memorise_and_recall", ["--repertoires", "--robot-episodes", "0"], "nothing to recall: rep"),
+        ("memorise_and_recall", ["--repertoires"], "number of repertoires must be at least 1, got 0"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_words(study, arguments, message, capsys, tmp_path):
@@ -230,7 +226,6 @@ def test_arguments_that_all_studies_share_are_checked():
         ({"cues": (10, STEPS)}, "cue must be shorter"),
         ({"dims": (3,)}, r"in 2 dimensions, or in 2 and 3, got \(3,\)"),
         ({"hidden": 3}, "at least the number of channels, 6, got 3"),
-        ({"robot_hidden": 20}, "at least the number of channels, 75, got 20"),
         ({"splines": 33}, "1 to 32 skills, got 33"),
     ],
 )
@@ -260,49 +255,6 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_study(tmp_path, caps
     monkeypatch.setattr(memorise_and_recall, "run", None)
     assert cli(["reproduce", "memorise_and_recall", "--out", str(tmp_path / "file")]) == 2
     assert "file" in capsys.readouterr().err
-
-
-def robot_episodes(spec: StreamSpec, steps: int, each: int = 3) -> list[Episode]:
-    """Hands that go somewhere, for each skill that is recalled."""
-    rng = np.random.default_rng(0)
-    streams = rng.normal(size=(len(robot_recall.RECALLED), each, steps, spec.size)).cumsum(axis=2)
-    return [
-        Episode.from_stream(stream, spec, info={"skill": task})
-        for task, own in zip(robot_recall.RECALLED, streams, strict=True)
-        for stream in own
-    ]
-
-
-def test_the_mean_demonstration_is_as_far_off_as_it_is():
-    spec = StreamSpec((Channel("hand_position", 3, "m"), Channel("action", 2, group=MOTOR)), 0.05)
-    train = robot_episodes(spec, 165)
-    records = robot_recall.stored(train, train, {"seed": 7, "hidden": 3})
-    found = {(r["domain"], r["model"]): r["error_cm"] for r in records}
-    assert {model for _, model in found} == {"hopfield", "library", "mean"}
-    for task, steps in robot_recall.RECALLED.items():
-        cue = robot_recall.ROBOT_CUE
-        hands = np.stack([e.stream[cue : cue + steps, :3] for e in train if e.info["skill"] == task])
-        off = 100 * np.linalg.norm(hands - hands.mean(axis=0), axis=2).mean()
-        assert found[task, "mean"] == pytest.approx(off, rel=1e-5)
-        assert found[task, "hopfield"] < found[task, "mean"]  # it has stored these very episodes
-    assert all(r["seed"] == 7 and not r["online"] for r in records)
-    with pytest.raises(ValueError, match="no successful episode of PickPlaceCan is 160 steps long"):
-        robot_recall.stored(robot_episodes(spec, 140), train, {})
-
-
-def test_robosuite_can_be_recalled_without_letters():
-    args = memorise_and_recall.Config(repertoires=(), splines=0)
-    assert memorise_and_recall.conditions(args) == []
-    models = [m for m in memorise_and_recall.MODELS if m != "memory_wide"] + ["mean"]
-    records = [
-        {"domain": task, "model": model, "seed": 0, "error_cm": 1.0 + n}
-        for task in robot_recall.RECALLED
-        for n, model in enumerate(models)
-    ]
-    (table,) = memorise_and_recall.tables(records, args)
-    assert [row[1] for row in table.rows] == [f"{1.0 + n:.1f}" for n in range(len(models))]
-    (panel,) = memorise_and_recall.drawn(records, args).axes
-    assert len(panel.patches) == len(models) * len(robot_recall.RECALLED)
 
 
 COUNTED = ("failure",)

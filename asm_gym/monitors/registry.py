@@ -108,7 +108,6 @@ _BASELINES = {
     "association_boosted": _row("association_boosted:BoostedAssociation", "mahalanobis"),
     "association_mlp": _row("association_mlp:MLPAssociation", "mahalanobis"),
     "window_pca": _row("window_pca:WindowPCA", "squares"),
-    "autoregression": _row("autoregression:Autoregression", "mahalanobis"),
     "elapsed_time": _row("elapsed_time:ElapsedTime", "squares"),
 }
 

@@ -36,7 +36,7 @@ from asm_gym.scripts.reproduce.handwriting import (
     repertoire,
 )
 from asm_gym.scripts.reproduce.kit import Findings, Record
-from asm_gym.scripts.reproduce.recordings import SKILLS, demonstrations, wide_enough
+from asm_gym.scripts.reproduce.recordings import wide_enough
 from asm_gym.validation import check_choice
 
 SHARED = 2
@@ -60,8 +60,6 @@ class Config(kit.Config):
     """Writings of each letter to learn from; as many others are judged."""
     steps: int = option(12000, quick=1500, least=1)
     """Steps in which the synapses change."""
-    robot_episodes: int = option(20, quick=0, least=0)
-    """Episodes of each robosuite skill to learn from; 0 leaves them out."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -227,26 +225,10 @@ def _example(memory: Memory, readout: Any, seen: Rows, truth: NDArray[np.intp], 
     )
 
 
-def robot(seed: int, train: Sequence[Episode], tests: Sequence[Episode], config: Config) -> list[Record]:
-    """The same question for robosuite skills in one memory."""
-    rng = np.random.default_rng(seed)
-    memory = Memory.learned(train, max(config.hidden, 128), rng, config.steps // 2)
-    (rows, skill), (seen, truth) = (_stacked(e, SKILLS) for e in (train, tests))
-    readout = _readout(_flat(np.tanh(memory.hidden(rows))), np.tile(skill, len(rows)), len(SKILLS), rng)
-    right = _certainty(np.tanh(memory.hidden(seen)), readout).argmax(axis=2) == truth
-    made = [(name, _over_time("state", "robosuite", right[:, truth == k], seed)) for k, name in enumerate(SKILLS)]
-    return [{**r, "skill": name} for name, records in made for r in records]
-
-
 def run(config: Config) -> Findings:
-    """Letters for every seed, then robosuite."""
+    """Letters for every seed."""
     found = kit.each("learning letters", partial(one_seed, config=config), config.repetitions, config)
     records = [r for own, _ in found for r in own]
-    if config.robot_episodes:
-        train = demonstrations(config, SKILLS, "fit", config.robot_episodes)
-        tests = demonstrations(config, SKILLS, "nominal", 15)
-        one = partial(robot, train=train, tests=tests, config=config)
-        records += kit.together(kit.each("learning robosuite skills", one, config.repetitions, config))
     return Findings(
         records, tables(records, len(set(config.skills))), drawn(records, found[0][1]), {"letter_steps": STEPS}
     )

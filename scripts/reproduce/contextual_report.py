@@ -15,13 +15,11 @@ from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.expression import Rows
 from asm_gym.scripts.reproduce.kit import Record, over_seeds
-from asm_gym.scripts.reproduce.recordings import SKILLS
 
 SPLICE = 30
 """Step at which another letter is gone on with."""
 
 TIMES = (5, 10, 20, 30, 40, 59)
-ROBOT_TIMES = (5, 10, 20, 40, 60, 80, 95)
 MIDDLE = (5, 10, 15, 20, 25, 30, 35, 40)
 """Steps at which letters with one middle are told apart; they differ up to about 15 and from about 38 on."""
 
@@ -39,7 +37,7 @@ class Example(NamedTuple):
 
 
 def tables(records: Sequence[Record], skills: int) -> list[Table]:
-    """Over time, cues begun late, switches, robosuite."""
+    """Over time, cues begun late, switches."""
 
     named: dict[str, Record] = {label: {"how": "named", "source": s} for s, label in SOURCES.items()}
     for source, label in (("state", "clusters of states, no label"), ("row", "clusters of rows, no label")):
@@ -49,20 +47,16 @@ def tables(records: Sequence[Record], skills: int) -> list[Table]:
     begun, switched = ({"state": {"how": how, "source": "state"}} for how in ("begun late", "switched"))
     late, since = kit.by("step", (1, 2, 5, 10, 20)), kit.by("step", (0, 1, 2, 5, 10, 20))
     parted = "Letters with one middle told apart [share], by step"
-    made = [
+    return [
         kit.grid(caption, records, "right", named, kit.by("step", TIMES)),
         kit.grid(parted, records, "right", middle, kit.by("step", MIDDLE)),
         kit.grid("Cue begun in mid-letter, by its length", records, "right", begun, late),
         kit.grid("The new skill named, so many steps after a switch", records, "right", switched, since),
     ]
-    if any(r["how"] == "robosuite" for r in records):
-        caption, own = "Robosuite skills named from the state [share], by step", kit.by("skill", SKILLS)
-        made.append(kit.grid(caption, records, "right", own, kit.by("step", ROBOT_TIMES), how="robosuite"))
-    return made
 
 
 def drawn(records: Sequence[Record], example: Example) -> Figure:
-    """Letters, states, certainty over time, a pair that parts, a switch, robosuite."""
+    """Letters, states, certainty over time, a pair that parts, a switch."""
     with figure(height=6.2, width=9.5) as fig:
         axes = fig.subplots(2, 3)
         for path, plane, k in zip(example.paths, example.plane, example.skill, strict=True):
@@ -79,8 +73,7 @@ def drawn(records: Sequence[Record], example: Example) -> Figure:
         _pair(axes[1, 1], example.switch, ("the letter begun", "the one gone on with"), "a switch", SPLICE)
         for i, (source, label) in enumerate((("state", "state"), ("row", "row alone"))):
             _curve(axes[1, 2], records, i, label, how="one middle", source=source)
-        _curve(axes[1, 2], records, 2, "robosuite, state", how="robosuite")
-        axes[1, 2].set(title="one middle; robosuite", xlabel="step", ylabel="right [share]", ylim=(0, 1.02))
+        axes[1, 2].set(title="one middle", xlabel="step", ylabel="right [share]", ylim=(0, 1.02))
         axes[1, 2].legend(fontsize=8)
     return fig
 

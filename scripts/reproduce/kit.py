@@ -115,11 +115,6 @@ def each(what: str, work: Callable[[Item], Result], items: Sequence[Item], confi
         return parallel_map(work, items, config.workers, tell)
 
 
-def called(job: Callable[[], Result]) -> Result:
-    """What it returns: the work of ``each`` where every job is a call of its own."""
-    return job()
-
-
 def together(found: Sequence[Sequence[Record]]) -> list[Record]:
     """The records of all repetitions."""
     return [record for own in found for record in own]

@@ -1,46 +1,41 @@
 """Memorise and recall: one network learns a repertoire without labels, and expresses each skill from a cue.
 
-Repertoires of handwriting-like movements in two and three dimensions, of cubic splines, and of three robosuite skills.
-Online, every row is read after it was expected; offline, none after the cue. What recalls them is in ``recall_rivals``
-and ``robot_recall``.
+Repertoires of handwriting-like movements in two and three dimensions, and of cubic splines. Online, every row is read
+after it was expected; offline, none after the cue. What recalls them is in ``recall_rivals``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from asm_gym.evaluation.figures import figure, look
+from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
 from asm_gym.scripts.options import fixed, option
-from asm_gym.scripts.reproduce import kit, robot_recall
+from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters
 from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds, shown
 from asm_gym.scripts.reproduce.recall_rivals import CALLED, MODELS, Condition, Practice, recall
-from asm_gym.scripts.reproduce.recordings import SENSED, SKILLS, demonstrations, wide_enough
-from asm_gym.scripts.reproduce.robot_recall import RECALLED, ROBOT_CUE
+from asm_gym.scripts.reproduce.recordings import wide_enough
 
 
 @dataclass(frozen=True)
 class Config(kit.Config):
     """Recall from a cue, against what else can recall."""
 
-    repertoires: tuple[int, ...] = option((1, 2, 4, 8, 16, 32), quick=(1, 4), check=check_letters)
-    """How many letters one network learns; none leaves letters and splines out."""
+    repertoires: tuple[int, ...] = option((1, 2, 4, 8, 16, 32), quick=(1, 4), least=1, check=check_letters)
+    """How many letters one network learns."""
     widths: tuple[int, ...] = option(
         (16, 32, 64, 128, 256, 512), quick=(16, 32), least=1, check=partial(wide_enough, channels=6)
     )
     """Hidden units, for a repertoire of eight."""
     cues: tuple[int, ...] = option((1, 2, 5, 10, 20, 30), least=1)
     """Steps that are read before recall begins."""
-    robot_episodes: int = option(40, quick=0, least=0)
-    """Episodes of each robosuite skill to learn from; 0 leaves them out."""
     steps: int = option(16000, quick=1500, least=1)
     """Steps in which the synapses of the memory change."""
     updates: int = option(1200, quick=40, least=1)
@@ -53,8 +48,6 @@ class Config(kit.Config):
     """How many cubic splines one network learns; 0 leaves them out."""
     width_seeds: int = fixed(1, least=0)
     """How many of the seeds are repeated with other widths, and in three dimensions."""
-    robot_hidden: int = fixed(256, check=partial(wide_enough, channels=SENSED))
-    """Hidden units for the robosuite skills."""
     writings: int = fixed(8, quick=4, least=1)
     """Writings of each letter to learn from."""
 
@@ -65,8 +58,6 @@ class Config(kit.Config):
                 raise ValueError(f"a cue must be shorter than the letter, 1 to {STEPS - 1} steps, got {cue}")
         if self.splines:
             check_letters(self.splines)
-        if not (self.repertoires or self.robot_episodes):
-            raise ValueError("there is nothing to recall: repertoires and robot_episodes are both left out")
         if 2 not in self.dims or not set(self.dims) <= {2, 3}:
             raise ValueError(f"letters are written in 2 dimensions, or in 2 and 3, got {self.dims}")
 
@@ -74,20 +65,17 @@ class Config(kit.Config):
 def conditions(config: Config) -> list[Condition]:
     """Repertoires and splines for every seed; widths and three dimensions for some."""
     middle = _middle(config)
-    few = config.repetitions[: config.width_seeds if config.repertoires else 0]
+    few = config.repetitions[: config.width_seeds]
     all_seeds = [Condition(s, n, config.hidden, 2) for s in config.repetitions for n in config.repertoires]
-    all_seeds += [
-        Condition(s, spline_count(config), config.hidden, 2, "splines")
-        for s in config.repetitions
-        if spline_count(config)
-    ]
+    if config.splines:
+        all_seeds += [Condition(s, config.splines, config.hidden, 2, "splines") for s in config.repetitions]
     wide = [Condition(s, middle, h, 2) for s in few for h in config.widths]
     deep = [Condition(s, middle, config.hidden, d) for s in few for d in config.dims if d > 2]
     return list(dict.fromkeys(all_seeds + wide + deep))
 
 
 def tables(records: Sequence[Record], config: Config) -> list[Table]:
-    """Repertoires, widths, cues, splines, and robosuite."""
+    """Repertoires, widths, cues and splines."""
     middle, longest = _middle(config), max(config.cues)
     basis: Record = {"domain": "letters", "dims": 2, "skills": middle, "hidden": config.hidden, "cue": longest}
 
@@ -100,51 +88,36 @@ def tables(records: Sequence[Record], config: Config) -> list[Table]:
 
     sizes, widths, cues = (("", *map(str, v)) for v in (config.repertoires, config.widths, config.cues))
     units = f"{config.hidden} units, cue of {longest}; mean ± SD over seeds, and share of right skills"
-    made = []
-    if config.repertoires:
-        made.append(Table(f"Offline error [cm] by letters, {units}", sizes, rows("skills", config.repertoires)))
-        online = rows("skills", config.repertoires, right=False, cue=STEPS)
-        made.append(Table("Online error [cm] by letters", sizes, online))
+    online = rows("skills", config.repertoires, right=False, cue=STEPS)
+    made = [
+        Table(f"Offline error [cm] by letters, {units}", sizes, rows("skills", config.repertoires)),
+        Table("Online error [cm] by letters", sizes, online),
+    ]
     made += [
         Table(f"Offline error [cm] by cue, {n} letters", cues, rows("cue", config.cues, skills=n))
         for n in config.repertoires
         if n >= middle
     ]
-    if spline_count(config):
+    if config.splines:
         own = rows("cue", config.cues, domain="splines", skills=config.splines)
         made.append(Table(f"Offline error [cm] by cue, {config.splines} splines", cues, own))
-    if config.repertoires and config.width_seeds:
+    if config.width_seeds:
         seeds = "one seed" if config.width_seeds == 1 else f"{config.width_seeds} seeds"
         where = f"{middle} letters, {seeds} for widths other than {config.hidden}"
         made.append(Table(f"Offline error [cm] by hidden units, {where}", widths, rows("hidden", config.widths)))
         if len(config.dims) > 1:
             heads = ("", *map(str, config.dims))
             made.append(Table(f"Offline error [cm] by dimensions, {middle} letters", heads, rows("dims", config.dims)))
-    if config.robot_episodes:
-        told = {"mean": "mean demonstration, told the skill"}
-        names = {m: name for m, name in CALLED.items() if m != "memory_wide"} | told
-        made.append(
-            Table(
-                f"Offline error of the hand [cm], one network for three robosuite skills, cue of {ROBOT_CUE}",
-                ("", *RECALLED),
-                [(names[m], *(shown(records, "error_cm", 1, domain=t, model=m) for t in RECALLED)) for m in names],
-            )
-        )
     return made
-
-
-def spline_count(config: Config) -> int:
-    """How many splines are learned: none where there are no letters."""
-    return config.splines if config.repertoires else 0
 
 
 def _middle(config: Config) -> int:
     """The repertoire for which widths and dimensions are tried."""
-    return 8 if 8 in config.repertoires else max(config.repertoires, default=0)
+    return 8 if 8 in config.repertoires else max(config.repertoires)
 
 
 def drawn(records: Sequence[Record], config: Config) -> Figure:
-    """Error by repertoire, width and cue; robosuite."""
+    """Error by repertoire, width and cue."""
     middle, longest = _middle(config), max(config.cues)
     base = {"domain": "letters", "dims": 2, "skills": middle, "hidden": config.hidden, "cue": longest}
     panels: list[tuple[str, str, Sequence[int], str]] = [
@@ -155,11 +128,6 @@ def drawn(records: Sequence[Record], config: Config) -> Figure:
     ]
     if not config.width_seeds:
         del panels[1]
-    if not config.repertoires:
-        with figure(height=4.0, width=7.6) as fig:
-            _robot(fig.subplots(), records, named=True)
-            fig.legend(loc="outside right upper")
-        return fig
     with figure(height=6.0, width=9.0) as fig:
         axes = fig.subplots(2, 3)
         for ax, (key, label, values, value) in zip(axes.flat, panels, strict=False):
@@ -171,8 +139,6 @@ def drawn(records: Sequence[Record], config: Config) -> Figure:
                 ax.set_xscale("log", base=2)
             ax.set_xticks(values, [str(v) for v in values])
         _online(axes[1, 1], records, config, base)
-        if config.robot_episodes:
-            _robot(axes[1, 2], records)
         for ax in axes.flat:
             ax.set_visible(ax.has_data())
         fig.legend(loc="outside upper center", ncols=3)
@@ -191,29 +157,10 @@ def _online(ax: Any, records: Sequence[Record], config: Config, base: Record) ->
     ax.set(xlabel="skills in the repertoire", ylabel="online error [cm]", ylim=0)
 
 
-def _robot(ax: Any, records: Sequence[Record], named: bool = False) -> None:
-    names = [*(m for m in MODELS if m != "memory_wide"), "mean"]
-    for i, model in enumerate(names):
-        mean, spread = np.array([over_seeds(records, "error_cm", domain=t, model=model) for t in RECALLED]).T
-        colour = look(i)[0] if model != "mean" else "#999999"
-        x = np.arange(len(RECALLED)) + 0.12 * (i - 3)
-        label = CALLED.get(model, "the mean") if named else None
-        ax.bar(x, mean, 0.11, yerr=spread, color=colour, error_kw={"linewidth": 1}, label=label)
-    ax.set_xticks(range(len(RECALLED)), [task.replace("Place", "Place\n") for task in RECALLED])
-    ax.set(ylabel="offline hand error [cm]", title="robosuite; grey: the mean")
-
-
 def run(config: Config) -> Findings:
     """Runs every condition and sums up."""
-    jobs: list[Callable[[], list[Record]]] = []
-    if config.robot_episodes:
-        train = demonstrations(config, SKILLS, "fit", config.robot_episodes)
-        tests = demonstrations(config, SKILLS, "nominal", 15)
-        sizes = config.robot_hidden, config.steps, config.updates // 2
-        jobs += [partial(robot_recall.learned, seed, train, tests, *sizes) for seed in config.repetitions]
-        jobs.append(partial(robot_recall.stored, train, tests, {"seed": config.seed, "hidden": config.robot_hidden}))
     # The longest first, so that no process is left with one of them at the end.
     practice = Practice(config.writings, config.steps, config.updates)
-    jobs += [partial(recall, c, practice, config.cues) for c in conditions(config)]
-    records = kit.together(kit.each("learning", kit.called, jobs, config))
+    work = partial(recall, practice=practice, cues=config.cues)
+    records = kit.together(kit.each("learning", work, conditions(config), config))
     return Findings(records, tables(records, config), drawn(records, config))

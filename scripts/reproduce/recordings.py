@@ -1,4 +1,4 @@
-"""Robosuite episodes of the studies: recorded once in the folder of the results, or read from an evaluation's."""
+"""What ``asm-gym evaluate`` recorded, as the studies read it; and what their networks must be wide enough for."""
 
 from __future__ import annotations
 
@@ -11,23 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from asm_gym.detection import conformal_episodes
-from asm_gym.episode import Episode, EpisodeLabel, load_episode
+from asm_gym.episode import Episode
 from asm_gym.evaluation import defaults
 from asm_gym.evaluation.comparison import Detectability
-from asm_gym.rollouts.record import record
-from asm_gym.rollouts.run_folder import make_missing, recorded, tasks_in
+from asm_gym.rollouts.run_folder import recorded, tasks_in
 from asm_gym.rollouts.scoring import detectability_of
-from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.validation import check_number
-
-SKILLS = ("Lift", "Stack", "PickPlaceCan")
-"""The robosuite skills of one memory."""
-
-SENSED = 75
-"""Numbers that their streams hold beside the action."""
 
 
 @dataclass(frozen=True)
@@ -76,20 +67,6 @@ def in_turn(episodes: Sequence[Episode], seed: int) -> list[Episode]:
     rng = np.random.default_rng(seed)
     shuffled = [[own[i] for i in rng.permutation(len(own))] for own in tasks.values()]
     return [e for turn in zip_longest(*shuffled) for e in turn if e is not None]
-
-
-def made(labels: Sequence[EpisodeLabel], config: kit.Config) -> list[Episode]:
-    """The episodes of these labels, recorded where they are not there yet; those that failed are among them."""
-    with kit.stage("recording robosuite episodes") as tell:
-        make = partial(record, config=RolloutConfig(), folder=config.out.resolve())
-        make_missing(make, labels, lambda label: config.out / label.path, config.workers, tell)
-    return [load_episode(config.out / label.path) for label in labels]
-
-
-def demonstrations(config: kit.Config, tasks: Sequence[str], role: str, episodes: int) -> list[Episode]:
-    """Nominal episodes of the scripted experts that succeeded; the same for every seed of a study."""
-    labels = [EpisodeLabel(task, role, seed=s) for task in tasks for s in role_seeds(0, task, role, episodes)]
-    return [e for e in made(labels, config) if e.success]
 
 
 def wide_enough(hidden: int, channels: int) -> None:
