@@ -61,7 +61,7 @@ class Args:
     """Name of a task."""
     on_alarm: Literal["graded", "hold", "terminate"] = option("graded")
     """What the wrapper does on an alarm: graded does what the cause asks for."""
-    false_alarm_rate: float = option(FALSE_ALARM_RATE, check=conformal_episodes)
+    false_alarm_rate: float = fixed(FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of nominal episodes that may raise an alarm; a smaller one takes more episodes to set its threshold."""
     video: bool = True
     """Make no video; there is none where this machine cannot render."""

@@ -21,7 +21,7 @@ from asm_gym.data.notes import noted
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
-from asm_gym.scripts.options import check_options, option
+from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.validation import check_number
 
 HEADINGS = ("channel", "unit", "is", "what is done", "from", "to", "noise", "resolution", "repeats", "missing")
@@ -45,7 +45,7 @@ class Args:
     """Names of the columns of files without a header."""
     join: bool = False
     """The files of a folder are parts of one recording: join them by their clocks."""
-    logs: int = option(3, least=1)
+    logs: int = fixed(3, least=1)
     """How many logs of a folder are shown."""
 
     def __post_init__(self) -> None:

@@ -1,6 +1,7 @@
 """Collecting and the demo, end to end on the real simulator with few episodes."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -132,7 +133,7 @@ def test_what_is_infinite_or_undefined_is_null_in_the_json(tmp_path):
 
 
 def test_quick_keeps_the_calibration_that_the_rate_needs():
-    args = command.parse("demo", demo.Args, ["--quick", "--false-alarm-rate", "0.02"])
+    args = replace(command.parse("demo", demo.Args, ["--quick"]), false_alarm_rate=0.02)
     assert args.calibrating == 49
     assert args.faulty_episodes < demo.Args().faulty_episodes
 

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import ALL_TICKS, Association, Feedback, learn_association
+from asm_gym.memory.association import ALL_TICKS, Feedback, learn_association
 from asm_gym.memory.energy import Array
 from asm_gym.memory.inference import Weights, carry, direct, expect, infer, sense, weight_shapes
 from asm_gym.memory.learning import Schedule, Trajectory, passes
@@ -41,23 +41,10 @@ def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Genera
 class Network(TemporalNetwork):
     """The temporal network by traces, and association beside it.
 
-    Args:
-        weights: the synapses through time.
-        association, iterations, prior_precision, sensory_precision: as ``TemporalNetwork`` has them.
+    The arguments are those of ``TemporalNetwork``.
     """
 
     weights: Weights
-
-    def __init__(
-        self,
-        weights: Weights,
-        association: Association,
-        iterations: int,
-        prior_precision: float,
-        sensory_precision: float,
-    ) -> None:
-        super().__init__(association, weights.W_F, iterations, prior_precision, sensory_precision)
-        self.weights = weights
 
     @property
     def hidden_size(self) -> int:

@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import Association
 from asm_gym.memory.energy import Array, Scalar, activate, kernel, outward
 from asm_gym.memory.inference import infer
 from asm_gym.memory.temporal import Step, TemporalNetwork
@@ -72,23 +71,10 @@ def settle(
 class SettlingNetwork(TemporalNetwork):
     """The temporal network whose state is carried on, and association beside it.
 
-    Args:
-        weights: the synapses through time.
-        association, iterations, prior_precision, sensory_precision: as ``TemporalNetwork`` has them.
+    The arguments are those of ``TemporalNetwork``.
     """
 
     weights: SettlingWeights
-
-    def __init__(
-        self,
-        weights: SettlingWeights,
-        association: Association,
-        iterations: int,
-        prior_precision: float,
-        sensory_precision: float,
-    ) -> None:
-        super().__init__(association, weights.W_F, iterations, prior_precision, sensory_precision)
-        self.weights = weights
 
     @property
     def hidden_size(self) -> int:

@@ -33,21 +33,25 @@ class TemporalNetwork(ABC):
     """Weights that no longer change, and what is needed to run them.
 
     Args:
+        weights: the synapses through time; ``W_F`` (N, H) of them says how long a step of inference may be.
         association: the synapses between senses.
-        W_F: (N, H) the synapses from the state, which say how long a step of inference may be.
         iterations: inference steps per control step.
         prior_precision: Π_z.
         sensory_precision: Π_x.
     """
 
+    weights: Any
+    """The synapses through time, a NamedTuple of arrays whose fields each kind of network has of its own."""
+
     def __init__(
-        self, association: Association, W_F: Array, iterations: int, prior_precision: float, sensory_precision: float
+        self, weights: Any, association: Association, iterations: int, prior_precision: float, sensory_precision: float
     ) -> None:
+        self.weights = weights
         self.association, self.spans = association, spans(association.U)
         self.iterations = iterations
         # Of single precision all of them, or the compiled loops would compute in double.
         self.prior_precision, self.sensory_precision = np.float32(prior_precision), np.float32(sensory_precision)
-        norm = float(np.linalg.norm(W_F.astype(np.float64), 2))
+        norm = float(np.linalg.norm(weights.W_F.astype(np.float64), 2))
         self.curvature = np.float32(prior_precision + sensory_precision * norm**2)
 
     def with_association(self, association: Association) -> Self:
@@ -71,9 +75,6 @@ class TemporalNetwork(ABC):
     def inference(self) -> tuple[Scalar, Scalar, Scalar, int]:
         """Π_z, Π_x, the curvature, and iterations."""
         return self.prior_precision, self.sensory_precision, self.curvature, self.iterations
-
-    weights: Any
-    """The synapses through time, a NamedTuple of arrays whose fields each kind of network has of its own."""
 
     @property
     @abstractmethod

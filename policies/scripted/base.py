@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -92,6 +93,32 @@ class Expert:
         self._read = ObservationReader(env)
         self._careful = set(env.unwrapped.robots) != {"Panda"}  # type: ignore[attr-defined]
         """Plans have the Panda's pace; other arms drift further from their course."""
+
+
+class PhasedExpert(Expert, ABC):
+    """An expert whose state says in which phase of its plan it is, since when, and how its noise has drifted."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], Any]:
+        """The action (A,); ``deterministic`` leaves the action noise out, not the style."""
+        if state is None or (episode_start is not None and np.any(episode_start)):
+            state = self._begin(observation)
+        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
+        command, state = self._act(observation, state, np.zeros_like(state.drift) if deterministic else state.drift)
+        return np.clip(command, -1.0, 1.0).astype(np.float32), state
+
+    @abstractmethod
+    def _begin(self, observation: Any) -> Any:
+        """Where an episode stands before its first step: a NamedTuple with ``since`` and ``drift``."""
+
+    @abstractmethod
+    def _act(self, observation: Any, state: Any, noise: Vector) -> tuple[Vector, Any]:
+        """The command (A,) with ``noise`` where it belongs, and where the episode then stands."""
 
 
 def has_settled(velocity: Vector, since: int, usual: int) -> bool:

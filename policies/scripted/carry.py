@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.policies.scripted.base import (
     CLOSE,
     OPEN,
-    Expert,
+    PhasedExpert,
     Style,
     Vector,
     gripping,
@@ -70,8 +69,8 @@ class CarryState(NamedTuple):
     drift: Vector  # correlated action noise
 
 
-class CarryExpert(Expert, ABC):
-    """An expert that carries objects one after the other; the arguments are those of ``Expert``."""
+class CarryExpert(PhasedExpert):
+    """An expert that carries objects one after the other; the arguments are those of ``PhasedExpert``."""
 
     pace = 0.55
     """Hand speed in action units."""
@@ -84,24 +83,13 @@ class CarryExpert(Expert, ABC):
     def next_task(self, observation: Any) -> CarryTask | None:
         """What to carry next; None where everything is done."""
 
-    def predict(
-        self,
-        observation: Any,
-        state: CarryState | None = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], CarryState]:
-        """The action (7,); ``deterministic`` leaves the action noise out, not the style."""
-        if state is None or (episode_start is not None and np.any(episode_start)):
-            state = self._begin(observation)
+    def _act(self, observation: Any, state: CarryState, noise: Vector) -> tuple[Vector, CarryState]:
         hand_at = self._read(observation, "hand_position")
         hand = rotation(self._read(observation, "hand_orientation"))
-        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
         state = self._advance(state, observation, hand_at, hand)
         command = self._command(state, observation, hand_at, hand)
-        if not deterministic:
-            command[:6] += state.drift[:6]
-        return np.clip(command, -1.0, 1.0).astype(np.float32), state
+        command[:6] += noise[:6]
+        return command, state
 
     def _begin(self, observation: Any) -> CarryState:
         style, rng = self.style, self.np_random

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.policies.scripted.base import (
     CLOSE,
     OPEN,
-    Expert,
+    PhasedExpert,
     Vector,
     move,
     rotation,
@@ -48,24 +47,14 @@ class DoorState(NamedTuple):
     drift: Vector  # (7,) correlated action noise
 
 
-class DoorExpert(Expert):
+class DoorExpert(PhasedExpert):
     """A scripted expert for Door."""
 
-    def predict(
-        self,
-        observation: Any,
-        state: DoorState | None = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], DoorState]:
-        """The action (7,); ``deterministic`` leaves the action noise out, not the style."""
-        if state is None or (episode_start is not None and np.any(episode_start)):
-            state = self._begin()
+    def _act(self, observation: Any, state: DoorState, noise: Vector) -> tuple[Vector, DoorState]:
         hand_at = self._read(observation, "hand_position")
         hand = rotation(self._read(observation, "hand_orientation"))
         turned = state.hardware.sign * float(self._read(observation, "handle_qpos")[0])
         opened = float(self._read(observation, "hinge_qpos")[0])
-        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
         left = _between(hand, self._facing(state, turned, opened))
         state = self._advance(state, hand_at, turned, opened, left)
         target, grip = self._target(state, turned, opened)
@@ -73,11 +62,10 @@ class DoorExpert(Expert):
         if state.phase == REACH:
             facing = self._rolling(state, hand, facing)
         command = np.append(move(hand_at, target, hand, facing, state.speed, gain=2.0), grip)
-        if not deterministic:
-            command[:6] += state.drift[:6]
-        return np.clip(command, -1.0, 1.0).astype(np.float32), state
+        command[:6] += noise[:6]
+        return command, state
 
-    def _begin(self) -> DoorState:
+    def _begin(self, observation: Any) -> DoorState:
         style, rng = self.style, self.np_random
         speed = style.pace(0.4, rng)
         spread = 0.3 * style.spread * rng.standard_normal(3)

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, Style, Vector, grasping, gripping, matrix
+from asm_gym.policies.scripted.base import CLOSE, OPEN, PhasedExpert, Style, Vector, grasping, gripping, matrix
 from asm_gym.policies.scripted.two_arms import ARMS, Hand, Hands, move_arm
 
 REACH, DESCEND, GRASP, RAISE, OFFER, MEET, TAKE, LET_GO, PART = range(9)
@@ -90,11 +89,11 @@ class HandoverState(NamedTuple):
     drift: Vector  # (14,) correlated action noise
 
 
-class HandoverExpert(Expert):
+class HandoverExpert(PhasedExpert):
     """A scripted expert for TwoArmHandover.
 
     Args:
-        env, seed, style: as for ``Expert``.
+        env, seed, style: as for ``PhasedExpert``.
         name: of the hammer, as observations call it.
         over: how far above the handle to come from [m].
         pace: hand speed in action units.
@@ -113,17 +112,7 @@ class HandoverExpert(Expert):
         self._hands = Hands(env)
         self._name, self._over, self._pace = name, over, pace
 
-    def predict(
-        self,
-        observation: Any,
-        state: HandoverState | None = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], HandoverState]:
-        """The action (14,); ``deterministic`` leaves the action noise out, not the style."""
-        if state is None or (episode_start is not None and np.any(episode_start)):
-            state = self._begin()
-        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
+    def _act(self, observation: Any, state: HandoverState, noise: Vector) -> tuple[Vector, HandoverState]:
         hands = self._hands.look(observation)
         hammer = self.hammer(observation)
         holds = float(np.abs(self._read(observation, "robot1_gripper_opening")).sum()) > _HELD
@@ -132,9 +121,8 @@ class HandoverExpert(Expert):
         for i, (at, turn, grip) in enumerate((_give(state, hands[0], hammer), _take(state, hammer))):
             command[i, :6] = move_arm(state.bases[i], hands[i], at, turn, state.speed, gain=2.0)
             command[i, 6] = grip
-        if not deterministic:
-            command[:, :6] += state.drift.reshape(ARMS, 7)[:, :6]
-        return np.clip(command.reshape(-1), -1.0, 1.0).astype(np.float32), state
+        command[:, :6] += noise.reshape(ARMS, 7)[:, :6]
+        return command.reshape(-1), state
 
     def hammer(self, observation: Any) -> Hammer:
         """The hammer as it is observed; its length is the model's."""
@@ -143,7 +131,7 @@ class HandoverExpert(Expert):
         turned = matrix(self._read(observation, f"{self._name}_quat"))
         return Hammer.seen(self._read(observation, f"{self._name}_pos"), turned, model.handle_length)
 
-    def _begin(self) -> HandoverState:
+    def _begin(self, observation: Any) -> HandoverState:
         style, rng = self.style, self.np_random
         speed = style.pace(self._pace, rng)
         spread = style.spread * np.clip(rng.standard_normal(3), -2, 2)

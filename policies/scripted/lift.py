@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.policies.scripted.base import (
     CLOSE,
     OPEN,
-    Expert,
+    PhasedExpert,
     Vector,
     has_settled,
     matrix,
@@ -35,19 +34,10 @@ class _State(NamedTuple):
     drift: Vector  # (7,) correlated action noise
 
 
-class LiftExpert(Expert):
+class LiftExpert(PhasedExpert):
     """A scripted expert for Lift."""
 
-    def predict(
-        self,
-        observation: Any,
-        state: _State | None = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], _State]:
-        """The action (7,); ``deterministic`` leaves the action noise out, not the style."""
-        if state is None or (episode_start is not None and np.any(episode_start)):
-            state = self._begin()
+    def _act(self, observation: Any, state: _State, noise: Vector) -> tuple[Vector, _State]:
         hand_at = self._read(observation, "hand_position")
         hand = rotation(self._read(observation, "hand_orientation"))
         cube_at = self._read(observation, "cube_pos")
@@ -60,11 +50,10 @@ class LiftExpert(Expert):
             target = target + np.array([0.0, 0.0, np.clip(4 * (astray - 0.012), 0.0, 0.06)])
         aligned = pointing_down(hand, cube if state.phase <= DESCEND else None)
         command = np.append(move(hand_at, target, hand, aligned, state.speed), grip)
-        if not deterministic:
-            command[:6] += state.drift[:6]
-        return np.clip(command, -1.0, 1.0).astype(np.float32), state
+        command[:6] += noise[:6]
+        return command, state
 
-    def _begin(self) -> _State:
+    def _begin(self, observation: Any) -> _State:
         style, rng = self.style, self.np_random
         return _State(
             phase=REACH,
@@ -78,7 +67,6 @@ class LiftExpert(Expert):
         )
 
     def _advance(self, state: _State, hand_at: Vector, cube_at: Vector, fingers: Vector) -> _State:
-        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
         offset = hand_at - cube_at
         if state.phase == REACH and np.linalg.norm(offset - state.hover) < 0.02:
             return state._replace(phase=DESCEND, since=0)

@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.base import Expert, Style, Vector, grasping, matrix
+from asm_gym.policies.scripted.base import PhasedExpert, Style, Vector, grasping, matrix
 from asm_gym.policies.scripted.two_arms import ARMS, Hands, move_arm
 
 TURN, ALIGN, INSERT = range(3)
@@ -38,24 +37,14 @@ class PegInHoleState(NamedTuple):
     drift: Vector  # (12,) correlated action noise
 
 
-class PegInHoleExpert(Expert):
+class PegInHoleExpert(PhasedExpert):
     """A scripted expert for TwoArmPegInHole."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
         super().__init__(env, seed, style)
         self._hands = Hands(env)
 
-    def predict(
-        self,
-        observation: Any,
-        state: PegInHoleState | None = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], PegInHoleState]:
-        """The action (12,); ``deterministic`` leaves the action noise out, not the style."""
-        if state is None or (episode_start is not None and np.any(episode_start)):
-            state = self._begin()
-        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
+    def _act(self, observation: Any, state: PegInHoleState, noise: Vector) -> tuple[Vector, PegInHoleState]:
         peg, plate = self._hands.look(observation)
         hole_at, hole = self._read(observation, "hole_pos"), matrix(self._read(observation, "hole_quat"))
         middle = hole_at - self._read(observation, "peg_to_hole")  # (3,) of the peg
@@ -79,11 +68,10 @@ class PegInHoleExpert(Expert):
                 move_arm(state.bases[1], plate, state.plate, _facing(plate.turned, state), state.speed, gain=1.5),
             ]
         )
-        if not deterministic:
-            command += state.drift
-        return np.clip(command, -1.0, 1.0).astype(np.float32), state
+        command += noise
+        return command, state
 
-    def _begin(self) -> PegInHoleState:
+    def _begin(self, observation: Any) -> PegInHoleState:
         style, rng = self.style, self.np_random
         first, second = self._hands.places()
         forth = (second - first) / np.linalg.norm(second - first)  # level

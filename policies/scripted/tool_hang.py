@@ -12,12 +12,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.policies.scripted.base import (
     CLOSE,
     OPEN,
-    Expert,
+    PhasedExpert,
     Vector,
     grasping,
     has_settled,
@@ -86,34 +85,23 @@ class ToolHangState(NamedTuple):
     drift: Vector  # (6,) correlated action noise
 
 
-class ToolHangExpert(Expert):
+class ToolHangExpert(PhasedExpert):
     """A scripted expert for ToolHang, on the Panda."""
 
-    def predict(
-        self,
-        observation: Any,
-        state: ToolHangState | None = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], ToolHangState]:
-        """The action (7,); ``deterministic`` leaves the action noise out, not the style."""
+    def _act(self, observation: Any, state: ToolHangState, noise: Vector) -> tuple[Vector, ToolHangState]:
         scene = self._look(observation)
-        if state is None or (episode_start is not None and np.any(episode_start)):
-            state = self._begin(scene)
-        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
         state = _advance(state, scene, has_settled(self._read(observation, "gripper_velocity"), state.since, 10))
         goal = _goal(state, scene)
         speed = goal.pace * state.speed
         command = move(scene.hand.at, goal.hand.at, scene.hand.turned, goal.hand.turned, speed, goal.gain)
-        if not deterministic:
-            # A hand that goes slowly is steadier: its noise grows with the command (Harris and Wolpert 1998).
-            command += goal.pace * state.drift
-        return np.clip(np.append(command, goal.grip), -1.0, 1.0).astype(np.float32), state
+        # A hand that goes slowly is steadier: its noise grows with the command (Harris and Wolpert 1998).
+        command += goal.pace * noise
+        return np.append(command, goal.grip), state
 
-    def _begin(self, scene: Scene) -> ToolHangState:
+    def _begin(self, observation: Any) -> ToolHangState:
         style, rng = self.style, self.np_random
         speed, spread = style.pace(0.6, rng), style.spread * np.clip(rng.standard_normal(3), -2, 2)
-        return ToolHangState(FRAME, REACH, 0, speed, spread, scene.hand, np.zeros(6))
+        return ToolHangState(FRAME, REACH, 0, speed, spread, self._look(observation).hand, np.zeros(6))
 
     def _look(self, observation: Any) -> Scene:
         def pose(name: str) -> Pose:

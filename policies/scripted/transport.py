@@ -170,7 +170,6 @@ class TransportExpert(Expert):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], TransportState]:
-        """The action (14,); ``deterministic`` leaves the action noise out, not the style."""
         if state is None or (episode_start is not None and np.any(episode_start)):
             state = TransportState()
         first, lid = self._lid.predict(observation, state.lid, deterministic=deterministic)

@@ -6,9 +6,8 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, Style, Vector, gripping, matrix
+from asm_gym.policies.scripted.base import CLOSE, OPEN, PhasedExpert, Style, Vector, gripping, matrix
 from asm_gym.policies.scripted.two_arms import ARMS, Hand, Hands, move_arm
 
 REACH, DESCEND, GRASP, LIFT, LOWER = range(5)
@@ -31,27 +30,17 @@ class TwoArmLiftState(NamedTuple):
     drift: Vector  # (14,) correlated action noise
 
 
-class TwoArmLiftExpert(Expert):
+class TwoArmLiftExpert(PhasedExpert):
     """A scripted expert for TwoArmLift."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
         super().__init__(env, seed, style)
         self._hands = Hands(env)
 
-    def predict(
-        self,
-        observation: Any,
-        state: TwoArmLiftState | None = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], TwoArmLiftState]:
-        """The action (14,); ``deterministic`` leaves the action noise out, not the style."""
-        if state is None or (episode_start is not None and np.any(episode_start)):
-            state = self._begin()
+    def _act(self, observation: Any, state: TwoArmLiftState, noise: Vector) -> tuple[Vector, TwoArmLiftState]:
         hands = self._hands.look(observation)
         handles = np.stack([self._read(observation, f"handle{i}_xpos") for i in range(ARMS)])  # (2, 3)
         across = matrix(self._read(observation, "pot_quat"))[:, 1]  # from one handle's bar to the other's
-        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
         state = self._advance(state, hands, handles, across)
         targets, grip = self._targets(state, handles, np.stack([hand.at for hand in hands]))
         command = np.zeros((ARMS, 7))
@@ -59,12 +48,11 @@ class TwoArmLiftExpert(Expert):
             held = gripping(hand.turned, across)
             command[i, :6] = move_arm(state.bases[i], hand, targets[i], held, state.speed, gain=1.5)
         command = command.reshape(-1)
-        if not deterministic:
-            command += state.drift
+        command += noise
         command[6::7] = grip
-        return np.clip(command, -1.0, 1.0).astype(np.float32), state
+        return command, state
 
-    def _begin(self) -> TwoArmLiftState:
+    def _begin(self, observation: Any) -> TwoArmLiftState:
         style, rng = self.style, self.np_random
         return TwoArmLiftState(
             phase=REACH,

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.base import Expert, Vector, gripping, move, rotation
+from asm_gym.policies.scripted.base import PhasedExpert, Vector, gripping, move, rotation
 
 REACH, LOWER, WIPE, REST = range(4)
 
@@ -29,30 +29,20 @@ class WipeState(NamedTuple):
     drift: Vector  # (6,) correlated action noise
 
 
-class WipeExpert(Expert):
+class WipeExpert(PhasedExpert):
     """A scripted expert for Wipe."""
 
-    def predict(
-        self,
-        observation: Any,
-        state: WipeState | None = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], WipeState]:
-        """The action (6,); ``deterministic`` leaves the action noise out, not the style."""
+    def _act(self, observation: Any, state: WipeState, noise: Vector) -> tuple[Vector, WipeState]:
         hand_at = self._read(observation, "hand_position")
         hand = rotation(self._read(observation, "hand_orientation"))
-        if state is None or (episode_start is not None and np.any(episode_start)):
-            state = self._begin(hand_at)
-        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
         left = state.dirt[self._dirty(state.order)]  # (M, 3)
         state = self._advance(state, hand_at, left)
         command = self._command(state, hand_at, hand, left)
-        if not deterministic:
-            command += state.drift
-        return np.clip(command, -1.0, 1.0).astype(np.float32), state
+        command += noise
+        return command, state
 
-    def _begin(self, hand_at: Vector) -> WipeState:
+    def _begin(self, observation: Any) -> WipeState:
+        hand_at = self._read(observation, "hand_position")
         style, rng = self.style, self.np_random
         pace = style.pace(1.0, rng)
         press = _PRESS * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.8, 1.2))
