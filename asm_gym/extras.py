@@ -19,6 +19,7 @@ BROUGHT_BY = {
     **dict.fromkeys(("torchrl", "wandb"), "learners"),
     **dict.fromkeys(("rosbags",), "ros"),
     **dict.fromkeys(("rerun",), "rerun"),
+    **dict.fromkeys(("onnx", "onnxruntime"), "onnx"),
 }
 """The extra of asm-gym that installs a package, by the name it is imported under."""
 

@@ -41,6 +41,7 @@ CHECKS = {
         "report,ros", "tests/test_logs.py tests/test_live.py tests/test_log_formats.py", "mcap pandas polars"
     ),
     "rerun": Check("report,rerun", "tests/test_rerun.py"),
+    "onnx": Check("onnx", "tests/test_export.py"),
     "data": Check("robosuite,data,report", "tests/test_datasets.py tests/test_public.py"),
     "agents": Check("agents", "tests/test_learners.py"),
     "learners": Check("learners", "tests/test_learners.py"),

@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from asm_gym.extras import needed_for
+from asm_gym.wrappers.features import StreamFeatures
 from asm_gym.wrappers.logging import FlatInfo, SafetyLog, SixValues
 from asm_gym.wrappers.recording import StreamRecorder
 from asm_gym.wrappers.repair import CompletedObservation
@@ -23,6 +24,7 @@ __all__ = [
     "RerunView",
     "SafetyLog",
     "SixValues",
+    "StreamFeatures",
     "StreamRecorder",
     "SurpriseOverlay",
     "VectorNeuralASMSafety",
