@@ -207,3 +207,9 @@ def _fields(path: Path) -> dict[str, Any]:
         label = EpisodeLabel(**{**label, "affected_channels": frozenset(label["affected_channels"])})
     about = {name: header[name] for name in ("success", "seed", "info")}
     return {**saved.arrays, **about, "label": label, "spec": StreamSpec.from_json(header["spec"])}
+
+
+def spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """The runs of True in ``mask`` (T,), as half-open [start, stop) steps."""
+    edges = np.diff(np.concatenate([[0], np.asarray(mask, np.int8), [0]]))  # (T + 1,)
+    return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from asm_gym.episode import spans
 from asm_gym.evaluation import metrics
 from asm_gym.evaluation.metrics import (
     Delays,
@@ -21,7 +22,7 @@ from asm_gym.evaluation.metrics import (
     time_matched_auroc,
     typical,
 )
-from asm_gym.evaluation.scored import InterventionOutcome, ScoredEpisode, TraceDetail, spans, window_steps
+from asm_gym.evaluation.scored import InterventionOutcome, ScoredEpisode, TraceDetail, window_steps
 from asm_gym.evaluation.statistics import Share, auroc, wilson_interval
 
 

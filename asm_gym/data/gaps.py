@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.evaluation.scored import spans
+from asm_gym.episode import spans
 from asm_gym.validation import check_number
 
 PAID_BACK = 0.1

@@ -12,8 +12,7 @@ import numpy as np
 
 from asm_gym.data.logs import Log
 from asm_gym.detection import conformal_episodes
-from asm_gym.episode import Episode
-from asm_gym.evaluation.scored import spans
+from asm_gym.episode import Episode, spans
 from asm_gym.readings import noise_of
 from asm_gym.spec import MOTOR
 

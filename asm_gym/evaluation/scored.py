@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.episode import spans
+
 Floats = NDArray[np.floating[Any]]
 
 NOMINAL = "nominal"
@@ -21,12 +23,6 @@ POLICY_ALONE = "policy alone"
 
 IDEAL = "ideal"
 """The acting in which a reflex is told of the fault, and senses that would be at fault are not."""
-
-
-def spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """The runs of True in ``mask`` (T,), as half-open [start, stop) steps."""
-    edges = np.diff(np.concatenate([[0], np.asarray(mask, np.int8), [0]]))  # (T + 1,)
-    return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))
 
 
 class InterventionOutcome(NamedTuple):

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from asm_gym.evaluation.scored import spans
+from asm_gym.episode import spans
 
 _PAPER, _INK, _FAINT, _RULE = "#14171c", "#f2f2f2", "#a0a8b2", "#343a42"
 _CURVE, _ALARM, _FAULT = "#56B4E9", "#FF4B3E", "#E69F00"

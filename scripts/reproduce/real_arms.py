@@ -30,8 +30,7 @@ from asm_gym.data.real_arms import (
 )
 from asm_gym.data.selection import pieces, unbroken
 from asm_gym.detection.scores import Largest
-from asm_gym.episode import Episode
-from asm_gym.evaluation.scored import spans
+from asm_gym.episode import Episode, spans
 from asm_gym.evaluation.statistics import auroc
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor

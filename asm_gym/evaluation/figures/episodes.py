@@ -12,8 +12,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from asm_gym.episode import spans
 from asm_gym.evaluation.figures.style import BLACK, BLUE, ORANGE, VERMILLION, figure, require_some
-from asm_gym.evaluation.scored import ScoredEpisode, TraceDetail, spans
+from asm_gym.evaluation.scored import ScoredEpisode, TraceDetail
 
 
 def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
