@@ -18,9 +18,6 @@ from asm_gym.envs.nominal import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
 from asm_gym.envs.views import ACTS, ARMED, FELT, JOINTS, LEFT, Band, Goals, Views
 
-REACH = 0.15
-"""How far a hand reaches from the point between its fingers, its camera and its palm included, about [m]."""
-
 
 class Expected(NamedTuple):
     """What the arms are to feel in the substeps of a control step, as ``Simulation.felt`` lays it out."""
@@ -233,11 +230,10 @@ class Simulation:
     # ------------------------------------------------------------------ knowledge of the robot
 
     def slowed(self, action: NDArray[np.float64], most: float) -> list[tuple[slice, float]]:
-        """For each arm, parts of its action, and what share of each keeps every point of its hand below ``most`` [m/s].
+        """For each arm, its part of the action, and what share of it keeps its hand below ``most`` [m/s].
 
         A controller that is asked for a change Δx of pose again and again, from where it is, comes to the velocity
-        Kp/Kd Δx. What a turn of the hand does to its farthest point counts by itself, so that a wild wrist does not
-        stop a hand. Actions of controllers that take anything else are left as they are.
+        Kp/Kd Δx. Actions of controllers that take anything else are left as they are.
         """
         found, start = [], 0
         for a, (robot, arm) in enumerate(self._parts):
@@ -252,14 +248,9 @@ class Simulation:
                 jacobian = np.zeros((3, self.model.nv))
                 mujoco.mj_jacSite(self.model, self.data, jacobian, None, int(self._arms.site[a]))
                 delta = jacobian[:, self._arms.dofs[a, :n]] @ delta
-                parts = [(part, delta, 1.0)]
-            else:
-                moves, turns = slice(part.start, part.start + 3), slice(part.start + 3, part.stop)
-                parts = [(moves, delta[:3], 1.0), (turns, delta[3:], REACH)]
             gain = float(np.mean(controller.kp[:3] / controller.kd[:3]))
-            for where, change, lever in parts:
-                speed = gain * lever * float(np.linalg.norm(change))
-                found.append((where, 1.0 if speed <= most else most / speed))
+            speed = gain * float(np.linalg.norm(delta[:3]))
+            found.append((part, 1.0 if speed <= most else most / speed))
         return found
 
     def motions(self, turns: NDArray[np.float64]) -> list[tuple[slice, NDArray[np.float64]]]:
