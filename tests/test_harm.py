@@ -44,7 +44,8 @@ def test_what_is_left_is_a_share_of_alone_and_the_worst_cell_is_one_in_which_the
 
 
 def test_every_cell_is_one_row_and_other_arms_are_asked_for():
-    chosen = harm.cells(harm.Config(episodes=2, elsewhere=1, healthy=3, taught=4, training=400, tasks=("Lift",)))
+    config = harm.Config(episodes=2, against=harm.AGAINST, healthy=3, training=400, tasks=("Lift",))
+    chosen = harm.cells(config)
     kinds = [cell.kind for cell, _ in chosen]
     assert {k: kinds.count(k) for k in set(kinds)} == {
         "hostile": 34,
@@ -53,7 +54,7 @@ def test_every_cell_is_one_row_and_other_arms_are_asked_for():
         "early": 6,
         "healthy": 9,
     }
-    assert {cell.robot for cell, n in chosen if n == 1} == {"Panda", "Sawyer", "IIWA"}
+    assert {cell.robot for cell, n in chosen if n == 2} == {"Panda", "Sawyer", "IIWA"}
     assert sorted({cell.steps for cell, _ in chosen if cell.kind == "early"}) == [100, 400]
 
 

@@ -25,7 +25,7 @@ from asm_gym.policies import Policy, rollout
 from asm_gym.policies.hostile import HOSTILE
 from asm_gym.rollouts.staging import environment, policy_for, staged
 from asm_gym.rollouts.trial import RolloutConfig, Trial
-from asm_gym.scripts.options import option
+from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import harm_agents, harm_braking, harm_report, kit
 from asm_gym.scripts.reproduce.harm_agents import EXCESS, HITTERS, LEARNERS
 from asm_gym.spec import control_period
@@ -66,6 +66,8 @@ HEALTHY = {
 FAULTS = ("frozen_encoder", "encoder_bias", "encoder_dropout", "weak_joint", "passing_push")
 """Kinds under which the healthy policies act too; of the suite, but for the last."""
 
+AGAINST = "hostile", "untrained", "taught", "elsewhere"
+
 ELSEWHERE = ("Sawyer", 20), ("IIWA", 20), ("Panda", 100)
 """Other arms, and another rate of the memory [Hz]."""
 
@@ -77,23 +79,21 @@ class Config(kit.Config):
     seeds: int = option(1, least=1)
     """How often it is done anew, with other seeds."""
     episodes: int = option(10, quick=1, least=0)
-    """Episodes of each hostile or untrained policy."""
-    elsewhere: int = option(0, least=0)
-    """Episodes of each hostile policy with the Sawyer, the IIWA, and at 100 Hz."""
+    """Episodes of each policy that a guard is against."""
+    against: tuple[str, ...] = option(("hostile", "untrained"), known=AGAINST, metavar="NAME")
+    """Which; elsewhere are hostile ones with the Sawyer, the IIWA, and at 100 Hz."""
     healthy: int = option(40, quick=1, least=0)
     """Episodes of each healthy policy."""
     faulty: int = option(0, least=0)
     """Episodes of each healthy policy of Lift and Stack under each kind of fault."""
-    taught: int = option(0, least=0)
-    """Episodes of each policy that was trained to hit, or for a while to its task."""
-    training: int = option(2000, quick=500, least=4)
-    """Steps of that training; a quarter of them too."""
     guards: tuple[str, ...] = option(
         (POLICY_ALONE, "default", "hold", "terminate"), known=tuple(GUARDS), metavar="NAME"
     )
     """Ways to guard."""
     tasks: tuple[str, ...] = option(("Lift", "Stack", "Door", "PickPlaceCan"), quick=("Lift",), metavar="TASK")
-    """Where hostile and learning policies act."""
+    """Where these act."""
+    training: int = fixed(2000, quick=500, least=4)
+    """Steps for which those are trained that learn, to hit and to their task; a quarter of them too."""
 
 
 class Cell(NamedTuple):
@@ -127,13 +127,9 @@ def cells(config: Config) -> list[tuple[Cell, int]]:
         for cell, fault in product(healthy, FAULTS)
         if cell.task in ("Lift", "Stack")
     ]
-    counted = (
-        (hostile + slower + untrained, config.episodes),
-        (trained + early, config.taught),
-        (elsewhere, config.elsewhere),
-        (healthy, config.healthy),
-        (faulty, config.faulty),
-    )
+    groups = dict(zip(AGAINST, (hostile + slower, untrained, trained + early, elsewhere), strict=True))
+    counted = [(groups[name], config.episodes) for name in config.against]
+    counted += [(healthy, config.healthy), (faulty, config.faulty)]
     return [(cell, n) for group, n in counted for cell in group if n]
 
 
@@ -196,8 +192,8 @@ def guarded(env: gym.Env[Any, Any], guard: str, memory: NeuralASM, rate: int) ->
     told = GUARDS[guard]
     if guard == IDEAL:
         return OracleReflex(env, beyond=EXCESS)
-    fast = {} if rate == 20 else {"monitor_freq": rate}
-    return env if told is None else NeuralASMSafety(env, memory, on_overrun="ignore", **told, **fast)
+    fast = None if rate == 20 else rate
+    return env if told is None else NeuralASMSafety(env, memory, on_overrun="ignore", monitor_freq=fast, **told)
 
 
 def one(cell: Cell, seed: int, guard: str, memory: NeuralASM, config: Config) -> kit.Record:
@@ -206,7 +202,7 @@ def one(cell: Cell, seed: int, guard: str, memory: NeuralASM, config: Config) ->
     rollouts = RolloutConfig(robot=cell.robot, stream_freq=None if cell.rate == 20 else cell.rate)
     arm: Any = environment(trial.env_id, rollouts.settings).unwrapped
     infos: list[dict[str, Any]] = []
-    felt, steps = Felt(arm), []  # rows within steps begin anew: there, and only there, every substep is read by itself
+    felt, steps = Felt(arm), list[Any]()  # where rows within steps begin anew, every substep is read by itself
     with staged(trial, rollouts) as env, felt.reading(steps if cell.rate == 20 else arm.substep_hooks):
         policy = policy_of(cell, env, seed, config)
         within = guarded(env, guard, memory, cell.rate)
@@ -277,8 +273,8 @@ def run(config: Config) -> kit.Findings:
         harm_report.blows_table(records, [g for g in guards if g in (POLICY_ALONE, "default")]),
     ]
     asked = {r["kind"] for r in records}
-    if config.elsewhere or config.quick:
+    if "elsewhere" in config.against:
         held = kit.together(kit.each("braking", harm_braking.braking, harm_braking.ROBOTS, config))
         tables.append(harm_braking.braking_table(held))
     tables += [harm_report.kept_table(records, guards, kind) for kind in ("healthy", "faulty") if kind in asked]
-    return kit.Findings(records, tables, harm_report.frontier(records, guards))
+    return kit.Findings(records, [table for table in tables if table.rows], harm_report.frontier(records, guards))

@@ -124,7 +124,7 @@ def settings_table(records: Sequence[Record], guards: Sequence[str]) -> Table:
     def of(ask: Callable[[Sequence[Record], str], str], row: Key) -> str:
         return ask(where(hostile, **{n: row[n] for n in SETTING}), row["guard"])
 
-    columns = [
+    columns: list[Column[Key]] = [
         Column("arm, rows of the memory", _setting),
         Column("guard", lambda row: str(row["guard"])),
         Column("harm avoided", partial(of, lambda own, guard: _percent(1.0 - left(own, guard)))),
