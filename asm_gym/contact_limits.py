@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -78,6 +78,16 @@ class ContactLimits:
                 f"healthy must say {len(most)} numbers, one for each that is felt, got {len(self.healthy)}"
             )
         return np.maximum(most, self.healthy) if self.healthy else most
+
+    def stricter(self, forces: float, speed: float) -> ContactLimits:
+        """With a share of the limits on ``forces``, and at most ``speed`` [m/s]."""
+        return replace(
+            self,
+            wrist_force=forces * self.wrist_force,
+            external_torque=forces * self.external_torque,
+            hand_speed=min(speed, self.hand_speed),
+            healthy=tuple(forces * value for value in self.healthy),
+        )
 
     @property
     def limits_speed(self) -> bool:

@@ -13,6 +13,9 @@ from asm_gym.monitors.registry import load_monitor
 from asm_gym.policies.reflexes import Hold, Retract
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
+from asm_gym.wrappers.factory import limits_of
+from asm_gym.wrappers.oracle import OracleReflex
+from asm_gym.wrappers.substeps import SubstepGuard
 from tests.fakes import SPEC, CueMonitor, FadingMonitor, FakeEnv
 from tests.test_completion import Judge
 from tests.test_responses import ACT as ARM_ACT
@@ -336,6 +339,34 @@ def test_what_healthy_motion_was_seen_to_reach_counts_where_it_is_more(lift):
     felt = lift.unwrapped.felt_channels
     most = ContactLimits(healthy=(50.0, *[1.0] * 9)).most(felt)
     np.testing.assert_array_equal(most, [50, *[40] * 6, 80, 80, 80])
+
+
+def test_a_force_range_that_was_never_calibrated_is_the_usual_one():
+    assert limits_of("memory", CueMonitor()) == ContactLimits()
+    unknown = CueMonitor()
+    unknown.healthy_, unknown.familiar_ = (), None
+    assert limits_of("memory", unknown) == ContactLimits()
+
+
+def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_third_as_fast_for_a_second(lift):
+    lift.reset(seed=0)
+    guard = SubstepGuard(lift, ContactLimits(), True, None, CueMonitor())
+    guard.begin()
+    guard.pressed()
+    told = []
+    for _ in range(21):
+        told.append(lift.unwrapped.contact_limits)
+        guard.acted()
+    assert told[:20] == [ContactLimits(wrist_force=40.0, external_torque=20.0, hand_speed=0.15 / 3)] * 20
+    assert told[20] == ContactLimits()
+
+
+def test_the_ideal_reflex_stops_at_what_the_simulator_knows(lift):
+    alone, _ = down(lift, 40)
+    stopped, said = down(OracleReflex(lift, beyond=40.0), 40)
+    assert stopped < 0.95 * alone
+    assert any(info["overridden"] for info in said)
+    assert not lift.unwrapped.substep_hooks
 
 
 def test_side_by_side_robots_are_stopped_as_each_alone():

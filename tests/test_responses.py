@@ -12,7 +12,8 @@ from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.arbiter import Arbiter, Sensed
 from asm_gym.wrappers.factory import make_fallback
-from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, responses_from
+from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, Responder, responses_from
+from asm_gym.wrappers.severity import Severity
 from asm_gym.wrappers.transitions import ReleaseRule
 from tests.fakes import CueMonitor, FakeEnv
 from tests.needs import needs
@@ -394,6 +395,16 @@ def test_the_policy_goes_on_only_where_somebody_would_feel_and_the_cause_is_sure
     said = infos(NeuralASMSafety(inner, monitor, "graded"), 13)
     assert (said[10]["transition"] == "go on") == goes_on
     assert said[11]["intervened"] != goes_on
+
+
+@pytest.mark.parametrize(("force", "goes_on"), [(39.0, True), (41.0, False)])
+def test_the_policy_goes_on_in_alarm_only_while_it_presses_no_harder_than_free_motion(force, goes_on):
+    monitor = Judge({10}, "object")
+    responder = Responder(Acting(), monitor, DEFAULT, repairs=True)
+    for _ in range(3):
+        responder.read(np.zeros(SPEC.size, np.float32))
+    said = responder.respond(True, False, np.full(SPEC.size, 1.0 / SPEC.size), Severity(load=0.5, force=force))
+    assert said.name == ("go on" if goes_on else "hold")
 
 
 def test_the_policy_goes_on_for_a_bounded_time_and_is_held_then():

@@ -15,7 +15,7 @@ from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, as_info, average
 from asm_gym.validation import check_choice, shown
 from asm_gym.wrappers.contact import ContactEstimator
 from asm_gym.wrappers.repair import ObservationMap, Repair
-from asm_gym.wrappers.severity import Severity
+from asm_gym.wrappers.severity import FREE_FORCE, Severity
 from asm_gym.wrappers.transitions import GOING_ON
 
 _log = logging.getLogger("asm_gym.safety")
@@ -53,7 +53,7 @@ DEFAULT: dict[str, str] = {
 }
 """What ``on_alarm="graded"`` does. What presses comes first: then only its two rows count, and neither may let the
 policy go on. Below that, the policy may go on where the cause is sure, the hand is not faster than any healthy one, for
-a bounded time, and where somebody would feel if it pressed; else the robot holds."""
+a bounded time, and where somebody feels that it presses with no more than 40 N; else the robot holds."""
 
 QUIET_S = 1.0
 """After so long without an alarm, what comes next has a cause of its own [s]."""
@@ -268,7 +268,7 @@ class Responder:
         if name == "complete":  # what is left judges on, and what is completed is bounded by itself
             return not severity.fast
         sure = cause is not None and cause.probability >= SURE
-        return sure and may_go_on and severity.felt and not severity.fast
+        return sure and may_go_on and severity.felt and not (severity.fast or severity.force > FREE_FORCE)
 
     def _held(self, case: str) -> str:
         """What is done where the policy may not go on: the response to what is unknown, or staying."""

@@ -23,6 +23,9 @@ from asm_gym.wrappers.severity import ContactForce
 CAREFUL = 1.0 / 3.0
 """Share of the speed limit that a hand has after it has pressed too hard."""
 
+GENTLE = 0.5
+"""Share of the limits on forces that the arm has then; only a policy that presses anew presses as hard so soon."""
+
 CAREFUL_S = 1.0
 """For so long [s], counted while the policy acts."""
 
@@ -125,11 +128,11 @@ class SubstepGuard:
             return
         limits = self._limits
         if limits is not None:
-            speed = limits.hand_speed * (CAREFUL if self._careful else 1.0)
+            forces, speed = (GENTLE, CAREFUL * limits.hand_speed) if self._careful else (1.0, limits.hand_speed)
             if self._familiar is not None:
                 speed = min(speed, self._familiar.at(self._place))
-            if speed != limits.hand_speed:
-                limits = replace(limits, hand_speed=speed)
+            if forces != 1.0 or speed != limits.hand_speed:
+                limits = limits.stricter(forces, speed)
         self._limited.contact_limits = limits
 
     def send(self, state: MonitorState, action: NDArray[np.floating[Any]], overridden: bool) -> None:

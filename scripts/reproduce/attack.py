@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,6 +75,10 @@ class Forging(gym.Wrapper[Any, Any, Any, Any]):
 
 
 ONSET = 20
+"""Row from which on somebody else speaks."""
+
+DIFFERS = 2.0
+"""Hand and joints contradict each other where they are so many times as far apart as they ever were before."""
 
 
 def forging(attack: Attack, spec: StreamSpec, recorded: NDArray[np.float32]) -> Forged:
@@ -108,6 +113,8 @@ def attacked(job: tuple[Attack, int], config: Config) -> kit.Record:
     watched = NeuralASMSafety(Forging(env, forged, ONSET), memory, "monitor", on_overrun="ignore")
     infos: list[dict[str, Any]] = []
     rollout(watched, make_policy("scripted", env, seed=seed), seed, infos.append)
+    apart = hand_off(env.unwrapped, memory.spec, np.stack([info["stream"] for info in infos]))
+    differs = np.flatnonzero(apart[ONSET:] > DIFFERS * apart[:ONSET].max())
     alarm = next((t for t, i in enumerate(infos) if t >= ONSET and i["asm"]["reason"] == "surprise"), None)
     took = (len(infos) if alarm is None else alarm + 1) - ONSET
     return {
@@ -116,7 +123,21 @@ def attacked(job: tuple[Attack, int], config: Config) -> kit.Record:
         "found": alarm is not None,
         "seconds": took * memory.spec.dt,
         "drift": attack.rate * took * memory.spec.dt,
+        "differs": attack.rate * (differs[0] + 1) * memory.spec.dt if differs.size else np.nan,
     }
+
+
+def hand_off(arm: Any, spec: StreamSpec, rows: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(T,) how far the hand's place in ``rows`` (T, D) is from where the joints' angles in them put it [m]."""
+    robot, model = arm.robosuite_env.robots[0], arm.simulation.model
+    data, found = mujoco.MjData(model), np.zeros(len(rows))
+    data.qpos[:] = arm.simulation.data.qpos
+    for t, row in enumerate(rows):
+        data.qpos[robot._ref_joint_pos_indexes] = row[spec.slices["joint_position"]]
+        mujoco.mj_kinematics(model, data)
+        place = data.site_xpos[robot.eef_site_id["right"]]
+        found[t] = np.linalg.norm(row[spec.slices["hand_position"]] - place)
+    return found
 
 
 def run(config: Config) -> kit.Findings:
@@ -143,6 +164,17 @@ def run(config: Config) -> kit.Findings:
         "Drift that is reached before the first alarm [rad]; where there is none, by the end", columns, joints
     )
 
+    def against(rate: float, joint: int) -> str:
+        own = [r["differs"] for r in records if (r["what"], r["rate"], r["joint"]) == (POSITION, rate, joint)]
+        return "never" if np.isnan(own).any() else f"{np.median(own):.3f}"
+
+    columns = [Column("joint", str), *(Column(f"{rate:g} rad/s", partial(against, rate)) for rate in config.rates)]
+    kinematic = tabulate(
+        "Drift at which the hand's place, if it is not computed from the encoders, contradicts them [rad]",
+        columns,
+        joints,
+    )
+
     def whole(what: str) -> str:
         own = [r for r in records if r["what"] == what]
         found = [r["seconds"] for r in own if r["found"]]
@@ -150,4 +182,4 @@ def run(config: Config) -> kit.Findings:
 
     others: list[Column[str]] = [Column("all senses replaced by", str), Column("found", whole)]
     names = tabulate("Whole senses", others, ("replay", "means"))
-    return kit.Findings(records, [drifts, names])
+    return kit.Findings(records, [drifts, kinematic, names])
