@@ -205,7 +205,10 @@ def _size(folder: Path) -> int:
 
 def test_python_3_13_is_told_why_it_has_no_robosuite(monkeypatch):
     monkeypatch.setattr(sys, "version_info", (3, 13, 0, "final", 0))
-    with pytest.raises(
-        ImportError, match=r"^a task needs robosuite: take Python 3.12, for 3.13 there is none: its mink"
-    ), needed_for("a task"):
+    with (
+        pytest.raises(
+            ImportError, match=r"^a task needs robosuite: take Python 3.12, for 3.13 there is none: its mink"
+        ),
+        needed_for("a task"),
+    ):
         raise ModuleNotFoundError(name="robosuite")
