@@ -78,7 +78,7 @@ $(stamp): pyproject.toml constraints.txt
 	@$(usable) || command -v $(PYTHON) >/dev/null || \
 	  { echo "make: there is no $(PYTHON); on Debian: apt-get install python3 python3-venv" >&2; exit 1; }
 	@$(usable) || $(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' || \
-	  { echo "make: asm-gym needs Python 3.11 or 3.12, and $(PYTHON) is $$($(PYTHON) -V 2>&1);" \
+	  { echo "make: the environments need Python 3.11 or 3.12, and $(PYTHON) is $$($(PYTHON) -V 2>&1);" \
 	         "name another: make PYTHON=python3.12" >&2; exit 1; }
 	@$(usable) || $(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
 	  { echo "make: $(PYTHON) cannot make a virtual environment; on Debian: apt-get install python3-venv" >&2; exit 1; }
@@ -88,3 +88,4 @@ $(stamp): pyproject.toml constraints.txt
 	  { echo "make: the install failed. Where building evdev failed (robosuite needs it), on Debian:" \
 	         "apt-get install gcc libc6-dev linux-libc-dev python3-dev" >&2; exit 1; }
 	@touch $@
+	@$(bin)/asm-gym warmup >&2

@@ -1,9 +1,16 @@
-"""Compiled functions, cached on disk for the whole folder they belong to."""
+"""Compiled functions, cached on disk for the whole folder they belong to.
+
+The cache lies beside the code, or else in the user's cache, or else, where neither can be written to (an install of
+another user, no HOME), in a folder of this user's under the temporary one. ``NUMBA_CACHE_DIR`` names another.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -24,7 +31,11 @@ def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), n
         nogil: other threads run Python meanwhile; worth it for what takes long.
     """
     how: dict[str, Any] = {"nogil": nogil, "fastmath": fastmath, "forceinline": fastmath, "error_model": "numpy"}
-    dispatcher: Any = numba.njit(cache=True, **how)(function)
+    try:
+        dispatcher: Any = numba.njit(cache=True, **how)(function)
+    except RuntimeError:  # numba found no folder that it may write to
+        with _cached_in(private_folder()) as kept:
+            dispatcher = numba.njit(cache=kept, **how)(function)
     cache = _cache_of(dispatcher)
     if cache is not None:
         # numba looks at the function's own file alone, and would keep code that another file's change made stale.
@@ -37,6 +48,41 @@ def must_compile(function: Any) -> bool:
     """Whether the next call of a compiled function will take seconds, as far as can be told."""
     cache = _cache_of(function)
     return cache is not None and not function.signatures and not cache._load_index()
+
+
+def kept_in(function: Any) -> Path | None:
+    """The folder that holds the compiled code of a function; None where nothing keeps it."""
+    cache = _cache_of(function)
+    return None if cache is None else Path(cache._cache_path)
+
+
+@lru_cache
+def private_folder() -> Path | None:
+    """A folder for compiled code that only this user can write to; None where there is none.
+
+    Compiled code is run as it is found: a folder of that name that another user may have filled is not used.
+    """
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    path = Path(tempfile.gettempdir()) / f"asm-gym-{user}"
+    try:
+        path.mkdir(mode=0o700, exist_ok=True)
+        about = path.lstat()
+        private = not path.is_symlink() and about.st_uid == user and not about.st_mode & 0o022
+        return path if private else Path(tempfile.mkdtemp(prefix="asm-gym-"))
+    except OSError:
+        return None
+
+
+@contextmanager
+def _cached_in(folder: Path | None) -> Iterator[bool]:
+    """While the block runs numba caches what it decorates there; whether there is such a folder."""
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    config.CACHE_DIR = before if folder is None else str(folder)
+    try:
+        yield folder is not None
+    finally:
+        config.CACHE_DIR = before
 
 
 def _cache_of(dispatcher: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -11,8 +12,8 @@ BROUGHT_BY = {
     **dict.fromkeys(("mujoco", "robosuite"), "robosuite"),
     **dict.fromkeys(("torch", "stable_baselines3", "tensorboard"), "agents"),
     **dict.fromkeys(("minari", "h5py"), "data"),
-    **dict.fromkeys(("matplotlib", "rich", "tyro", "imageio", "imageio_ffmpeg", "PIL"), "report"),
-    **dict.fromkeys(("pyarrow", "sklearn", "loky", "packaging"), "report"),
+    **dict.fromkeys(("matplotlib", "imageio", "imageio_ffmpeg", "PIL"), "report"),
+    **dict.fromkeys(("pyarrow", "sklearn", "loky"), "report"),
     **dict.fromkeys(("distributed", "dask", "ray"), "cluster"),
     **dict.fromkeys(("moviepy",), "video"),
     **dict.fromkeys(("gymnasium_robotics", "shimmy", "dm_control"), "environments"),
@@ -22,6 +23,12 @@ BROUGHT_BY = {
     **dict.fromkeys(("onnx", "onnxruntime"), "onnx"),
 }
 """The extra of asm-gym that installs a package, by the name it is imported under."""
+
+NOT_ON_3_13 = {
+    "robosuite": "its mink asks for NumPy below 2, of which there is no build",
+    "dm_control": "its labmaze has no build",
+}
+"""Why no extra brings a package to Python 3.13 and later."""
 
 
 def require(module: str, *, what: str, extra: str = "") -> Any:
@@ -53,4 +60,7 @@ def needed_for(what: str, extra: str = "") -> Iterator[None]:
         extra = extra or BROUGHT_BY.get(package, "")
         if not extra or package == "asm_gym":
             raise
-        raise ImportError(f"{what} needs {package}: pip install 'asm-gym[{extra}]'", name=package) from error
+        remedy = f"pip install 'asm-gym[{extra}]'"
+        if package in NOT_ON_3_13 and sys.version_info >= (3, 13):
+            remedy = f"take Python 3.12, for 3.13 there is none: {NOT_ON_3_13[package]}"
+        raise ImportError(f"{what} needs {package}: {remedy}", name=package) from error

@@ -266,5 +266,5 @@ def control_period(env: gym.Env[Any, Any]) -> float:
     dt = getattr(env.unwrapped, "dt", None)
     if isinstance(dt, int | float) and dt > 0:
         return float(dt)
-    fps = env.metadata.get("render_fps")
-    return 1.0 / fps if fps else 1.0
+    rate = (env.metadata or {}).get("render_fps") or getattr(env, "control_freq", None)  # robosuite's GymWrapper
+    return 1.0 / rate if rate else 1.0

@@ -87,13 +87,17 @@ OWN: dict[str, EnvSpec] = registry("asm_gym.tasks:OWN", {})
 """What ``register_task`` added, by name."""
 
 
-def register_task(name: str, make: Callable[..., gym.Env[Any, Any]] | str, horizon: int) -> None:
+def register_task(
+    name: str, make: Callable[..., gym.Env[Any, Any]] | type[Any] | str, horizon: int, **arguments: Any
+) -> None:
     """Makes an environment of one's own known as a task, here and in worker processes.
 
     Args:
         name: the Gymnasium id is ``asm_gym/<name>-v0``.
-        make: a class of environments with Box spaces or a function that makes one; or ``module:name`` of it.
+        make: a class of environments with Box spaces or a function that makes one; or ``module:name`` of it. A class of
+            robosuite's environments will do as it is: its sensors become channels of the stream, by their names.
         horizon: control steps before an episode is truncated.
+        arguments: that it is made with: ``robots="Panda"``, ``controller_configs=…``.
 
     Raises:
         ValueError: the name is taken.
@@ -108,7 +112,9 @@ def register_task(name: str, make: Callable[..., gym.Env[Any, Any]] | str, horiz
     if name in TASKS:
         raise ValueError(f"there is a task {name!r} already")
     check_number("horizon", horizon, low=1, whole=True)
-    spec = EnvSpec(f"asm_gym/{name}-v0", entry_point=make, max_episode_steps=horizon)
+    if isinstance(make, type) and any(c.__module__.startswith("robosuite.") for c in make.__mro__):
+        make, arguments = "asm_gym.envs.own_class:OwnRobosuite", {"make": make} | arguments
+    spec = EnvSpec(f"asm_gym/{name}-v0", entry_point=make, max_episode_steps=horizon, kwargs=arguments)
     add("task", OWN, name, spec)
     gym.registry[spec.id] = spec
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import platform
+import subprocess
 import sys
 from dataclasses import dataclass
 from importlib import metadata
@@ -15,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from asm_gym.extras import BROUGHT_BY
+from asm_gym.extras import BROUGHT_BY, NOT_ON_3_13
 from asm_gym.graphics import GET_ENCODER, GET_RENDERING, encoder_problem, loads, rendering_backend, rendering_problem
 from asm_gym.scripts.command import run
 
@@ -54,7 +55,7 @@ class Args:
 def run_checks() -> list[Check]:
     """Every check, in the order in which a remedy for one helps the next."""
     libraries = [library(name, package) for name, package in LIBRARIES.items()] if sys.platform == "linux" else []
-    return [python(), *map(package, PACKAGES), *libraries, rendering(), encoder()]
+    return [python(), *map(package, PACKAGES), compiled_code(), *libraries, rendering(), encoder()]
 
 
 def python() -> Check:
@@ -80,6 +81,9 @@ def package(name: str) -> Check:
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
+        if name in NOT_ON_3_13 and sys.version_info >= (3, 13):
+            why = f"not installed: {NOT_ON_3_13[name]} for Python 3.13"
+            return Check(name, False, False, why, "python3.12 -m venv, and install there")
         extra = BROUGHT_BY.get(name.replace("-", "_"))
         remedy = f"python -m pip install 'asm-gym[{extra}]'" if extra else REINSTALL
         if name == "robosuite":  # it brings evdev, which is compiled
@@ -108,6 +112,30 @@ def applies(requirement: Requirement) -> bool:
     return marker is None or any(marker.evaluate({"extra": extra}) for extra in ("", *BROUGHT_BY.values()))
 
 
+COMPILED = """
+from asm_gym.compilation import kept_in, must_compile
+from asm_gym.monitors.fused import _observe
+print(int(must_compile(_observe)), kept_in(_observe) or "")
+"""
+
+
+def compiled_code() -> Check:
+    """Where compiled code is kept, and whether there is some already."""
+    done = subprocess.run([sys.executable, "-c", COMPILED], capture_output=True, text=True, check=False)
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["nothing was said"])[-1]
+        return Check("compiled code", False, True, last, REINSTALL)
+    missing, _, folder = done.stdout.strip().partition(" ")
+    if not folder:
+        return Check("compiled code", False, False, "kept nowhere: no folder can be written to", "set NUMBA_CACHE_DIR")
+    where = f"in {folder}"
+    return (
+        Check("compiled code", False, False, f"not yet {where}", "asm-gym warmup")
+        if missing == "1"
+        else Check("compiled code", True, False, where)
+    )
+
+
 def library(name: str, package: str) -> Check:
     """A shared library that opencv links to, which only robosuite's own viewer uses."""
     ok = loads(name)
@@ -117,6 +145,10 @@ def library(name: str, package: str) -> Check:
 
 def rendering() -> Check:
     """A way to draw without a screen; without one there is no video, and everything else runs."""
+    try:
+        metadata.version("mujoco")
+    except metadata.PackageNotFoundError:
+        return Check("rendering", False, False, "no video without mujoco", "python -m pip install 'asm-gym[robosuite]'")
     problem = rendering_problem()
     detail = problem or f"MUJOCO_GL={rendering_backend()} draws a frame"
     return Check("rendering", not problem, False, detail, GET_RENDERING if problem else "")

@@ -27,12 +27,10 @@ from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
 from asm_gym.data.live import RowReader, SourceDied, is_live, lines_from
 from asm_gym.data.logs import Layout, Log, read_logs
 from asm_gym.data.notes import noted
-from asm_gym.evaluation import figures
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, traces_of
-from asm_gym.evaluation.report import write_report
-from asm_gym.evaluation.scored import ScoredEpisode
+from asm_gym.evaluation.scored import ScoredEpisode, moments_of
 from asm_gym.evaluation.tables import Table
-from asm_gym.extras import require
+from asm_gym.extras import needed_for, require
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
@@ -107,7 +105,8 @@ def review(args: Args, monitor: Any, console: Console) -> int:
             episodes += len(group)
             progress(episodes, episodes)
     said = f"{len(alarms)} alarm{'s' * (len(alarms) != 1)} in {len({a.log for a in alarms})} of {episodes} episodes"
-    publish(args, said, alarms, worst)
+    write_alarms(args.out / "alarms.csv", alarms)
+    lacks = publish(args, said, alarms, worst)
     if args.rerun is not None:
         write_rerun(args.rerun, worst, monitor)
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
@@ -119,21 +118,31 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     for cells in [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []:
         log, start, end, channel, why, excess = cells
         say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
-    say(f"Wrote {args.out / 'report.html'} and alarms.csv")
+    say(lacks or f"Wrote {args.out / 'report.html'} and alarms.csv")
     return BAD_NEWS if alarms else DONE
 
 
-def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[ScoredEpisode]) -> None:
-    """Writes the table of all alarms, and a report with the most surprising episodes."""
-    args.out.mkdir(parents=True, exist_ok=True)
-    with (args.out / "alarms.csv").open("w", newline="", encoding="utf-8") as file:
+def write_alarms(path: Path, alarms: Sequence[Alarm]) -> None:
+    """Writes the table of all alarms."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([HEADINGS, *(alarm.cells() for alarm in alarms)])
+
+
+def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[ScoredEpisode]) -> str:
+    """Writes a report with the most surprising episodes; what it lacks where nothing can be drawn."""
+    try:
+        with needed_for("the report"):
+            from asm_gym.evaluation import figures
+            from asm_gym.evaluation.report import write_report
+    except ImportError as error:
+        return f"Wrote {args.out / 'alarms.csv'}; {error}"
     drawn = {
         "surprise": ("Surprise over time in the most surprising episodes", figures.surprise_figure(worst)),
         "attribution": ("Where surprise came from in the most surprising one", figures.attribution_figure(worst[0])),
         "stream": ("What its most surprising channels sensed", figures.stream_figure(worst[0])),
     }
-    moments = sorted((m for trace in worst for m in figures.moments_of(trace)), key=lambda m: -m.excess)[:MOMENTS]
+    moments = sorted((m for trace in worst for m in moments_of(trace)), key=lambda m: -m.excess)[:MOMENTS]
     if moments:
         drawn = {
             "moments": (
@@ -151,6 +160,7 @@ def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Scor
         dict(drawn.values()),
         details={"command": f"asm-gym watch {args.source} --monitor {args.monitor}"},
     )
+    return ""
 
 
 def write_rerun(path: Path, traces: Sequence[ScoredEpisode], monitor: Any) -> None:

@@ -13,12 +13,13 @@ import zipfile
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from asm_gym.extras import BROUGHT_BY, needed_for, require
 from tests.wheel import LINKS, ROOT, build_wheel
 
-CORE = ("gymnasium", "numpy", "numba", "scipy", "threadpoolctl")
+CORE = ("filelock", "gymnasium", "numpy", "numba", "packaging", "rich", "scipy", "threadpoolctl", "tyro")
 LARGEST = 500e6
 """[bytes] that a core install may take."""
 
@@ -90,7 +91,7 @@ ONE_IMPORT = {
     **dict.fromkeys(("register_monitor", "register_policy", "register_task"), None),
     "FaultInjection": SAID[0],
     "register_fault": SAID[0].replace("a robosuite environment or a fault in one", "register_fault"),
-    **dict.fromkeys(("collect", "harmless"), "running episodes needs loky: pip install 'asm-gym[report]'"),
+    **dict.fromkeys(("collect", "harmless"), SAID[0]),
 }
 """What a core install answers for each name of the package."""
 
@@ -114,20 +115,30 @@ def test_the_core_watches_a_stream_and_names_what_the_rest_needs(tmp_path):
 
 
 def test_a_command_says_which_extra_it_lacks(tmp_path):
-    code = NOTHING_ELSE.replace("ABSENT", "{'rich'}") + "from asm_gym.scripts.cli import main; sys.exit(main())"
-    done = subprocess.run([sys.executable, "-c", code, "doctor"], capture_output=True, text=True, check=False)
+    code = NOTHING_ELSE.replace("ABSENT", "{'matplotlib'}") + "from asm_gym.scripts.cli import main; sys.exit(main())"
+    done = subprocess.run([sys.executable, "-c", code, "evaluate"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "asm-gym doctor: this command needs rich: pip install 'asm-gym[report]'\n"
+    assert done.stderr == "asm-gym evaluate: this command needs matplotlib: pip install 'asm-gym[report]'\n"
 
 
 def test_logs_are_watched_without_a_simulator(tmp_path):
-    absent = {name for name, extra in BROUGHT_BY.items() if extra != "report"}
-    code = NOTHING_ELSE.replace("ABSENT", repr(absent)) + (
-        "from asm_gym.scripts import fit, watch\ntry:\n    from asm_gym.rollouts import collect\n"
-        "except ImportError as error:\n    print(error)"
+    log = tmp_path / "logs"
+    log.mkdir()
+    for k in range(40):
+        rows = np.sin(0.2 * np.arange(60)[:, None] + np.array((k, 2 * k, 3.0)))
+        rows[30:, 0] += 9.0 * (k == 39)
+        np.savetxt(log / f"{k:02}.csv", rows, delimiter=",", header="a,b,c", comments="", fmt="%.6f")
+    (log / "39.csv").rename(tmp_path / "torn.csv")
+    code = NOTHING_ELSE.replace("ABSENT", repr(set(BROUGHT_BY))) + (
+        "from asm_gym.scripts.cli import main\n"
+        "fit = 'fit logs --rate 20 --monitor kalman --false-alarm-rate 0.1 --out m.asm'.split()\n"
+        "watch = 'watch torn.csv --rate 20 --monitor m.asm --out seen'.split()\n"
+        "print(main(['doctor']), main(fit), main(watch))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (done.stdout.strip(), done.stderr) == (SAID[0], "")
+    assert done.stdout.endswith("0 0 1\n"), done.stdout + done.stderr
+    assert "alarms.csv; the report needs matplotlib: pip install 'asm-gym[report]'" in done.stdout
+    assert [p.name for p in (tmp_path / "seen").iterdir()] == ["alarms.csv"]
 
 
 def test_every_requirement_of_an_extra_is_known_by_the_name_it_is_imported_under():
@@ -141,6 +152,7 @@ def test_every_requirement_of_an_extra_is_known_by_the_name_it_is_imported_under
 
     assert names(project["dependencies"]) == set(CORE)
     extras = {e: names(r) for e, r in project["optional-dependencies"].items() if e not in ("all", "dev", "docs")}
+    extras["environments"].remove("mujoco")  # only bounded there
     assert extras == {e: {n for n in BROUGHT_BY if BROUGHT_BY[n] == e and n != "dask"} for e in BROUGHT_BY.values()}
 
 
@@ -177,8 +189,8 @@ def test_a_core_install_is_small_and_works(tmp_path):
     installed = {name.lower().replace("-", "_") for name in listed.stdout.split()}
     print(f"{grown / 1e6:.0f} MB: {', '.join(sorted(installed))}")
     assert installed <= {*CORE, "asm_gym", "pip", "setuptools", "llvmlite", "cloudpickle"} | {
-        "farama_notifications",
-        "typing_extensions",
+        *("farama_notifications", "typing_extensions", "markdown_it_py", "mdurl", "pygments"),
+        *("docstring_parser", "typeguard", "shtab"),
     }
     assert grown < LARGEST
     done = subprocess.run([python, "-c", WATCH], capture_output=True, text=True, check=False, **alone)
@@ -189,3 +201,14 @@ def test_a_core_install_is_small_and_works(tmp_path):
 def _size(folder: Path) -> int:
     """[bytes] of all files."""
     return sum(f.lstat().st_size for f in folder.rglob("*") if f.is_file())
+
+
+def test_python_3_13_is_told_why_it_has_no_robosuite(monkeypatch):
+    monkeypatch.setattr(sys, "version_info", (3, 13, 0, "final", 0))
+    with (
+        pytest.raises(
+            ImportError, match=r"^a task needs robosuite: take Python 3.12, for 3.13 there is none: its mink"
+        ),
+        needed_for("a task"),
+    ):
+        raise ModuleNotFoundError(name="robosuite")

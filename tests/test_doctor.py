@@ -48,6 +48,7 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         monkeypatch.setattr(metadata, "version", installed)
         monkeypatch.setattr(graphics, "draws_a_frame", lambda backend: backend in draws)
         monkeypatch.setattr(sys, "platform", "linux")
+        monkeypatch.setattr(doctor, "compiled_code", lambda: doctor.Check("compiled code", True, False, "in a folder"))
 
     return make
 
@@ -222,6 +223,21 @@ def test_the_table_shows_commands_with_square_brackets_as_they_are(capsys: pytes
     shown = capsys.readouterr().out
     assert "found [red]" in shown
     assert "pip install '.[dev]'" in shown
+
+
+def test_code_that_is_still_to_be_compiled_is_said_with_what_compiles_it(monkeypatch: Any, tmp_path: Path) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    check = doctor.compiled_code()
+    assert (check.ok, check.needed, check.remedy) == (False, False, "asm-gym warmup")
+    assert check.detail.startswith(f"not yet in {tmp_path}")
+
+
+def test_python_3_13_is_told_why_it_has_no_robosuite(machine: Any, monkeypatch: Any) -> None:
+    machine(robosuite=None)
+    monkeypatch.setattr(sys, "version_info", (3, 13, 0, "final", 0))
+    check = failed()["robosuite"]
+    assert "NumPy below 2" in check.detail
+    assert "3.12" in check.remedy
 
 
 def test_the_doctor_imports_nothing_that_it_checks() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from loky import get_reusable_executor
 
-from asm_gym.rollouts import ParallelConfig, collect, parallel, parallel_map
+from asm_gym.rollouts import ParallelConfig, collect, parallel_map
 from tests.needs import needs
 
 PARENT = """
@@ -108,7 +108,7 @@ def test_no_more_processes_are_started_than_there_is_work(monkeypatch):
         started.append(workers)
         return get_reusable_executor(workers, **more)
 
-    monkeypatch.setattr(parallel, "get_reusable_executor", executor)
+    monkeypatch.setattr("loky.get_reusable_executor", executor)
     assert parallel_map(abs, [-3, 1], 500) == [3, 1]
     assert started == [2]
 

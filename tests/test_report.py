@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.metrics import by_condition, false_alarms, time_matched_auroc
 from asm_gym.evaluation.report import write_json, write_report
-from asm_gym.evaluation.scored import InterventionOutcome, ScoredEpisode, TraceDetail
+from asm_gym.evaluation.scored import InterventionOutcome, ScoredEpisode, TraceDetail, moments_of
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Column, Table, detection_table, headline, outcome_table, tabulate
 from asm_gym.view.film import write_video
@@ -128,7 +128,7 @@ def test_a_strip_shows_how_each_alarm_began_and_the_channel_that_raised_it():
     stream = np.arange(200.0).reshape(100, 2)
     detail = TraceDetail(attribution, ("q", "torque"), np.zeros(100, np.bool_), stream)
     trace = ScoredEpisode("log.csv", 0, 0.01, 20.0, surprise, detail=detail)
-    moments = figures.moments_of(trace)
+    moments = moments_of(trace)
     assert [(m.start, m.stop, m.channel, m.excess) for m in moments] == [(20, 22, 1, 2.5), (60, 61, 0, np.inf)]
     first, second, third = figures.moments_figure(moments).axes
     assert first.get_title(loc="left") == "torque, 0.21 s, 2.5×"
@@ -137,7 +137,7 @@ def test_a_strip_shows_how_each_alarm_began_and_the_channel_that_raised_it():
     assert second.get_title(loc="left") == "q, 0.61 s, inf×"
     assert not third.get_visible()
     with pytest.raises(ValueError, match="without the detail"):
-        figures.moments_of(dataclasses.replace(trace, detail=None))
+        moments_of(dataclasses.replace(trace, detail=None))
 
 
 def test_the_stream_is_shown_beside_its_twin_and_the_most_surprising_channel_first(traces: list[ScoredEpisode]):

@@ -11,7 +11,7 @@ import pytest
 
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.comparison import LeftOut
-from asm_gym.rollouts.run_folder import LOCK, NOMINAL_ROLES, Recordings, claimed, locked, make_missing
+from asm_gym.rollouts.run_folder import HOLDER, LOCK, NOMINAL_ROLES, Recordings, claimed, locked, make_missing
 from asm_gym.scripts.cli import main
 from tests.streams import sine_episodes
 
@@ -47,9 +47,9 @@ def test_a_second_command_is_refused_with_a_line_that_names_the_first(holder, tm
 def test_the_lock_of_a_killed_command_is_taken_over(holder, tmp_path):
     holder.kill()
     holder.wait()
-    assert str(holder.pid) in (tmp_path / LOCK).read_text()
+    assert str(holder.pid) in (tmp_path / HOLDER).read_text()
     with locked(tmp_path):
-        assert f"process {os.getpid()} " in (tmp_path / LOCK).read_text()
+        assert f"process {os.getpid()} " in (tmp_path / HOLDER).read_text()
     assert not list(tmp_path.iterdir())
 
 
@@ -87,7 +87,7 @@ def test_only_what_is_missing_is_made(tmp_path):
 def test_two_commands_on_one_folder_are_one_too_many(command, holder, tmp_path, capsys):
     assert main([*command, "--out", str(tmp_path)]) == 2
     assert f"in use by process {holder.pid} on" in capsys.readouterr().err
-    assert [p.name for p in tmp_path.iterdir()] == [LOCK]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [LOCK, HOLDER]
 
 
 def recording(role: str, seed: int, force: float, success: bool = True) -> Episode:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from asm_gym.extras import needed_for
 from asm_gym.wrappers.features import StreamFeatures
-from asm_gym.wrappers.logging import FlatInfo, SafetyLog, SixValues
+from asm_gym.wrappers.logging import FlatInfo, SafetyLog, SixValues, WandbWriter
 from asm_gym.wrappers.recording import StreamRecorder
 from asm_gym.wrappers.repair import CompletedObservation
 from asm_gym.wrappers.safety import NeuralASMSafety
@@ -28,6 +28,7 @@ __all__ = [
     "StreamRecorder",
     "SurpriseOverlay",
     "VectorNeuralASMSafety",
+    "WandbWriter",
 ]
 
 _NEED_MORE = {"FaultInjection": "faults", "RerunView": "live_view", "SurpriseOverlay": "overlay"}

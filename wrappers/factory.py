@@ -7,11 +7,12 @@ from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
+import numpy as np
 
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection.adaptive import AdaptiveThreshold, RunningThreshold
 from asm_gym.familiar_speed import FamiliarSpeed
-from asm_gym.monitors import ExpectsActions, ExplainsItself, Monitor, NeuralASM, pretrained_for
+from asm_gym.monitors import CalibratedMonitor, ExpectsActions, ExplainsItself, Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Comply, Graded, Hold, Recall, Retract, nearest_to_rest
 from asm_gym.protocols import SensesWithinSteps
@@ -106,7 +107,25 @@ def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
     if not isinstance(monitor, Watches):
         raise TypeError(f"monitor must have initial_state() and observe(), got {shown(monitor)}")
     monitor.spec.require(watched, "the monitor")
+    if not isinstance(monitor, CalibratedMonitor):
+        check_answer(monitor)
     return check_number("the monitor's threshold", monitor.threshold)
+
+
+def check_answer(monitor: Monitor) -> None:
+    """Raises TypeError where a monitor answers a row with something else than it should, which would alarm for ever."""
+    try:
+        answer: Any = monitor.observe(monitor.initial_state(1), np.zeros((1, monitor.spec.size), np.float32))
+    except Exception as error:  # what fails is an alarm, and may be mended meanwhile
+        LOG.warning("the monitor failed at a row of zeros: %r", error)
+        return
+    if not (isinstance(answer, tuple) and len(answer) == 2 and hasattr(answer[1], "attribution")):
+        got = type(answer).__name__ if not isinstance(answer, tuple) else f"a tuple of {len(answer)}"
+        got = f"(state, {type(answer[1]).__name__})" if isinstance(answer, tuple) and len(answer) == 2 else got
+        raise TypeError(
+            "observe(state, stream) must return (state, Surprise(value (B,), attribution (B, D))), of "
+            f"asm_gym.monitors, got {got}"
+        )
 
 
 def names_causes(monitor: Monitor) -> bool:

@@ -19,10 +19,11 @@ from typing import Any, NamedTuple, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.channels import bare_name, label_of
+from asm_gym.data.channels import bare_name, label_of, unit_of
 from asm_gym.data.clock import Clock, clock_among
 from asm_gym.data.rtde import rtde_lines
 from asm_gym.data.text import Dialect, header_of
+from asm_gym.data.units import ratio
 from asm_gym.files import regular_file
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number
@@ -157,6 +158,15 @@ class Row(NamedTuple):
     lost: int = 0
 
 
+def _factor(name: str, unit: str) -> float:
+    """How many of ``unit`` are in one of what a name says behind it. Raises ValueError where there is no way."""
+    theirs = unit_of(name)
+    factor = 1.0 if not theirs or unit == "1" else ratio(theirs, unit)
+    if factor is None:
+        raise ValueError(f"{name} is in {theirs}, and the memory reads {unit}")
+    return factor
+
+
 class RowReader:
     """Reads lines as rows of a spec.
 
@@ -166,6 +176,7 @@ class RowReader:
 
     def __init__(self, spec: StreamSpec) -> None:
         self.spec, self.line = spec, 0
+        self._units = [c.unit for c in spec.channels for _ in c.labels]
         self._order: list[int] | None = None  # of CSV: where each number of a row stands
         self._how = Dialect(",", comma=False)
         self._clock: Clock | None = None
@@ -208,6 +219,7 @@ class RowReader:
         except ValueError as error:
             raise ValueError(f"line 1 is no row of numbers, and no header: {error}") from error
         self._order, self._width = [places[label] for label in self.spec.labels], len(names)
+        self._factors = np.array([_factor(header[k], unit) for k, unit in zip(self._order, self._units, strict=True)])
         headed = [name.strip() for name in header]
         self._clock = clock_among(headed)
         self._clock_at = headed.index(self._clock.column) if self._clock else 0
@@ -217,7 +229,7 @@ class RowReader:
         if len(cells) < self._width or any(cell.strip() for cell in cells[self._width :]):
             raise ValueError(f"it has {len(cells)} cells, the header {self._width}")
         assert self._order is not None
-        numbers = np.array([self._how.number(cells[k]) for k in self._order])
+        numbers = self._factors * np.array([self._how.number(cells[k]) for k in self._order])
         return numbers, None if self._clock is None else self._clock.moment(cells[self._clock_at])
 
     def _json(self, line: str) -> tuple[NDArray[np.float64], float | None]:
@@ -232,6 +244,8 @@ class RowReader:
     def _by_name(self, said: dict[str, Any]) -> NDArray[np.float64]:
         """The numbers (D,) by the names of channels or of single numbers; the first row has to hold them all."""
         parts, missing = [], []
+        if any(unit_of(name) for name in said):
+            said = {bare_name(n): v if not unit_of(n) else self._converted(n, v) for n, v in said.items()}
         said = {label_of(name): value for name, value in said.items()} | said
         for channel in self.spec.channels:
             values = said[channel.name] if channel.name in said else [said.get(label) for label in channel.labels]
@@ -241,6 +255,13 @@ class RowReader:
         if missing and self.line == 1:
             raise ValueError(f"it lacks {', '.join(missing)}")
         return np.concatenate(parts)
+
+    def _converted(self, name: str, value: Any) -> Any:
+        """In the unit that the memory reads."""
+        bare = bare_name(name)
+        units = {c.name: c.unit for c in self.spec.channels} | dict(zip(self.spec.labels, self._units, strict=True))
+        unit = units.get(bare, units.get(label_of(bare)))
+        return value if unit is None or value is None else _factor(name, unit) * np.asarray(value, np.float64)
 
     def _lost(self, stamp: float | None) -> int:
         """Rows that should have come before the one of this time."""

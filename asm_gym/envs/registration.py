@@ -21,6 +21,8 @@ class Maker:
         task = arguments.pop("task", self._task)
         if task != self._task:
             raise ValueError(f"{TASKS[self._task].id} makes {self._task}, got task={shown(task)}: leave it out")
+        if "robots" in arguments:
+            raise TypeError(f"{TASKS[self._task].id} takes robot=, got robots={shown(arguments['robots'])}")
         return RobosuiteEnv(task=self._task, **arguments)
 
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from asm_gym.data.gaps import blamed, bridged, reason
 from asm_gym.data.logs import Log
-from asm_gym.evaluation import figures
-from asm_gym.evaluation.scored import ScoredEpisode, TraceDetail
+from asm_gym.evaluation.scored import ScoredEpisode, TraceDetail, moments_of
 from asm_gym.spec import StreamSpec
 
 
@@ -46,7 +45,7 @@ def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
     detail = trace.detail
     assert detail is not None
     found = []
-    for m in figures.moments_of(trace):
+    for m in moments_of(trace):
         row = np.zeros(len(detail.channels)) if detail.stream is None else detail.stream[m.start]
         at = blamed(row, detail.attribution[m.start])
         channel = "" if at is None else detail.channels[at]

@@ -196,3 +196,31 @@ def window_steps(window_s: float, dt: float) -> int:
     if not window_s > 0:
         raise ValueError(f"window_s must be > 0, got {window_s}")
     return max(1, math.floor(window_s / dt + 1e-6))  # 0.3 / 0.1 is a hair below 3
+
+
+class Moment(NamedTuple):
+    """An alarm, and how it began.
+
+    Attributes:
+        trace: in which.
+        start, stop: its rows.
+        channel: which number surprised most in the first of them; later others follow, and may surprise more.
+        excess: how surprising the worst of them was, in thresholds; infinite where it was not finite.
+    """
+
+    trace: ScoredEpisode
+    start: int
+    stop: int
+    channel: int
+    excess: float
+
+
+def moments_of(trace: ScoredEpisode) -> list[Moment]:
+    """The alarms of an episode, in order. Raises ValueError where the trace has no detail."""
+    if trace.detail is None:
+        raise ValueError("this trace was kept without the detail that says which channel surprised")
+    found = []
+    for start, stop in spans(trace.alarm):
+        channel = int(np.argmax(trace.detail.attribution[start]))
+        found.append(Moment(trace, start, stop, channel, float(trace.surprise[start:stop].max() / trace.threshold)))
+    return found

@@ -43,6 +43,10 @@ class StreamModel:
     def error_columns(self) -> NDArray[np.intp]:
         return self.spec.sensory
 
+    def state(self) -> Arrays:
+        """What a file keeps, as arrays of floats that ``restore`` is given; a model that learned anything else has its own."""
+        return self.learned_
+
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         self.learned_, self.skills_ = learned, skills
         return self

@@ -76,7 +76,8 @@ class CalibratedMonitor(Calibrated):
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
         """All that ``fit`` has found, by name; empty before."""
-        found = dict(self.model.learned_)
+        model: Any = self.model
+        found = dict(model.state() if hasattr(model, "state") else model.learned_)
         for detection in self.detections.values():
             found |= detection.learned_
         return found
@@ -267,7 +268,8 @@ class CalibratedMonitor(Calibrated):
     def save(self, path: str | Path) -> None:
         """Writes everything learned to one file: arrays and JSON."""
         self._fitted()
-        arrays = {**self.learned_, **calibration_arrays(self.maxima_, self.blocks_, self._learned_from)}
+        learned = {n: a if a.dtype.kind == "f" else np.asarray(a, np.float64) for n, a in self.learned_.items()}
+        arrays = {**learned, **calibration_arrays(self.maxima_, self.blocks_, self._learned_from)}
         header = {
             "spec": self.spec.to_json(),
             "hyperparameters": self.get_params(),

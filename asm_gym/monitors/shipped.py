@@ -56,6 +56,11 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
         if not misfits:
             return name
         lines.append(f"  {name}: {'; '.join(misfits)}")
+    own = "fit one on nominal episodes of it, as StreamRecorder(env) keeps them, and hand it over as monitor"
+    if spec.source == "spaces":
+        raise ValueError(
+            f"shipped memories know arms of robosuite, and this stream is made of an environment's spaces: {own}"
+        )
     raise ValueError(
         f"no shipped memory fits this stream of {spec.source or 'an unnamed body'} at {1 / spec.dt:g} Hz"
         f"{f' under {controller}' if controller else ''}. There are:\n" + "\n".join(lines) + f"\nFit one of your own: "

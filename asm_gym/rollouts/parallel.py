@@ -18,7 +18,6 @@ from functools import partial
 from typing import Any, TypeVar
 
 import cloudpickle
-from loky import get_reusable_executor
 from threadpoolctl import threadpool_limits
 
 from asm_gym.extras import require
@@ -147,6 +146,7 @@ def _call_on_cluster(task: bytes, item: Any) -> Any:
 
 
 def _loky(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
+    get_reusable_executor = require("loky", what="running episodes in several processes").get_reusable_executor
     # A process that another thread starts would end with that thread.
     here = threading.current_thread() is threading.main_thread()
     workers = min(parallel.workers, len(items))  # an executor starts all of them at once

@@ -5,7 +5,6 @@ A second call with the same settings goes on in a folder, one with others is ref
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import platform
@@ -15,9 +14,10 @@ from contextlib import contextmanager, suppress
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 import asm_gym
 from asm_gym.episode import Episode, EpisodeLabel, load_episode
@@ -27,7 +27,7 @@ from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 
 Item = TypeVar("Item")
 
-LOCK = ".lock"
+LOCK, HOLDER = ".lock", ".lock_holder"
 NOMINAL_ROLES = ("fit", "calibration", "nominal")
 """Roles of the episodes that nothing is done to."""
 CRASH = 2.0
@@ -80,34 +80,23 @@ def locked(folder: Path) -> Iterator[None]:
         BlockingIOError: another command works in it; the message says which process, where and since when.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / LOCK
-    file = _lock(path)
+    path, holder = folder / LOCK, folder / HOLDER  # two files: Windows lets nobody read one that is locked
+    lock = FileLock(path, blocking=False, is_singleton=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        by = holder.read_text(encoding="utf-8") if holder.is_file() else "another process"
+        raise BlockingIOError(f"{folder} is in use by {by}: wait for it, or name another --out") from None
     try:
         since = time.strftime("%Y-%m-%d %H:%M:%S %Z")
         with named(folder):
-            file.write(f"process {os.getpid()} on {platform.node()}, since {since}")
-            file.flush()
-            yield
+            holder.write_text(f"process {os.getpid()} on {platform.node()}, since {since}", encoding="utf-8")
+        yield
     finally:
-        path.unlink(missing_ok=True)
-        file.close()
-
-
-def _lock(path: Path) -> TextIO:
-    while True:
-        file = path.open("a+", encoding="utf-8")
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            holder = file.read() or "another process"
-            file.close()
-            raise BlockingIOError(f"{path.parent} is in use by {holder}: wait for it, or name another --out") from None
-        # Whoever held it may have removed the file between the two lines above: then the lock is of no file.
-        if path.is_file() and path.stat().st_ino == os.fstat(file.fileno()).st_ino:
-            file.truncate(0)
-            return file
-        file.close()
+        holder.unlink(missing_ok=True)
+        with suppress(OSError):  # Windows removes no file that is open; whoever waits for this one looks at it anew
+            path.unlink()
+        lock.release()
 
 
 def make_missing(

@@ -3,7 +3,7 @@
 from asm_gym.evaluation.figures.detection import delay_figure, heat_map, maxima_figure, roc_figure, severity_curves
 from asm_gym.evaluation.figures.episodes import attribution_figure, stream_figure, surprise_figure
 from asm_gym.evaluation.figures.logs import log_figure
-from asm_gym.evaluation.figures.moments import moments_figure, moments_of
+from asm_gym.evaluation.figures.moments import moments_figure
 from asm_gym.evaluation.figures.style import figure, look, save
 
 __all__ = [
@@ -15,7 +15,6 @@ __all__ = [
     "look",
     "maxima_figure",
     "moments_figure",
-    "moments_of",
     "roc_figure",
     "save",
     "severity_curves",

@@ -4,48 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from asm_gym.episode import spans
 from asm_gym.evaluation.figures.style import BLACK, BLUE, VERMILLION, figure, require_some
-from asm_gym.evaluation.scored import ScoredEpisode
+from asm_gym.evaluation.scored import Moment
 
 AROUND_S, AROUND_ROWS = 0.5, 10
 """How much is shown before and after [s], and at least how many rows."""
 
 ACROSS = 3
 """Panels side by side."""
-
-
-class Moment(NamedTuple):
-    """An alarm, and how it began.
-
-    Attributes:
-        trace: in which.
-        start, stop: its rows.
-        channel: which number surprised most in the first of them; later others follow, and may surprise more.
-        excess: how surprising the worst of them was, in thresholds; infinite where it was not finite.
-    """
-
-    trace: ScoredEpisode
-    start: int
-    stop: int
-    channel: int
-    excess: float
-
-
-def moments_of(trace: ScoredEpisode) -> list[Moment]:
-    """The alarms of an episode, in order. Raises ValueError where the trace has no detail."""
-    if trace.detail is None:
-        raise ValueError("this trace was kept without the detail that says which channel surprised")
-    found = []
-    for start, stop in spans(trace.alarm):
-        channel = int(np.argmax(trace.detail.attribution[start]))
-        found.append(Moment(trace, start, stop, channel, float(trace.surprise[start:stop].max() / trace.threshold)))
-    return found
 
 
 def moments_figure(moments: Sequence[Moment]) -> Figure:
