@@ -18,6 +18,7 @@ BROUGHT_BY = {
     **dict.fromkeys(("gymnasium_robotics", "shimmy", "dm_control"), "environments"),
     **dict.fromkeys(("torchrl", "wandb"), "learners"),
     **dict.fromkeys(("rosbags",), "ros"),
+    **dict.fromkeys(("cyclonedds",), "dds"),
     **dict.fromkeys(("rerun",), "rerun"),
 }
 """The extra of asm-gym that installs a package, by the name it is imported under."""
