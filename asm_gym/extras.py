@@ -19,6 +19,7 @@ BROUGHT_BY = {
     **dict.fromkeys(("gymnasium_robotics", "shimmy", "dm_control"), "environments"),
     **dict.fromkeys(("torchrl", "wandb"), "learners"),
     **dict.fromkeys(("rosbags",), "ros"),
+    **dict.fromkeys(("cyclonedds",), "dds"),
     **dict.fromkeys(("rerun",), "rerun"),
     **dict.fromkeys(("onnx", "onnxruntime"), "onnx"),
 }

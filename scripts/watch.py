@@ -1,9 +1,9 @@
 """Says when a recording is surprising, where, and how much; or watches rows as they come.
 
 A recording gives a table, figures and a report. A live source is - for standard input, tail:FILE for a file that grows,
-udp:PORT for datagrams from this machine, or rtde:HOST for a UR controller: JSON lines (a list of numbers, or an object
-by channel, one a row), or CSV with a header; every alarm is printed as it is raised, in constant memory. Exit code 1:
-there was an alarm.
+udp:PORT for datagrams from this machine, rtde:HOST for a UR controller, or dds:/joint_states for ROS 2: JSON lines (a
+list of numbers, or an object by channel, one a row), or CSV with a header; every alarm is printed as it is raised, in
+constant memory. Exit code 1: there was an alarm.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from __future__ import annotations
 import csv
 import math
 import sys
-import time
-from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -20,11 +18,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
-from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
-from asm_gym.data.live import RowReader, SourceDied, is_live, lines_from
+from asm_gym.data.live import RETURNING, is_live, lines_from
 from asm_gym.data.logs import Layout, Log, read_logs
 from asm_gym.data.notes import noted
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, traces_of
@@ -34,8 +30,8 @@ from asm_gym.extras import needed_for, require
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
+from asm_gym.scripts.following import follow
 from asm_gym.scripts.options import check_options, fixed, option
-from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number
 from asm_gym.view.rerun import LiveView
 
@@ -48,19 +44,13 @@ MOMENTS = 6
 SHOWN_ROWS = 20
 """Alarms printed; the file holds them all."""
 
-MOST_LOST = 1000
-"""Lost rows that a bridge is asked about one by one."""
-
-LATENCIES = 10_000
-"""Newest rows whose latency is kept."""
-
 
 @dataclass(frozen=True)
 class Args:
     """Watches a recording, or rows as they come."""
 
     source: str = option(positional=True, metavar="SOURCE")
-    """What asm-gym fit reads; or what is live: -, tail:FILE, udp:PORT or rtde:HOST."""
+    """What asm-gym fit reads; or what is live: -, tail:FILE, udp:PORT, rtde:HOST or dds:/TOPIC."""
     monitor: Path = option(metavar="FILE.asm")
     """A calibrated monitor, such as asm-gym fit writes."""
     out: Path = option(Path("runs/watch"), metavar="FOLDER")
@@ -75,6 +65,8 @@ class Args:
     """For how long a number may be missing without an alarm, such as 0.05; such rows are not judged."""
     silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
     """Without a row for so long a live source has died, which is an alarm."""
+    wait: float = option(600.0, check=partial(check_number, "wait", low=0), metavar="SECONDS")
+    """For how long a controller or a topic that has died may take to come back; then it is watched anew."""
     rerun: Path | None = option(None, metavar="FILE.rrd")
     """Where to write the most surprising episodes of a recording for Rerun's viewer."""
     figures: int = fixed(4, check=partial(check_number, "figures", low=1, whole=True))
@@ -178,53 +170,6 @@ def write_rerun(path: Path, traces: Sequence[ScoredEpisode], monitor: Any) -> No
                 view.row(seconds, row, float(surprise), trace.threshold, shares)
 
 
-def follow(lines: Iterable[str], monitor: Any, console: Console, seconds: float = 0.0) -> int:
-    """Watches rows as they come, in constant memory: prints every alarm as it is raised, and why.
-
-    Args:
-        seconds: that something may be missing without an alarm.
-    """
-    say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-    spec: StreamSpec = monitor.spec
-    state = monitor.initial_state(1)
-    monitor.observe(state, np.zeros((1, spec.size)))  # compiles; the state is a value, and stays as it is
-    latencies: deque[float] = deque(maxlen=LATENCIES)
-    rows = alarms = 0
-    before = False
-    bridge = Bridge(seconds, spec.dt, spec.size)
-    try:
-        for (row, lost), came in RowReader(spec).rows(lines):
-            if lost:
-                nothing = np.full(spec.size, np.nan)
-                over = [bridge.over(np.isnan(nothing)) for _ in range(min(lost, MOST_LOST))]
-                for _ in over if all(over) else over[:1]:
-                    state, _ = monitor.observe(state, nothing[None])
-                if not all(over):
-                    say(f"{(rows + 1) * spec.dt:.3f} s  {lost} row{'s' * (lost != 1)} lost: an alarm ({LATE})")
-                    alarms += 1
-            rows += 1 + lost
-            state, surprise = monitor.observe(state, row[None])
-            value = 0.0 if bridge.over(np.isnan(row)) else float(surprise.value[0])
-            latencies.append(1e3 * (time.perf_counter() - came))
-            if value > monitor.threshold and not before:
-                alarms += 1
-                at, why = blamed(row, surprise.attribution[0]), reason(row)
-                channel = "" if at is None else spec.labels[at] + "  "
-                late = f"{latencies[-1]:.2f} ms after the row came"
-                because = "" if why == SURPRISING else f"  ({why})"
-                say(f"{rows * spec.dt:.3f} s  {channel}{value / monitor.threshold:.2f} thresholds  {late}{because}")
-            before = value > monitor.threshold
-    except SourceDied as error:
-        alarms += 1
-        say(f"{rows * spec.dt:.3f} s  the source has died, {error}: an alarm")
-    if not rows:
-        raise ValueError("no row came")
-    median, late_ms = np.percentile(latencies, [50, 99])
-    counted = f"{rows} rows, {alarms} alarm{'s' * (alarms != 1)}"
-    say(f"{counted}; a row took {median:.2f} ms, 99 % of the newest under {late_ms:.2f} ms")
-    return BAD_NEWS if alarms else DONE
-
-
 def watch(args: Args, console: Console) -> int:
     """Watches whichever it is."""
     if args.rerun is not None:
@@ -235,7 +180,9 @@ def watch(args: Args, console: Console) -> int:
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
     if is_live(args.source):
-        return follow(lines_from(args.source, sys.stdin, args.silence, monitor.spec), monitor, console, args.bridge)
+        opened = partial(lines_from, args.source, sys.stdin, args.silence, monitor.spec)
+        again = opened if args.source.startswith(RETURNING) else None
+        return follow(opened(), monitor, console, args.bridge, again, args.wait)
     return review(args, monitor, console)
 
 

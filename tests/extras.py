@@ -40,6 +40,7 @@ CHECKS = {
     "logs": Check(
         "report,ros", "tests/test_logs.py tests/test_live.py tests/test_log_formats.py", "mcap pandas polars"
     ),
+    "dds": Check("report,dds", "tests/test_dds.py"),
     "rerun": Check("report,rerun", "tests/test_rerun.py"),
     "onnx": Check("onnx", "tests/test_export.py"),
     "data": Check("robosuite,data,report", "tests/test_datasets.py tests/test_public.py"),

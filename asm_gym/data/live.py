@@ -1,4 +1,4 @@
-"""Rows as they come: from standard input, a file that grows, UDP, or a controller; as JSON lines or as CSV.
+"""Rows as they come: from standard input, a file that grows, UDP, a controller or DDS; as JSON lines or as CSV.
 
 A JSON line is a list of numbers, or an object by channel or by number. CSV begins with a header. Where there is a time,
 rows that are missing by it are said. A source that falls silent has died, which is for the reader to say.
@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from asm_gym.data.channels import bare_name, label_of, unit_of
 from asm_gym.data.clock import Clock, clock_among
+from asm_gym.data.dds import dds_lines
+from asm_gym.data.pace import ClockWentBack, Pace
 from asm_gym.data.rtde import rtde_lines
 from asm_gym.data.text import Dialect, header_of
 from asm_gym.data.units import ratio
@@ -34,7 +36,10 @@ POLL_S = 0.002
 LARGEST = 65_535
 """Bytes of a datagram, and more than a row of any robot."""
 
-SOURCES = ("-", "tail:FILE", "udp:PORT", "rtde:HOST")
+SOURCES = ("-", "tail:FILE", "udp:PORT", "rtde:HOST", "dds:/TOPIC")
+
+RETURNING = ("udp:", "rtde:", "dds:")
+"""Sources that may come back after they have died."""
 
 
 class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
@@ -43,7 +48,7 @@ class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
 
 def is_live(source: str) -> bool:
     """Whether it is followed, and no recording."""
-    return source == "-" or source.startswith(("tail:", "udp:", "rtde:"))
+    return source == "-" or source.startswith(("tail:", *RETURNING))
 
 
 def lines_from(source: str, stdin: TextIO, silence: float, spec: StreamSpec | None = None) -> Iterator[str]:
@@ -51,7 +56,8 @@ def lines_from(source: str, stdin: TextIO, silence: float, spec: StreamSpec | No
 
     Args:
         source: ``-`` for standard input, ``tail:FILE`` for a file that grows, ``udp:PORT`` for datagrams sent to this
-            machine from itself, of which an empty one is the end, ``rtde:HOST`` for a controller of Universal Robots.
+            machine from itself, of which an empty one is the end, ``rtde:HOST`` for a controller of Universal Robots,
+            ``dds:/joint_states`` for topics of ROS 2.
         silence: seconds without a line, after the first one, from which on the source has died.
         spec: of the memory that is to read them: a controller is asked for its channels, at its rate.
 
@@ -68,7 +74,10 @@ def lines_from(source: str, stdin: TextIO, silence: float, spec: StreamSpec | No
     if kind == "udp":
         return _datagrams(place, silence)
     if kind == "rtde" and spec is not None:
-        return _controller(place, spec, silence)
+        rows = rtde_lines(place, [channel.name for channel in spec.channels], 1 / spec.dt, silence)
+        return _dying(rows, f"the controller at {place}")
+    if kind == "dds":
+        return _dying(dds_lines(place, silence), place)
     raise ValueError(f"unknown source {source!r}; known: {', '.join(SOURCES)}")
 
 
@@ -119,15 +128,16 @@ def _datagrams(place: str, silence: float) -> Iterator[str]:
         yield from _cut(more, silence)
 
 
-def _controller(place: str, spec: StreamSpec, silence: float) -> Iterator[str]:
+def _dying(lines: Iterator[str], what: str) -> Iterator[str]:
+    """These lines, of a source that has died where they fall silent after the first."""
     heard = False
     try:
-        for line in rtde_lines(place, [channel.name for channel in spec.channels], 1 / spec.dt, silence):
+        for line in lines:
             heard = True
             yield line
     except TimeoutError as error:
         if not heard:
-            raise OSError(f"no row came from the controller at {place}: {error}") from error
+            raise OSError(f"no row came from {what}: {error}") from error
         raise SourceDied(str(error)) from error
 
 
@@ -152,10 +162,19 @@ def _cut(more: Callable[[], bytes | None], silence: float) -> Iterator[str]:
 
 
 class Row(NamedTuple):
-    """A row, and how many were lost before it."""
+    """A row.
 
-    numbers: NDArray[np.float64]  # (D,) NaN where one was lost
+    Attributes:
+        numbers: (D,) NaN where one was lost.
+        lost: rows that should have come before it.
+        read: whether it stands where the memory reads one.
+        change: what is to be said of the rate, where that changed.
+    """
+
+    numbers: NDArray[np.float64]
     lost: int = 0
+    read: bool = True
+    change: str = ""
 
 
 def _factor(name: str, unit: str) -> float:
@@ -182,7 +201,7 @@ class RowReader:
         self._clock: Clock | None = None
         self._clock_at = 0
         self._width = 0
-        self._before: float | None = None
+        self._pace = Pace(spec.dt)
 
     def rows(self, lines: Iterable[str]) -> Iterator[tuple[Row, float]]:
         """Each row, and when its line had come, by ``time.perf_counter``.
@@ -201,12 +220,13 @@ class RowReader:
                 continue
             try:
                 numbers, stamp = self._cells(line) if self._order is not None else self._json(line)
-                lost = self._lost(stamp)
+                lost = 0 if stamp is None else self._pace.lost(stamp)
             except (ValueError, TypeError) as error:
-                raise ValueError(f"line {self.line} is no row of numbers: {error}") from error
+                kind = ClockWentBack if isinstance(error, ClockWentBack) else ValueError
+                raise kind(f"line {self.line} is no row of numbers: {error}") from error
             if numbers.shape != (self.spec.size,):
                 raise ValueError(f"line {self.line} must hold {self.spec.size} numbers, got the shape {numbers.shape}")
-            yield Row(numbers, lost), came
+            yield Row(numbers, lost or 0, lost is not None, "" if stamp is None else self._pace.change), came
 
     def _begin(self, header: list[str]) -> None:
         """Where the numbers stand that are read, by the header of CSV."""
@@ -262,12 +282,3 @@ class RowReader:
         units = {c.name: c.unit for c in self.spec.channels} | dict(zip(self.spec.labels, self._units, strict=True))
         unit = units.get(bare, units.get(label_of(bare)))
         return value if unit is None or value is None else _factor(name, unit) * np.asarray(value, np.float64)
-
-    def _lost(self, stamp: float | None) -> int:
-        """Rows that should have come before the one of this time."""
-        before, self._before = self._before, stamp if stamp is not None else self._before
-        if stamp is None or before is None:
-            return 0
-        if not stamp > before:
-            raise ValueError(f"time must increase, got {stamp:g} s after {before:g} s")
-        return max(0, round((stamp - before) / self.spec.dt) - 1)

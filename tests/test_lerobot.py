@@ -1,0 +1,231 @@
+"""A policy in LeRobot's loop is guarded: with the library's own pipeline where it is installed, and without it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from asm_gym.episode import Episode
+from asm_gym.monitors import make_monitor
+from asm_gym.wrappers.lerobot import LeRobotGuard
+from tests.needs import needs
+
+MOTORS = ["shoulder_pan.pos", "shoulder_lift.pos", "elbow_flex.pos", "wrist_flex.pos", "wrist_roll.pos", "gripper.pos"]
+RATE = 30.0
+
+
+class Arm:
+    """Servos that go a third of the way to where they are told; ``jammed`` ones stay. Degrees, as an SO-101 says."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.q, self.jammed, self.sent = np.zeros(6), np.zeros(6, np.bool_), list[np.ndarray]()
+        self.phase = self.rng.uniform(0, 6, 6)
+
+    def get_observation(self) -> dict[str, float]:
+        return dict(zip(MOTORS, (self.q + 0.05 * self.rng.normal(size=6)).tolist(), strict=True))
+
+    def send_action(self, action: dict[str, float]) -> dict[str, float]:
+        told = np.array([action[m] for m in MOTORS])
+        self.sent.append(told)
+        self.q = np.where(self.jammed, self.q, self.q + (told - self.q) / 3)
+        return action
+
+    def policy(self, k: int) -> dict[str, float]:
+        wave = 30 * np.sin(np.arange(1, 7) * 0.4 * k / RATE + self.phase)
+        return dict(zip(MOTORS, (wave * min(1, k / 30)).tolist(), strict=True))
+
+
+def recorded(seed: int, rows: int = 260) -> Episode:
+    """A healthy run, with a pause, for a hold is one too."""
+    arm, columns = Arm(seed), list[list[float]]()
+    pause = int(np.random.default_rng(seed).integers(60, 180))
+    for k in range(rows):
+        going = k if k < pause else max(pause, k - 60)
+        observation, action = arm.get_observation(), arm.policy(going)
+        columns.append([*observation.values(), *action.values()])
+        arm.send_action(action)
+    names = [f"{what}[{m}]" for what in ("observation.state", "action") for m in MOTORS]
+    made = dict(zip(names, np.array(columns).T, strict=True))
+    return Episode.from_table(made, rate=RATE, action=["action*"], success=True)
+
+
+@pytest.fixture(scope="module")
+def monitor():
+    made = make_monitor("kalman+evidence", recorded(0).spec).fit([recorded(n) for n in range(20)])
+    return made.calibrate([recorded(100 + n) for n in range(39)], 0.025)
+
+
+def ticks():
+    """A clock of 30 rows a second."""
+    now = iter(np.arange(1, 100_000) / RATE)
+    return lambda: float(next(now))
+
+
+def run(guard, arm, rows=200, jam=100, begin=0, step=None):
+    """The rows of alarm and of intervention."""
+    step = step or (lambda o, a: guard({"observation": o, "action": a})["action"])
+    alarms, others = [], []
+    for k in range(begin, begin + rows):
+        if k == jam:
+            arm.jammed[2] = True
+        arm.send_action(step(arm.get_observation(), arm.policy(k)))
+        alarms += [k] * guard.alarm
+        others += [k] * guard.intervened
+    return alarms, others
+
+
+def test_a_healthy_policy_is_let_go_on(monitor):
+    guard, arm = LeRobotGuard(monitor, clock=ticks()), Arm(200)
+    assert run(guard, arm, jam=-1) == ([], [])
+    np.testing.assert_array_equal(arm.sent[-1], list(arm.policy(199).values()))
+
+
+def test_a_jammed_joint_is_an_alarm_and_the_arm_stays_where_it_stood(monitor):
+    guard, arm = LeRobotGuard(monitor, clock=ticks()), Arm(201)
+    alarms, others = run(guard, arm, rows=120)
+    assert 100 < alarms[0] <= 115
+    assert others[0] == alarms[0]
+    assert "elbow_flex" in guard.said["channel"]
+    held = arm.sent[alarms[0] :]
+    np.testing.assert_array_equal(held, np.repeat(held[:1], len(held), axis=0))
+    told_before = arm.sent[alarms[0] - 1]
+    assert held[0][5] == told_before[5]  # the gripper keeps its grip
+    assert np.abs(held[0][:5] - arm.q[:5]).max() < 1.0
+
+
+def test_a_hold_ends_when_it_is_quiet_and_a_stop_when_it_is_reset(monitor):
+    for response, over in (("hold", True), ("stop", False)):
+        guard, arm = LeRobotGuard(monitor, response, quiet_s=0.5, clock=ticks()), Arm(202)
+        run(guard, arm, rows=115)
+        assert guard.intervened
+        arm.jammed[:] = False
+        still = dict(zip(MOTORS, arm.sent[-1], strict=True))
+        for _ in range(120):
+            arm.send_action(guard({"observation": arm.get_observation(), "action": dict(still)})["action"])
+        assert guard.intervened is not over
+        guard.reset()
+        arm.send_action(guard({"observation": arm.get_observation(), "action": dict(still)})["action"])
+        assert not guard.intervened
+
+
+def test_slow_goes_a_fifth_of_the_way_and_monitor_only_says_so(monitor):
+    guard, arm = LeRobotGuard(monitor, "slow", clock=ticks()), Arm(203)
+    run(guard, arm, rows=115)
+    observation, action = arm.get_observation(), arm.policy(115)
+    sent = guard({"observation": observation, "action": action})["action"]
+    assert sent["elbow_flex.pos"] == pytest.approx(
+        observation["elbow_flex.pos"] + 0.2 * (action["elbow_flex.pos"] - observation["elbow_flex.pos"])
+    )
+    guard, arm = LeRobotGuard(monitor, "monitor", clock=ticks()), Arm(203)
+    alarms, others = run(guard, arm, rows=120)
+    assert alarms
+    assert not others
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda o, a: o.pop("wrist_roll.pos"),
+        lambda o, a: o.update({"wrist_roll.pos": float("nan")}),
+        lambda o, a: a.update({"wrist_roll.pos": float("inf")}),
+    ],
+)
+def test_what_is_missing_or_not_finite_is_held_at_once_at_finite_numbers(monitor, spoil):
+    guard, arm = LeRobotGuard(monitor, clock=ticks()), Arm(204)
+    run(guard, arm, rows=60, jam=-1)
+    observation, action = arm.get_observation(), arm.policy(60)
+    spoil(observation, action)
+    sent = guard({"observation": observation, "action": action})["action"]
+    assert guard.intervened
+    assert np.isfinite(list(sent.values())).all()
+    assert abs(sent["wrist_roll.pos"] - arm.q[4]) < 8  # near where it stands
+
+
+def test_a_monitor_that_fails_ends_in_the_hold(monitor, monkeypatch):
+    guard, arm = LeRobotGuard(monitor, clock=ticks()), Arm(205)
+    run(guard, arm, rows=60, jam=-1)
+    monkeypatch.setattr(type(monitor), "observe", lambda *args: 1 / 0)
+    guard({"observation": arm.get_observation(), "action": arm.policy(60)})
+    assert guard.intervened
+
+
+def test_what_it_cannot_guard_is_refused(monitor):
+    with pytest.raises(ValueError, match="unknown on_alarm 'run'; known: hold"):
+        LeRobotGuard(monitor, "run")
+    other = Episode.from_table({"q": np.zeros(20)}, rate=30.0).spec
+    monitor_of_other = make_monitor("kalman+evidence", other)
+    with pytest.raises(RuntimeError):
+        LeRobotGuard(monitor_of_other)
+    with pytest.raises(TypeError, match="actions have names"):
+        LeRobotGuard(monitor)({"observation": {}, "action": np.zeros(6)})
+
+
+def test_lerobots_own_pipeline_takes_it(monitor):
+    processor = needs("lerobot.processor")
+    converters = needs("lerobot.processor.converters")
+    guard, arm = LeRobotGuard(monitor, clock=ticks()), Arm(206)
+    pipeline = processor.RobotProcessorPipeline(
+        steps=[guard],
+        to_transition=converters.robot_action_observation_to_transition,
+        to_output=converters.transition_to_robot_action,
+    )
+    alarms, others = run(guard, arm, rows=120, step=lambda o, a: pipeline((a, o)))
+    assert 100 < alarms[0] <= 115
+    assert others[0] == alarms[0]
+    pipeline.reset()
+    assert not guard.intervened
+
+
+class Passing:
+    """A processor that changes nothing."""
+
+    def __call__(self, what):
+        return what
+
+    def reset(self) -> None:
+        pass
+
+
+def test_lerobots_own_loop_runs_a_policy_on_an_arm_and_the_guard_stays_it(monitor):
+    record = needs("lerobot.scripts.lerobot_record")
+    processor, converters = needs("lerobot.processor"), needs("lerobot.processor.converters")
+    torch = needs("torch")
+    guard, arm = LeRobotGuard(monitor, "stop"), Arm(207)
+    arm.name = arm.robot_type = "mock"
+    count = iter(range(10_000))
+
+    class Policy(Passing):
+        config = type("Config", (), {"device": "cpu", "use_amp": False})
+
+        def select_action(self, batch):
+            k = next(count)
+            arm.jammed[2] = k >= 60
+            return torch.tensor([list(arm.policy(k).values())])
+
+    feature = {"dtype": "float32", "shape": (6,), "names": MOTORS}
+    frames: list[dict] = []
+    dataset = type("Dataset", (), {"fps": 30, "features": {"observation.state": feature, "action": feature}})()
+    dataset.add_frame = frames.append
+    record.record_loop(
+        robot=arm,
+        events={"exit_early": False},
+        fps=30,
+        teleop_action_processor=Passing(),
+        robot_action_processor=processor.RobotProcessorPipeline(
+            steps=[guard],
+            to_transition=converters.robot_action_observation_to_transition,
+            to_output=converters.transition_to_robot_action,
+        ),
+        robot_observation_processor=Passing(),
+        dataset=dataset,
+        policy=Policy(),
+        preprocessor=Passing(),
+        postprocessor=Passing(),
+        control_time_s=4,
+    )
+    sent = np.array(arm.sent)
+    asked = np.array([frame["action"] for frame in frames])
+    np.testing.assert_allclose(sent[:60], asked[:60], atol=1e-4)
+    assert guard.intervened
+    assert np.ptp(sent[80:], axis=0).max() == 0
