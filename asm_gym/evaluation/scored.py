@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
@@ -107,6 +107,7 @@ class ScoredEpisode:
         affected_channels: those in which an attentive observer would see the fault first.
         top_channel: the one with the greatest share of surprise at ``first_alarm``; empty without an alarm.
         outcome: how the episode ended.
+        excused: (T,) surprise in the rows of knocks, and of stops, but for what excuses it; 0 in others. By event.
         detail: what only figures need.
     """
 
@@ -123,11 +124,12 @@ class ScoredEpisode:
     affected_channels: frozenset[str] = frozenset()
     top_channel: str = ""
     outcome: InterventionOutcome = InterventionOutcome()  # noqa: RUF009  (immutable)
+    excused: Mapping[str, Floats] = field(default_factory=dict)
     detail: TraceDetail | None = None
 
     def to_json(self) -> str:
         """All of it but ``detail``."""
-        kept = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "detail"}
+        kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "detail"}
         return json.dumps(
             kept, default=lambda value: value.tolist() if isinstance(value, np.ndarray) else sorted(value)
         )
@@ -139,7 +141,8 @@ class ScoredEpisode:
         outcome = InterventionOutcome(*kept.pop("outcome"))
         outcome = outcome._replace(contact=ContactForce(*outcome.contact))
         surprise, affected = np.array(kept.pop("surprise"), np.float64), frozenset(kept.pop("affected_channels"))
-        return cls(**kept, surprise=surprise, affected_channels=affected, outcome=outcome)
+        excused = {event: np.array(value) for event, value in kept.pop("excused", {}).items()}
+        return cls(**kept, surprise=surprise, affected_channels=affected, outcome=outcome, excused=excused)
 
     def __post_init__(self) -> None:
         if self.surprise.ndim != 1 or not len(self.surprise):

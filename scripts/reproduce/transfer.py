@@ -20,7 +20,7 @@ from asm_gym.faults.suite import TEST, kinds_of
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, NeuralASM
 from asm_gym.monitors.registry import check_monitor
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
-from asm_gym.rollouts.pretraining.healthy import harmless, healthy, held_out, learn_body
+from asm_gym.rollouts.pretraining.healthy import Lessons, harmless, healthy, held_out, learn_body
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.scoring import fitted
 from asm_gym.rollouts.trial import RolloutConfig
@@ -175,9 +175,13 @@ def judged(
     def made(name: str, fit: Sequence[Episode], calibration: Sequence[Episode]) -> CalibratedMonitor:
         return fitted(config.out.resolve(), name, fit, judge.seed).calibrate(calibration, config.false_alarm_rate)
 
+    def learned(lessons: Lessons) -> NeuralASM:
+        body = learn_body(lessons, lessons.fit[0].spec, judge.seed, lambda done, total: None)
+        return body.calibrate(lessons.calibration, config.false_alarm_rate)
+
     everywhere, lessons = config.watched, healthy(babbled)
     records = judge.records("of one policy", made("neural_asm", **shown), everywhere)
-    body = learn_body(lessons, config.false_alarm_rate, judge.seed, lambda done, total: None)
+    body = learned(lessons)
     records += judge.records("of the body", body, everywhere)
     shipped = NeuralASM.pretrained(SHIPPED)
     records += judge.records("of the body, as shipped", shipped, everywhere)
@@ -188,10 +192,9 @@ def judged(
             for name, memory in of_its_own(bodies, judge.own[watched], config, judge.seed):
                 records += judge.records(name, memory, [watched])
     for task in config.without:
-        others = healthy([e for e in babbled if e.labelled.task != task])
-        less = learn_body(others, config.false_alarm_rate, judge.seed, lambda done, total: None)
+        less = learned(healthy([e for e in babbled if e.labelled.task != task]))
         records += judge.records(f"of the body, without {task}", less, [w for w in everywhere if w.task == task])
     for rival in config.rivals:
         for name in (rival, rival + EVIDENCE):
-            records += judge.records(name, made(name, *lessons), everywhere)
+            records += judge.records(name, made(name, lessons.fit, lessons.calibration), everywhere)
     return records, fewer_senses(body, judge)
