@@ -282,7 +282,7 @@ def test_an_examination_is_told_at_each_rate_that_the_memory_can_promise():
     assert told == (
         f"In all: {nothing} faults, {nothing} knocks, {nothing} stops an hour in 0.00 healthy hours, 0 of 1 faults "
         "found, 1 of 2 pushes of 20 N noticed within 100 ms. At the threshold for 200 an hour, 2: 9000.0 (227.9 to "
-        f"50144.7) faults, {nothing} knocks, {nothing} stops an hour in 0.00 healthy hours, 1 of 1 faults found, "
+        f"50144.8) faults, {nothing} knocks, {nothing} stops an hour in 0.00 healthy hours, 1 of 1 faults found, "
         "2 of 2 pushes of 20 N noticed within 100 ms."
     )
 
