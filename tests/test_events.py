@@ -68,13 +68,17 @@ def test_a_knock_is_felt_for_a_second_at_any_rate():
         assert found[round(KNOCKED_S / dt)] == ("", 1.0)
 
 
+def test_a_finger_has_moved_for_a_tenth_of_a_second():
+    assert [d for _, d in excused([changed(8, -0.1), CALM, CALM])] == [SLIPPED, SLIPPED, 1.0]
+
+
 def test_streams_without_such_senses_excuse_nothing():
     assert excused([np.full(5, 1e9)], SPEC) == [("", 1.0)]
 
 
 def test_what_is_left_of_an_excused_surprise_adds_up_and_hides_nothing():
     raw = Surprise(np.array([60.0]), np.array([[20.0, 40.0]]))
-    _, by = Excuses(ARM).step(np.zeros(1, np.int64), changed(5, 80.0)[None])
+    _, by = Excuses(ARM).step(np.zeros((1, 2), np.int64), changed(5, 80.0)[None])
     left = raw.excused(by)
     assert left.value == pytest.approx(60.0 / EXCUSED)
     assert left.attribution.sum() == pytest.approx(left.value)

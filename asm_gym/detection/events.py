@@ -2,7 +2,7 @@
 
     knock    a wrist has felt more than 50 N on an axis within the last second; its peaks count, where they are sensed
     stop     a joint is within 0.03 rad of one of its stops
-    s'       s / 30 where either is so, s / 2 where a finger moves by more than its sensor's noise, s elsewhere
+    s'       s / 30 where either is so, s / 3 where a finger has just moved by more than its sensor's noise, else s
 
 A hand that strikes a table surprises, and so does a joint that comes to its stop or a finger that slips: none is
 a fault of the body, and between them they made four of five alarms of healthy robots. They are not forgiven. What is
@@ -31,10 +31,10 @@ KNOCKED_S = 1.0
 """For how long a knock is felt in what comes after it [s]."""
 NEAR_STOP = 0.03
 """[rad]"""
-EXCUSED, SLIPPED = 30.0, 2.0
-"""What surprise is divided by, at a knock or a stop, and while fingers move."""
-MOVING = 5.0
-"""Standard deviations of its sensor's noise at which a finger moves."""
+EXCUSED, SLIPPED = 30.0, 3.0
+"""What surprise is divided by, at a knock or a stop, and where fingers move."""
+MOVING, MOVED_S = 5.0, 0.1
+"""Standard deviations of its sensor's noise at which a finger moves, and for how long it has just moved [s]."""
 
 
 class Excused(NamedTuple):
@@ -63,11 +63,11 @@ class Excuses:
         self._ends = np.array([pair for c in spec.channels for pair in c.stops], np.float64).reshape(-1, 2)
         self._fingers = _columns(spec, lambda c: c.name.endswith("gripper_velocity") and c.noise > 0)
         self._moving = MOVING * spec.noise[self._fingers]
-        self._rows = max(1, round(KNOCKED_S / spec.dt))
+        self._rows = tuple(max(1, round(seconds / spec.dt)) for seconds in (KNOCKED_S, MOVED_S))
 
     def start(self, batch: int) -> NDArray[np.int64]:
-        """(B,) for how many rows a knock is still felt: none."""
-        return np.zeros(batch, np.int64)
+        """(B, 2) for how many rows a knock is still felt, and fingers have just moved: none."""
+        return np.zeros((batch, 2), np.int64)
 
     def step(self, left: NDArray[np.int64], rows: NDArray[np.float64]) -> tuple[NDArray[np.int64], Excused]:
         """What the next rows (B, D) excuse, some of whose numbers may not be finite."""
@@ -92,22 +92,23 @@ def _columns(spec: StreamSpec, which: Callable[[Channel], bool]) -> NDArray[np.i
 
 
 @compiled
-def _step(left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any, moving: Any, lasting: int) -> Any:
+def _step(left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any, moving: Any, lasting: Any) -> Any:
     B = len(rows)
-    after, kind, divisor = np.zeros(B, np.int64), np.zeros(B, np.int8), np.ones(B)
+    after, kind, divisor = np.maximum(left - 1, 0), np.zeros(B, np.int8), np.ones(B)
     for n in range(B):
-        after[n] = max(left[n] - 1, 0)
         for i in wrist:
             if abs(rows[n, i]) > KNOCKING and np.isfinite(rows[n, i]):
-                after[n] = lasting
+                after[n, 0] = lasting[0]
         for j in range(len(fingers)):
-            if abs(rows[n, fingers[j]]) > moving[j]:
-                divisor[n] = SLIPPED
+            if abs(rows[n, fingers[j]]) > moving[j] and np.isfinite(rows[n, fingers[j]]):
+                after[n, 1] = lasting[1]
+        if after[n, 1] > 0:
+            divisor[n] = SLIPPED
         for j in range(len(joints)):
             q = rows[n, joints[j]]
             if q < ends[j, 0] + NEAR_STOP or q > ends[j, 1] - NEAR_STOP:
                 kind[n] = 2
-        if after[n] > 0:
+        if after[n, 0] > 0:
             kind[n] = 1
         if kind[n] > 0:
             divisor[n] = EXCUSED
