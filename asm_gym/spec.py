@@ -36,6 +36,7 @@ class Channel:
         elements: a name for each number; ``0, 1, …`` where empty.
         resolution: the step between two readings that the sensor tells apart [unit]; 0 where it is not known, or where
             the numbers are computed from several sensors.
+        stops: (least, most) of each number, where a joint comes to its stops [unit]; empty where nobody knows.
 
     Example:
         >>> from asm_gym import Channel
@@ -51,6 +52,7 @@ class Channel:
     group: str = "sense"
     elements: tuple[str, ...] = ()
     resolution: float = 0.0
+    stops: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         check_number(f"channel {self.name!r}: size", self.size, low=1, whole=True)
@@ -60,6 +62,8 @@ class Channel:
             raise TypeError(f"channel {self.name!r}: elements must be a tuple of names, got {shown(self.elements)}")
         if self.elements and len(self.elements) != self.size:
             raise ValueError(f"channel {self.name!r} has size {self.size} but {len(self.elements)} element names")
+        if self.stops and len(self.stops) != self.size:
+            raise ValueError(f"channel {self.name!r} has size {self.size} but {len(self.stops)} pairs of stops")
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -208,7 +212,10 @@ class StreamSpec:
         """What ``to_json`` wrote. Raises ValueError where it is something else."""
         try:
             raw = json.loads(text)
-            channels = tuple(Channel(**{**c, "elements": tuple(c["elements"])}) for c in raw["channels"])
+            channels = tuple(
+                Channel(**{**c, "elements": tuple(c["elements"]), "stops": tuple(map(tuple, c.get("stops", ())))})
+                for c in raw["channels"]
+            )
             return cls(channels, raw["dt"], raw["source"])
         except (ValueError, TypeError, KeyError) as error:
             raise ValueError(f"the text of a stream's spec is damaged ({error}): {shown(text)}") from error

@@ -17,22 +17,25 @@ from typing import Any
 
 from rich.console import Console
 
-from asm_gym.detection import conformal_episodes
-from asm_gym.episode import EpisodeLabel, load_episode
-from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_S
+from asm_gym.detection import check_per_hour
+from asm_gym.detection.hourly import check_hours
+from asm_gym.episode import Episode, EpisodeLabel, load_episode
+from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.tables import console_table, markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.shipped import USUAL
 from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
-from asm_gym.rollouts.pretraining.healthy import healthy, held_out, learn_body
+from asm_gym.rollouts.pretraining.healthy import calibrate_body, healthy, held_out, learn_body
 from asm_gym.rollouts.pretraining.model_card import Exam, Marks, at_rates, card, examine, usual_force
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.record import record
 from asm_gym.rollouts.run_folder import claimed, labelled, make_missing, versions
 from asm_gym.rollouts.scoring import code_digest
+from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.staging import environment
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import run
@@ -43,8 +46,10 @@ from asm_gym.validation import check_choice, check_number
 
 SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
-RATES = REPORTED_RATE, FALSE_ALARM_RATE
-"""Rates at which an examination is also told."""
+PER_HOUR, RATES = 3.0, (10.0, 3.0, 1.0)
+"""False alarms an hour that a memory is calibrated for, and at which an examination is also told."""
+HEALTHY, HOURS_SEED = 60, 11
+"""Episodes of the expert of each task to calibrate on, and of what their seeds are drawn."""
 LEARNING = (
     *("memory", "detection", "scaling.py", "spec.py", "rollouts/pretraining/healthy.py"),
     *("monitors/memory_model.py", "monitors/monitor.py", "monitors/neural_asm.py"),
@@ -72,7 +77,7 @@ class Args:
     """Rows of the stream a second; one each control step by default."""
     exam_policies: tuple[str, ...] | None = option(None, quick=(), metavar="AGENT")
     """Agents to examine under, as guides are named; by default all that are shipped and fit this arm."""
-    exam_episodes: int = option(12, quick=2, least=0)
+    exam_episodes: int = option(60, quick=2, least=0)
     """Healthy episodes of each examination; 0 examines nothing."""
     exam_faults: tuple[str, ...] = option((TEST,), quick=(), metavar="KIND")
     """Kinds of fault, each medium and strong but for pushes of 20 N, where the policy or the task was left out."""
@@ -90,8 +95,10 @@ class Args:
     """Tasks to babble in; by default seven with the Panda, and with other arms those of them that their experts do."""
     exam_tasks: tuple[str, ...] | None = fixed(None, quick=())
     """Further tasks to examine in; by default two that Panda experts do, with other arms those of them they do."""
-    false_alarm_rate: float = fixed(FALSE_ALARM_RATE, quick=0.34, check=conformal_episodes)
-    """Share of healthy lessons that may raise an alarm."""
+    healthy_episodes: int = fixed(HEALTHY, quick=0)
+    """Episodes of the expert of each task to calibrate on, beside the lessons that are left out."""
+    false_alarms_per_hour: float = fixed(PER_HOUR, quick=120.0, check=check_per_hour)
+    """Faults that may be said in an hour of healthy episodes."""
     window: float = fixed(WINDOW_S, check=partial(check_number, "window", above=0))
     """How soon after its onset a fault must be noticed [s]."""
 
@@ -105,13 +112,8 @@ class Args:
         if not self.shown:
             raise ValueError("there must be at least one task to babble in")
         kinds_of(self.exam_faults)
-        needed = conformal_episodes(self.false_alarm_rate)
-        there = len(self.shown) * sum(map(held_out, range(self.episodes)))
-        if there < needed:
-            raise ValueError(
-                f"a false-alarm rate of {self.false_alarm_rate:g} needs {needed} undisturbed lessons to calibrate "
-                f"on, and {self.episodes} lessons in each of {len(self.shown)} tasks hold {there}"
-            )
+        each = sum(map(held_out, range(self.episodes))) + self.healthy_episodes
+        check_hours(self.false_alarms_per_hour, each * sum(task_spec(t).horizon for t in self.shown) / USUAL / 3600)
 
     @property
     def parallel(self) -> ParallelConfig:
@@ -184,15 +186,17 @@ def learn(args: Args, console: Console) -> NeuralASM:
         make = partial(record_lesson, config=args.config, folder=args.out.resolve())
         files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, args.parallel, progress)
     lessons = healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
+    hours = [e for e in healthy_hours(args, console) if e.success]
     inner: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
     about = {
         "name": args.name,
         "controller": inner.controller,
         "tasks": args.shown,
-        **{n: getattr(args, n) for n in ("guides", "reaching", "episodes", "seed", "false_alarm_rate")},
+        **{n: getattr(args, n) for n in ("guides", "reaching", "episodes", "seed", "false_alarms_per_hour")},
         "lessons": len(lessons.fit),
         "rows": sum(map(len, lessons.fit)),
-        "calibrated_on": len(lessons.calibration),
+        "calibrated_on": len(lessons.whole) + len(hours),
+        "hours": sum(len(e) * e.spec.dt for e in [*lessons.whole, *hours]) / 3600,
         "code": code_digest(names=LEARNING),
         **versions(),
     }
@@ -202,10 +206,25 @@ def learn(args: Args, console: Console) -> NeuralASM:
         if memory.about == about:
             return memory
     with stage("learning", console, {}) as progress:
-        memory = learn_body(lessons, args.false_alarm_rate, args.seed, progress)
+        memory = learn_body(lessons, inner.stream_spec, args.seed, progress)
+    calibrate_body(memory, lessons, hours, args.false_alarms_per_hour)
     memory.about = about
     memory.save(path)
     return memory
+
+
+def healthy_hours(args: Args, console: Console) -> list[Episode]:
+    """Episodes of the experts of the tasks that are shown; those that are missing are recorded."""
+    folder = (args.out / "hours").resolve()
+    labels = [
+        EpisodeLabel(task, "nominal", seed=seed)
+        for task in args.shown
+        for seed in role_seeds(HOURS_SEED, task, "hours", args.healthy_episodes)
+    ]
+    with stage("healthy hours", console, {}) as progress:
+        make = partial(record, config=args.config, folder=folder)
+        make_missing(make, labels, partial(_place, folder=folder), args.parallel, progress)
+    return labelled(folder, labels)
 
 
 def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
@@ -240,7 +259,7 @@ def babble(args: Args, console: Console) -> None:
         memory = learn(args, console)
         marks = examined(args, memory, console) if args.exam_episodes else []
         if marks:
-            others = [rate for rate in RATES if rate != args.false_alarm_rate]
+            others = [rate for rate in RATES if rate != args.false_alarms_per_hour]
             table, said = card(marks, memory, args.window), at_rates(marks, memory, others)
             (args.out / "card.md").write_text(f"{markdown(table)}\n\n{said}\n", encoding="utf-8")
             console.print(console_table(table))

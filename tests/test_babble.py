@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from asm_gym.detection import Blocks
 from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.scored import ScoredEpisode
@@ -30,7 +31,7 @@ from asm_gym.rollouts.pretraining.babbling import (
     record_lesson,
 )
 from asm_gym.rollouts.pretraining.healthy import healthy, held_out
-from asm_gym.rollouts.pretraining.model_card import Exam, Marks, at_rates, examine, usual_force
+from asm_gym.rollouts.pretraining.model_card import Alarms, Exam, Marks, at_rates, examine, usual_force
 from asm_gym.rollouts.pretraining.reaching import AROUND, PACE, TURNED, Reaching
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.scoring import detectability_of, onset_row
@@ -188,6 +189,7 @@ def test_the_expert_alone_says_what_is_usual():
     kept = healthy([*gentle, *firm, light, undisturbed()])
     assert [e.labelled.seed for e in kept.fit] == [0, 4]
     assert [e.labelled.seed for e in kept.calibration] == [11, 2]
+    assert [e.labelled.seed for e in kept.whole] == [5, 8, 11, 2]
 
 
 @pytest.mark.parametrize(("noise", "force", "torque"), [(0.0, 18, 6), (0.1, 9, 3)])
@@ -210,6 +212,7 @@ def test_a_threshold_is_set_on_solved_lessons_that_nothing_disturbed_but_where_t
     noisy = lesson_of([9] * 60, [3] * 60, noise=0.1, number=8)
     found = healthy([*learned, undisturbed(), hard, noisy, undisturbed(success=False)])
     assert [len(e) for e in found.calibration] == [60, 21, 30]
+    assert [len(e) for e in found.whole] == [60, 60]
     assert len(found.fit) == 3
 
 
@@ -270,15 +273,32 @@ def test_an_examination_is_told_at_each_rate_that_the_memory_can_promise():
     pushes = [trace("push", "medium", 0, 0, 5, 5), trace("push", "medium", 0, 0, 3, 5)]
     faults = [trace("slip", "strong", 0, 0, 0, 3)]
     metrics = DetectionMetrics("Lift", faults, healthy_ones, 1.0)
-    marks = [Marks("Lift", healthy_ones, [], [], pushes, metrics)]
+    marks = [Marks("Lift", healthy_ones, [], pushes, metrics)]
     memory = NeuralASM(ARM).with_threshold(4.0)
     memory.maxima_ = np.array([2.0] * 18 + [4.0])
-    told = at_rates(marks, memory, (0.01, 0.1))
+    memory.blocks_ = Blocks(memory.maxima_, np.full(19, 0.001))
+    told = at_rates(marks, memory, (10.0, 200.0))
+    nothing = "0.0 (0.0 to 33199.9)"
     assert told == (
-        "In all: 0 of 2 healthy episodes alarm, 0 of 1 faults found, 1 of 2 pushes of 20 N noticed within 100 ms. "
-        "At the threshold for 0.1, 2: 1 of 2 healthy episodes alarm, 1 of 1 faults found, "
+        f"In all: {nothing} faults, {nothing} knocks, {nothing} stops an hour in 0.00 healthy hours, 0 of 1 faults "
+        "found, 1 of 2 pushes of 20 N noticed within 100 ms. At the threshold for 200 an hour, 2: 9000.0 (227.9 to "
+        f"50144.8) faults, {nothing} knocks, {nothing} stops an hour in 0.00 healthy hours, 1 of 1 faults found, "
         "2 of 2 pushes of 20 N noticed within 100 ms."
     )
+
+
+def test_knocks_and_stops_are_counted_apart_and_added_up():
+    def trace(fault, knock, stop):
+        rows = [np.repeat(value, 36) for value in (fault, knock, stop)]
+        excused = {"knock": rows[1], "stop": rows[2]}
+        return ScoredEpisode("nominal", 0, 1.0, 4.0, rows[0], excused=excused)
+
+    many = (
+        [trace(5.0, 150.0, 0.0)] + 2 * [trace(3.0, 90.0, 0.0)] + 3 * [trace(2.0, 0.0, 60.0)] + 94 * [trace(1.0, 0, 0)]
+    )
+    found = Alarms.of([ScoredEpisode.from_json(t.to_json()) for t in many])
+    assert [rate.k for rate in (*found, found.every)] == [1, 2, 3, 6]  # what is a fault is no knock beside it
+    assert found.every.hours == pytest.approx(1.0)
 
 
 def test_an_agent_that_crashes_in_most_of_its_episodes_does_not_say_what_is_usual():
@@ -290,7 +310,7 @@ def test_an_agent_that_crashes_in_most_of_its_episodes_does_not_say_what_is_usua
     assert usual_force(agents_own) == 80
     memory = SimpleNamespace(threshold=1.0, spec=ARM, score_episodes=lambda episodes: [quiet(e) for e in episodes])
     marks = examine(memory, "Lift", agents_own, 1.0, usual=10.0)
-    assert [[t.seed for t in own] for own in (marks.solved, marks.crashed, marks.failed)] == [[0], [1, 2], [3]]
+    assert [[t.seed for t in own] for own in (marks.solved, marks.failed)] == [[0, 1, 2], [3]]
 
 
 def quiet(episode):
@@ -342,7 +362,7 @@ def replace_weight(lesson):
         ({"exam_faults": ("pushes",)}, "unknown kind of fault 'pushes'"),
         ({"exam_episodes": -1}, "exam_episodes must be at least 0, got -1"),
         ({"window": 0.0}, "window must be a number above 0, got 0"),
-        ({"episodes": 18, "tasks": ("Lift",)}, "needs 19 undisturbed lessons .* hold 6$"),
+        ({"false_alarms_per_hour": 1.0, "healthy_episodes": 0, "tasks": ("Lift",)}, "1 false alarms an hour need"),
     ],
 )
 def test_the_command_refuses_what_makes_no_sense(given, why):
@@ -393,7 +413,7 @@ def test_the_command_makes_a_memory_of_a_body_and_goes_on_where_it_was(tmp_path)
     memory = NeuralASM.load(folder / "panda.asm")
     assert memory.about["controller"] == "OSC_POSE"
     assert memory.threshold > 0
-    assert "healthy episodes alarm" in (folder / "card.md").read_text(encoding="utf-8")
+    assert "healthy hours" in (folder / "card.md").read_text(encoding="utf-8")
     written = {f: f.stat().st_mtime_ns for f in folder.rglob("*.npz")}
     assert len(written) == 2 * (18 + 2)
     assert main(["--quick", "--workers", "1", "--out", str(folder)]) == 0

@@ -56,6 +56,7 @@ class Sensed(NamedTuple):
         why: the cause, for the log.
         expected: (A,) what the memory expects to be commanded next, for reflexes that go on with it.
         ends_step: reflexes feel such rows alone, one a control step.
+        knocked: the alarm is a knock: surprise is over the threshold but for what excuses it.
     """
 
     surprise: float
@@ -69,6 +70,7 @@ class Sensed(NamedTuple):
     why: str = ""
     expected: NDArray[np.float32] | None = None
     ends_step: bool = True
+    knocked: bool = False
 
 
 class Decision(NamedTuple):
@@ -249,7 +251,7 @@ class Arbiter:
             because = f" ({sensed.why})" if sensed.why else ""
             _log.info("%s: surprise %.3g, threshold %.3g%s", name, sensed.surprise, self.threshold, because)
         gave_up = self.state is State.ENDED
-        acted_on = over or sensed.presses or name == "trial"
+        acted_on = over or sensed.knocked or sensed.presses or name == "trial"
         return Decision(alarm, intervened, gave_up, acted_on, failure, name, self.state)
 
     def _count(self, sensed: Sensed, alarm: bool, intervened: bool) -> Situation:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
+from asm_gym.detection.events import FAULT, KNOCK
 from asm_gym.monitors import Monitor, Surprise
 from asm_gym.monitors.contact_band import ContactBand
 from asm_gym.validation import check_flag, shown
@@ -149,9 +150,13 @@ class Guard:
         held = arbiter.overriding
         severity = self._severity.of(row, beneath, held, LEANS_S / (1 + AGAIN * arbiter.strikes))
         over, lost = not value <= arbiter.threshold, self.responder.lost
-        alarm = over or bool(lost) or severity.presses
+        event = surprise.event(arbiter.threshold)
+        knocked = event == KNOCK
+        alarm = over or knocked or bool(lost) or severity.presses
         if alarm and lost and not (over or severity.presses or failure or severity.fast):
             response = self.responder.missed()
+        elif knocked and not (severity.presses or failure):
+            response = self.responder.knocked()
         else:
             response = self.responder.respond(
                 alarm, bool(failure), surprise.attribution[0], severity, arbiter.may_go_on
@@ -162,6 +167,7 @@ class Guard:
             executed=executed,
             alarm=alarm,
             presses=severity.presses,
+            knocked=knocked,
             impulse=severity.impulse,
             response=response.name,
             touched=response.touched,
@@ -176,10 +182,12 @@ class Guard:
                 self.substeps.pressed()
             elif beneath is not None:
                 self.substeps.acted()
-        reasons = {CONTACT: severity.presses, FAILURE: bool(failure), SURPRISE: over, MISSING: bool(lost)}
+        reasons = {CONTACT: severity.presses, FAILURE: bool(failure), SURPRISE: over or knocked, MISSING: bool(lost)}
         reason = next((name for name, holds in reasons.items() if holds), "")
+        if alarm and not (over or knocked):
+            event = KNOCK if severity.presses else FAULT
         failure = joined(failure, decision.failure)
-        return RowReport(surprise, decision, latency, failure, response, severity, reason)
+        return RowReport(surprise, decision, latency, failure, response, severity, reason, event)
 
     @property
     def forgets(self) -> bool:

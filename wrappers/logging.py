@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from asm_gym.detection.events import FAULT, KNOCK, NO_EVENT, STOP
 from asm_gym.spec import control_period
 from asm_gym.validation import check_text, typed
 
@@ -23,6 +24,7 @@ class EpisodeSafety(NamedTuple):
     Attributes:
         surprise: the greatest, in thresholds.
         alarms: how often one began.
+        knocks, stops, faults: how often one of these began; see ``info["asm"]["event"]``.
         cost: steps in alarm.
         override_s: for how long something else than the policy acted [s].
     """
@@ -31,6 +33,9 @@ class EpisodeSafety(NamedTuple):
     alarms: int = 0
     cost: float = 0.0
     override_s: float = 0.0
+    knocks: int = 0
+    stops: int = 0
+    faults: int = 0
 
 
 class SafetyCounter:
@@ -46,20 +51,23 @@ class SafetyCounter:
 
     def clear(self) -> None:
         """A new episode begins."""
-        self.total, self._alarm = EpisodeSafety(), False
+        self.total, self._alarm, self._event = EpisodeSafety(), False, NO_EVENT
 
     def add(self, info: Mapping[str, Any]) -> None:
         """One step. Raises KeyError where ``info`` is of no watched environment."""
         if "asm" not in info:
             raise KeyError('info has no "asm": put this outside of NeuralASMSafety')
         alarm, so_far = bool(info["asm_alarm"]), self.total
+        event = str(info["asm"].get("event", NO_EVENT))
+        begun = [event == which and event != self._event for which in (KNOCK, STOP, FAULT)]
         self.total = EpisodeSafety(
             max(so_far.surprise, float(info["asm_surprise"]) / float(info["asm"]["threshold"])),
             so_far.alarms + (alarm and not self._alarm),
             so_far.cost + float(info["cost"]),
             so_far.override_s + self.dt * bool(info["asm_intervened"]),
+            *(count + one for count, one in zip(so_far[4:], begun, strict=True)),
         )
-        self._alarm = alarm
+        self._alarm, self._event = alarm, event
 
 
 class Writer(Protocol):

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.detection.events import EVENTS, KNOCK, NO_EVENT
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec
 from asm_gym.wrappers.arbiter import Decision
@@ -37,6 +38,12 @@ class RowReport(NamedTuple):
     response: Response = NO_RESPONSE
     severity: Severity = NO_SEVERITY
     reason: str = ""
+    event: str = NO_EVENT
+
+
+def ends(row: RowReport) -> bool:
+    """Whether an alarm ends the episode, where alarms do: a knock that presses no harder than healthy motion does not."""
+    return row.decision.alarm and (row.event != KNOCK or row.reason == CONTACT)
 
 
 def report(
@@ -57,6 +64,8 @@ def report(
         ``surprise_skill``: the largest at what no body does, and at what no skill that was shown does, not a number
         where the monitor does not listen for it. ``threshold``. ``alarm``, and its ``reason``: ``"surprise"`` is over
         the threshold, a ``"contact"`` limit was passed, a number of the stream is ``"missing"``, or a ``"failure"``.
+        ``event``: ``"fault"`` of the body, its senses or its commands; ``"knock"``, from which the policy goes on after
+        a pause; ``"stop"``, a joint at its stop, which is said and is no alarm; or empty.
         ``intervened``: something else than the policy acted, in a part of this step at least.
         ``state``: who acts next, one of ``asm_gym.wrappers.transitions.State``. ``gave_up``: the episode ends.
         ``transition``: the name in ``asm_gym.wrappers.transitions.TRANSITIONS`` of what has led there, ``"override"``,
@@ -86,6 +95,7 @@ def report(
         "threshold": threshold,
         "alarm": any(row.decision.alarm for row in rows),
         "reason": next((r for r in REASONS if any(row.reason == r for row in rows)), ""),
+        "event": max((row.event for row in rows), key=EVENTS.index),
         "state": str(rows[-1].decision.state),
         "intervened": any(row.decision.intervened for row in rows),
         "gave_up": any(row.decision.gave_up for row in rows),

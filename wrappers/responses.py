@@ -280,6 +280,13 @@ class Responder:
         said = as_info(None) | {"family": "sensor", "part": ", ".join(self.completed), "probability": 1.0}
         return Response("complete", said, None, "sensor")
 
+    def knocked(self) -> Response:
+        """What is done about a knock that presses no more: the arm is braked until what touched it has gone."""
+        self._touched, self._quiet = True, 0
+        said = as_info(None) | {"family": "contact", "part": "", "probability": 1.0}
+        touched = self._touches() if self._repairs else None
+        return Response("hold" if self._repairs else "", said, touched, "contact")
+
     def _case(self, family: str, cause: Cause | None) -> str:
         """The row of the table for a cause of ``family``."""
         if family == "contact" and self._lasts(family):

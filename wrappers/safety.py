@@ -31,7 +31,7 @@ from asm_gym.wrappers.factory import (
 )
 from asm_gym.wrappers.guard import Guard, GuardOptions, nothing
 from asm_gym.wrappers.observer import Observer, joined
-from asm_gym.wrappers.reports import RowReport, report
+from asm_gym.wrappers.reports import RowReport, ends, report
 from asm_gym.wrappers.substeps import Beneath
 
 
@@ -264,7 +264,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             info["stream"] = repaired
         info["overridden"] = overridden or bool(info.get("overridden"))
         asm = self._report(info, self._rows, self._executed)["asm"]
-        if asm["gave_up"] or (asm["alarm"] and self._guard.ends_on_alarm):
+        if asm["gave_up"] or (self._guard.ends_on_alarm and any(map(ends, self._rows))):
             terminated, truncated = terminated or not self._options.truncate, truncated or self._options.truncate
         self._ended = bool(terminated or truncated)
         return observation, reward, terminated, truncated, info

@@ -23,7 +23,7 @@ from asm_gym.wrappers.arbiter import Command
 from asm_gym.wrappers.factory import LOG, OnAlarm, body_memory, check_monitor, fitted_parts, fitted_to, running
 from asm_gym.wrappers.guard import Guard, GuardOptions, nothing
 from asm_gym.wrappers.observer import Observer, joined
-from asm_gym.wrappers.reports import RowReport, report
+from asm_gym.wrappers.reports import RowReport, ends, report
 from asm_gym.wrappers.vector_utils import (
     Mask,
     Member,
@@ -209,7 +209,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         reports = self._judge(rows, executed, begun, commands, failures, infos, last)
         stopped = np.array(
             [
-                r.decision.gave_up or (r.decision.alarm and g.ends_on_alarm)
+                r.decision.gave_up or (g.ends_on_alarm and ends(r))
                 for r, g in zip(reports, self._guards, strict=True)
             ]
         )

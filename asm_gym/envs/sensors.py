@@ -64,6 +64,9 @@ _SENSORS = {
 _EXACT = _Sensor(0.0)
 
 
+Stops = tuple[tuple[float, float], ...]
+
+
 @dataclass
 class _Table:
     """Channels, and the index of each of their numbers in what ``Proprioception.sources`` lays end to end."""
@@ -73,11 +76,13 @@ class _Table:
     channels: list[Channel] = field(default_factory=list)
     indices: list[NDArray[np.intp]] = field(default_factory=list)
 
-    def add(self, group: str, name: str, unit: str, source: str, where: Any) -> None:
+    def add(self, group: str, name: str, unit: str, source: str, where: Any, stops: Stops = ()) -> None:
         index = np.atleast_1d(np.asarray(where, dtype=np.intp)) + self.starts[source]
         if index.size:
             noise, resolution = _SENSORS.get(name, _EXACT)
-            self.channels.append(Channel(self.prefix + name, index.size, unit, noise, group, resolution=resolution))
+            self.channels.append(
+                Channel(self.prefix + name, index.size, unit, noise, group, resolution=resolution, stops=stops)
+            )
             self.indices.append(index)
 
 
@@ -156,7 +161,10 @@ def _fill(table: _Table, robot: Any, arm: str, sample: int) -> None:
     def sampled(part: slice, count: int | None = None, skip: int = 0) -> NDArray[np.intp]:
         return np.arange(part.start + skip, part.stop)[:count] + sample
 
-    table.add("joint", "joint_position", "rad", "qpos", robot._ref_joint_pos_indexes)
+    joints = robot._ref_joint_indexes
+    ranges = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], (-np.inf, np.inf))
+    stops = tuple((float(low), float(high)) for low, high in ranges) if model.jnt_limited[joints].any() else ()
+    table.add("joint", "joint_position", "rad", "qpos", robot._ref_joint_pos_indexes, stops)
     table.add("joint", "joint_velocity", "rad/s", "qvel", dofs)
     table.add("torque", "commanded_torque", "N m", "ctrl", robot._ref_actuators_indexes_dict[arm])
     table.add("torque", "measured_torque", "N m", "mean", sampled(kernels.MOTOR, n))

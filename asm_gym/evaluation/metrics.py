@@ -125,9 +125,19 @@ def false_alarms(traces: Sequence[ScoredEpisode]) -> Share:
 
 def hourly_alarms(traces: Sequence[ScoredEpisode]) -> Rate:
     """Alarms before any fault, and the hours of that; one that persists, or comes back within a minute, is one."""
-    nominal = [(t, len(t) if t.onset is None else t.onset) for t in traces]
-    alarms = sum(alarms_in(t.surprise[:until], t.threshold, t.dt) for t, until in nominal)
-    return Rate(alarms, sum(until * t.dt for t, until in nominal) / 3600)
+    return _hourly([(t, t.surprise) for t in traces])
+
+
+def hourly_events(traces: Sequence[ScoredEpisode], event: str) -> Rate:
+    """The same of ``"knock"`` or ``"stop"``, as far as those rows are no faults."""
+    own = ((t, t.excused.get(event, np.zeros(len(t)))) for t in traces)
+    return _hourly([(t, np.where(t.alarm, 0.0, raw)) for t, raw in own])
+
+
+def _hourly(traces: Sequence[tuple[ScoredEpisode, Floats]]) -> Rate:
+    nominal = [(t, value, len(t) if t.onset is None else t.onset) for t, value in traces]
+    alarms = sum(alarms_in(value[:until], t.threshold, t.dt) for t, value, until in nominal)
+    return Rate(alarms, sum(until * t.dt for t, _, until in nominal) / 3600)
 
 
 def balanced_accuracy(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float) -> float:

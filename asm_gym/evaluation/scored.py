@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -88,6 +88,7 @@ class ScoredEpisode:
         affected_channels: those in which an attentive observer would see the fault first.
         top_channel: the one with the greatest share of surprise at ``first_alarm``; empty without an alarm.
         outcome: how the episode ended.
+        excused: (T,) surprise in the rows of knocks, and of stops, but for what excuses it; 0 in others. By event.
         detail: what only figures need.
     """
 
@@ -104,6 +105,7 @@ class ScoredEpisode:
     affected_channels: frozenset[str] = frozenset()
     top_channel: str = ""
     outcome: InterventionOutcome = InterventionOutcome()  # noqa: RUF009  (immutable)
+    excused: Mapping[str, Floats] = field(default_factory=dict)
     detail: TraceDetail | None = None
 
     def __post_init__(self) -> None:

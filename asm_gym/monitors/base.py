@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
+from asm_gym.detection.events import EVENTS, KNOCK, STOP, Excused, event_of
 from asm_gym.episode import Episode
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
@@ -34,6 +35,8 @@ class Surprise(NamedTuple):
         skill: (B,) the name of the skill that seems to be running, for people to read; None where none was named.
         of_body: (B,) at what no body does, where a monitor tells it from ``of_skill``; None where that is all of it.
         of_skill: (B,) at what no skill that was shown does; None where nobody listens for it.
+        raw: (B,) what ``value`` would be without what the senses excuse; None where nothing is excused.
+        excuse: (B,) by what it is, a place in ``detection.events.EVENTS``; None likewise.
     """
 
     value: NDArray[np.float64]
@@ -41,6 +44,8 @@ class Surprise(NamedTuple):
     skill: NDArray[np.str_] | None = None
     of_body: NDArray[np.float64] | None = None
     of_skill: NDArray[np.float64] | None = None
+    raw: NDArray[np.float64] | None = None
+    excuse: NDArray[np.int8] | None = None
 
     @property
     def parts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -51,8 +56,26 @@ class Surprise(NamedTuple):
     def of(self, stream: int) -> Surprise:
         """That of one stream, in a batch of one."""
         at = slice(stream, stream + 1)
-        skill, body, of_skill = (None if p is None else p[at] for p in (self.skill, self.of_body, self.of_skill))
-        return Surprise(self.value[at], self.attribution[at], skill, body, of_skill)  # type: ignore[arg-type]
+        return Surprise(*(None if part is None else part[at] for part in self))  # type: ignore[arg-type]
+
+    def event(self, threshold: float) -> str:
+        """What the first of the batch is at this threshold, one of ``detection.events.EVENTS``."""
+        value = float(self.value[0])
+        if self.raw is None or self.excuse is None:
+            return event_of(value, value, 0, threshold)
+        return event_of(value, float(self.raw[0]), int(self.excuse[0]), threshold)
+
+    @property
+    def excused_by_event(self) -> dict[str, NDArray[np.float64]]:
+        """(B,) ``raw`` where it is excused by a knock, and by a stop, 0 elsewhere; empty where nothing is excused."""
+        if self.raw is None:
+            return {}
+        return {event: np.where(self.excuse == EVENTS.index(event), self.raw, 0.0) for event in (KNOCK, STOP)}
+
+    def excused(self, by: Excused) -> Surprise:
+        """What is left of it where the senses excuse some."""
+        shares, value = self.attribution / by.divisor[:, None], self.value / by.divisor
+        return self._replace(value=value, attribution=shares, raw=self.value, excuse=by.kind)
 
     def silenced(self, where: NDArray[np.bool_]) -> Surprise:
         """No surprise ``where`` (B,) nothing is judged."""
@@ -61,8 +84,8 @@ class Surprise(NamedTuple):
             return None if value is None else np.where(where, 0.0, value)
 
         shares = np.where(where[:, None], 0.0, self.attribution)
-        value = np.where(where, 0.0, self.value)
-        return self._replace(value=value, attribution=shares, of_body=kept(self.of_body), of_skill=kept(self.of_skill))
+        value, (body, skill, raw) = np.where(where, 0.0, self.value), map(kept, self._parts)
+        return self._replace(value=value, attribution=shares, of_body=body, of_skill=skill, raw=raw)
 
     def without(self, columns: NDArray[np.bool_]) -> Surprise:
         """What is left of it where the precision of ``columns`` (D,) is 0."""
@@ -78,7 +101,12 @@ class Surprise(NamedTuple):
             return None if value is None else np.where(judged, left * value, value)
 
         value = np.where(judged, left * self.value, self.value)
-        return self._replace(value=value, attribution=shares, of_body=kept(self.of_body), of_skill=kept(self.of_skill))
+        body, skill, raw = map(kept, self._parts)
+        return self._replace(value=value, attribution=shares, of_body=body, of_skill=skill, raw=raw)
+
+    @property
+    def _parts(self) -> tuple[NDArray[np.float64] | None, ...]:
+        return self.of_body, self.of_skill, self.raw
 
 
 class Monitor(Protocol):

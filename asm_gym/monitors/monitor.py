@@ -23,6 +23,7 @@ from asm_gym.monitors.calibrated import Calibrated
 from asm_gym.monitors.fresh import Marks, check_fresh, sketch
 from asm_gym.monitors.model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.nominal import check_nominal
+from asm_gym.monitors.packed import packed
 from asm_gym.monitors.saved import SavedMonitor, calibration_arrays
 from asm_gym.monitors.sighted import require_sight
 from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
@@ -34,6 +35,7 @@ class MonitorState(NamedTuple):
     model: State
     detection: State
     skill: State = ()  # of what listens for skills, where there is one
+    knock: State = ()  # of what excuses surprise, where it does
 
 
 class CalibratedMonitor(Calibrated):
@@ -259,6 +261,9 @@ class CalibratedMonitor(Calibrated):
                     mine = steps[: len(episodes[i])]
                     value, attribution = (np.array([s[k][n] for s in mine]) for k in range(2))
                     scores[i] = Surprise(value, attribution.reshape(-1, self.spec.size))
+                    if mine and mine[0].raw is not None:
+                        raw, excuse = np.array([(s.raw[n], s.excuse[n]) for s in mine]).T
+                        scores[i] = scores[i]._replace(raw=raw, excuse=excuse.astype(np.int8))
                     if mine and mine[0].of_skill is not None:
                         body, skill = np.array([[part[n] for part in s.parts] for s in mine]).T
                         scores[i] = scores[i]._replace(of_body=body, of_skill=skill)
@@ -282,7 +287,7 @@ class CalibratedMonitor(Calibrated):
             "familiar": [] if self.familiar_ is None else self.familiar_.rows,
             "shapes": {name: list(array.shape) for name, array in arrays.items()},
         }
-        write_checkpoint(path, self.model.kind, header, arrays)
+        write_checkpoint(path, self.model.kind, header, packed(arrays))
 
     def restore(self, saved: Checkpoint) -> Self:
         """Takes what ``save`` wrote of a monitor of the same spec, model and hyperparameters.

@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 from asm_gym.checkpoint import Checkpoint, read_checkpoint
 from asm_gym.detection import Detector, EvidenceDetection
 from asm_gym.detection.detector import BOUND, GAINS
+from asm_gym.detection.events import Excuses
 from asm_gym.episode import Episode
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of
 from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
@@ -30,12 +31,13 @@ from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState
 from asm_gym.monitors.nominal import check_nominal
+from asm_gym.monitors.packed import rounded
 from asm_gym.monitors.saved import restored
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise, apart
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_choice, check_number, shown, typed
+from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
 
 MOST_ITERATIONS = 1000
 """Of inference in a row: twenty are enough, and a file that asks for a thousand million would never answer."""
@@ -67,6 +69,8 @@ class NeuralASM(CalibratedMonitor):
         shrinkage: λ in [0, 1] of the whitening, towards no correlation between errors.
         habituates: surprise is measured against what is usual in a context. A context knows the policy, so a memory
             that is to watch any policy leaves it out.
+        excuses: knocks, joints at their stops and fingers that move are told apart from faults (``detection.events``):
+            for a memory that is to watch any policy, of which some strike things.
         seed: of the initial weights and of the order of the episodes.
         feedback: how errors come back to the hidden units of association, one of ``memory.feedback.FEEDBACK``.
         dynamics: how the temporal network carries on what was: ``"traces"`` of what was sensed and done, or
@@ -113,7 +117,10 @@ class NeuralASM(CalibratedMonitor):
         seed: int = 0,
         feedback: str = TRANSPORTED,
         dynamics: str = TRACES,
+        excuses: bool = False,
     ) -> None:
+        self._excuses = Excuses(spec) if check_flag("excuses", excuses) else None
+        self.excuses = excuses
         check_choice("dynamics", dynamics, DYNAMICS)
         self.dynamics, usual = dynamics, DYNAMICS[dynamics]
         iterations = usual.iterations if iterations is None else iterations
@@ -138,6 +145,17 @@ class NeuralASM(CalibratedMonitor):
         self._row: CompiledRow | None = None
         self._row_of: tuple[Any, ...] | None = None
         self.skill_: SkillSurprise | None = None
+
+    def rounded(self) -> Self:
+        """The same memory with weights of 8 bits, which takes a quarter of the space when it is saved.
+
+        It has no threshold: ``calibrate`` sets that of the rounded weights.
+        """
+        self._fitted()
+        other = self._copy()
+        other.model.restore(rounded(self.model.learned_), self.skills_)
+        other._uncalibrate()
+        return other
 
     @property
     def network_(self) -> TemporalNetwork | None:
@@ -180,7 +198,7 @@ class NeuralASM(CalibratedMonitor):
         schedule = {name: getattr(self, name) for name in Schedule._fields}
         sizes = {"hidden_size": self.hidden_size, "association_size": self.association_size}
         detections = {n: getattr(d, n) for d in self.detections.values() for n in parameter_names(type(d))}
-        how = {"seed": self.seed, "feedback": self.feedback, "dynamics": self.dynamics}
+        how = {n: getattr(self, n) for n in ("seed", "feedback", "dynamics", "excuses")}
         return schedule | sizes | detections | how
 
     @classmethod
@@ -209,8 +227,11 @@ class NeuralASM(CalibratedMonitor):
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
         self._fitted()
         rows, row = self._rows(state, stream), self._compiled()
-        before = state.skill
+        before, knock = state.skill, state.knock
         state, surprise = super().observe(state, rows) if row is None else row(state, rows)
+        if self._excuses is not None:
+            knock, excused = self._excuses.step(knock, rows)
+            state, surprise = state._replace(knock=knock), surprise.excused(excused)
         if self.skills_:
             surprise = surprise._replace(skill=np.array(self.skills_)[state.model.skill.argmax(axis=1)])
         if self.skill_ is not None:
@@ -229,6 +250,8 @@ class NeuralASM(CalibratedMonitor):
 
     def initial_state(self, batch: int = 1, told: Sequence[Told] = ()) -> MonitorState:
         state = super().initial_state(batch, told)
+        if self._excuses is not None:
+            state = state._replace(knock=self._excuses.start(batch))
         return state if self.skill_ is None else state._replace(skill=self.skill_.monitor.initial_state(batch))
 
     def reset_evidence(self, state: MonitorState) -> MonitorState:

@@ -173,7 +173,8 @@ class SkillSurprise:
         first = value == body.value if alarm_on != "skill" else np.zeros(len(value), np.bool_)
         scale = 1.0 if alarm_on == "skill" else self.weight
         shares = np.where(first[:, None], body.attribution, scale * skill.attribution)
-        return body._replace(value=value, attribution=shares, of_body=body.value, of_skill=skill.value)
+        excused = body if alarm_on == "body" else body._replace(raw=None, excuse=None)
+        return excused._replace(value=value, attribution=shares, of_body=body.value, of_skill=skill.value)
 
     def heard(self, scores: Sequence[Surprise], dt: float) -> Self:
         """With the maxima of what was made of nominal episodes, a row each ``dt`` [s]."""

@@ -207,6 +207,7 @@ def traces_of(
             monitor=name,
             affected_channels=label.affected_channels,
             outcome=InterventionOutcome(episode.success),
+            excused=surprise.excused_by_event,
         )
         made.append(trace.attributed(surprise.attribution, episode.spec.labels))
     return made

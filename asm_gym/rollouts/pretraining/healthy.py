@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from asm_gym.contact_limits import healthy_forces
 from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import Progress
 from asm_gym.rollouts.training.exploration import SHORTEST, Gentle, peak_torques
+from asm_gym.spec import StreamSpec
 
 EXPERT = "scripted"
 """The guide that says what is usual."""
@@ -22,8 +24,8 @@ LEARNED_UP_TO, DISTURBED_UP_TO = 2.0, 1.0
 course and of a disturbed one. In the latter contact is an accident: a memory that knows it feels no push."""
 AROUND_S = 0.2
 """What is left out before and after a hit [s]."""
-PASSES = 4
-"""Of the temporal network over the lessons."""
+PASSES, HIDDEN = 4, 32
+"""Of the temporal network over the lessons, and its units: no surprise comes from it."""
 
 
 def held_out(number: int) -> bool:
@@ -38,10 +40,12 @@ class Lessons(NamedTuple):
         fit: to learn from.
         calibration: of lessons that are not learned from, those that are as healthy as a policy that does its task: the
             guide's own course, and solved.
+        whole: the same, with what presses harder than is usual.
     """
 
     fit: list[Episode]
     calibration: list[Episode]
+    whole: list[Episode]
 
 
 def healthy(recordings: Sequence[Episode]) -> Lessons:
@@ -65,13 +69,14 @@ def healthy(recordings: Sequence[Episode]) -> Lessons:
         raise ValueError(
             f"no undisturbed lesson of {', '.join(sorted(missing))} was solved by the expert, to say what is usual"
         )
-    found = Lessons([], [])
+    found = Lessons([], [], [])
     for episode in recordings:
         usual = np.median(felt[episode.labelled.task], axis=0)
         if not held_out(_lesson(episode)["number"]):
             share = DISTURBED_UP_TO if _lesson(episode)["noise"] else LEARNED_UP_TO
             found.fit.extend(gentle_pieces(episode, Gentle(*(share * usual))))
         elif _undisturbed(episode):
+            found.whole.append(episode)
             found.calibration.extend(gentle_pieces(episode, Gentle(*(LEARNED_UP_TO * usual))))
     if not all(found):
         raise ValueError(f"{len(recordings)} lessons leave too little that is healthy: record more")
@@ -130,11 +135,28 @@ def _lesson(episode: Episode) -> dict[str, Any]:
     return lesson
 
 
-def learn_body(lessons: Lessons, rate: float, seed: int, progress: Progress) -> NeuralASM:
-    """The memory, calibrated so that a share ``rate`` of healthy lessons that it has not learned from alarms.
+def learn_body(lessons: Lessons, spec: StreamSpec, seed: int, progress: Progress) -> NeuralASM:
+    """The memory, without a threshold.
 
     Nothing is measured against a context, which a policy that was never met would lead astray; so the temporal network,
-    which makes it, is learned for a few passes alone.
+    which makes it, is small and learned for a few passes alone.
+
+    Args:
+        spec: of the stream, as the body has it today.
     """
-    memory = NeuralASM(lessons.fit[0].spec, epochs=PASSES, habituates=False, seed=seed)
-    return memory.fit(lessons.fit, progress).calibrate(lessons.calibration, rate)
+    memory = NeuralASM(spec, hidden_size=HIDDEN, epochs=PASSES, habituates=False, excuses=True, seed=seed)
+    return memory.fit(lessons.fit, progress).rounded()
+
+
+def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode], per_hour: float) -> NeuralASM:
+    """Calibrated so that so many faults are said in an hour of healthy episodes, hits and all.
+
+    How hard healthy motion presses is told by what presses no harder than is usual: a limit that a hit has raised would
+    be none.
+
+    Args:
+        hours: of healthy episodes beside the lessons that are left out.
+    """
+    memory.calibrate([*lessons.whole, *hours], false_alarms_per_hour=per_hour)
+    memory.healthy_ = healthy_forces([episode.stream for episode in lessons.calibration], memory.spec)
+    return memory

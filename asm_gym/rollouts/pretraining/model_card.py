@@ -9,11 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from asm_gym.detection.events import KNOCK, STOP
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.comparison import visible_kinds
-from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, hourly_alarms
+from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, hourly_alarms, hourly_events
 from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
-from asm_gym.evaluation.statistics import Share
+from asm_gym.evaluation.statistics import Rate, Share
 from asm_gym.evaluation.tables import Column, Table, count, milliseconds, percent, tabulate
 from asm_gym.monitors import CalibratedMonitor
 from asm_gym.rollouts.run_folder import CRASH
@@ -26,6 +27,8 @@ SEVERITIES = "medium", "strong"
 
 PUSH = "push", "medium"
 """Kind and severity of a push of 20 N."""
+SCENES = 12
+"""In which faults happen; of more healthy episodes the first."""
 PROMPT_S = 0.1
 """How soon a push should be noticed [s]."""
 
@@ -46,13 +49,14 @@ class Exam(NamedTuple):
     def labels(self, episodes: int, kinds: Sequence[str], seed: int, pushes: int = 0) -> list[EpisodeLabel]:
         """Nominal episodes; and a twin of the first for each of ``kinds`` and severity, the second for the next.
 
-        Then pushes of 20 N, in the last of the scenes.
+        Then pushes of 20 N, in the last of the scenes, of which there are ``SCENES`` at most.
         """
-        seeds = role_seeds(seed, self.task, "nominal", episodes)
+        every = role_seeds(seed, self.task, "nominal", episodes)
+        seeds = every[:SCENES]
         horizon = task_spec(self.task).horizon
-        nominal = [EpisodeLabel(self.task, "nominal", seed=s) for s in seeds]
+        nominal = [EpisodeLabel(self.task, "nominal", seed=s) for s in every]
         faults = [(kind, severity) for kind in kinds for severity in SEVERITIES]
-        pairs = [(fault, seeds[n % episodes]) for n, fault in enumerate(faults)]
+        pairs = [(fault, seeds[n % len(seeds)]) for n, fault in enumerate(faults)]
         pairs += [(PUSH, s) for s in seeds[::-1][:pushes] if (PUSH, s) not in pairs]
         return nominal + [EpisodeLabel(self.task, "faulty", *fault, s, draw_onset(s, horizon)) for fault, s in pairs]
 
@@ -62,8 +66,7 @@ class Marks(NamedTuple):
 
     Attributes:
         name: of the exam.
-        solved: traces of healthy episodes in which the task was solved.
-        crashed: of those in which it was, but something pressed twice as hard as is usual under the task's expert.
+        solved: traces of healthy episodes in which the task was solved, however hard something pressed.
         failed: of those in which it was not.
         pushes: those of pushes of 20 N.
         metrics: on the other faults that an ideal observer could see. Of all faults those are left out in whose scenes
@@ -72,7 +75,6 @@ class Marks(NamedTuple):
 
     name: str
     solved: list[ScoredEpisode]
-    crashed: list[ScoredEpisode]
     failed: list[ScoredEpisode]
     pushes: list[ScoredEpisode]
     metrics: DetectionMetrics
@@ -83,9 +85,9 @@ class Marks(NamedTuple):
         def judged(traces: Sequence[ScoredEpisode]) -> list[ScoredEpisode]:
             return [t.at(threshold) for t in traces]
 
-        solved, crashed, failed, pushes = map(judged, (self.solved, self.crashed, self.failed, self.pushes))
+        solved, failed, pushes = map(judged, (self.solved, self.failed, self.pushes))
         metrics = DetectionMetrics(self.name, judged(self.metrics.faulty), solved, self.metrics.window_s)
-        return Marks(self.name, solved, crashed, failed, pushes, metrics)
+        return Marks(self.name, solved, failed, pushes, metrics)
 
 
 def usual_force(recordings: Sequence[Episode]) -> float:
@@ -112,16 +114,40 @@ def examine(memory: CalibratedMonitor, name: str, recordings: Sequence[Episode],
     visible = [t for t in traces if t.onset is not None and t.seed not in hit and seen[t.kind, t.severity]]
     pushes, faults = ([t for t in visible if ((t.kind, t.severity) == PUSH) is want] for want in (True, False))
     nominal = [t for t in traces if t.kind == NOMINAL]
-    done, failed = ([t for t in nominal if t.outcome.success is want] for want in (True, False))
-    solved, crashed = ([t for t in done if (t.seed in hit) is want] for want in (False, True))
-    return Marks(name, solved, crashed, failed, pushes, DetectionMetrics(name, faults, solved, window))
+    solved, failed = ([t for t in nominal if t.outcome.success is want] for want in (True, False))
+    return Marks(name, solved, failed, pushes, DetectionMetrics(name, faults, solved, window))
+
+
+class Alarms(NamedTuple):
+    """Of healthy episodes, an hour each: faults that are none, knocks, stops, and all of them."""
+
+    fault: Rate
+    knock: Rate
+    stop: Rate
+
+    @classmethod
+    def of(cls, traces: Sequence[ScoredEpisode]) -> Alarms:
+        """At the threshold of the traces."""
+        return cls(hourly_alarms(traces), *(hourly_events(traces, event) for event in (KNOCK, STOP)))
+
+    @property
+    def every(self) -> Rate:
+        """The sum."""
+        return Rate(sum(rate.k for rate in self), self.fault.hours)
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        return f"{self.fault.text} faults, {self.knock.text} knocks, {self.stop.text} stops an hour"
 
 
 COLUMNS: Sequence[Column[Marks]] = (
     Column("", lambda m: m.name),
-    Column("healthy, alarm", lambda m: count(false_alarms(m.solved))),
-    Column("per hour", lambda m: hourly_alarms(m.solved).text),
-    Column("crashed, alarm", lambda m: count(false_alarms(m.crashed)) if m.crashed else ""),
+    Column("hours", lambda m: f"{hourly_alarms(m.solved).hours:.2f}"),
+    Column("fault", lambda m: Alarms.of(m.solved).fault.text),
+    Column("knock", lambda m: f"{Alarms.of(m.solved).knock.value:.0f}" if m.solved else ""),
+    Column("stop", lambda m: f"{Alarms.of(m.solved).stop.value:.0f}" if m.solved else ""),
+    Column("all", lambda m: f"{Alarms.of(m.solved).every.value:.0f}" if m.solved else ""),
     Column("failed, alarm", lambda m: count(false_alarms(m.failed)) if m.failed else ""),
     Column("AUROC", lambda m: f"{m.metrics.auroc:.3f}" if m.metrics.faulty else ""),
     Column("found", lambda m: f"{percent(m.metrics.detected)} of {m.metrics.detected.n}" if m.metrics.faulty else ""),
@@ -133,12 +159,15 @@ def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Ta
     """A row for each exam."""
     about = memory.about
     learned = f"learned from {about['lessons']} lessons of {', '.join(about['tasks'])} ({about['rows']} rows)"
-    limit = f"threshold {memory.threshold:.3g} from {about['calibrated_on']} others at {about['false_alarm_rate']:g}"
+    limit = (
+        f"threshold {memory.threshold:.3g} for {about['false_alarms_per_hour']:g} an hour, from "
+        f"{about['calibrated_on']} others of {about['hours']:.2f} hours"
+    )
     return tabulate(
-        f"{about['name']}: {learned}, {limit}. Episodes with an alarm, apart those that solved the task, those that "
-        "solved it but pressed twice as hard as its expert usually does at most, and those that failed; alarms an hour "
-        "of the first, with a 95 % Poisson interval, one that comes back within a minute counted once; faults of "
-        f"medium and strong severity that an ideal observer could see, found within {window:g} s.",
+        f"{about['name']}: {learned}, {limit}. Alarms an hour of healthy episodes that solved the task: of faults that "
+        "are none, with a 95 % Poisson interval, of knocks, of joints at their stops, and all; one that comes back "
+        "within a minute is counted once. Episodes with such a fault, of those that failed. Faults of medium and "
+        f"strong severity that an ideal observer could see, found within {window:g} s.",
         COLUMNS,
         marks,
     )
@@ -146,22 +175,22 @@ def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Ta
 
 def summary(marks: Sequence[Marks]) -> str:
     """Alarms, and faults and pushes found, in all exams together."""
-    solved = Share.of([bool(t.false_alarms) for m in marks for t in m.solved])
+    alarms = Alarms.of([t for m in marks for t in m.solved])
     found = Share(sum(m.metrics.detected.k for m in marks), sum(m.metrics.detected.n for m in marks))
     delays = [t.delay for m in marks for t in m.pushes]
     prompt = Share.of([delay is not None and delay <= PROMPT_S + 1e-9 for delay in delays])
     return (
-        f"{count(solved)} healthy episodes alarm, {count(found)} faults found, {count(prompt)} pushes of 20 N "
-        f"noticed within {1e3 * PROMPT_S:.0f} ms"
+        f"{alarms.text} in {alarms.fault.hours:.2f} healthy hours, {count(found)} faults found, {count(prompt)} "
+        f"pushes of 20 N noticed within {1e3 * PROMPT_S:.0f} ms"
     )
 
 
 def at_rates(marks: Sequence[Marks], memory: CalibratedMonitor, rates: Sequence[float]) -> str:
-    """``summary`` at the memory's threshold, and at that of each of ``rates`` that it can promise."""
+    """``summary`` at the memory's threshold, and at that of each of ``rates`` an hour that it can promise."""
     said = [f"In all: {summary(marks)}."]
     for rate in rates:
         with suppress(ValueError):  # it was calibrated on too few
-            threshold = memory.threshold_at(rate)
+            threshold = memory.threshold_at(false_alarms_per_hour=rate)
             there = summary([m.at(threshold) for m in marks])
-            said.append(f"At the threshold for {rate:g}, {threshold:.3g}: {there}.")
+            said.append(f"At the threshold for {rate:g} an hour, {threshold:.3g}: {there}.")
     return " ".join(said)

@@ -1,0 +1,115 @@
+"""Knock, stop or fault: how far what the senses themselves tell of excuses a surprise.
+
+    knock    a wrist has felt more than 50 N on an axis within the last second; its peaks count, where they are sensed
+    stop     a joint is within 0.03 rad of one of its stops
+    s'       s / 30 where either is so, s / 3 where a finger has just moved by more than its sensor's noise, else s
+
+A hand that strikes a table surprises, and so does a joint that comes to its stop or a finger that slips: none is
+a fault of the body, and between them they made four of five alarms of healthy robots. They are not forgiven. What is
+still over the threshold is a fault: a pair of joints that were swapped exceeds it by orders of magnitude. What is over
+it but for the excuse is an alarm of its own name. A number that is missing excuses nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.compilation import compiled
+from asm_gym.spec import Channel, StreamSpec
+
+NO_EVENT, KNOCK, STOP, FAULT = "", "knock", "stop", "fault"
+EVENTS = NO_EVENT, KNOCK, STOP, FAULT
+"""What a row is. The last is the worst."""
+
+KNOCKING = 50.0
+"""At the wrist, on an axis [N]."""
+KNOCKED_S = 1.0
+"""For how long a knock is felt in what comes after it [s]."""
+NEAR_STOP = 0.03
+"""[rad]"""
+EXCUSED, SLIPPED = 30.0, 3.0
+"""What surprise is divided by, at a knock or a stop, and where fingers move."""
+MOVING, MOVED_S = 5.0, 0.1
+"""Standard deviations of its sensor's noise at which a finger moves, and for how long it has just moved [s]."""
+
+
+class Excused(NamedTuple):
+    """What the senses make of rows.
+
+    Attributes:
+        kind: (B,) 1 for a knock, 2 for a stop, 0 for neither: places in ``EVENTS``.
+        divisor: (B,) of the surprise.
+    """
+
+    kind: NDArray[np.int8]
+    divisor: NDArray[np.float64]
+
+
+class Excuses:
+    """What excuses surprise, by the names of the channels of a stream.
+
+    Args:
+        spec: of the stream; without forces at a wrist no knock is known, and without ``Channel.stops`` no stop.
+    """
+
+    def __init__(self, spec: StreamSpec) -> None:
+        peaks = _columns(spec, lambda c: c.name.endswith("wrist_force_peak"))
+        self._wrist = peaks if peaks.size else _columns(spec, lambda c: c.name.endswith("wrist_force"))
+        self._joints = _columns(spec, lambda c: bool(c.stops))
+        self._ends = np.array([pair for c in spec.channels for pair in c.stops], np.float64).reshape(-1, 2)
+        self._fingers = _columns(spec, lambda c: c.name.endswith("gripper_velocity") and c.noise > 0)
+        self._moving = MOVING * spec.noise[self._fingers]
+        self._rows = tuple(max(1, round(seconds / spec.dt)) for seconds in (KNOCKED_S, MOVED_S))
+
+    def start(self, batch: int) -> NDArray[np.int64]:
+        """(B, 2) for how many rows a knock is still felt, and fingers have just moved: none."""
+        return np.zeros((batch, 2), np.int64)
+
+    def step(self, left: NDArray[np.int64], rows: NDArray[np.float64]) -> tuple[NDArray[np.int64], Excused]:
+        """What the next rows (B, D) excuse, some of whose numbers may not be finite."""
+        after, kind, divisor = _step(
+            left, rows, self._wrist, self._joints, self._ends, self._fingers, self._moving, self._rows
+        )
+        return after, Excused(kind, divisor)
+
+
+def event_of(value: float, raw: float, kind: int, threshold: float) -> str:
+    """What a row is: its surprise as far as it is not excused, all of it, and what excuses it."""
+    if not value <= threshold:
+        return FAULT
+    return EVENTS[kind] if raw > threshold else NO_EVENT
+
+
+def _columns(spec: StreamSpec, which: Callable[[Channel], bool]) -> NDArray[np.intp]:
+    """(N,) of the channels that are meant."""
+    found = [np.arange(spec.size)[spec.slices[c.name]] for c in spec.channels if which(c)]
+    columns: NDArray[np.intp] = np.concatenate([np.zeros(0, np.intp), *found])
+    return columns
+
+
+@compiled
+def _step(left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any, moving: Any, lasting: Any) -> Any:
+    B = len(rows)
+    after, kind, divisor = np.maximum(left - 1, 0), np.zeros(B, np.int8), np.ones(B)
+    for n in range(B):
+        for i in wrist:
+            if abs(rows[n, i]) > KNOCKING and np.isfinite(rows[n, i]):
+                after[n, 0] = lasting[0]
+        for j in range(len(fingers)):
+            if abs(rows[n, fingers[j]]) > moving[j] and np.isfinite(rows[n, fingers[j]]):
+                after[n, 1] = lasting[1]
+        if after[n, 1] > 0:
+            divisor[n] = SLIPPED
+        for j in range(len(joints)):
+            q = rows[n, joints[j]]
+            if q < ends[j, 0] + NEAR_STOP or q > ends[j, 1] - NEAR_STOP:
+                kind[n] = 2
+        if after[n, 0] > 0:
+            kind[n] = 1
+        if kind[n] > 0:
+            divisor[n] = EXCUSED
+    return after, kind, divisor

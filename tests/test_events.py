@@ -1,0 +1,219 @@
+"""Knock, stop and fault: told apart by senses alone, each with what is done about it, and none of them hidden."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import SyncVectorEnv
+
+from asm_gym import Episode, NeuralASM
+from asm_gym.detection.events import EVENTS, EXCUSED, KNOCKED_S, SLIPPED, Excuses, event_of
+from asm_gym.monitors import Surprise
+from asm_gym.spec import Channel, StreamSpec
+from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
+from asm_gym.wrappers.logging import SafetyCounter
+from tests.fakes import SPEC, FadingMonitor, FakeEnv
+
+ARM = StreamSpec(
+    (
+        Channel("joint_position", 2, "rad", 2e-4, "joint", stops=((-1.0, 1.0), (-2.0, 2.0))),
+        Channel("wrist_force", 3, "N", 0.2, "wrench"),
+        Channel("wrist_force_peak", 3, "N", 0.4, "wrench"),
+        Channel("gripper_velocity", 2, "m/s", 0.002, "gripper"),
+    ),
+    dt=0.05,
+)
+CALM = np.array([0.2, 1.5, 60.0, 0, 0, 10.0, 0, 0, 0, 0])  # the mean of a row tells no knock where its peak is sensed
+
+
+def excused(rows, spec=ARM):
+    excuses = Excuses(spec)
+    state, found = excuses.start(1), []
+    for row in rows:
+        state, by = excuses.step(state, np.asarray(row, np.float64)[None])
+        found.append((EVENTS[by.kind[0]], by.divisor[0]))
+    return found
+
+
+def changed(column, value):
+    row = CALM.copy()
+    row[column] = value
+    return row
+
+
+@pytest.mark.parametrize(
+    ("row", "event", "divisor"),
+    [
+        (CALM, "", 1.0),
+        (changed(6, -50.1), "knock", EXCUSED),
+        (changed(6, -49.9), "", 1.0),
+        (changed(6, np.nan), "", 1.0),
+        (changed(6, np.inf), "", 1.0),
+        (changed(0, 0.98), "stop", EXCUSED),
+        (changed(1, -1.98), "stop", EXCUSED),
+        (changed(0, 0.96), "", 1.0),
+        (changed(0, np.nan), "", 1.0),
+        (changed(9, 0.011), "", SLIPPED),
+        (changed(9, 0.009), "", 1.0),
+    ],
+)
+def test_what_the_senses_say_of_a_row(row, event, divisor):
+    assert excused([row]) == [(event, divisor)]
+
+
+def test_a_knock_is_felt_for_a_second_at_any_rate():
+    for dt in (0.05, 0.01):
+        spec = StreamSpec(ARM.channels, dt)
+        found = excused([changed(5, 80.0)] + [CALM] * 200, spec)
+        assert [e for e, _ in found].count("knock") == round(KNOCKED_S / dt)
+        assert found[round(KNOCKED_S / dt)] == ("", 1.0)
+
+
+def test_a_finger_has_moved_for_a_tenth_of_a_second():
+    assert [d for _, d in excused([changed(8, -0.1), CALM, CALM])] == [SLIPPED, SLIPPED, 1.0]
+
+
+def test_streams_without_such_senses_excuse_nothing():
+    assert excused([np.full(5, 1e9)], SPEC) == [("", 1.0)]
+
+
+def test_what_is_left_of_an_excused_surprise_adds_up_and_hides_nothing():
+    raw = Surprise(np.array([60.0]), np.array([[20.0, 40.0]]))
+    _, by = Excuses(ARM).step(np.zeros((1, 2), np.int64), changed(5, 80.0)[None])
+    left = raw.excused(by)
+    assert left.value == pytest.approx(60.0 / EXCUSED)
+    assert left.attribution.sum() == pytest.approx(left.value)
+    assert left.raw == 60.0
+    assert [left.event(q) for q in (1.9, 2.1, 61.0)] == ["fault", "knock", ""]
+    assert event_of(np.nan, np.nan, 0, 1.0) == event_of(np.inf, np.inf, 1, 1.0) == "fault"
+
+
+def wild(count, knocks=False, seed=0, spec=ARM):
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(count):
+        x = 0.02 * rng.normal(size=(80, spec.size)).cumsum(0) + CALM
+        x[:, 2:5] -= 55.0
+        x[:, 8:] = 0.002 * rng.normal(size=(80, 2))
+        if knocks:
+            x[40, 5:8] += 100.0
+        found.append(Episode.from_stream(x, spec))
+    return found
+
+
+def test_knocks_set_no_threshold_of_faults_and_the_choice_is_saved(tmp_path):
+    plain, told = (NeuralASM(ARM, hidden_size=8, association_size=8, epochs=1, excuses=e) for e in (False, True))
+    for memory in (plain, told):
+        memory.fit(wild(20)).calibrate(wild(40, knocks=True, seed=1), false_alarms_per_hour=60.0)
+    assert told.threshold < plain.threshold / 5
+    knocked = told.score(wild(1, knocks=True, seed=2)[0])
+    assert knocked.raw[40] > told.threshold
+    assert knocked.excuse[40] == EVENTS.index("knock")
+    assert (knocked.value <= told.threshold).all()
+    told.save(tmp_path / "told.asm")
+    loaded = NeuralASM.load(tmp_path / "told.asm")
+    assert loaded.excuses
+    assert loaded.spec.channels[0].stops == ARM.channels[0].stops
+    np.testing.assert_array_equal(loaded.score(wild(1, knocks=True, seed=2)[0]).value, knocked.value)
+
+
+class Eventful(FadingMonitor):
+    """What it senses of ``cue`` surprises it by 2 (threshold 1), and is excused by what ``kind`` says."""
+
+    kind = "knock"
+
+    def observe(self, state, stream):
+        surprised = np.isin(stream[:, 0], list(self.cue))
+        raw = np.where(surprised, 2.0, 0.1)
+        excuse = np.where(surprised, EVENTS.index(self.kind), 0).astype(np.int8)
+        value = np.where(excuse > 0, raw / EXCUSED, raw)
+        shares = np.zeros((len(stream), self.spec.size))
+        shares[:, 0] = value
+        return state._replace(steps=state.steps + 1), Surprise(value, shares, raw=raw, excuse=excuse)
+
+
+class Stopping(Eventful):
+    kind = "stop"
+
+
+class Faulty(Eventful):
+    kind = ""
+
+
+def lived(env, steps=15):
+    env.reset(seed=0)
+    counter, said = SafetyCounter(0.05), []
+    for _ in range(steps):
+        *_, ended, _, info = env.step(np.array([0.5, -0.5, 1.0], np.float32))
+        counter.add(info)
+        said.append((info["asm"]["event"], bool(info["asm_alarm"]), info["asm"]["state"], float(info["cost"])))
+        if ended:
+            break
+    return said, counter.total
+
+
+def test_a_knock_is_braked_and_the_policy_goes_on():
+    said, total = lived(NeuralASMSafety(FakeEnv(), Eventful([5]), "hold", release_after=3))
+    assert said[4] == ("knock", True, "reflex", 1.0)
+    assert [s[2] for s in said[5:9]] == ["reflex", "reflex", "trial", "trial"]
+    assert (total.knocks, total.stops, total.faults, total.alarms) == (1, 0, 0, 1)
+
+
+def test_a_stop_is_said_and_no_alarm():
+    said, total = lived(NeuralASMSafety(FakeEnv(), Stopping([5]), "hold"))
+    assert said[4] == ("stop", False, "policy", 0.0)
+    assert (total.knocks, total.stops, total.faults, total.cost) == (0, 1, 0, 0.0)
+
+
+def test_a_fault_is_acted_on_and_ends_an_episode_that_a_knock_does_not():
+    said, total = lived(NeuralASMSafety(FakeEnv(), Faulty([5]), "terminate"))
+    assert said[4][:2] == ("fault", True)
+    assert (len(said), total.faults) == (5, 1)
+    said, _ = lived(NeuralASMSafety(FakeEnv(), Eventful([5]), "terminate"))
+    assert len(said) == 15
+
+
+def test_many_environments_say_the_same():
+    envs = SyncVectorEnv([lambda: FakeEnv(), lambda: FakeEnv(first=100)])
+    watched = VectorNeuralASMSafety(envs, Eventful([5]), "hold", release_after=3)
+    watched.reset(seed=0)
+    for t in range(1, 7):
+        *_, info = watched.step(np.zeros((2, 3), np.float32))
+        assert info["asm"]["event"].tolist() == ["knock" if t == 5 else "", ""]
+
+
+def test_a_knock_that_presses_too_hard_is_held_by_the_limits_all_the_same():
+    """The hand is driven down on the table under a memory that excuses whatever it feels."""
+
+    class Deaf(FadingMonitor):
+        def observe(self, state, stream):
+            kind = np.full(len(stream), EVENTS.index("knock"), np.int8)
+            nothing = np.zeros((len(stream), self.spec.size))
+            return state, Surprise(np.zeros(len(stream)), nothing, raw=np.full(len(stream), 9.0), excuse=kind)
+
+    lift = gym.make("asm_gym/Lift-v0")
+    guarded = NeuralASMSafety(lift, Deaf([], spec=lift.unwrapped.stream_spec), "hold", on_overrun="ignore")
+    guarded.reset(seed=0)
+    down = np.array([0, 0, -1.0, 0, 0, 0, -1.0], np.float32)
+    said = []
+    for _ in range(60):
+        *_, terminated, truncated, info = guarded.step(down)
+        said.append(info["asm"])
+        if terminated or truncated:
+            break
+    assert said[0]["event"] == "knock"
+    assert all(s["intervened"] for s in said[1:])  # braked from the first on
+    assert max(s["severity"]["speed"] for s in said) < 0.19
+    lift.close()
+
+
+def test_arms_of_the_package_know_their_stops():
+    lift = gym.make("asm_gym/Lift-v0")
+    stops = next(c.stops for c in lift.unwrapped.stream_spec.channels if c.name == "joint_position")
+    assert stops[3] == pytest.approx((-3.0718, -0.0698))
+    assert StreamSpec.from_json(lift.unwrapped.stream_spec.to_json()) == lift.unwrapped.stream_spec
+    lift.close()
+
+
+def test_stops_of_another_number_of_joints_are_refused():
+    with pytest.raises(ValueError, match="channel 'q' has size 2 but 1 pairs of stops"):
+        Channel("q", 2, "rad", stops=((0.0, 1.0),))
