@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from asm_gym import Channel, Episode, NeuralASM, StreamSpec
-from asm_gym.memory.free_energy import FreeEnergy
+from asm_gym.memory.association import Association, association_change
+from asm_gym.memory.free_energy import FreeEnergy, _between
+from asm_gym.memory.precision import precision_change
 
 SPEC = StreamSpec(
     (
@@ -34,8 +36,7 @@ def known(request):
     healthy = [episode(rng) for _ in range(30)]
     asm = NeuralASM(SPEC, hidden_size=24, association_size=16, epochs=10, dynamics=request.param).fit(healthy[:20])
     asm.learn_to_act(healthy[:20], units=16)
-    energy = FreeEnergy.of(asm.network_, asm.senses_, asm.motor_, [e.stream for e in healthy[20:24]])
-    return energy, healthy[24:]
+    return asm.model.free_energy(healthy[20:24]), healthy[24:]
 
 
 def test_its_slope_is_that_of_finite_differences(known):
@@ -124,3 +125,34 @@ def test_spreads_of_no_row_are_refused(known):
     energy, fresh = known
     with pytest.raises(ValueError, match="no healthy row"):
         FreeEnergy.of(energy.network, energy.senses, energy.motor, [fresh[0].stream[:2]])
+
+
+def test_the_rules_of_association_are_its_slopes_in_the_synapses():
+    """Of V, U, D where errors are judged alike, of W_S and b_S in any context: each rule is -∂F/∂W of its own term."""
+    rng = np.random.default_rng(3)
+    inputs, units, X = 6, 4, 3
+    V, U, D = (rng.normal(0, 0.5, shape) for shape in ((units, inputs), (X, units), (X, inputs)))
+    W_S, b_S, span = rng.normal(0, 0.3, (X, units)), rng.normal(0, 0.3, X), np.array([[-9.0] * X, [9.0] * X])
+    a, delta = rng.normal(size=inputs), rng.normal(0, 0.2, X)
+
+    def slope_of(array: np.ndarray, association: Association) -> np.ndarray:
+        out = np.zeros_like(array)
+        for at in np.ndindex(array.shape):
+            usual = array[at]
+            array[at] = usual + 1e-6
+            above = _between(association, a, delta)[0]
+            array[at] = usual - 1e-6
+            out[at] = (above - _between(association, a, delta)[0]) / 2e-6
+            array[at] = usual
+        return out
+
+    alike = Association(V, U, D, np.zeros_like(W_S), np.zeros(X), span, np.ones(X))
+    row = (a[None].astype(np.float32), delta[None].astype(np.float32), np.ones(X, np.float32))
+    change, error = association_change(*row, *(W.astype(np.float32) for W in (V, U, D)), bound=np.inf)
+    for W, told in zip((V, U, D), change, strict=True):
+        np.testing.assert_allclose(told, -slope_of(W, alike), atol=2e-5)
+    known = Association(V, U, D, W_S, b_S, span, np.ones(X))
+    f = np.tanh(V @ a)[None].astype(np.float32)
+    told_W, told_b = precision_change(f, error, W_S.astype(np.float32), b_S.astype(np.float32))
+    np.testing.assert_allclose(told_W, -2 * slope_of(W_S, known), atol=1e-4)
+    np.testing.assert_allclose(told_b, -2 * slope_of(b_S, known), atol=1e-4)

@@ -139,7 +139,8 @@ class FreeEnergy:
     def inferred(self, moment: Moment, row: Floats) -> Floats:
         """z (H,), the state that the network through time infers from a row (D,)."""
         read = self.senses.read(row[None], moment.before, moment.earlier)
-        return self.network.follow(moment.c, read.commands, read.senses, read.seen).z[0].astype(np.float64)
+        z: Floats = self.network.follow(moment.c, read.commands, read.senses, read.seen).z[0].astype(np.float64)
+        return z
 
     def terms(self, moment: Moment, row: Floats, z: Floats) -> Terms:
         """F of a row (D,) and a state (H,), by its parts."""
@@ -193,9 +194,10 @@ class FreeEnergy:
 
     def expected(self, moment: Moment) -> Floats:
         """(A,) the command that the motor association expects; that of the row before where there is none."""
-        if self.motor is None:
-            return moment.last[0, self.senses.spec.motor]
-        return self.motor.command(situation(self.senses, moment.last))[0].astype(np.float64)
+        known = moment.last[0, self.senses.spec.motor]
+        if self.motor is not None:
+            known = self.motor.command(situation(self.senses, moment.last))[0]
+        return np.asarray(known, np.float64)
 
     def after(self, moment: Moment, row: Floats, turn: bool = True) -> NDArray[np.float32]:
         """c (1, I) after a row (D,); as it was where it is not the row's ``turn``, for every l-th is taken up."""

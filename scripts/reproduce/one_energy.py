@@ -46,7 +46,7 @@ CUE, PUSHED, LETTERS, WRITINGS = 15, 25, 4, 16
 DISPLACED = 1.0
 """How far a pen is displaced [cm]."""
 
-DRIVES = "motor association", "lowest F"
+DRIVES = "network through time", "motor association", "lowest F"
 
 
 @dataclass(frozen=True)
@@ -147,14 +147,24 @@ def written(energy: FreeEnergy, model: Episode, way: str, push: Floats) -> Float
     for t in range(len(rows)):
         moment = before(rows, t, c, energy)
         if t >= CUE:
-            command = energy.reaction(moment) if way == DRIVES[1] else energy.expected(moment)
+            command = commanded(energy, moment, way)
             pen += DT * command + (push if t == PUSHED else 0.0)
             rows[t] = np.concatenate([pen + NOISE * rng.standard_normal(2), command])
         c = energy.after(moment, rows[t], turn=t % energy.senses.lag == 0)
     return rows[:, :2]
 
 
-def reactions(asm: NeuralASM, energy: FreeEnergy, models: Sequence[Episode], seed: int) -> list[Record]:
+def commanded(energy: FreeEnergy, moment: Moment, way: str) -> Floats:
+    """(A,) by one of ``DRIVES``."""
+    if way == DRIVES[0]:
+        scaler, network = energy.senses, energy.network
+        told = network.run_on(moment.c).expected[0, scaler.size :].astype(np.float64)
+        motor = scaler.spec.motor
+        return np.asarray(scaler.mean[motor] + scaler.spread[motor] * told)
+    return energy.reaction(moment) if way == DRIVES[2] else energy.expected(moment)
+
+
+def reactions(energy: FreeEnergy, models: Sequence[Episode], seed: int) -> list[Record]:
     """How far letters are from those they go on from, with and without a displacement [cm]."""
     made, rng = [], np.random.default_rng(seed)
     for model in models:
@@ -173,7 +183,7 @@ def one(job: tuple[str, int], faults: FaultSet, config: Config) -> list[Record]:
     dynamics, seed = job
     asm = NeuralASM(faults.fit[0].spec, dynamics=dynamics, seed=seed).fit(faults.fit).learn_to_act(faults.fit)
     apart = max(1, len(faults.calibration) // 4)  # healthy rows for τ, from which no threshold is taken
-    energy = FreeEnergy.of(asm.network_, asm.senses_, asm.motor_, [e.stream for e in faults.calibration[:apart]])
+    energy = asm.model.free_energy(faults.calibration[:apart])
     sets = {"calibration": faults.calibration[apart:], "nominal": faults.nominal}
     sets["faulty"] = [e for _, _, e in faults.faulty]
     courses = {name: [course(energy, e) for e in own] for name, own in sets.items()}
@@ -187,8 +197,8 @@ def one(job: tuple[str, int], faults: FaultSet, config: Config) -> list[Record]:
     letters = repertoire(LETTERS, 2, rng)
     learned, fresh = (copybook(letters, n, 2, rng) for n in (WRITINGS, -(-config.written // LETTERS)))
     pen = NeuralASM(learned[0].spec, 64, 64, dynamics=dynamics, seed=seed).fit(learned).learn_to_act(learned, units=64)
-    of_pen = FreeEnergy.of(pen.network_, pen.senses_, pen.motor_, [e.stream for e in fresh[:2]])
-    records += reactions(pen, of_pen, fresh[: config.written], seed)
+    of_pen = pen.model.free_energy(fresh[:2])
+    records += reactions(of_pen, fresh[: config.written], seed)
     return [{"dynamics": dynamics, "seed": seed, **r} for r in records]
 
 
@@ -234,31 +244,30 @@ def tables(records: Sequence[Record]) -> list[Table]:
 
 
 def drawn(records: Sequence[Record]) -> Figure:
-    """AUROC of each part, and what is completed, relative to the last value."""
-    with figure(height=3.2, width=9) as fig:
+    """AUROC of each part, what is completed relative to the last value, and how far off a pen is."""
+    completed = [(lost, way) for lost in LOST for way in ("correlation memory", "lowest F")]
+
+    def against_last(d: str, lost: str, way: str) -> float:
+        own, last = (kit.over_seeds(records, "rmse", dynamics=d, lost=lost, way=w).mean for w in (way, "last value"))
+        return own / last
+
+    with figure(height=3.4, width=11) as fig:
         axes = fig.subplots(1, 3)
         for i, d in enumerate(DYNAMICS):
-            at = 0.38 * (i - 0.5)
-            colour = {"color": look(i)[0], "label": d}
-            found = [kit.over_seeds(records, "auroc", dynamics=d, part=p).mean for p in PARTS]
-            axes[0].barh(np.arange(len(PARTS)) + at, found, 0.36, **colour)
-            for n, way in enumerate(("correlation memory", "lowest F")):
-                own = [
-                    kit.over_seeds(records, "rmse", dynamics=d, lost=k, way=way).mean
-                    / kit.over_seeds(records, "rmse", dynamics=d, lost=k, way="last value").mean
-                    for k in LOST
-                ]
-                axes[1].plot(own, range(len(LOST)), "os"[n], **(colour | {"label": f"{way}, {d}"}))
-            off = [kit.over_seeds(records, "off", dynamics=d, pushed=True, way=w).mean for w in DRIVES]
-            axes[2].barh(np.arange(len(DRIVES)) + at, off, 0.36, **colour)
-        axes[0].set(xlabel="AUROC", xlim=(0.4, 1.0))
-        axes[0].set_yticks(range(len(PARTS)), PARTS)
-        axes[1].set(xlabel="error / that of the last value", xscale="log")
-        axes[1].set_yticks(range(len(LOST)), list(LOST))
-        axes[1].legend(fontsize=6)
-        axes[2].set(xlabel="off, after a push [cm]")
-        axes[2].set_yticks(range(len(DRIVES)), list(DRIVES))
-        axes[0].legend(fontsize=7)
+            panels = (
+                (PARTS, [kit.over_seeds(records, "auroc", dynamics=d, part=p).mean for p in PARTS]),
+                ([f"{lost}, {way}" for lost, way in completed], [against_last(d, *c) for c in completed]),
+                (DRIVES, [kit.over_seeds(records, "off", dynamics=d, pushed=True, way=w).mean for w in DRIVES]),
+            )
+            for ax, (names, found) in zip(axes, panels, strict=True):
+                ax.barh(np.arange(len(names)) + 0.38 * (i - 0.5), found, 0.36, color=look(i)[0], label=d)
+                ax.set_yticks(range(len(names)), names, fontsize=8)
+                ax.invert_yaxis() if i == 0 else None
+        axes[0].set(xlabel="AUROC of faults", xlim=(0.4, 1.0))
+        axes[1].set(xlabel="error of completion / that of the last value", xscale="log")
+        axes[1].axvline(1.0, color="#444444", linewidth=1)
+        axes[2].set(xlabel="distance from the letter after a push [cm]")
+        fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, fontsize=8)
     return fig
 
 
