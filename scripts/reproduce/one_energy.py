@@ -8,7 +8,7 @@ and goes on by the motor association, or by the command that lets F be lowest ov
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import conformal_threshold
 from asm_gym.episode import Episode
-from asm_gym.evaluation import defaults
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.metrics import detected, false_alarms, time_matched_auroc
 from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
@@ -29,14 +28,13 @@ from asm_gym.memory.free_energy import FreeEnergy, Moment
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.fault_sets import FaultSet, robot_fault_set
 from asm_gym.scripts.reproduce.handwriting import DT, NOISE, copybook, repertoire
 from asm_gym.scripts.reproduce.kit import Findings, Record, shown
+from asm_gym.scripts.reproduce.recordings import RunConfig, in_turn
 
 Floats = NDArray[np.float64]
+Roles = Mapping[str, Sequence[Episode]]
 
-TASKS, KINDS = ("Lift", "Stack"), ("push", "weak_joint", "encoder_bias", "frozen_encoder", "action_delay")
-WINDOW_S = 1.0
 MEAN_ROWS = 4
 """F is judged by its mean over so many rows: 0.2 s in robosuite."""
 
@@ -50,16 +48,12 @@ DRIVES = "network through time", "motor association", "lowest F"
 
 
 @dataclass(frozen=True)
-class Config(kit.Config):
+class Config(RunConfig):
     """F of the memory, by traces and by settling."""
 
-    episodes: int = option(30, quick=4, least=4)
-    """Robosuite episodes of each skill to learn from; half as many to calibrate on."""
-    faulty: int = option(6, quick=1, least=1)
-    """Faulty episodes of each skill and kind."""
-    completed: int = option(4, quick=1, least=1)
-    """Healthy episodes of each skill in which senses go missing."""
-    written: int = option(24, quick=2, least=1)
+    completed: int = option(8, quick=1, least=1)
+    """Healthy episodes in which senses go missing."""
+    written: int = option(16, quick=2, least=1)
     """Letters that are written in closed loop."""
 
 
@@ -77,22 +71,26 @@ def course(energy: FreeEnergy, episode: Episode) -> dict[str, Floats]:
     return {part: smoothed(np.concatenate([np.full(early, own[0]), own])) for part, own in each.items()}
 
 
-def faults_by(part: str, courses: dict[str, list[dict[str, Floats]]], faults: FaultSet) -> list[Record]:
+def faults_by(part: str, courses: dict[str, list[dict[str, Floats]]], roles: Roles, config: Config) -> list[Record]:
     """What one part of F tells of faults, at a threshold of its own."""
-    rate = max(defaults.FALSE_ALARM_RATE, 1.0 / (1 + len(courses["calibration"])))  # the least that few can promise
-    threshold = conformal_threshold(np.array([c[part].max() for c in courses["calibration"]]), rate)
+    threshold = conformal_threshold(np.array([c[part].max() for c in courses["calibration"]]), config.false_alarm_rate)
 
-    def judged(e: Episode, own: dict[str, Floats], kind: str = NOMINAL, onset: int | None = None) -> ScoredEpisode:
-        task = str(e.info["skill"])
-        return ScoredEpisode(kind, e.seed or 0, e.spec.dt, threshold, own[part], onset, task=task)
+    def judged(e: Episode, own: dict[str, Floats]) -> ScoredEpisode:
+        label = e.labelled
+        kind = label.kind or NOMINAL
+        return ScoredEpisode(kind, label.seed, e.spec.dt, threshold, own[part], label.onset, task=label.task)
 
-    nominal = [judged(e, c) for e, c in zip(faults.nominal, courses["nominal"], strict=True)]
+    nominal = [judged(e, c) for e, c in zip(roles["nominal"], courses["nominal"], strict=True)]
     made: list[Record] = [{"part": part, "alarm": false_alarms([t]).value} for t in nominal]
-    for (kind, onset, e), own in zip(faults.faulty, courses["faulty"], strict=True):
-        scored = judged(e, own, kind, onset)
-        auroc = time_matched_auroc([scored], nominal, WINDOW_S)
+    for e, own in zip(roles["faulty"], courses["faulty"], strict=True):
+        scored = judged(e, own)
+        auroc = time_matched_auroc([scored], nominal, config.window)
         made.append(
-            {"part": part, "auroc": None if np.isnan(auroc) else auroc, "found": detected([scored], WINDOW_S).value}
+            {
+                "part": part,
+                "auroc": None if np.isnan(auroc) else auroc,
+                "found": detected([scored], config.window).value,
+            }
         )
     return made
 
@@ -178,35 +176,28 @@ def reactions(energy: FreeEnergy, models: Sequence[Episode], seed: int) -> list[
     return made
 
 
-def one(job: tuple[str, int], faults: FaultSet, config: Config) -> list[Record]:
+def one(job: tuple[str, int], roles: Roles, config: Config) -> list[Record]:
     """All of it, for one dynamics and one seed."""
     dynamics, seed = job
-    asm = NeuralASM(faults.fit[0].spec, dynamics=dynamics, seed=seed).fit(faults.fit).learn_to_act(faults.fit)
-    apart = max(1, len(faults.calibration) // 4)  # healthy rows for τ, from which no threshold is taken
-    energy = asm.model.free_energy(faults.calibration[:apart])
-    sets = {"calibration": faults.calibration[apart:], "nominal": faults.nominal}
-    sets["faulty"] = [e for _, _, e in faults.faulty]
-    courses = {name: [course(energy, e) for e in own] for name, own in sets.items()}
-    for name, own in sets.items():
+    asm = NeuralASM(roles["fit"][0].spec, dynamics=dynamics, seed=seed).fit(roles["fit"]).learn_to_act(roles["fit"])
+    energy = asm.model.free_energy(roles["apart"])
+    judged = {name: roles[name] for name in ("calibration", "nominal", "faulty")}
+    courses = {name: [course(energy, e) for e in own] for name, own in judged.items()}
+    for name, own in judged.items():
         for found, surprise in zip(courses[name], asm.score_episodes(own), strict=True):
             found["in use"] = surprise.value
-    records = [r for part in PARTS for r in faults_by(part, courses, faults)]
-    each = [[e for e in faults.nominal if e.info["skill"] == task] for task in dict.fromkeys(_skills(faults))]
-    records += completions(asm, energy, [e for own in each for e in own[: config.completed]])
+    records = [r for part in PARTS for r in faults_by(part, courses, roles, config)]
+    records += completions(asm, energy, in_turn(roles["nominal"], seed)[: config.completed])
     rng = np.random.default_rng(seed)
     letters = repertoire(LETTERS, 2, rng)
     learned, fresh = (copybook(letters, n, 2, rng) for n in (WRITINGS, -(-config.written // LETTERS)))
     pen = NeuralASM(learned[0].spec, 64, 64, dynamics=dynamics, seed=seed).fit(learned).learn_to_act(learned, units=64)
-    of_pen = pen.model.free_energy(fresh[:2])
+    of_pen = pen.model.free_energy(copybook(letters, 1, 2, rng))
     records += reactions(of_pen, fresh[: config.written], seed)
     return [{"dynamics": dynamics, "seed": seed, **r} for r in records]
 
 
-def _skills(faults: FaultSet) -> list[str]:
-    return [str(e.info["skill"]) for e in faults.nominal]
-
-
-def tables(records: Sequence[Record]) -> list[Table]:
+def tables(records: Sequence[Record], config: Config) -> list[Table]:
     """Faults, completion, reaction."""
     both = tuple(DYNAMICS)
 
@@ -215,10 +206,10 @@ def tables(records: Sequence[Record]) -> list[Table]:
 
     head = [f"{value}, {d}" for value in ("AUROC", "found", "nominal in alarm") for d in both]
     rows = [(p, *(c for v in ("auroc", "found", "alarm") for c in cells(v, 2, part=p))) for p in PARTS]
-    rate = f"{100 * defaults.FALSE_ALARM_RATE:g} %"
+    rate = f"{100 * config.false_alarm_rate:g} %"
     made = [
         Table(
-            f"Faults within 1 s, thresholds for {rate} of nominal episodes: F, its parts, surprise in use",
+            f"Faults in {config.window:g} s, {rate} of nominal episodes may alarm: F, its parts, the surprise in use",
             ("", *head),
             rows,
         )
@@ -273,7 +264,10 @@ def drawn(records: Sequence[Record]) -> Figure:
 
 def run(config: Config) -> Findings:
     """For both dynamics and every seed."""
-    faults = robot_fault_set(config, TASKS, config.episodes, KINDS, "medium", config.faulty)
+    roles = dict(config.roles)
+    roles["faulty"] = [e for e in roles["faulty"] if len(e) > (e.labelled.onset or 0)]
+    healthy = in_turn(roles["calibration"], 0)  # of each task some whose rows τ is from, and no threshold
+    roles["apart"], roles["calibration"] = healthy[: len(healthy) // 5], healthy[len(healthy) // 5 :]
     jobs = [(d, seed) for d in DYNAMICS for seed in config.repetitions]
-    records = kit.together(kit.each("learning and judging", partial(one, faults=faults, config=config), jobs, config))
-    return Findings(records, tables(records), drawn(records))
+    records = kit.together(kit.each("learning and judging", partial(one, roles=roles, config=config), jobs, config))
+    return Findings(records, tables(records, config), drawn(records))
