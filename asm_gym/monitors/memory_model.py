@@ -18,6 +18,7 @@ from asm_gym.memory.association import Association, association_shapes, existing
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of
 from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
+from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs
 from asm_gym.memory.marginalise import MOST_INPUTS, Kept, fewer_changes, fewer_settled, fewer_traces, moments
@@ -232,6 +233,10 @@ class MemoryModel(StreamModel):
         motor, senses = self.spec.motor, self.senses_
         action = self.network.run_on(state.traces).expected[:, senses.size :]
         return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
+
+    def free_energy(self, healthy: Sequence[Episode]) -> FreeEnergy:
+        """F of all that it expects, in the spreads that ``healthy`` episodes leave, from which it has not learned."""
+        return FreeEnergy.of(self.network, self.senses_, self.motor_, [e.stream for e in healthy])
 
     def recall(self, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
         """(steps, D) rows that come after a cue (T, D), in the units of the stream."""

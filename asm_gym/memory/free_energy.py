@@ -1,0 +1,289 @@
+"""One energy over all that the memory expects: what surprise rises with, and what everything else descends.
+
+    F(x, u, z) = [½ Π_z ‖z - μ‖² + ½ Π_x ‖ε‖²]/τ² + N log τ           time: the state, and what it says of the row
+               + Σ_i ½ (e_i/σ_i)² + log σ_i                           association: each group of senses from the rest
+               + Σ_j ½ ((u_j - û_j)/τ_j)² + log τ_j                   motor association: the command that belongs here
+
+    surprise      F rises where x is not what was expected
+    inference     z ← argmin F, at x and u as they are; the two other sums know nothing of z
+    completion    x_M ← argmin F over what is missing, and z with it
+    reaction      (x, u) ← argmin F over the command and the row that it will lead to, before either is there
+    learning      ΔW ∝ -∂F/∂W of every synapse, in its own term
+
+ε, μ, e, σ and û are those of ``inference`` (or ``settling``), ``association`` and ``motor``. Π_z and Π_x are those that
+the network learned with, so that z settles where it does in use. τ, one for the network through time, and τ_j, one for
+each command, are the spreads that were left in healthy rows: with them the three sums are in the same unit, nats.
+
+A rule of ``association`` bounds e/σ, which is the slope of Huber's ρ in place of ½r²; to the bound they are the same.
+
+Sources: Friston 2005 (Phil. Trans. R. Soc. B) for the sum and its precisions; Millidge et al. 2024 for the part through
+time; Adams, Shipp and Friston 2013 (Brain Struct. Funct.) for actions that descend the energy of what they make felt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from asm_gym.memory.association import Association
+from asm_gym.memory.inference import Weights
+from asm_gym.memory.motor import Motor, situation
+from asm_gym.memory.settling import SettlingWeights
+from asm_gym.memory.temporal import TemporalNetwork
+from asm_gym.scaling import FARTHEST, StreamScaler
+
+Floats = NDArray[np.float64]
+
+STEPS = 200
+"""Steps of L-BFGS in which a row comes to rest, at most."""
+
+SMALLEST_SPREAD = 1e-3
+"""Of τ."""
+
+
+class Terms(NamedTuple):
+    """What each part adds to F [nats]."""
+
+    time: float
+    association: float
+    motor: float
+
+    @property
+    def total(self) -> float:
+        """F."""
+        return self.time + self.association + self.motor
+
+
+class Slope(NamedTuple):
+    """Where F rises."""
+
+    row: Floats  # (D,) ∂F/∂(x, u), for each standard deviation of a number
+    z: Floats  # (H,)
+
+
+class Moment(NamedTuple):
+    """All that was there before a row."""
+
+    c: NDArray[np.float32]  # (1, I) what the network through time carries on
+    before: Floats  # (1, D) the row l rows before
+    earlier: Floats  # (1, D) as long before that
+    last: Floats  # (1, D) the row before it
+
+
+class _Read(NamedTuple):
+    """A row as the memory reads it."""
+
+    x: Floats  # (S,)
+    u: Floats  # (A + 1,)
+    inputs: Floats  # (I,) of association
+    changes: Floats  # (X,)
+
+
+@dataclass(frozen=True, eq=False)
+class FreeEnergy:
+    """F of a memory.
+
+    Args:
+        network: its synapses through time and between senses.
+        senses: how it reads a row.
+        motor: its motor association; None where it has none, and the third sum is not there.
+        tau: τ, of the network through time.
+        tau_motor: (A,) τ_j, in spreads of a command.
+    """
+
+    network: TemporalNetwork
+    senses: StreamScaler
+    motor: Motor | None
+    tau: float
+    tau_motor: Floats
+
+    @classmethod
+    def of(
+        cls,
+        network: TemporalNetwork,
+        senses: StreamScaler,
+        motor: Motor | None,
+        streams: Sequence[NDArray[np.floating[Any]]],
+    ) -> Self:
+        """With the spreads that healthy ``streams`` (T, D) leave."""
+        raw = cls(network, senses, motor, 1.0, np.ones(len(senses.spec.motor)))
+        time, commands, rows = 0.0, np.zeros(len(senses.spec.motor)), 0
+        for stream in streams:
+            for moment, row in raw.moments(stream):
+                z = raw.inferred(moment, row)
+                time += raw.terms(moment, row, z).time
+                commands += raw._unexpected(moment, raw._read(moment, row).u[:-1]) ** 2
+                rows += 1
+        if not rows:
+            raise ValueError("no healthy row is long enough to learn the spreads of")
+        tau = max(SMALLEST_SPREAD, float(np.sqrt(2.0 * time / (rows * raw._numbers))))
+        return replace(raw, tau=tau, tau_motor=np.maximum(np.sqrt(commands / rows), SMALLEST_SPREAD))
+
+    def moments(self, stream: NDArray[np.floating[Any]]) -> list[tuple[Moment, Floats]]:
+        """Each row (D,) of an episode (T, D) from the ``2 lag``-th on, and what was there before it."""
+        rows, lag = np.asarray(stream, np.float64), self.senses.lag
+        c, found = self.network.at_rest(1), []
+        for t in range(len(rows)):
+            moment = Moment(c, *(rows[None, max(0, t - k)] for k in (lag, 2 * lag, 1)))
+            if t >= 2 * lag:
+                found.append((moment, rows[t]))
+            c = self.after(moment, rows[t], turn=t % lag == 0)
+        return found
+
+    def inferred(self, moment: Moment, row: Floats) -> Floats:
+        """z (H,), the state that the network through time infers from a row (D,)."""
+        read = self.senses.read(row[None], moment.before, moment.earlier)
+        z: Floats = self.network.follow(moment.c, read.commands, read.senses, read.seen).z[0].astype(np.float64)
+        return z
+
+    def terms(self, moment: Moment, row: Floats, z: Floats) -> Terms:
+        """F of a row (D,) and a state (H,), by its parts."""
+        return self._of(moment, row, z)[0]
+
+    def slope(self, moment: Moment, row: Floats, z: Floats) -> Slope:
+        """∂F of a row (D,) and a state (H,)."""
+        return self._of(moment, row, z)[1]
+
+    def settled(self, moment: Moment, row: Floats, free: NDArray[np.bool_]) -> tuple[Floats, Terms]:
+        """The row (D,) in which F is lowest over its ``free`` (D,) numbers and the state; and F there.
+
+        What is free should begin near what is likely, for F has other valleys: see ``expected``.
+        """
+        spread, count = self.senses.spread, int(free.sum())
+        start = np.concatenate([np.zeros(count), self.inferred(moment, row)])
+
+        def at(offset: Floats) -> tuple[float, Floats]:
+            tried = row.copy()
+            tried[free] += spread[free] * offset[:count]
+            terms, slope = self._of(moment, tried, offset[count:])
+            return terms.total, np.concatenate([slope.row[free], slope.z])
+
+        found = minimize(at, start, jac=True, method="L-BFGS-B", options={"maxiter": STEPS, "maxcor": 20})
+        settled = row.copy()
+        settled[free] += spread[free] * found.x[:count]
+        return settled, self.terms(moment, settled, found.x[count:])
+
+    def reaction(self, moment: Moment) -> Floats:
+        """(A,) the command that lets F be lowest over itself and the row that it leads to.
+
+        Nothing of the row is there yet: what the network through time expects of it is what it is drawn to.
+        """
+        guess = moment.last[0].copy()
+        guess[self.senses.spec.motor] = self.expected(moment)
+        settled, _ = self.settled(moment, guess, np.ones(len(guess), np.bool_))
+        return settled[self.senses.spec.motor]
+
+    @cached_property
+    def _weights(self) -> tuple[Any, Association]:
+        """All synapses in double precision, for differences of F are small."""
+        w, association = self.network.weights, self.network.association
+        return type(w)(*(np.asarray(W, np.float64) for W in w)), Association(
+            *(np.asarray(W, np.float64) for W in association)
+        )
+
+    @property
+    def _numbers(self) -> int:
+        """N, that the network through time expects."""
+        return self.senses.size + len(self.senses.spec.motor)
+
+    def expected(self, moment: Moment) -> Floats:
+        """(A,) the command that the motor association expects; that of the row before where there is none."""
+        known = moment.last[0, self.senses.spec.motor]
+        if self.motor is not None:
+            known = self.motor.command(situation(self.senses, moment.last))[0]
+        return np.asarray(known, np.float64)
+
+    def after(self, moment: Moment, row: Floats, turn: bool = True) -> NDArray[np.float32]:
+        """c (1, I) after a row (D,); as it was where it is not the row's ``turn``, for every l-th is taken up."""
+        if not turn:
+            return moment.c
+        read = self.senses.read(row[None], moment.before, moment.earlier)
+        return self.network.carry_on(moment.c, read.commands, read.senses, read.seen)[1]
+
+    def _read(self, moment: Moment, row: Floats) -> _Read:
+        """What ``StreamScaler.read`` does, unrounded: L-BFGS sees the last digits of single precision as valleys."""
+        senses, spec, before = self.senses, self.senses.spec, moment.before[0]
+        value, moved = (row - senses.mean) / senses.spread, (row - before) / senses.change
+        x = np.concatenate([value[spec.sensory], moved[senses.slow]])
+        u, changes = np.append(value[spec.motor], 1.0), moved[spec.sensory]
+        past = (before - moment.earlier[0])[senses.slow] / senses.change[senses.slow]
+        inputs = np.concatenate([(before - senses.mean) / senses.spread, changes, past, u])
+        return _Read(x, u, np.where(np.abs(inputs) < FARTHEST, inputs, 0.0), changes)
+
+    def _unexpected(self, moment: Moment, u: Floats) -> Floats:
+        """u - û (A,) in spreads of the stream; 0 where there is no motor association."""
+        if self.motor is None:
+            return np.zeros(len(u))
+        spec, senses = self.senses.spec, self.senses
+        found: Floats = u - (self.expected(moment) - senses.mean[spec.motor]) / senses.spread[spec.motor]
+        return found
+
+    def _of(self, moment: Moment, row: Floats, z: Floats) -> tuple[Terms, Slope]:
+        senses, spec, (w, association) = self.senses, self.senses.spec, self._weights
+        x, u, a, changes = self._read(moment, row)
+        how = float(self.network.prior_precision), float(self.network.sensory_precision)
+        through = _by_settling if isinstance(w, SettlingWeights) else _by_traces
+        raw, of_x, of_u, of_z = through(w, moment.c[0].astype(np.float64), u, x, z, *how)
+        time, scale = raw / self.tau**2 + self._numbers * np.log(self.tau), 1.0 / self.tau**2
+        between, of_a, of_changes = _between(association, a, changes)
+        off = self._unexpected(moment, u[:-1])
+        motor = float(np.sum(0.5 * (off / self.tau_motor) ** 2 + np.log(self.tau_motor))) if self.motor else 0.0
+        D, X, L, A = len(row), len(spec.sensory), len(senses.slow), len(spec.motor)
+        slope = np.zeros(D)
+        by_change = senses.spread / senses.change  # of a number that moves by one spread, in spreads of its change
+        believed = (np.abs(changes) < FARTHEST) * 1.0
+        slope[spec.sensory] += scale * of_x[:X]
+        slope[spec.sensory] += by_change[spec.sensory] * (of_changes + believed * of_a[D : D + X])
+        slope[senses.slow] += scale * by_change[senses.slow] * of_x[X:]
+        slope[spec.motor] += scale * of_u + of_a[D + X + L : D + X + L + A]
+        if self.motor is not None:
+            slope[spec.motor] += off / self.tau_motor**2
+        return Terms(time, between, motor), Slope(slope, scale * of_z)
+
+
+def _between(association: Association, a: Floats, changes: Floats) -> tuple[float, Floats, Floats]:
+    """Σ ½(e/σ)² + log σ for inputs (I,) and changes (X,), and how it rises with either."""
+    V, U, D, W_S, b_S, span, s = association
+    f = np.tanh(V @ a)
+    asked = W_S @ f + b_S
+    log_variance = np.clip(asked, span[0], span[1])
+    e = (changes - D @ a - U @ f) / s
+    judged = e**2 * np.exp(-log_variance)
+    of_changes = e * np.exp(-log_variance) / s
+    of_variance = np.where((asked > span[0]) & (asked < span[1]), 0.5 * (1.0 - judged), 0.0)
+    of_f = W_S.T @ of_variance - U.T @ of_changes
+    of_a = V.T @ ((1.0 - f**2) * of_f) - D.T @ of_changes
+    return float(np.sum(0.5 * judged + 0.5 * log_variance)), of_a, of_changes
+
+
+Through = tuple[float, Floats, Floats, Floats]
+"""The sum through time, and how it rises with x (S,), u (A,) and z (H,)."""
+
+
+def _by_traces(w: Weights, c: Floats, u: Floats, x: Floats, z: Floats, pi_z: float, pi_x: float) -> Through:
+    """½ Π_z ‖z - W_C c‖² + ½ Π_x ‖[x, u] - W_F f(z) - W_D [c, u, 1]‖²."""
+    W_C, W_F, W_D, _ = w
+    f, off = np.tanh(z), z - W_C @ c
+    error = np.concatenate([x, u[:-1]]) - W_F @ f - W_D @ np.concatenate([c, u])
+    S, past, A = len(x), len(c), len(u) - 1
+    of_u = pi_x * (error[S:] - W_D[:, past : past + A].T @ error)
+    of_z = pi_z * off - pi_x * (1.0 - f**2) * (W_F.T @ error)
+    return float(0.5 * pi_z * off @ off + 0.5 * pi_x * error @ error), pi_x * error[:S], of_u, of_z
+
+
+def _by_settling(w: SettlingWeights, c: Floats, u: Floats, x: Floats, z: Floats, pi_z: float, pi_x: float) -> Through:
+    """½ Π_z ‖z - μ‖² + ½ Π_x ‖x - W_F f(z) - b_F‖² + ½ ‖u - W_A f(h)‖²."""
+    W_H, W_U, W_F, b_F, W_A = w
+    carried, f = W_H @ np.tanh(c), np.tanh(z)
+    off, error = z - carried - W_U @ u, x - b_F - W_F @ f
+    action = u[:-1] - W_A @ np.tanh(carried + W_U[:, -1])
+    of_z = pi_z * off - pi_x * (1.0 - f**2) * (W_F.T @ error)
+    of_u = action - pi_z * W_U[:, :-1].T @ off
+    whole = 0.5 * pi_z * off @ off + 0.5 * pi_x * error @ error + 0.5 * action @ action
+    return float(whole), pi_x * error, of_u, of_z
