@@ -42,7 +42,7 @@ class RowReport(NamedTuple):
 
 
 def ends(row: RowReport) -> bool:
-    """Whether an alarm ends the episode, where alarms do: a knock that presses no harder than healthy motion does not."""
+    """Whether an alarm ends the episode, where alarms do: a knock no harder than healthy motion does not."""
     return row.decision.alarm and (row.event != KNOCK or row.reason == CONTACT)
 
 

@@ -208,10 +208,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         rows, failures = self._sensed(observations, executed, infos, last)
         reports = self._judge(rows, executed, begun, commands, failures, infos, last)
         stopped = np.array(
-            [
-                r.decision.gave_up or (g.ends_on_alarm and ends(r))
-                for r, g in zip(reports, self._guards, strict=True)
-            ]
+            [r.decision.gave_up or (g.ends_on_alarm and ends(r)) for r, g in zip(reports, self._guards, strict=True)]
         )
         stopped &= ~begun
         terminated = np.asarray(terminated, bool) | (stopped & (not self._options.truncate))
