@@ -75,7 +75,7 @@ class Args:
     """Whether the hand reaches for places where noise alone would move it."""
     stream_freq: int | None = option(None, least=1, metavar="HZ")
     """Rows of the stream a second; one each control step by default."""
-    exam_policies: tuple[str, ...] | None = option(None, quick=(), metavar="AGENT")
+    exam_policies: tuple[str, ...] | None = fixed(None, quick=())
     """Agents to examine under, as guides are named; by default all that are shipped and fit this arm."""
     exam_episodes: int = option(60, quick=2, least=0)
     """Healthy episodes of each examination; 0 examines nothing."""

@@ -43,7 +43,7 @@ CHECKS = {
     "dds": Check("report,dds", "tests/test_dds.py"),
     "rerun": Check("report,rerun", "tests/test_rerun.py"),
     "onnx": Check("onnx", "tests/test_export.py"),
-    "data": Check("robosuite,data,report", "tests/test_datasets.py tests/test_public.py"),
+    "data": Check("robosuite,data,report", "tests/test_datasets.py"),
     "agents": Check("agents", "tests/test_learners.py"),
     "learners": Check("learners", "tests/test_learners.py"),
     "rllib": Check("cluster", "tests/test_learners.py", "ray[rllib] torch", pins="gymnasium"),

@@ -91,13 +91,13 @@ class _Graph:
         self.constants.append(self._onnx.numpy_helper.from_array(array, f"c{len(self.constants)}"))
         return str(self.constants[-1].name)
 
-    def cast(self, what: str, kind: type[Any], out: str = "") -> str:
+    def cast(self, what: str, kind: type[Any]) -> str:
         """The same as another type of number."""
-        return self("Cast", what, to=self._onnx.helper.np_dtype_to_tensor_dtype(np.dtype(kind)), out=out)
+        return self("Cast", what, to=self._onnx.helper.np_dtype_to_tensor_dtype(np.dtype(kind)))
 
-    def taken(self, what: str, where: NDArray[np.intp], axis: int = 1) -> str:
+    def taken(self, what: str, where: NDArray[np.intp]) -> str:
         """Some columns."""
-        return self("Gather", what, np.asarray(where, np.int64), axis=axis)
+        return self("Gather", what, np.asarray(where, np.int64), axis=1)
 
     def column(self, what: str) -> str:
         """(B,) as (B, 1)."""

@@ -36,7 +36,6 @@ STUDIES = {
     "diagnosis": Study("what is wrong, of kinds of faults that were never seen", needs_a_run=True),
     "real_arms": Study("faults in recordings of real arms, once downloaded", needs_a_run=True),
     "actprobe": Study("will GR00T fail, by logs of others", needs_a_run=True),
-    "public": Study("AUROC by kind on voraus-AD or AURSAD, once downloaded", needs_a_run=True),
 }
 INDEPENDENT = tuple(name for name, study in STUDIES.items() if not study.needs_a_run)
 

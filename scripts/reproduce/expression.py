@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from asm_gym.episode import Episode
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
-from asm_gym.memory.inference import Weights
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.network import Network, initial_weights
 from asm_gym.memory.recall import Recalled, follow, run_on, to_rows
@@ -27,6 +26,9 @@ from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import recurrent
 
 Rows = NDArray[np.float64]
+
+FREE = 0.6
+"""``free_running_probability`` of ``NeuralASM``: how much of what follows a cue is learned from alone."""
 
 
 class Expresser(Protocol):
@@ -63,10 +65,7 @@ class Memory:
         hidden: int,
         rng: np.random.Generator,
         steps: int,
-        free: float = 0.6,
-        iterations: int = 5,
         rate: float = 3e-3,
-        prior_precision: float = 30.0,
         gain: float = 1.0,
         dynamics: str = TRACES,
     ) -> Memory:
@@ -74,54 +73,20 @@ class Memory:
 
         Args:
             steps: in which its synapses change, with 64 episodes side by side.
-            free: ``free_running_probability`` of ``NeuralASM``, which explains the others too.
-            gain: of the synapses onto the state before it learns; large ones make units that tell beginnings apart.
-            dynamics: traces alone have a ``gain``, and others infer and learn as they usually do.
+            gain: of traces' synapses onto the state before it learns; large ones make units that tell beginnings apart.
+            dynamics: one of ``DYNAMICS``, with its usual inference.
         """
-        if dynamics != TRACES:
-            return cls.by(dynamics, episodes, hidden, rng, steps, free, rate)
-        blank = cls.untaught(episodes, hidden, rng, iterations, prior_precision)
-        blank.network.weights.W_C[:] *= np.float32(gain)
-        return blank.taught(episodes, rng, steps, free, rate)
-
-    @classmethod
-    def by(
-        cls,
-        dynamics: str,
-        episodes: Sequence[Episode],
-        hidden: int,
-        rng: np.random.Generator,
-        steps: int,
-        free: float,
-        rate: float,
-    ) -> Memory:
-        """One of ``DYNAMICS``, with its usual inference; arguments as in ``learned``."""
         reader, how, size = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes]), DYNAMICS[dynamics], 64
         epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
-        schedule = Schedule(epochs, size, rate, how.iterations, how.prior_precision, 1.0, free)
-        return cls(reader, how.learn(trajectories(reader, episodes), hidden, schedule, rng, lambda: None).network)
-
-    @classmethod
-    def untaught(
-        cls, episodes: Sequence[Episode], hidden: int, rng: np.random.Generator, iterations: int, prior_precision: float
-    ) -> Memory:
-        """That knows how large the numbers of these episodes are, and nothing else of them."""
-        reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
+        schedule = Schedule(epochs, size, rate, how.iterations, how.prior_precision, 1.0, FREE)
+        taught = trajectories(reader, episodes)
+        if dynamics != TRACES:
+            return cls(reader, how.learn(taught, hidden, schedule, rng, lambda: None).network)
         weights = initial_weights(hidden, reader.size, len(reader.spec.motor), rng)
-        weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in trajectories(reader, episodes)])
-        return cls(reader, Network(weights, unassociated(), iterations, prior_precision, 1.0))
-
-    def taught(
-        self, episodes: Sequence[Episode], rng: np.random.Generator, steps: int, free: float = 0.6, rate: float = 3e-3
-    ) -> Memory:
-        """What it becomes by going on to learn from these; arguments as in ``learned``."""
-        net, size = self.network, 64
-        weights = Weights(*(w.copy() for w in net.weights))
-        how = net.iterations, float(net.prior_precision), float(net.sensory_precision)
-        epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
-        schedule = Schedule(epochs, size, rate, *how, free)
-        learn(weights, trajectories(self.reader, episodes), schedule, rng, lambda: None)
-        return Memory(self.reader, Network(weights, net.association, *how))
+        weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in taught])
+        weights.W_C[:] *= np.float32(gain)
+        learn(weights, taught, schedule, rng, lambda: None)
+        return cls(reader, Network(weights, unassociated(), how.iterations, how.prior_precision, 1.0))
 
     def hidden(self, streams: Rows) -> NDArray[np.float32]:
         """The inferred states (T, B, H) of streams (T, B, D)."""
@@ -255,19 +220,16 @@ def mean_demonstrations(train: Sequence[Episode], dims: int) -> NDArray[np.float
     return np.stack([np.mean([e.stream[:, :dims] for e in train if e.info["skill"] == n], axis=0) for n in names])
 
 
-def recalled(
-    model: Expresser, tests: Sequence[Episode], means: NDArray[np.float64], cue: int, skills: Sequence[str] = ()
-) -> tuple[float, float]:
+def recalled(model: Expresser, tests: Sequence[Episode], means: NDArray[np.float64], cue: int) -> tuple[float, float]:
     """Mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
 
     Args:
         tests: of one length.
         means: (K, T, P) mean demonstration of each skill, in order of name.
         cue: the whole length for online recall.
-        skills: their names; those of the tests, where it is empty.
     """
     streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)  # (T, B, D)
-    dims, names = means.shape[2], sorted(skills or {str(e.info["skill"]) for e in tests})
+    dims, names = means.shape[2], sorted({str(e.info["skill"]) for e in tests})
     first = cue if cue < len(streams) else 1
     hand = model.express(streams, cue)[first:, :, :dims]  # (T', B, P)
     error = np.linalg.norm(hand - streams[first:, :, :dims], axis=2).mean()
