@@ -46,7 +46,7 @@ from asm_gym.validation import check_choice, check_number
 
 SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
-PER_HOUR, RATES = 3.0, (10.0, 3.0, 1.0)
+PER_HOUR, RATES = 5.0, (10.0, 3.0, 1.0)
 """False alarms an hour that a memory is calibrated for, and at which an examination is also told."""
 HEALTHY, HOURS_SEED = 60, 11
 """Episodes of the expert of each task to calibrate on, and of what their seeds are drawn."""
