@@ -46,7 +46,7 @@ from asm_gym.validation import check_choice, check_number
 
 SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
-PER_HOUR, RATES = 3.0, (10.0, 3.0, 1.0)
+PER_HOUR, RATES = 5.0, (10.0, 3.0, 1.0)
 """False alarms an hour that a memory is calibrated for, and at which an examination is also told."""
 HEALTHY, HOURS_SEED = 60, 11
 """Episodes of the expert of each task to calibrate on, and of what their seeds are drawn."""
@@ -75,14 +75,14 @@ class Args:
     """Whether the hand reaches for places where noise alone would move it."""
     stream_freq: int | None = option(None, least=1, metavar="HZ")
     """Rows of the stream a second; one each control step by default."""
+    healthy_episodes: int = option(HEALTHY, quick=0, least=0)
+    """Episodes of the expert of each task to calibrate on, beside the lessons that are left out."""
     exam_policies: tuple[str, ...] | None = fixed(None, quick=())
     """Agents to examine under, as guides are named; by default all that are shipped and fit this arm."""
     exam_episodes: int = option(60, quick=2, least=0)
     """Healthy episodes of each examination; 0 examines nothing."""
     exam_faults: tuple[str, ...] = option((TEST,), quick=(), metavar="KIND")
     """Kinds of fault, each medium and strong but for pushes of 20 N, where the policy or the task was left out."""
-    exam_pushes: int = option(3, quick=0, least=0)
-    """Pushes of 20 N in each such examination; they are judged by how soon they are noticed."""
     workers: str = option("2", check=ParallelConfig.named, metavar="N")
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
     seed: int = option(0, least=0)
@@ -91,12 +91,12 @@ class Args:
     """Folder of the run."""
     quick: bool = False
     """To see that everything runs, not to judge the figures."""
+    exam_pushes: int = fixed(3, quick=0)
+    """Pushes of 20 N in each examination in which there are faults; they are judged by how soon they are noticed."""
     tasks: tuple[str, ...] | None = fixed(None)
     """Tasks to babble in; by default seven with the Panda, and with other arms those of them that their experts do."""
     exam_tasks: tuple[str, ...] | None = fixed(None, quick=())
     """Further tasks to examine in; by default two that Panda experts do, with other arms those of them they do."""
-    healthy_episodes: int = fixed(HEALTHY, quick=0)
-    """Episodes of the expert of each task to calibrate on, beside the lessons that are left out."""
     false_alarms_per_hour: float = fixed(PER_HOUR, quick=120.0, check=check_per_hour)
     """Faults that may be said in an hour of healthy episodes."""
     window: float = fixed(WINDOW_S, check=partial(check_number, "window", above=0))

@@ -83,7 +83,7 @@ def test_what_is_left_of_an_excused_surprise_adds_up_and_hides_nothing():
     assert left.value == pytest.approx(60.0 / EXCUSED)
     assert left.attribution.sum() == pytest.approx(left.value)
     assert left.raw == 60.0
-    assert [left.event(q) for q in (1.9, 2.1, 61.0)] == ["fault", "knock", ""]
+    assert [left.event(q) for q in (5.9, 6.1, 61.0)] == ["fault", "knock", ""]
     assert event_of(np.nan, np.nan, 0, 1.0) == event_of(np.inf, np.inf, 1, 1.0) == "fault"
 
 
@@ -104,7 +104,7 @@ def test_knocks_set_no_threshold_of_faults_and_the_choice_is_saved(tmp_path):
     plain, told = (NeuralASM(ARM, hidden_size=8, association_size=8, epochs=1, excuses=e) for e in (False, True))
     for memory in (plain, told):
         memory.fit(wild(20)).calibrate(wild(40, knocks=True, seed=1), false_alarms_per_hour=60.0)
-    assert told.threshold < plain.threshold / 5
+    assert told.threshold < plain.threshold / 3
     knocked = told.score(wild(1, knocks=True, seed=2)[0])
     assert knocked.raw[40] > told.threshold
     assert knocked.excuse[40] == EVENTS.index("knock")

@@ -2,12 +2,12 @@
 
     knock    a wrist has felt more than 50 N on an axis within the last second; its peaks count, where they are sensed
     stop     a joint is within 0.03 rad of one of its stops
-    s'       s / 30 where either is so, s / 3 where a finger has just moved by more than its sensor's noise, else s
+    s'       s / 10 where either is so, s / 3 where a finger has just moved by more than its sensor's noise, else s
 
-A hand that strikes a table surprises, and so does a joint that comes to its stop or a finger that slips: none is
-a fault of the body, and between them they made four of five alarms of healthy robots. They are not forgiven. What is
-still over the threshold is a fault: a pair of joints that were swapped exceeds it by orders of magnitude. What is over
-it but for the excuse is an alarm of its own name. A number that is missing excuses nothing.
+A hand that strikes a table surprises, and so does a joint that comes to its stop or a finger that slips: none is a
+fault of the body, and most alarms of healthy robots are such. They are not forgiven: what is still over the threshold
+is a fault, as a pair of swapped joints is by far. What is over it but for the excuse has a name of its own, and is
+counted. A number that is missing excuses nothing.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ KNOCKED_S = 1.0
 """For how long a knock is felt in what comes after it [s]."""
 NEAR_STOP = 0.03
 """[rad]"""
-EXCUSED, SLIPPED = 30.0, 3.0
+EXCUSED, SLIPPED = 10.0, 3.0
 """What surprise is divided by, at a knock or a stop, and where fingers move."""
 MOVING, MOVED_S = 5.0, 0.1
 """Standard deviations of its sensor's noise at which a finger moves, and for how long it has just moved [s]."""
