@@ -44,7 +44,7 @@ class StreamModel:
         return self.spec.sensory
 
     def state(self) -> Arrays:
-        """What a file keeps, as arrays of floats that ``restore`` is given; a model that learned anything else has its own."""
+        """Arrays of floats, which a file keeps and ``restore`` is given; a model that learned anything else has its own."""
         return self.learned_
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
