@@ -101,13 +101,12 @@ def pairs(wheel: Path) -> str:
             subprocess.run(f"{pip} --dry-run --ignore-installed --report {plan} {wanted}", shell=True, cwd=ROOT)
             found = json.loads(plan.read_text())["install"] if plan.is_file() else []
             versions = {re.sub("_", "-", i["metadata"]["name"].lower()): i["metadata"]["version"] for i in found}
-            late = [
-                f"{n} {versions[n]}" for n, v in BREAKS.items() if n in versions and Version(versions[n]) >= Version(v)
-            ]
+            late = [f"{n} {v}" for n, v in versions.items() if n in BREAKS and Version(v) >= Version(BREAKS[n])]
             wrong += [f"{'+'.join(two)}: {', '.join(late) or 'cannot be installed'}"] if late or not found else []
             print("+".join(two), *(f"{n} {versions.get(n)}" for n in ("mujoco", "numpy", "torch")), flush=True)
         for extra in EXTRAS:
-            tried = f"{pip} '{wheel}[{extra}]' && {folder}/bin/python -m pip check -q && {folder}/bin/python -c \"{STILL_RUNS}\""
+            python = f"{folder}/bin/python"
+            tried = f"{pip} '{wheel}[{extra}]' && {python} -m pip check -q && {python} -c \"{STILL_RUNS}\""
             there = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
             done = subprocess.run(tried, shell=True, cwd=folder, env=there)
             wrong += [f"{extra} after robosuite"] if done.returncode else []
