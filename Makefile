@@ -14,7 +14,7 @@ pytest = $(one_thread) $(bin)/python -m pytest -n $(JOBS) --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo reproduce doctor test test-all test-floats extras soak check format docs page pages verify clean
+.PHONY: help demo reproduce doctor test test-all test-floats extras soak check format docs page pages verify wheel clean
 
 help: ## list the commands
 	@sed -nE 's/^([a-z-]+):.* ## (.*)/  make \1\t\2/p' Makefile | expand -t 20
@@ -66,6 +66,10 @@ pages: $(stamp) ## prints every page for which something has changed, and goes o
 
 verify: $(stamp) ## runs the checks of the pages of results, and says which print something else
 	$(one_thread) $(bin)/python docs/pages.py verify $(ARGS)
+
+wheel: $(stamp) ## the wheel and the source archive, in dist/
+	$(bin)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
+	$(bin)/python -c "from setuptools.build_meta import build_sdist as b; print('make: dist/' + b('dist'))"
 
 clean: ## removes .venv, builds and caches; runs/ stays
 	rm -rf .venv build dist docs/_build docs/reference/api *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -18,11 +18,17 @@ from asm_gym.data.channels import read_recorded
 from asm_gym.files import regular_file
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32, typed
+from asm_gym.view.inline import lines_over_time
 
 KIND = "episode"
 
 ARRAYS = {"stream": "f", "actions": "f", "observations": "fiub", "rewards": "f", "faults": "b", "contact_force": "f"}
 """What a file holds, and the kinds of numbers that each may have."""
+
+
+def _liveliest(part: NDArray[np.float32]) -> int:
+    """Which column of (T, n) moves most."""
+    return int(np.argmax(np.nan_to_num(np.ptp(part, axis=0)))) if len(part) else 0
 
 
 def _empty() -> NDArray[np.float32]:
@@ -105,6 +111,20 @@ class Episode:
 
     def __len__(self) -> int:
         return len(self.stream)
+
+    def __repr__(self) -> str:
+        """In a line: how long, of what, and how it ended."""
+        seconds, seed = len(self) * self.spec.dt, "" if self.seed is None else f", seed {self.seed}"
+        faults = f", {int(self.faults.sum())} rows with a fault" if self.faults.any() else ""
+        ended = "success" if self.success else "no success"
+        rows = f"{len(self)} rows of {self.spec.size}, {seconds:g} s"
+        return f"<Episode of {self.spec.source or 'a stream'}: {rows}, {ended}{seed}{faults}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: each channel over time, the largest number of it; red where a fault was active."""
+        parts = {f"{c.name} [{c.unit}]": self.stream[:, self.spec.slices[c.name]] for c in self.spec.channels}
+        lines = {name: part[:, _liveliest(part)] for name, part in parts.items()}
+        return lines_over_time(repr(self), lines, self.spec.dt, self.faults if len(self.faults) else None)
 
     @property
     def labelled(self) -> EpisodeLabel:

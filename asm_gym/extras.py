@@ -18,6 +18,8 @@ BROUGHT_BY = {
     **dict.fromkeys(("moviepy",), "video"),
     **dict.fromkeys(("gymnasium_robotics", "shimmy", "dm_control"), "environments"),
     **dict.fromkeys(("torchrl", "wandb"), "learners"),
+    **dict.fromkeys(("huggingface_hub",), "hub"),
+    **dict.fromkeys(("ipywidgets", "ipykernel", "nbclient", "nbformat"), "notebooks"),
     **dict.fromkeys(("rosbags",), "ros"),
     **dict.fromkeys(("cyclonedds",), "dds"),
     **dict.fromkeys(("rerun",), "rerun"),

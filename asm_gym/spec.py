@@ -104,6 +104,16 @@ class StreamSpec:
             raise ValueError("a stream needs at least one channel that is not an action")
         check_number("dt", self.dt, above=0.0)
 
+    def __repr__(self) -> str:
+        """Its channels with how many numbers each has, and their units."""
+        channels = ", ".join(f"{c.name} ({c.size}) [{c.unit}]" for c in self.channels)
+        return f"<StreamSpec of {self.source or 'a stream'} at {1 / self.dt:g} Hz: {channels}>"
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """D units, one for each of ``labels``."""
+        return tuple(c.unit for c in self.channels for _ in c.labels)
+
     @cached_property
     def size(self) -> int:
         """D, the length of a row."""

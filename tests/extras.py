@@ -2,20 +2,25 @@
 
     python -m tests.extras              all of them, minutes each; make extras
     python -m tests.extras learners     one
+    python -m tests.extras pairs        every two resolved together, and each installed after robosuite
 
 A test may be skipped where it says another extra that it needs, and for no other reason.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
 import sys
 import venv
+from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
+
+from packaging.version import Version
 
 from tests.wheel import ROOT, build_wheel
 
@@ -74,11 +79,47 @@ def check(name: str, wheel: Path) -> str:
     return "; ".join(wrong + [line for line in skipped if "pip install" not in line or ours.search(line)])
 
 
+EXTRAS = (
+    *("robosuite", "report", "data", "agents", "environments", "learners", "hub", "notebooks"),
+    *("cluster", "rerun", "ros", "video"),
+)
+BREAKS = {"mujoco": "3.10", "dm-control": "1.0.41", "numpy": "3", "pyarrow": "22"}
+"""From which version on a package has not been tried, or breaks environments."""
+STILL_RUNS = (
+    "import gymnasium as gym; from asm_gym import NeuralASMSafety; e = NeuralASMSafety(gym.make('asm_gym/Lift-v0'));"
+    "e.reset(seed=0); print(e.step(e.action_space.sample())[-1]['asm']['state'])"
+)
+
+
+def pairs(wheel: Path) -> str:
+    """What is wrong with two extras at once, by the newest versions there are; or with one after robosuite."""
+    wrong = []
+    with TemporaryDirectory() as folder:
+        venv.create(folder, with_pip=True)
+        pip, plan = f"{folder}/bin/python -m pip install -q", Path(folder, "plan.json")
+        for two in combinations(EXTRAS, 2):
+            wanted = f"'{wheel}[{','.join(two)}]'"
+            plan.unlink(missing_ok=True)
+            subprocess.run(f"{pip} --dry-run --ignore-installed --report {plan} {wanted}", shell=True, cwd=ROOT)
+            found = json.loads(plan.read_text())["install"] if plan.is_file() else []
+            versions = {re.sub("_", "-", i["metadata"]["name"].lower()): i["metadata"]["version"] for i in found}
+            late = [f"{n} {v}" for n, v in versions.items() if n in BREAKS and Version(v) >= Version(BREAKS[n])]
+            wrong += [f"{'+'.join(two)}: {', '.join(late) or 'cannot be installed'}"] if late or not found else []
+            print("+".join(two), *(f"{n} {versions.get(n)}" for n in ("mujoco", "numpy", "torch")), flush=True)
+        for extra in EXTRAS:
+            python = f"{folder}/bin/python"
+            tried = f"{pip} '{wheel}[{extra}]' && {python} -m pip check -q && {python} -c \"{STILL_RUNS}\""
+            there = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+            done = subprocess.run(tried, shell=True, cwd=folder, env=there)
+            wrong += [f"{extra} after robosuite"] if done.returncode else []
+    return "; ".join(wrong)
+
+
 def main(names: list[str]) -> int:
     """Checks some or all, and returns 1 where one is wrong."""
     with TemporaryDirectory() as folder:
         wheel = build_wheel(Path(folder))
-        said = {name: check(name, wheel) for name in names or CHECKS}
+        said = {name: pairs(wheel) if name == "pairs" else check(name, wheel) for name in names or (*CHECKS, "pairs")}
     for name, wrong in said.items():
         print(f"{name:<14} {wrong or 'ok'}")
     return int(any(said.values()))

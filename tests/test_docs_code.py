@@ -19,6 +19,7 @@ from asm_gym.monitors import MONITORS
 from asm_gym.scripts import command as command_of
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.command import run
+from asm_gym.tasks import OWN
 from tests import documents
 from tests.soak import __main__ as soak
 
@@ -50,7 +51,7 @@ class Parsed(Exception):  # noqa: N818 (it is no error)
 @pytest.fixture
 def registries():
     """Faults and monitors that a page adds are gone afterwards."""
-    kept = [(registry, dict(registry)) for registry in (FAULTS, MONITORS)]
+    kept = [(registry, dict(registry)) for registry in (FAULTS, MONITORS, OWN)]
     yield
     for registry, before in kept:
         registry.clear()

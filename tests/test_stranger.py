@@ -180,3 +180,26 @@ def test_a_callback_finds_out_the_control_period():
     guarded = NeuralASMSafety(env, alarmed, on_alarm="hold")
     sb3.PPO("MlpPolicy", guarded, n_steps=20, batch_size=20).learn(20, callback=callback)
     assert callback.ended[0].override_s == pytest.approx(19 * spec.dt)
+
+
+def test_what_a_notebook_shows_is_a_line_or_a_small_picture():
+    episode = sine_episodes(1)[0]
+    assert len(repr(episode)) < 200
+    assert "rows of" in repr(episode)
+    html = episode._repr_html_()
+    assert html.count("<svg") == min(8, len(episode.spec.channels))
+    assert f"{len(episode) * episode.spec.dt:.2f} s" in html
+    assert len(repr(episode.spec)) < 400
+    surprise = Surprise(np.arange(5.0), np.ones((5, 3)))
+    assert repr(surprise) == "<Surprise of 5: last 4, largest 4>"
+    assert "surprise" in surprise._repr_html_()
+    assert len(repr(Surprise(np.zeros(0), np.zeros((0, 3))))) < 40
+
+
+def test_each_label_has_its_unit():
+    assert dict(zip(SPEC.labels, SPEC.units, strict=True)) == {
+        "angle[0]": "rad",
+        "angle[1]": "rad",
+        "current": "A",
+        "u": "1",
+    }

@@ -195,7 +195,7 @@ class RowReader:
 
     def __init__(self, spec: StreamSpec) -> None:
         self.spec, self.line = spec, 0
-        self._units = [c.unit for c in spec.channels for _ in c.labels]
+        self._units = spec.units
         self._order: list[int] | None = None  # of CSV: where each number of a row stands
         self._how = Dialect(",", comma=False)
         self._clock: Clock | None = None

@@ -15,6 +15,7 @@ from asm_gym.detection.events import EVENTS, KNOCK, STOP, Excused, event_of
 from asm_gym.episode import Episode
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
+from asm_gym.view.inline import lines_over_time
 
 Progress = Callable[[int, int], object]
 """Called as ``progress(done, total)``."""
@@ -46,6 +47,19 @@ class Surprise(NamedTuple):
     of_skill: NDArray[np.float64] | None = None
     raw: NDArray[np.float64] | None = None
     excuse: NDArray[np.int8] | None = None
+
+    def __repr__(self) -> str:
+        """In a line: of how many rows, the last and the largest."""
+        if not len(self.value):
+            return "<Surprise of no row>"
+        return f"<Surprise of {len(self.value)}: last {self.value[-1]:.4g}, largest {self.value.max():.4g}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: surprise over time, and the numbers that had the largest share."""
+        shares = np.nan_to_num(np.atleast_2d(self.attribution))
+        most = np.argsort(-shares.sum(axis=0))[:4]
+        lines = {"surprise": self.value} | {f"share of number {k}": shares[:, k] for k in most}
+        return lines_over_time(repr(self), lines)
 
     @property
     def parts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

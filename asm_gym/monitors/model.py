@@ -44,7 +44,7 @@ class StreamModel:
         return self.spec.sensory
 
     def state(self) -> Arrays:
-        """What a file keeps for ``restore``, as arrays of floats; a model that learned anything else has its own."""
+        """Arrays of floats that a file keeps and ``restore`` is given; what learned anything else has its own."""
         return self.learned_
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
