@@ -14,6 +14,7 @@ from typing import Any
 
 from rich.console import Console
 
+from asm_gym.data.commands import feedback
 from asm_gym.data.gaps import filled
 from asm_gym.data.logs import Layout, read_logs
 from asm_gym.data.notes import noted
@@ -29,6 +30,7 @@ from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.spec import MOTOR
 from asm_gym.validation import check_number
 
 ANY_EPISODE = 0.5
@@ -119,6 +121,25 @@ def promised(args: Args, calibration: list[Episode]) -> str:
     return f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones, {at_their_length}"
 
 
+def about_commands(args: Args, episodes: list[Episode]) -> list[str]:
+    """What is worth saying of the commands in logs, a line each."""
+    spec = episodes[0].spec
+    if spec.source != "table":
+        return []
+    names = ", ".join(dict.fromkeys(c.name for c in spec.channels if c.group == MOTOR))
+    if not names:
+        return [
+            "no command is on record: what was asked of the arm is guessed from its motion, so that a fault is found "
+            "later, and by linear monitors hardly (docs/guides/your_robot.md); --action names one"
+        ]
+    said = [] if args.action else [f"taken as commanded, by name: {names}"]
+    return said + [
+        f"{label} answers what is sensed (R² {share:.2f}): it is a controller's output, and holds a push already; "
+        "leave it out by --channels, or take what the controller was asked for"
+        for label, share in feedback(episodes).items()
+    ]
+
+
 def hours_of(episodes: list[Episode]) -> float:
     """How long they are together [h]."""
     return sum(len(e) * e.spec.dt for e in episodes) / 3600
@@ -128,7 +149,7 @@ def fit(args: Args, console: Console) -> None:
     """Reads, learns, calibrates, saves, and says what came of it."""
     start = time.perf_counter()
     with stage("reading", console, {}) as progress:
-        layout = Layout(None, args.rate, args.action, args.channels, args.label, args.columns, args.join)
+        layout = Layout(None, args.rate, args.action, args.channels, args.label, args.columns, args.join, by_name=True)
         with noted() as notes:
             kept = normal_episodes(read_logs(args.data, layout), args.keep_failures, progress)
     left_out = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
@@ -146,7 +167,7 @@ def fit(args: Args, console: Console) -> None:
     spec = fitting[0].spec
     rows = sum(map(len, fitting))
     say = partial(console.print, soft_wrap=True, highlight=False)
-    for line in notes:
+    for line in [*notes, *about_commands(args, kept.episodes)]:
         say(f"Note: {line}.", markup=False)
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
     if left_out:
