@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,9 +17,18 @@ from rich.console import Console
 
 from asm_gym.data.commands import feedback
 from asm_gym.data.gaps import filled
+from asm_gym.data.live import is_live, lines_from
 from asm_gym.data.logs import Layout, read_logs
 from asm_gym.data.notes import noted
-from asm_gym.data.selection import declared_by_all, divided, normal_episodes, pieces, unbroken
+from asm_gym.data.selection import (
+    SHORTEST_S,
+    declared_by_all,
+    divided,
+    divided_in_time,
+    normal_episodes,
+    pieces,
+    unbroken,
+)
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.episode import Episode
@@ -29,9 +39,16 @@ from asm_gym.monitors.registry import check_monitor
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
+from asm_gym.scripts.listening import listen, rtde_source
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.spec import MOTOR
 from asm_gym.validation import check_number
+
+SILENCE_S = 2.0
+"""Without a row for so long a live source has died, and what it said till then is learned from [s]."""
+
+PIECE_S, SPARE = 5.0, 4
+"""Longest pieces of what was recorded live [s], and how many more there are than the promise needs."""
 
 ANY_EPISODE = 0.5
 """A rate that one episode can promise: by the hour it is hours that count."""
@@ -43,7 +60,8 @@ class Args:
 
     data: Path = option(positional=True, metavar="DATA")
     """A run folder of collect, import or evaluate, a Minari or LeRobot dataset, or logs (a file, or a folder): .csv,
-    .tsv, .txt, .jsonl, .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS."""
+    .tsv, .txt, .jsonl, .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS. Or a live source, as asm-gym watch takes
+    it, of JSON objects: it is recorded beside FILE."""
     out: Path = option(Path("runs/fit/memory.asm"), metavar="FILE")
     """File to write the memory to."""
     monitor: str = option("neural_asm", check=check_monitor, listed=MONITORS)
@@ -70,6 +88,8 @@ class Args:
     """Length of the pieces that long logs are cut into; each then counts as an episode."""
     keep_failures: bool = False
     """Learn from episodes that did not succeed, too."""
+    minutes: float = option(10.0, check=partial(check_number, "minutes", above=0))
+    """For how long a live source is recorded at most; it ends sooner once enough was heard."""
     seed: int = option(0, least=0)
     """Seed of the memory, and of which episodes it learns from."""
     quick: bool = False
@@ -78,6 +98,8 @@ class Args:
     """Share of the episodes that set the threshold, and are not learned from."""
     most: int | None = fixed(None, quick=20)
     """Episodes to learn from at most."""
+    in_time: bool = fixed(False)
+    """The heads of logs are learned from, and their tails calibrated on."""
     epochs: int | None = fixed(None, quick=5)
     """Passes over them, of a monitor that learns in passes."""
 
@@ -103,11 +125,36 @@ def learned(args: Args, fitting: list[Episode], calibration: list[Episode], prog
     return monitor.fit(fitting, progress).calibrate(calibration, **args.asked.named)
 
 
-def parted(args: Args, episodes: list[Episode]) -> tuple[list[Episode], list[Episode]]:
+def recorded(args: Args, say: Callable[[str], None]) -> Args:
+    """Records a live source, and returns how to learn from that: cut into as many pieces as the promise needs."""
+    source, to = str(args.data), args.out.with_suffix(".jsonl")
+    if source.startswith("rtde:"):
+        lines = rtde_source(source.partition(":")[2], args.channels, args.rate, SILENCE_S)
+    else:
+        lines = lines_from(source, sys.stdin, SILENCE_S)
+    seconds = listen(lines, to, args.minutes, say)
+    needed = (
+        conformal_episodes(args.false_alarm_rate) / args.calibration_share + SPARE if args.asked.per == EPISODE else 0
+    )
+    split = args.split or min(PIECE_S, seconds / needed if needed else PIECE_S)
+    return replace(args, data=to, split=max(split, SHORTEST_S), in_time=True)
+
+
+def parted(args: Args, whole: list[Episode]) -> tuple[list[Episode], list[Episode]]:
     """Those to learn from, and those to calibrate on. Raises ValueError where they are too few for the promise."""
-    if args.asked.per == EPISODE:
-        return divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
-    fitting, calibration = divided(episodes, ANY_EPISODE, args.calibration_share, args.seed)
+    logs = [[e] if args.split is None else pieces(e, args.split) for e in whole]
+    if args.in_time or (args.asked.per == HOUR and args.split is not None):
+        fitting, calibration = divided_in_time(logs, args.calibration_share)
+        if args.asked.per == EPISODE and len(calibration) < (needed := conformal_episodes(args.false_alarm_rate)):
+            raise ValueError(
+                f"a false-alarm rate of {args.false_alarm_rate:g} needs {needed} pieces to calibrate on, got "
+                f"{len(calibration)} of {args.split:g} s: record for longer, or take a higher --false-alarm-rate"
+            )
+    else:
+        episodes = [part for log in logs for part in log]
+        if args.asked.per == EPISODE:
+            return divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
+        fitting, calibration = divided(episodes, ANY_EPISODE, args.calibration_share, args.seed)
     args.asked.check_hours(hours_of(calibration))
     return fitting, calibration
 
@@ -147,6 +194,8 @@ def hours_of(episodes: list[Episode]) -> float:
 
 def fit(args: Args, console: Console) -> None:
     """Reads, learns, calibrates, saves, and says what came of it."""
+    if is_live(str(args.data)):
+        args = recorded(args, partial(console.print, soft_wrap=True, highlight=False, markup=False))
     start = time.perf_counter()
     with stage("reading", console, {}) as progress:
         layout = Layout(None, args.rate, args.action, args.channels, args.label, args.columns, args.join, by_name=True)
@@ -158,8 +207,7 @@ def fit(args: Args, console: Console) -> None:
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
     bridged = [replace(e, stream=filled(e.stream, e.spec.dt, args.bridge)) for e in declared_by_all(kept.episodes)]
     whole = [part for episode in bridged for part in unbroken(episode)]
-    episodes = whole if args.split is None else [p for e in whole for p in pieces(e, args.split)]
-    fitting, calibration = parted(args, episodes)
+    fitting, calibration = parted(args, whole)
     fitting = fitting[: args.most]
     with stage("learning", console, {}) as progress:
         monitor = learned(args, fitting, calibration, progress)

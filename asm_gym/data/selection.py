@@ -86,6 +86,25 @@ def unbroken(episode: Episode) -> list[Episode]:
     return [Episode.from_stream(episode.stream[part], episode.spec, success=True) for part in parts]
 
 
+def divided_in_time(logs: list[list[Episode]], calibration_share: float) -> tuple[list[Episode], list[Episode]]:
+    """The same, of pieces of long logs in order: the head of each log, and its tail, with one piece between left out.
+
+    Pieces of one log that follow each other are alike: shuffled, those that set the threshold would lie between those
+    that were learned from, and promise too much.
+
+    Raises:
+        ValueError: no log is long enough.
+    """
+    fitting, calibration = list[Episode](), list[Episode]()
+    for parts in logs:
+        head = math.ceil(len(parts) * (1 - calibration_share))
+        fitting += parts[:head]
+        calibration += parts[head + 1 :] if len(logs) > 1 or len(parts) > 2 else parts[head:]
+    if not fitting or not calibration:
+        raise ValueError(f"{len(fitting) + len(calibration)} pieces are too few to learn from and to calibrate on")
+    return fitting, calibration
+
+
 def divided(
     episodes: list[Episode], false_alarm_rate: float, calibration_share: float, seed: int
 ) -> tuple[list[Episode], list[Episode]]:
