@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -39,6 +39,7 @@ from asm_gym.monitors.registry import check_monitor
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
+from asm_gym.scripts.kinds import Part, about_pieces, left_out
 from asm_gym.scripts.listening import listen, rtde_source
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.spec import MOTOR
@@ -92,6 +93,8 @@ class Args:
     """For how long a live source is recorded at most; it ends sooner once enough was heard."""
     seed: int = option(0, least=0)
     """Seed of the memory, and of which episodes it learns from."""
+    leave_out: bool = False
+    """Learn without each log, or each folder of them, in turn too, and say what alarms the one left out raises."""
     quick: bool = False
     """Learn little, from few episodes: to see that everything runs."""
     calibration_share: float = fixed(0.5, check=partial(check_number, "calibration_share", above=0, below=1))
@@ -140,9 +143,8 @@ def recorded(args: Args, say: Callable[[str], None]) -> Args:
     return replace(args, data=to, split=max(split, SHORTEST_S), in_time=True)
 
 
-def parted(args: Args, whole: list[Episode]) -> tuple[list[Episode], list[Episode]]:
+def parted(args: Args, logs: list[list[Episode]]) -> tuple[list[Episode], list[Episode]]:
     """Those to learn from, and those to calibrate on. Raises ValueError where they are too few for the promise."""
-    logs = [[e] if args.split is None else pieces(e, args.split) for e in whole]
     if args.in_time or (args.asked.per == HOUR and args.split is not None):
         fitting, calibration = divided_in_time(logs, args.calibration_share)
         if args.asked.per == EPISODE and len(calibration) < (needed := conformal_episodes(args.false_alarm_rate)):
@@ -187,6 +189,23 @@ def about_commands(args: Args, episodes: list[Episode]) -> list[str]:
     ]
 
 
+def origins(logs: list[str], whole: list[list[Episode]]) -> dict[int, Part]:
+    """Where each piece came from, by its identity: the log, and the seconds of it that were learned from before."""
+    found: dict[int, Part] = {}
+    seconds = dict.fromkeys(logs, 0.0)
+    for log, parts in zip(logs, whole, strict=True):
+        for episode in parts:
+            found[id(episode)] = Part(log, seconds[log], episode)
+            seconds[log] += len(episode) * episode.spec.dt
+    return found
+
+
+def left_out_kinds(args: Args, parts: list[list[Part]]) -> Mapping[str, str]:
+    """What to expect of a kind of move that was not shown, by kind."""
+    fitted, calibrated = parts
+    return left_out(fitted, calibrated, lambda fitting, calibration: learned(args, fitting, calibration, lambda *_: None))
+
+
 def hours_of(episodes: list[Episode]) -> float:
     """How long they are together [h]."""
     return sum(len(e) * e.spec.dt for e in episodes) / 3600
@@ -201,31 +220,37 @@ def fit(args: Args, console: Console) -> None:
         layout = Layout(None, args.rate, args.action, args.channels, args.label, args.columns, args.join, by_name=True)
         with noted() as notes:
             kept = normal_episodes(read_logs(args.data, layout), args.keep_failures, progress)
-    left_out = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
+    gone = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
     if not kept.episodes:
         hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""
-        raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
+        raise ValueError(f"{args.data} holds no normal episode: {gone or 'it is empty'}{hint}")
     bridged = [replace(e, stream=filled(e.stream, e.spec.dt, args.bridge)) for e in declared_by_all(kept.episodes)]
-    whole = [part for episode in bridged for part in unbroken(episode)]
+    named = [(name, part) for name, e in zip(kept.logs, bridged, strict=True) for part in unbroken(e)]
+    whole = [[e] if args.split is None else pieces(e, args.split) for _, e in named]
     fitting, calibration = parted(args, whole)
     fitting = fitting[: args.most]
+    origin = origins([name for name, _ in named], whole)
     with stage("learning", console, {}) as progress:
         monitor = learned(args, fitting, calibration, progress)
     monitor.save(args.out)
     spec = fitting[0].spec
     rows = sum(map(len, fitting))
     say = partial(console.print, soft_wrap=True, highlight=False)
-    for line in [*notes, *about_commands(args, kept.episodes)]:
+    odd = about_pieces([origin[id(e)] for e in calibration], monitor.maxima_)
+    for line in [*notes, *about_commands(args, kept.episodes), *odd]:
         say(f"Note: {line}.", markup=False)
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
-    if left_out:
-        say(f"Left out: {left_out}.")
-    if len(whole) != len(kept.episodes):
+    if gone:
+        say(f"Left out: {gone}.")
+    if len(named) != len(kept.episodes):
         say(
-            f"Rows were lost: {len(kept.episodes)} episodes were cut there, into {len(whole)} parts."
+            f"Rows were lost: {len(kept.episodes)} episodes were cut there, into {len(named)} parts."
             + ("" if args.bridge else " --bridge 0.05 fills gaps up to 0.05 s.")
         )
     say(f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: {promised(args, calibration)}.")
+    if args.leave_out:
+        for kind, found in left_out_kinds(args, [[origin[id(e)] for e in es] for es in (fitting, calibration)]).items():
+            say(f"Learned without {kind}: {found}.", markup=False)
     seconds = time.perf_counter() - start
     say(f"Wrote {args.out} after {seconds:.0f} s. Watch with it: asm-gym watch LOG --monitor {args.out}")
 

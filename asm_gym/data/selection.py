@@ -22,18 +22,19 @@ SHORTEST_S = 0.5
 
 
 class Kept(NamedTuple):
-    """The episodes that are learned from, and how many others were left out, by why."""
+    """The episodes that are learned from, how many others were left out, by why, and the logs of the first."""
 
     episodes: list[Episode]
     left_out: Counter[str]
+    logs: list[str]
 
 
 def normal_episodes(
     logs: Iterable[Log], keep_failures: bool = False, progress: Callable[[int, int], object] | None = None
 ) -> Kept:
     """The normal episodes among ``logs``."""
-    kept = Kept([], Counter())
-    for n, (_, episode) in enumerate(logs, 1):
+    kept = Kept([], Counter(), [])
+    for n, (name, episode) in enumerate(logs, 1):
         if progress is not None:
             progress(n, n)  # how many there are is known at the end
         why = _abnormal(episode)
@@ -43,6 +44,7 @@ def normal_episodes(
             kept.left_out[why] += 1
         else:
             kept.episodes.append(episode)
+            kept.logs.append(name)
     return kept
 
 
