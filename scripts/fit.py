@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,10 +15,20 @@ from typing import Any
 
 from rich.console import Console
 
+from asm_gym.data.commands import feedback
 from asm_gym.data.gaps import filled
+from asm_gym.data.live import is_live, lines_from
 from asm_gym.data.logs import Layout, read_logs
 from asm_gym.data.notes import noted
-from asm_gym.data.selection import declared_by_all, divided, normal_episodes, pieces, unbroken
+from asm_gym.data.selection import (
+    SHORTEST_S,
+    declared_by_all,
+    divided,
+    divided_in_time,
+    normal_episodes,
+    pieces,
+    unbroken,
+)
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.episode import Episode
@@ -28,8 +39,17 @@ from asm_gym.monitors.registry import check_monitor
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
+from asm_gym.scripts.kinds import Part, about_pieces, left_out
+from asm_gym.scripts.listening import listen, rtde_source
 from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.spec import MOTOR
 from asm_gym.validation import check_number
+
+SILENCE_S = 2.0
+"""Without a row for so long a live source has died, and what it said till then is learned from [s]."""
+
+PIECE_S, SPARE = 5.0, 4
+"""Longest pieces of what was recorded live [s], and how many more there are than the promise needs."""
 
 ANY_EPISODE = 0.5
 """A rate that one episode can promise: by the hour it is hours that count."""
@@ -41,7 +61,8 @@ class Args:
 
     data: Path = option(positional=True, metavar="DATA")
     """A run folder of collect, import or evaluate, a Minari or LeRobot dataset, or logs (a file, or a folder): .csv,
-    .tsv, .txt, .jsonl, .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS."""
+    .tsv, .txt, .jsonl, .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS. Or a live source, as asm-gym watch takes
+    it, of JSON objects: it is recorded beside FILE."""
     out: Path = option(Path("runs/fit/memory.asm"), metavar="FILE")
     """File to write the memory to."""
     monitor: str = option("neural_asm", check=check_monitor, listed=MONITORS)
@@ -68,14 +89,20 @@ class Args:
     """Length of the pieces that long logs are cut into; each then counts as an episode."""
     keep_failures: bool = False
     """Learn from episodes that did not succeed, too."""
+    minutes: float = option(10.0, check=partial(check_number, "minutes", above=0))
+    """For how long a live source is recorded at most; it ends sooner once enough was heard."""
     seed: int = option(0, least=0)
     """Seed of the memory, and of which episodes it learns from."""
+    leave_out: bool = False
+    """Learn without each log, or each folder of them, in turn too, and say what alarms the one left out raises."""
     quick: bool = False
     """Learn little, from few episodes: to see that everything runs."""
     calibration_share: float = fixed(0.5, check=partial(check_number, "calibration_share", above=0, below=1))
     """Share of the episodes that set the threshold, and are not learned from."""
     most: int | None = fixed(None, quick=20)
     """Episodes to learn from at most."""
+    in_time: bool = fixed(False)
+    """The heads of logs are learned from, and their tails calibrated on."""
     epochs: int | None = fixed(None, quick=5)
     """Passes over them, of a monitor that learns in passes."""
 
@@ -101,11 +128,35 @@ def learned(args: Args, fitting: list[Episode], calibration: list[Episode], prog
     return monitor.fit(fitting, progress).calibrate(calibration, **args.asked.named)
 
 
-def parted(args: Args, episodes: list[Episode]) -> tuple[list[Episode], list[Episode]]:
+def recorded(args: Args, say: Callable[[str], None]) -> Args:
+    """Records a live source, and returns how to learn from that: cut into as many pieces as the promise needs."""
+    source, to = str(args.data), args.out.with_suffix(".jsonl")
+    if source.startswith("rtde:"):
+        lines = rtde_source(source.partition(":")[2], args.channels, args.rate, SILENCE_S)
+    else:
+        lines = lines_from(source, sys.stdin, SILENCE_S)
+    seconds = listen(lines, to, args.minutes, say)
+    needed = (
+        conformal_episodes(args.false_alarm_rate) / args.calibration_share + SPARE if args.asked.per == EPISODE else 0
+    )
+    split = args.split or min(PIECE_S, seconds / needed if needed else PIECE_S)
+    return replace(args, data=to, split=max(split, SHORTEST_S), in_time=True)
+
+
+def parted(args: Args, logs: list[list[Episode]]) -> tuple[list[Episode], list[Episode]]:
     """Those to learn from, and those to calibrate on. Raises ValueError where they are too few for the promise."""
-    if args.asked.per == EPISODE:
-        return divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
-    fitting, calibration = divided(episodes, ANY_EPISODE, args.calibration_share, args.seed)
+    if args.in_time or (args.asked.per == HOUR and args.split is not None):
+        fitting, calibration = divided_in_time(logs, args.calibration_share)
+        if args.asked.per == EPISODE and len(calibration) < (needed := conformal_episodes(args.false_alarm_rate)):
+            raise ValueError(
+                f"a false-alarm rate of {args.false_alarm_rate:g} needs {needed} pieces to calibrate on, got "
+                f"{len(calibration)} of {args.split:g} s: record for longer, or take a higher --false-alarm-rate"
+            )
+    else:
+        episodes = [part for log in logs for part in log]
+        if args.asked.per == EPISODE:
+            return divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
+        fitting, calibration = divided(episodes, ANY_EPISODE, args.calibration_share, args.seed)
     args.asked.check_hours(hours_of(calibration))
     return fitting, calibration
 
@@ -119,6 +170,42 @@ def promised(args: Args, calibration: list[Episode]) -> str:
     return f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones, {at_their_length}"
 
 
+def about_commands(args: Args, episodes: list[Episode]) -> list[str]:
+    """What is worth saying of the commands in logs, a line each."""
+    spec = episodes[0].spec
+    if spec.source != "table":
+        return []
+    names = ", ".join(dict.fromkeys(c.name for c in spec.channels if c.group == MOTOR))
+    if not names:
+        return [
+            "no command is on record: what was asked of the arm is guessed from its motion, so that a fault is found "
+            "later, and by linear monitors hardly (docs/guides/your_robot.md); --action names one"
+        ]
+    said = [] if args.action else [f"taken as commanded, by name: {names}"]
+    return said + [
+        f"{label} answers what is sensed (R² {share:.2f}): it is a controller's output, and holds a push already; "
+        "leave it out by --channels, or take what the controller was asked for"
+        for label, share in feedback(episodes).items()
+    ]
+
+
+def origins(logs: list[str], whole: list[list[Episode]]) -> dict[int, Part]:
+    """Where each piece came from, by its identity: the log, and the seconds of it that were learned from before."""
+    found: dict[int, Part] = {}
+    seconds = dict.fromkeys(logs, 0.0)
+    for log, parts in zip(logs, whole, strict=True):
+        for episode in parts:
+            found[id(episode)] = Part(log, seconds[log], episode)
+            seconds[log] += len(episode) * episode.spec.dt
+    return found
+
+
+def left_out_kinds(args: Args, parts: list[list[Part]]) -> Mapping[str, str]:
+    """What to expect of a kind of move that was not shown, by kind."""
+    fitted, calibrated = parts
+    return left_out(fitted, calibrated, lambda fitting, held: learned(args, fitting, held, lambda *_: None))
+
+
 def hours_of(episodes: list[Episode]) -> float:
     """How long they are together [h]."""
     return sum(len(e) * e.spec.dt for e in episodes) / 3600
@@ -126,37 +213,44 @@ def hours_of(episodes: list[Episode]) -> float:
 
 def fit(args: Args, console: Console) -> None:
     """Reads, learns, calibrates, saves, and says what came of it."""
+    if is_live(str(args.data)):
+        args = recorded(args, partial(console.print, soft_wrap=True, highlight=False, markup=False))
     start = time.perf_counter()
     with stage("reading", console, {}) as progress:
-        layout = Layout(None, args.rate, args.action, args.channels, args.label, args.columns, args.join)
+        layout = Layout(None, args.rate, args.action, args.channels, args.label, args.columns, args.join, by_name=True)
         with noted() as notes:
             kept = normal_episodes(read_logs(args.data, layout), args.keep_failures, progress)
-    left_out = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
+    gone = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
     if not kept.episodes:
         hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""
-        raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
+        raise ValueError(f"{args.data} holds no normal episode: {gone or 'it is empty'}{hint}")
     bridged = [replace(e, stream=filled(e.stream, e.spec.dt, args.bridge)) for e in declared_by_all(kept.episodes)]
-    whole = [part for episode in bridged for part in unbroken(episode)]
-    episodes = whole if args.split is None else [p for e in whole for p in pieces(e, args.split)]
-    fitting, calibration = parted(args, episodes)
+    named = [(name, part) for name, e in zip(kept.logs, bridged, strict=True) for part in unbroken(e)]
+    whole = [[e] if args.split is None else pieces(e, args.split) for _, e in named]
+    fitting, calibration = parted(args, whole)
     fitting = fitting[: args.most]
+    origin = origins([name for name, _ in named], whole)
     with stage("learning", console, {}) as progress:
         monitor = learned(args, fitting, calibration, progress)
     monitor.save(args.out)
     spec = fitting[0].spec
     rows = sum(map(len, fitting))
     say = partial(console.print, soft_wrap=True, highlight=False)
-    for line in notes:
+    odd = about_pieces([origin[id(e)] for e in calibration], monitor.maxima_)
+    for line in [*notes, *about_commands(args, kept.episodes), *odd]:
         say(f"Note: {line}.", markup=False)
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
-    if left_out:
-        say(f"Left out: {left_out}.")
-    if len(whole) != len(kept.episodes):
+    if gone:
+        say(f"Left out: {gone}.")
+    if len(named) != len(kept.episodes):
         say(
-            f"Rows were lost: {len(kept.episodes)} episodes were cut there, into {len(whole)} parts."
+            f"Rows were lost: {len(kept.episodes)} episodes were cut there, into {len(named)} parts."
             + ("" if args.bridge else " --bridge 0.05 fills gaps up to 0.05 s.")
         )
     say(f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: {promised(args, calibration)}.")
+    if args.leave_out:
+        for kind, found in left_out_kinds(args, [[origin[id(e)] for e in es] for es in (fitting, calibration)]).items():
+            say(f"Learned without {kind}: {found}.", markup=False)
     seconds = time.perf_counter() - start
     say(f"Wrote {args.out} after {seconds:.0f} s. Watch with it: asm-gym watch LOG --monitor {args.out}")
 

@@ -87,7 +87,7 @@ def test_the_command_prints_a_table_and_draws_a_picture(tmp_path, capsys, monkey
     (tmp_path / "arm.csv").write_text(text + "\n")
     assert main(["inspect", str(tmp_path / "arm.csv"), "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
-    assert "looks commanded: --action 'target_1'" in said
+    assert "commanded, by its name: fit takes it so" in said
     assert "0.002" in said
     assert (tmp_path / "out" / "arm.png").read_bytes().startswith(b"\x89PNG")
     (tmp_path / "bad.csv").write_text("t,q\n1,2\n0,3\n")

@@ -28,8 +28,8 @@ CONNECT_S = 5.0
 LOOK_S = 0.05
 """How often the end of a source is looked for while nothing comes [s]."""
 
-AT_ONCE = 256
-"""Messages of a topic taken, and kept for the reader, at once: half a second of 500 Hz."""
+AT_ONCE = 2048
+"""Messages of a topic taken, and kept for the reader, at once: four seconds of 500 Hz."""
 
 FIELDS: dict[str, dict[str, str]] = {
     "builtin_interfaces/msg/Time": {"sec": "int32", "nanosec": "uint32"},

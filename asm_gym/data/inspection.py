@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
@@ -13,13 +12,9 @@ from numpy.typing import NDArray
 
 from asm_gym.data.channels import bare_name, counts_rows, is_label, unit_of
 from asm_gym.data.clock import clock_among, is_clock
+from asm_gym.data.commands import is_command
 from asm_gym.data.timing import FAR, increasing, period
 from asm_gym.readings import noise_of, resolution
-
-COMMAND = re.compile(
-    r"(.*[^a-z])?(target|desired|cmd|commands?|commanded|set_?points?|goal|ref|reference|action)([^a-z].*)?"
-)
-"""What a column is called that was commanded and not sensed."""
 
 FEW_VALUES = 8
 """A channel of fewer different values hardly moves."""
@@ -90,7 +85,7 @@ class ChannelFound:
                 "clock": "tells the rate; no channel",
                 "label": "rows it marks are not learned from; no channel",
                 "counter": "counts rows; no channel",
-                "command": f"looks commanded: --action {self.name!r}",
+                "command": "commanded, by its name: fit takes it so",
             }[self.role]
         said = []
         if self.missing == self.rows:
@@ -243,4 +238,4 @@ def _role(column: str, values: NDArray[Any], action: Sequence[str], labels: Sequ
     if counts_rows(name, values):
         return "counter"
     asked = any(fnmatchcase(name, pattern) for pattern in action)
-    return "command" if asked or COMMAND.fullmatch(name.lower()) else "sense"
+    return "command" if asked or is_command(name) else "sense"

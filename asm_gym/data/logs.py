@@ -8,6 +8,8 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from glob import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,13 +20,14 @@ from asm_gym.checkpoint import read_arrays
 from asm_gym.data.bags import read_bag
 from asm_gym.data.channels import is_label
 from asm_gym.data.clock import is_clock
+from asm_gym.data.commands import is_command
 from asm_gym.data.datasets import METADATA, read_dataset
 from asm_gym.data.joining import joined
 from asm_gym.data.lerobot import INFO, read_lerobot
 from asm_gym.data.tabular import read_array, read_parquet
 from asm_gym.data.text import read_json_lines, read_table
 from asm_gym.episode import Episode, load_episode
-from asm_gym.spec import StreamSpec
+from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import typed
 
 
@@ -47,6 +50,7 @@ class Layout:
         labels: patterns of the columns that say what is wrong, beside those that are called so.
         columns: names of the columns of files without a header.
         join: the files of a folder are parts of one recording.
+        by_name: where no ``action`` is said, columns were commanded that are called so.
     """
 
     spec: StreamSpec | None = None
@@ -56,12 +60,19 @@ class Layout:
     labels: Sequence[str] = ()
     columns: Sequence[str] = ()
     join: bool = False
+    by_name: bool = False
 
     def episode(self, columns: Any) -> Episode:
         """A log is a success unless somebody says otherwise: it was handed over."""
         chosen = self.spec or (list(self.channels) if self.channels else None)
         action = () if self.spec else self.action
-        return Episode.from_table(columns, chosen, self.rate, action, self.labels, success=True)
+        read = partial(Episode.from_table, columns, chosen, self.rate, labels=self.labels, success=True)
+        found = read(action=action)
+        if self.spec or self.action or not self.by_name:
+            return found
+        channels = found.spec.channels
+        named = [escape(c.name) for c in channels if c.group != MOTOR and is_command(c.name)]
+        return read(action=named) if 0 < len(named) < len(channels) else found
 
     def keeps(self, name: str) -> bool:
         """Whether the words of a column of that name say something."""

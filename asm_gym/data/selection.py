@@ -21,18 +21,19 @@ SHORTEST_S = 0.5
 
 
 class Kept(NamedTuple):
-    """The episodes that are learned from, and how many others were left out, by why."""
+    """The episodes that are learned from, how many others were left out, by why, and the logs of the first."""
 
     episodes: list[Episode]
     left_out: Counter[str]
+    logs: list[str]
 
 
 def normal_episodes(
     logs: Iterable[Log], keep_failures: bool = False, progress: Callable[[int, int], object] | None = None
 ) -> Kept:
     """The normal episodes among ``logs``."""
-    kept = Kept([], Counter())
-    for n, (_, episode) in enumerate(logs, 1):
+    kept = Kept([], Counter(), [])
+    for n, (name, episode) in enumerate(logs, 1):
         if progress is not None:
             progress(n, n)  # how many there are is known at the end
         why = _abnormal(episode)
@@ -42,6 +43,7 @@ def normal_episodes(
             kept.left_out[why] += 1
         else:
             kept.episodes.append(episode)
+            kept.logs.append(name)
     return kept
 
 
@@ -83,6 +85,25 @@ def unbroken(episode: Episode) -> list[Episode]:
     least = max(2, round(SHORTEST_S / episode.spec.dt))
     parts = [slice(start, stop) for start, stop in spans(known) if stop - start >= least]
     return [Episode.from_stream(episode.stream[part], episode.spec, success=True) for part in parts]
+
+
+def divided_in_time(logs: list[list[Episode]], calibration_share: float) -> tuple[list[Episode], list[Episode]]:
+    """The same, of pieces of long logs in order: the head of each log, and its tail, with one piece between left out.
+
+    Pieces of one log that follow each other are alike: shuffled, those that set the threshold would lie between those
+    that were learned from, and promise too much.
+
+    Raises:
+        ValueError: no log is long enough.
+    """
+    fitting, calibration = list[Episode](), list[Episode]()
+    for parts in logs:
+        head = math.ceil(len(parts) * (1 - calibration_share))
+        fitting += parts[:head]
+        calibration += parts[head + 1 :] if len(logs) > 1 or len(parts) > 2 else parts[head:]
+    if not fitting or not calibration:
+        raise ValueError(f"{len(fitting) + len(calibration)} pieces are too few to learn from and to calibrate on")
+    return fitting, calibration
 
 
 def divided(

@@ -68,7 +68,8 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     @staticmethod
     def _read(sensed: dict[str, Any], names: tuple[str, ...]) -> NDArray[np.float32]:
-        return np.concatenate([np.ravel(sensed[name]) for name in names]).astype(np.float32)
+        row: NDArray[np.float32] = np.concatenate([np.ravel(sensed[name]) for name in names]).astype(np.float32)
+        return row
 
 
 def _unit(name: str) -> str:

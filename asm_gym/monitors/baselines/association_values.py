@@ -24,6 +24,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.coverage import POSITION, SPEED
 from asm_gym.data.units import ratio
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
@@ -56,9 +57,6 @@ TOLD, CERTAIN = 0.5, 0.99
 
 FAINTEST = 1e-4
 """Least spread of what is left of a standardised number."""
-
-_SPEED = re.compile(r"(.*[^a-z])?(vel|velocity|velocities|speeds?|qd|dq|qvel|joint_vel)([^a-z].*)?")
-_POSITION = re.compile(r"(.*[^a-z])?(pos|position|positions|angles?|q|qpos|joint_pos)([^a-z].*)?")
 
 
 class _Fitted(NamedTuple):
@@ -195,7 +193,7 @@ class Derived(NamedTuple):
         """What a stream has by the names of its channels."""
         place = {int(column): k for k, column in enumerate(spec.sensory)}
         moving, from_steps = speeds(spec) if friction else (np.zeros(0, np.intp), False)
-        columns = _named(spec, _POSITION) if body else np.zeros(0, np.intp)
+        columns = _named(spec, POSITION) if body else np.zeros(0, np.intp)
         columns = columns if len(columns) <= MOST_ANGLES else columns[:0]
         units = {
             i: c.unit for c, s in zip(spec.channels, spec.slices.values(), strict=True) for i in range(s.start, s.stop)
@@ -240,7 +238,7 @@ def _named(spec: StreamSpec, pattern: re.Pattern[str]) -> NDArray[np.intp]:
 
 def speeds(spec: StreamSpec) -> tuple[NDArray[np.intp], bool]:
     """Columns of the stream that are speeds; or of positions, and that their changes are."""
-    for pattern, from_steps in ((_SPEED, False), (_POSITION, True)):
+    for pattern, from_steps in ((SPEED, False), (POSITION, True)):
         found = _named(spec, pattern)
         if len(found):
             return found, from_steps
