@@ -203,11 +203,8 @@ def kept_table(records: Sequence[Record], guards: Sequence[str], kind: str) -> T
     return tabulate(f"Success kept by {kind} policies", columns, rows)
 
 
-_LABEL: dict[str, Any] = {"textcoords": "offset points", "arrowprops": {"arrowstyle": "-", "lw": 0.5}}
-
-
 def frontier(records: Sequence[Record], guards: Sequence[str]) -> Figure:
-    """Success kept against harm avoided, a point for each way to guard."""
+    """Success kept against harm that is left, a point for each way to guard."""
     figure = Figure(figsize=(5.5, 4.0), layout="constrained")
     axes = figure.subplots()
     harmful = [r for r in records if r["kind"] in HARMFUL and r["robot"] == "Panda" and r["rate"] == 20]
@@ -217,11 +214,11 @@ def frontier(records: Sequence[Record], guards: Sequence[str]) -> Figure:
         if np.isnan(share) or not own:
             continue
         low, high = wilson_interval(sum(own), len(own))
-        x, y = 100 * (1 - share), 100 * np.mean(own)
-        axes.errorbar(x, y, yerr=[[y - 100 * low], [100 * high - y]], marker="o", capsize=3, color="C0")
-        side, offset = ("left", 30) if x < 50 else ("right", -30)
-        axes.annotate(f"{guard}: {x:.1f}, {y:.1f}", (x, y), xytext=(offset, 8 - 14 * n), ha=side, **_LABEL)
-    axes.set_xlabel("harm avoided of policies that a guard is against [%]")
+        x, y = 100 * share, 100 * np.mean(own)
+        axes.errorbar(x, y, yerr=[[y - 100 * low], [100 * high - y]], marker="o", capsize=3, color=f"C{n}", label=guard)
+    axes.set_xscale("log")
+    axes.invert_xaxis()
+    axes.set_xlabel("harm left of policies that a guard is against [% of alone]")
     axes.set_ylabel("healthy episodes solved [%]")
-    axes.set_xlim(-8, 106)
+    axes.legend(loc="lower left")
     return figure
