@@ -75,14 +75,10 @@ class Args:
     """Whether the hand reaches for places where noise alone would move it."""
     stream_freq: int | None = option(None, least=1, metavar="HZ")
     """Rows of the stream a second; one each control step by default."""
-    healthy_episodes: int = option(HEALTHY, quick=0, least=0)
-    """Episodes of the expert of each task to calibrate on, beside the lessons that are left out."""
     exam_policies: tuple[str, ...] | None = fixed(None, quick=())
     """Agents to examine under, as guides are named; by default all that are shipped and fit this arm."""
     exam_episodes: int = option(60, quick=2, least=0)
     """Healthy episodes of each examination; 0 examines nothing."""
-    exam_faults: tuple[str, ...] = option((TEST,), quick=(), metavar="KIND")
-    """Kinds of fault, each medium and strong but for pushes of 20 N, where the policy or the task was left out."""
     workers: str = option("2", check=ParallelConfig.named, metavar="N")
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
     seed: int = option(0, least=0)
@@ -91,6 +87,10 @@ class Args:
     """Folder of the run."""
     quick: bool = False
     """To see that everything runs, not to judge the figures."""
+    healthy_episodes: int = fixed(HEALTHY, quick=0)
+    """Episodes of the expert of each task to calibrate on, beside the lessons that are left out."""
+    exam_faults: tuple[str, ...] = fixed((TEST,), quick=())
+    """Kinds of fault, each medium and strong but for pushes of 20 N, where the policy or the task was left out."""
     exam_pushes: int = fixed(3, quick=0)
     """Pushes of 20 N in each examination in which there are faults; they are judged by how soon they are noticed."""
     tasks: tuple[str, ...] | None = fixed(None)

@@ -296,7 +296,7 @@ def test_knocks_and_stops_are_counted_apart_and_added_up():
     many = (
         [trace(5.0, 150.0, 0.0)] + 2 * [trace(3.0, 90.0, 0.0)] + 3 * [trace(2.0, 0.0, 60.0)] + 94 * [trace(1.0, 0, 0)]
     )
-    found = Alarms.of([ScoredEpisode.from_json(t.to_json()) for t in many])
+    found = Alarms.of(many)
     assert [rate.k for rate in (*found, found.every)] == [1, 2, 3, 6]  # what is a fault is no knock beside it
     assert found.every.hours == pytest.approx(1.0)
 

@@ -2,7 +2,7 @@
 
     knock    a wrist has felt more than 50 N on an axis within the last second; its peaks count, where they are sensed
     stop     a joint is within 0.03 rad of one of its stops
-    s'       s / 10 where either is so, s / 3 where a finger has just moved by more than its sensor's noise, else s
+    s'       s / 10 where either is so, s / 3 where a finger has just slid by 1 cm/s, else s
 
 A hand that strikes a table surprises, and so does a joint that comes to its stop or a finger that slips: none is a
 fault of the body, and most alarms of healthy robots are such. They are not forgiven: what is still over the threshold
@@ -33,8 +33,8 @@ NEAR_STOP = 0.03
 """[rad]"""
 EXCUSED, SLIPPED = 10.0, 3.0
 """What surprise is divided by, at a knock or a stop, and where fingers move."""
-MOVING, MOVED_S = 5.0, 0.1
-"""Standard deviations of its sensor's noise at which a finger moves, and for how long it has just moved [s]."""
+MOVING, MOVED_S = 0.01, 0.1
+"""At which a finger moves that slides [m/s], and for how long it has just moved [s]. Those that turn never rest."""
 
 
 class Excused(NamedTuple):
@@ -61,8 +61,7 @@ class Excuses:
         self._wrist = peaks if peaks.size else _columns(spec, lambda c: c.name.endswith("wrist_force"))
         self._joints = _columns(spec, lambda c: bool(c.stops))
         self._ends = np.array([pair for c in spec.channels for pair in c.stops], np.float64).reshape(-1, 2)
-        self._fingers = _columns(spec, lambda c: c.name.endswith("gripper_velocity") and c.noise > 0)
-        self._moving = MOVING * spec.noise[self._fingers]
+        self._fingers = _columns(spec, lambda c: c.name.endswith("gripper_velocity") and c.unit == "m/s")
         self._rows = tuple(max(1, round(seconds / spec.dt)) for seconds in (KNOCKED_S, MOVED_S))
 
     def start(self, batch: int) -> NDArray[np.int64]:
@@ -71,9 +70,7 @@ class Excuses:
 
     def step(self, left: NDArray[np.int64], rows: NDArray[np.float64]) -> tuple[NDArray[np.int64], Excused]:
         """What the next rows (B, D) excuse, some of whose numbers may not be finite."""
-        after, kind, divisor = _step(
-            left, rows, self._wrist, self._joints, self._ends, self._fingers, self._moving, self._rows
-        )
+        after, kind, divisor = _step(left, rows, self._wrist, self._joints, self._ends, self._fingers, self._rows)
         return after, Excused(kind, divisor)
 
 
@@ -92,15 +89,15 @@ def _columns(spec: StreamSpec, which: Callable[[Channel], bool]) -> NDArray[np.i
 
 
 @compiled
-def _step(left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any, moving: Any, lasting: Any) -> Any:
+def _step(left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any, lasting: Any) -> Any:
     B = len(rows)
     after, kind, divisor = np.maximum(left - 1, 0), np.zeros(B, np.int8), np.ones(B)
     for n in range(B):
         for i in wrist:
             if abs(rows[n, i]) > KNOCKING and np.isfinite(rows[n, i]):
                 after[n, 0] = lasting[0]
-        for j in range(len(fingers)):
-            if abs(rows[n, fingers[j]]) > moving[j] and np.isfinite(rows[n, fingers[j]]):
+        for i in fingers:
+            if abs(rows[n, i]) > MOVING and np.isfinite(rows[n, i]):
                 after[n, 1] = lasting[1]
         if after[n, 1] > 0:
             divisor[n] = SLIPPED
