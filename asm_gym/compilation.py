@@ -11,7 +11,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -41,7 +41,16 @@ def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), n
         # numba looks at the function's own file alone, and would keep code that another file's change made stale.
         own, package = Path(function.__code__.co_filename).parent, Path(__file__).parent
         cache._source_stamp = f"{how}" + "".join(map(_digest, (own, *(package / name for name in calls))))
+        cache._load_index = partial(_index_of, cache._load_index)
     return cast(F, dispatcher)
+
+
+def _index_of(load: Callable[[], dict[Any, str]]) -> dict[Any, str]:
+    """What is kept; nothing where that speaks of types that are gone, which fails before numba compares stamps."""
+    try:
+        return load()
+    except (AttributeError, ImportError):
+        return {}
 
 
 def must_compile(function: Any) -> bool:

@@ -39,7 +39,7 @@ class Grip(NamedTuple):
     evidence: NDArray[np.float64]  # (G,) E [s]
 
 
-class Readout:
+class CommandReadout:
     """Makes actions of what is expected to be commanded: kept in the space, and each gripper at one end of its range.
 
     Args:

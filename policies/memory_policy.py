@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import State
-from asm_gym.policies.grip import Grip, Readout
+from asm_gym.policies.grip import CommandReadout, Grip
 from asm_gym.spec import MOTOR, StreamSpec, control_period
 from asm_gym.validation import typed
 
@@ -90,7 +90,7 @@ class StreamReader:
         return row
 
 
-class MemoryState(NamedTuple):
+class ActingState(NamedTuple):
     """Where the policy is: a value."""
 
     memory: State
@@ -120,7 +120,7 @@ class NeuralASMPolicy:
         self.memory = memory
         self._size = require_motor(memory.spec, env)
         self._read = StreamReader(memory.spec, env)
-        self._readout = Readout(env)
+        self._readout = CommandReadout(env)
         memory.initial_state()
 
     @classmethod
@@ -131,17 +131,17 @@ class NeuralASMPolicy:
     def predict(
         self,
         observation: Any,
-        state: MemoryState | None = None,
+        state: ActingState | None = None,
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], MemoryState]:
+    ) -> tuple[NDArray[np.float32], ActingState]:
         """The action (A,) that the memory expects, and the state to pass in next time; nothing is drawn at random."""
         if state is None or (episode_start is not None and np.any(episode_start)):
-            state = MemoryState(self.memory.initial_state(), np.zeros(self._size, np.float32))
+            state = ActingState(self.memory.initial_state(), np.zeros(self._size, np.float32))
         row = self._read(observation, state.action)
         memory, _ = self.memory.observe(state.memory, row[None])
         action, grip = self._readout(self.memory.expected_action(memory)[0], state.grip)
-        return action, MemoryState(memory, action, grip)
+        return action, ActingState(memory, action, grip)
 
 
 def require_motor(spec: StreamSpec, env: gym.Env[Any, Any]) -> int:

@@ -39,7 +39,7 @@ class Args:
     """Rows a second, where the log has no clock."""
     action: tuple[str, ...] = option((), metavar="COLUMN")
     """Columns that were commanded and not sensed: names, or patterns such as 'cmd*'."""
-    label: tuple[str, ...] = option((), metavar="COLUMN")
+    label: tuple[str, ...] = fixed(())
     """Columns that say what is wrong, beside those called so."""
     columns: tuple[str, ...] = option((), metavar="NAME")
     """Names of the columns of files without a header."""

@@ -74,3 +74,27 @@ def test_a_folder_that_others_may_have_filled_is_not_trusted(tmp_path):
     found = kept(tmp_path)
     assert found.startswith(str(tmp_path / "asm-gym-"))
     assert not found.startswith(f"{ours}/")
+
+
+OF_A_TYPE = """
+from typing import NamedTuple
+from asm_gym.compilation import compiled, must_compile
+
+class TYPE(NamedTuple):
+    x: float
+
+@compiled
+def twice(of):
+    return 2 * of.x
+
+print(must_compile(twice), twice(TYPE(2.0)))
+"""
+
+
+def test_code_that_was_kept_for_a_type_that_is_gone_is_compiled_anew(tmp_path):
+    said, env = [], os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    for name in ("Before", "After", "After"):
+        (tmp_path / "arm.py").write_text(OF_A_TYPE.replace("TYPE", name))
+        run = [sys.executable, "-c", "import arm"]
+        said.append(subprocess.run(run, capture_output=True, text=True, env=env, check=True, cwd=tmp_path).stdout)
+    assert said == ["True 4.0\n", "True 4.0\n", "False 4.0\n"]

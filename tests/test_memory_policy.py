@@ -16,7 +16,7 @@ from asm_gym.episode import Episode
 from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, situation
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
-from asm_gym.policies.grip import ENOUGH, FORGETS, Readout
+from asm_gym.policies.grip import ENOUGH, FORGETS, CommandReadout
 from asm_gym.policies.memory_policy import StreamReader, common_spec
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import Channel, StreamSpec
@@ -178,7 +178,7 @@ def test_learning_to_act_leaves_the_surprise_as_it_was(pilot):
 
 def told(shares: list[float], dt: float = 0.05) -> NDArray[np.float64]:
     """What a gripper is told while these are expected, from -1 to 1."""
-    readout, grip, actions = Readout(Point(dt)), None, []
+    readout, grip, actions = CommandReadout(Point(dt)), None, []
     for share in shares:
         action, grip = readout(np.array([2.0, np.nan, share], np.float32), grip)
         actions.append(action)

@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 
 from asm_gym.compilation import compiled
-from asm_gym.envs.views import JOINT_POSITION, Arms, Floats, Goals, Ints, Nominal, Views
+from asm_gym.envs.views import JOINT_POSITION, Arms, Floats, Goals, Ints, NominalViews, Views
 
 
 @compiled
@@ -199,7 +199,7 @@ def hold_at(views: Views, arms: Arms, goals: Goals, a: int) -> None:
 
 
 @compiled
-def _believed(views: Views, nominal: Nominal, arms: Arms, a: int, M: Floats, h: Floats) -> None:
+def _believed(views: Views, nominal: NominalViews, arms: Arms, a: int, M: Floats, h: Floats) -> None:
     """Writes mass matrix (n, n) and bias (n,) of arm ``a``, as the robot knows itself, into M and h."""
     n, dofs = arms.joints[a], arms.dofs[a]
     edited = nominal.model != 0
@@ -217,7 +217,7 @@ def _command(views: Views, arms: Arms, a: int, tau: Floats) -> None:
 
 
 @compiled
-def brake(views: Views, nominal: Nominal, arms: Arms, goals: Goals, a: int) -> None:
+def brake(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, a: int) -> None:
     """Commands the motors of arm ``a`` so that it is held at its anchor, which follows what presses too hard."""
     n, dofs = arms.joints[a], arms.dofs[a]
     M, h, J = np.empty((n, n)), np.empty(n), np.empty((6, n))
@@ -258,7 +258,7 @@ def brake(views: Views, nominal: Nominal, arms: Arms, goals: Goals, a: int) -> N
 
 
 @compiled
-def control(views: Views, nominal: Nominal, arms: Arms, goals: Goals, a: int) -> None:
+def control(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, a: int) -> None:
     """Commands the motors of arm ``a``."""
     if goals.held[a]:
         brake(views, nominal, arms, goals, a)

@@ -35,7 +35,7 @@ LARGEST = 1e10
 """Beyond it MuJoCo itself takes a state for a bad one (mjMAXVAL)."""
 
 
-class Recorded(NamedTuple):
+class DemonstrationFile(NamedTuple):
     """What a file was recorded in.
 
     Attributes:
@@ -56,7 +56,7 @@ class Recorded(NamedTuple):
         return gym.make(task_spec(self.task).id, robot=self.robots, **how)
 
 
-def recorded_in(path: Path) -> Recorded:
+def recorded_in(path: Path) -> DemonstrationFile:
     """Reads what a file says of itself.
 
     Raises:
@@ -76,10 +76,10 @@ def recorded_in(path: Path) -> Recorded:
     control_freq = check_number(f"{path}: control_freq", kwargs.get("control_freq", 20), low=1, high=500)
     robots = kwargs.get("robots", "Panda")
     robots = (robots,) if isinstance(robots, str) else tuple(robots)
-    return Recorded(task_spec(name).name, robots, int(control_freq), tuple(demos))
+    return DemonstrationFile(task_spec(name).name, robots, int(control_freq), tuple(demos))
 
 
-def replay(path: Path, recorded: Recorded, env: gym.Env[Any, Any], seed: int = 0) -> Iterator[Episode]:
+def replay(path: Path, recorded: DemonstrationFile, env: gym.Env[Any, Any], seed: int = 0) -> Iterator[Episode]:
     """The demonstrations as episodes, one step shorter than in the file, which has no state after the last action.
 
     Args:

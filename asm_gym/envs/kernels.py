@@ -29,11 +29,11 @@ from asm_gym.envs.views import (
     PASSED,
     STAYED,
     Arms,
-    Band,
     Floats,
     Goals,
     Ints,
-    Nominal,
+    NominalViews,
+    SubstepBand,
     Views,
 )
 
@@ -59,7 +59,7 @@ _rne: Any = types.ExternalFunction("mj_rne", types.void(types.intp, types.intp, 
 
 
 @compiled
-def _believe(views: Views, nominal: Nominal) -> None:
+def _believe(views: Views, nominal: NominalViews) -> None:
     """Brings the nominal model's dynamics to the live joint positions and velocities."""
     nominal.qpos[:] = views.qpos
     nominal.qvel[:] = views.qvel
@@ -71,7 +71,7 @@ def _believe(views: Views, nominal: Nominal) -> None:
 
 
 @compiled
-def sample(views: Views, nominal: Nominal, arms: Arms, k: int, samples: Floats) -> None:
+def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Floats) -> None:
     """Writes what the sensors of every arm give after substep ``k`` into samples (A, K, SAMPLE)."""
     edited = nominal.model != 0
     mass = nominal.mass if edited else views.mass
@@ -115,7 +115,7 @@ def sample(views: Views, nominal: Nominal, arms: Arms, k: int, samples: Floats) 
 
 
 @compiled
-def feel(arms: Arms, band: Band, k: int, samples: Floats) -> None:
+def feel(arms: Arms, band: SubstepBand, k: int, samples: Floats) -> None:
     """Compares what the arms felt in substep ``k`` with what they were to feel; what is not a number is outside."""
     state = band.state
     if state[ARMED]:
@@ -133,7 +133,7 @@ def feel(arms: Arms, band: Band, k: int, samples: Floats) -> None:
 
 
 @compiled
-def brake_held(views: Views, nominal: Nominal, arms: Arms, goals: Goals) -> None:
+def brake_held(views: Views, nominal: NominalViews, arms: Arms, goals: Goals) -> None:
     """Brakes the arms that are held, beneath controllers that are not compiled."""
     if goals.held.any():
         if nominal.model != 0:
@@ -144,7 +144,7 @@ def brake_held(views: Views, nominal: Nominal, arms: Arms, goals: Goals) -> None
 
 
 @compiled
-def must_stay(band: Band) -> bool:
+def must_stay(band: SubstepBand) -> bool:
     """Whether the arms are to be told now to stay, which they are once."""
     state = band.state
     now = state[ACTS] and state[LEFT] >= 0 and not state[STAYED]
@@ -156,10 +156,10 @@ def must_stay(band: Band) -> bool:
 @partial(compiled, nogil=True)
 def run(
     views: Views,
-    nominal: Nominal,
+    nominal: NominalViews,
     arms: Arms,
     goals: Goals,
-    band: Band,
+    band: SubstepBand,
     deltas: Floats,
     turns: Floats,
     fresh: bool,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs import kernels
-from asm_gym.envs.views import Nominal, Views
+from asm_gym.envs.views import NominalViews, Views
 
 _INERTIA = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
 """Whoever edits these in the model edits the world, not the robot's knowledge of it."""
@@ -29,11 +29,11 @@ class NominalDynamics:
         self._live = {name: getattr(model, name).reshape(model.nbody, -1) for name in _INERTIA}
         self._frozen = {name: live.copy() for name, live in self._live.items()}
         v = views
-        self.unedited = Nominal(0, 0, v.qpos, v.qvel, v.mass, v.bias, v.damping.copy())
+        self.unedited = NominalViews(0, 0, v.qpos, v.qvel, v.mass, v.bias, v.damping.copy())
         """Those of the live model, which hold while its masses are as they were."""
-        self._copy: tuple[mujoco.MjModel, mujoco.MjData, Nominal] | None = None
+        self._copy: tuple[mujoco.MjModel, mujoco.MjData, NominalViews] | None = None
 
-    def now(self) -> Nominal:
+    def now(self) -> NominalViews:
         """Those of the live model, and of a copy as soon as somebody has edited the robots' masses."""
         if not any(kernels.edited(self._live[n], self._frozen[n], self._robots) for n in _INERTIA):
             return self.unedited
@@ -43,6 +43,6 @@ class NominalDynamics:
                 getattr(model, name)[:] = self._frozen[name].reshape(getattr(model, name).shape)
             data = mujoco.MjData(model)
             addresses, motion = (model._address, data._address), (data.qpos, data.qvel, data.qM)
-            nominal = Nominal(*addresses, *motion, np.zeros(model.nv), self.unedited.damping)
+            nominal = NominalViews(*addresses, *motion, np.zeros(model.nv), self.unedited.damping)
             self._copy = model, data, nominal
         return self._copy[2]

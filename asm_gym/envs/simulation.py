@@ -16,7 +16,7 @@ from asm_gym.envs.arms import bodies, compilable, describe
 from asm_gym.envs.control import hold_at
 from asm_gym.envs.nominal import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
-from asm_gym.envs.views import ACTS, ARMED, FELT, JOINTS, LEFT, Band, Goals, Views
+from asm_gym.envs.views import ACTS, ARMED, FELT, JOINTS, LEFT, Goals, SubstepBand, Views
 
 
 class Expected(NamedTuple):
@@ -52,7 +52,7 @@ class Simulation:
         """What the robot believes of itself."""
         self._samples = np.zeros((len(self._parts), substeps, kernels.SAMPLE))
         n = len(self._parts)
-        self._band = Band(
+        self._band = SubstepBand(
             *(np.zeros((n, FELT)), np.zeros((n, FELT)), np.full((n, FELT), np.inf)), np.zeros(1), np.zeros(5, np.int64)
         )
         self.proprioception = Proprioception(self._parts, self._views, self.data)

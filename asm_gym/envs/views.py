@@ -75,7 +75,7 @@ class Views(NamedTuple):
         )
 
 
-class Nominal(NamedTuple):
+class NominalViews(NamedTuple):
     """The dynamics that the controllers and the torque estimate believe in, frozen when the model was loaded."""
 
     model: int  # 0 while the live model is the nominal one
@@ -119,7 +119,7 @@ class Goals(NamedTuple):
     held: Ints  # (A,) whether it is: 0, ``control.BRAKING`` or ``control.YIELDING``
 
 
-class Band(NamedTuple):
+class SubstepBand(NamedTuple):
     """What the arms are expected to feel in every substep of a control step; changed in place."""
 
     low: Floats  # (A, FELT) [N m], [N]
@@ -130,5 +130,5 @@ class Band(NamedTuple):
 
 
 ARMED, ACTS, PASSED, LEFT, STAYED = range(5)
-"""Of ``Band.state``: whether it is looked at; whether the arms stay once it is left; substeps since the control step
-began; in which of them it was first left, -1 for none; whether they were told to stay."""
+"""Of ``SubstepBand.state``: whether it is looked at; whether the arms stay once it is left; substeps since the control
+step began; in which of them it was first left, -1 for none; whether they were told to stay."""

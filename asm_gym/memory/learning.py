@@ -127,7 +127,7 @@ def power_iteration(W: Array, v: Array) -> tuple[float, Array]:
     return norm, v / (norm + np.float32(1e-12))
 
 
-class Change(NamedTuple):
+class HebbianChange(NamedTuple):
     """What one control step asks of each weight array (the sum of local products, averaged over the batch)."""
 
     W_C: Array
@@ -137,7 +137,7 @@ class Change(NamedTuple):
 
 def hebbian_change(
     c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: float, exists: Array | None = None
-) -> Change:
+) -> HebbianChange:
     """The local learning rules.
 
     Args:
@@ -150,7 +150,7 @@ def hebbian_change(
     """
     motor = u.shape[1] - 1
     exists = direct_synapses(error.shape[1] - motor, motor) if exists is None else exists
-    return Change(
+    return HebbianChange(
         W_C=coincidence(np.float32(pi_z) * (z - mu), c),
         W_F=coincidence(error, activate(z)),
         W_D=coincidence(error, np.hstack([c, u])) * exists,
@@ -169,7 +169,7 @@ class Schedule(NamedTuple):
     free_running_probability: float
 
 
-class Step(NamedTuple):
+class LearningStep(NamedTuple):
     """What a control step of learning came to."""
 
     expected: Array  # (B, S + A) x̂_t and â_t, before anything was read
@@ -181,14 +181,14 @@ class Learner:
 
     def __init__(self, weights: Weights, schedule: Schedule, rng: np.random.Generator) -> None:
         self.weights, self.schedule, self.rng = weights, schedule, rng
-        self.synapses = {name: Synapse(getattr(weights, name)) for name in Change._fields}
+        self.synapses = {name: Synapse(getattr(weights, name)) for name in HebbianChange._fields}
         motor = weights.W_D.shape[1] - weights.W_C.shape[1] - 1
         self._direct = direct_synapses(len(weights.W_D) - motor, motor)
         self._direction = rng.standard_normal(weights.W_F.shape[1]).astype(np.float32)
         for _ in range(20):
             self._norm, self._direction = power_iteration(weights.W_F, self._direction)
 
-    def step(self, c: Array, u: Array, x: Array, rate: float, taken: Array | None = None) -> Step:
+    def step(self, c: Array, u: Array, x: Array, rate: float, taken: Array | None = None) -> LearningStep:
         """One control step of a batch.
 
         Args:
@@ -213,7 +213,7 @@ class Learner:
             synapse.learn(getattr(change, name), rate)
         # W_F moves little in a step, so one iteration keeps the norm up to date.
         self._norm, self._direction = power_iteration(w.W_F, self._direction)
-        return Step(expected, total)
+        return LearningStep(expected, total)
 
 
 def passes(trajectories: Sequence[Trajectory], schedule: Schedule) -> int:

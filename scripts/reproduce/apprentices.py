@@ -23,7 +23,7 @@ from asm_gym.episode import Episode
 from asm_gym.memory.motor import fineness, lessons, situation
 from asm_gym.monitors.baselines.torch_model import adam, descend, padded
 from asm_gym.policies import make_policy
-from asm_gym.policies.grip import Grip, Readout
+from asm_gym.policies.grip import CommandReadout, Grip
 from asm_gym.policies.memory_policy import StreamReader, common_spec, require_motor
 from asm_gym.policies.scripted.base import Style
 from asm_gym.rollouts.staging import environment
@@ -145,7 +145,7 @@ class ClonePolicy:
     """A clone in an environment; see ``NeuralASMPolicy``."""
 
     def __init__(self, clone: Clone, env: gym.Env[Any, Any]) -> None:
-        self._clone, self._readout = clone, Readout(env)
+        self._clone, self._readout = clone, CommandReadout(env)
         self._size = require_motor(clone.senses.spec, env)
         self._read = StreamReader(clone.senses.spec, env)
 

@@ -66,7 +66,7 @@ class Config(kit.Config):
                 raise ValueError(f"unknown skill {task!r}; there is an expert of one arm for: {known}")
 
 
-class Trial(NamedTuple):
+class Scenes(NamedTuple):
     """Scenes of a task, for one policy."""
 
     task: str
@@ -99,7 +99,7 @@ def learn(what: tuple[str, int], episodes: Sequence[Episode], config: Config) ->
     return TrainedModel(seed, model, brain, time.perf_counter() - start)
 
 
-def attempt(trial: Trial, brains: Mapping[tuple[str, int], NeuralASM | Clone]) -> list[Record]:
+def attempt(trial: Scenes, brains: Mapping[tuple[str, int], NeuralASM | Clone]) -> list[Record]:
     """How each scene went."""
     env = environment(f"asm_gym/{trial.task}-v0", SETTINGS)
     where = {"task": trial.task, "model": trial.model, "seed": trial.seed}
@@ -117,13 +117,13 @@ def attempt(trial: Trial, brains: Mapping[tuple[str, int], NeuralASM | Clone]) -
     return records
 
 
-def trials(config: Config) -> list[Trial]:
+def trials(config: Config) -> list[Scenes]:
     """Every policy in every scene, a task after the other, so that a process seldom makes a new environment."""
     plan = []
     for task in config.tasks:
         for seed in config.repetitions:
             scenes = tuple(role_seeds(seed, task, "express", config.trials))
-            plan += [Trial(task, m, seed, scenes[i : i + 17]) for m in MODELS for i in range(0, len(scenes), 17)]
+            plan += [Scenes(task, m, seed, scenes[i : i + 17]) for m in MODELS for i in range(0, len(scenes), 17)]
     return plan
 
 

@@ -66,7 +66,7 @@ class Config(kit.Config):
         known=(*MONITORS, *NAMES),
     )
     """Names of monitors, and of rivals that read commands; memory_skill is skill surprise."""
-    episodes: int = option(40, quick=3, least=2)
+    episodes: int = option(40, quick=6, least=2)
     """Episodes of each task to learn from, to calibrate on, and to test on for each way of acting."""
     false_alarm_rate: float = option(defaults.FALSE_ALARM_RATE, quick=0.5, check=conformal_episodes)
     """Share of the agent's successful episodes that may raise an alarm."""
