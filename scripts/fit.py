@@ -5,14 +5,16 @@ Part of the episodes are learned from, the others set the threshold. Episodes th
 
 from __future__ import annotations
 
+import math
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from asm_gym.data.commands import feedback
@@ -28,6 +30,7 @@ from asm_gym.data.selection import (
     normal_episodes,
     pieces,
     unbroken,
+    unmarked,
 )
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE, HOUR
@@ -119,13 +122,21 @@ class Args:
         return Asked.of(self.false_alarm_rate if hourly is None else None, hourly)
 
 
-def learned(args: Args, fitting: list[Episode], calibration: list[Episode], progress: Progress) -> Any:
-    """The monitor, fitted and calibrated."""
+def learned(
+    args: Args, fitting: list[Episode], calibration: list[Episode], progress: Progress, parts: Sequence[Part] = ()
+) -> Any:
+    """The monitor, fitted and calibrated; where that is refused, the message says which of ``parts`` was odd."""
     settings: dict[str, Any] = {"seed": args.seed}
     if args.epochs is not None and "epochs" in monitor_class(args.monitor).hyperparameters:
         settings["epochs"] = args.epochs
     monitor: Any = make_monitor(args.monitor, fitting[0].spec, **settings)
-    return monitor.fit(fitting, progress).calibrate(calibration, **args.asked.named)
+    monitor.fit(fitting, progress)
+    try:
+        return monitor.calibrate(calibration, **args.asked.named)
+    except ValueError as error:
+        maxima = np.array([score.value.max() for score in monitor.score_episodes(calibration)])
+        odd = about_pieces(parts, maxima) if len(parts) else []
+        raise ValueError("; ".join([str(error), *odd])) from error
 
 
 def recorded(args: Args, say: Callable[[str], None]) -> Args:
@@ -155,10 +166,22 @@ def parted(args: Args, logs: list[list[Episode]]) -> tuple[list[Episode], list[E
     else:
         episodes = [part for log in logs for part in log]
         if args.asked.per == EPISODE:
+            check_count(args, episodes)
             return divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
         fitting, calibration = divided(episodes, ANY_EPISODE, args.calibration_share, args.seed)
     args.asked.check_hours(hours_of(calibration))
     return fitting, calibration
+
+
+def check_count(args: Args, episodes: list[Episode]) -> None:
+    """Raises ValueError where episodes are few, but long enough to be cut: the message says into what."""
+    needed = math.ceil(conformal_episodes(args.false_alarm_rate) / args.calibration_share) + SPARE
+    length = math.floor(100 * 3600 * hours_of(episodes) / needed) / 100
+    if args.split is None and 2 * len(episodes) < needed and length >= SHORTEST_S:
+        raise ValueError(
+            f"a false-alarm rate of {args.false_alarm_rate:g} needs {needed} normal episodes, got {len(episodes)} that "
+            f"are {3600 * hours_of(episodes):.4g} s long together: --split {min(length, PIECE_S):g} cuts them"
+        )
 
 
 def promised(args: Args, calibration: list[Episode]) -> str:
@@ -219,10 +242,12 @@ def fit(args: Args, console: Console) -> None:
     with stage("reading", console, {}) as progress:
         layout = Layout(None, args.rate, args.action, args.channels, args.label, args.columns, args.join, by_name=True)
         with noted() as notes:
-            kept = normal_episodes(read_logs(args.data, layout), args.keep_failures, progress)
+            logs = read_logs(args.data, layout)
+            kept = normal_episodes(logs if args.split is None else unmarked(logs), args.keep_failures, progress)
     gone = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
     if not kept.episodes:
         hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""
+        hint = hint or ("; --split 5 learns from between the marked rows of a log" if args.split is None else "")
         raise ValueError(f"{args.data} holds no normal episode: {gone or 'it is empty'}{hint}")
     bridged = [replace(e, stream=filled(e.stream, e.spec.dt, args.bridge)) for e in declared_by_all(kept.episodes)]
     named = [(name, part) for name, e in zip(kept.logs, bridged, strict=True) for part in unbroken(e)]
@@ -231,7 +256,7 @@ def fit(args: Args, console: Console) -> None:
     fitting = fitting[: args.most]
     origin = origins([name for name, _ in named], whole)
     with stage("learning", console, {}) as progress:
-        monitor = learned(args, fitting, calibration, progress)
+        monitor = learned(args, fitting, calibration, progress, [origin[id(e)] for e in calibration])
     monitor.save(args.out)
     spec = fitting[0].spec
     rows = sum(map(len, fitting))

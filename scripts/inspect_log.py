@@ -19,12 +19,11 @@ from asm_gym.data.inspection import ChannelFound, Inspection, in_time, inspected
 from asm_gym.data.logs import Layout, read_tables
 from asm_gym.data.notes import noted
 from asm_gym.evaluation import figures
-from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.validation import check_number
 
-HEADINGS = ("channel", "unit", "is", "what is done", "from", "to", "noise", "resolution", "repeats", "missing")
+HEADINGS = ("channel", "unit", "is", "from", "to", "noise", "resolution", "repeats", "missing", "what is done")
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,8 @@ def inspect(args: Args, console: Console) -> int:
             for name, columns in islice(read_tables(args.log, layout), args.logs)
         ]
     for found in shown:
-        console.print(console_table(table(found), left=4))
+        for line in table(found):
+            say(line)
         for line in found.remarks():
             say(f"- {line}")
         file = figures.save(figures.log_figure(found), args.out / f"{Path(found.name).stem or 'log'}.png")
@@ -77,12 +77,15 @@ def inspect(args: Args, console: Console) -> int:
     return code
 
 
-def table(found: Inspection) -> Table:
-    """A row a channel."""
+def table(found: Inspection) -> list[str]:
+    """A line a channel, however narrow the console: a table with borders folded away what matters."""
     clock = found.clock
     rate = f"{clock.rate:.6g} Hz, jitter {100 * clock.jitter:.1f} %" if clock.rate else "no rate"
     caption = f"{found.name}: {clock.rows} rows, {in_time(clock.seconds)}, {rate}, {len(clock.gaps)} gaps"
-    return Table(caption, HEADINGS, [cells(channel) for channel in found.channels])
+    rows = [HEADINGS, *(tuple(map(str, cells(channel))) for channel in found.channels)]
+    used = [k for k in range(len(HEADINGS)) if any(row[k] for row in rows[1:])]
+    widths = {k: max(len(row[k]) for row in rows) for k in used}
+    return [caption, *("  ".join(row[k].ljust(widths[k]) for k in used).rstrip() for row in rows)]
 
 
 def cells(channel: ChannelFound) -> Sequence[object]:
@@ -92,13 +95,13 @@ def cells(channel: ChannelFound) -> Sequence[object]:
         channel.name,
         channel.unit,
         channel.role,
-        channel.treatment(),
         f"{channel.low:.4g}" if read else "",
         f"{channel.high:.4g}" if read else "",
         f"{channel.noise:.2g}" if channel.noise else "0",
         f"{channel.resolution:.2g}" if channel.resolution else "",
         f"{100 * channel.repeats:.0f} %",
         channel.missing or "",
+        channel.treatment(),
     )
 
 

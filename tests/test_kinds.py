@@ -67,3 +67,32 @@ def test_a_kind_that_was_left_out_is_surprising_where_it_differs(tmp_path, capsy
     share = {kind: float(line.split(" min, ")[1].split(" %")[0]) for kind, line in said.items()}
     assert share["heavy"] > 50
     assert max(share["light"], share["empty"]) < 5
+
+
+def test_a_long_log_is_learned_from_between_its_marked_rows(tmp_path, capsys):
+    write(tmp_path / "log.csv", 0, 120)
+    rows = (tmp_path / "log.csv").read_text().splitlines()
+    marked = [f"{row},{'fault' if n == 0 else int(2500 <= n < 2550)}" for n, row in enumerate(rows)]
+    (tmp_path / "log.csv").write_text("\n".join(marked))
+    fit = ["fit", str(tmp_path / "log.csv"), "--out", str(tmp_path / "m.asm"), "--monitor", "kalman"]
+    fit += ["--false-alarm-rate", "0.1"]
+    assert main(fit) == 2
+    assert "1 with a fault; --split 5 learns from between" in " ".join(capsys.readouterr().err.split())
+    assert main([*fit, "--split", "1"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Learned from 54 episodes: 2700 rows" in said  # half of 44 pieces before the mark, 64 after it
+    assert "with a fault" not in said
+
+
+def test_a_threshold_that_is_refused_names_the_piece(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("asm_gym.monitors.sighted.MOST", 0.0)
+    write(tmp_path / "log.csv", 0, 60)
+    rows = [row.split(",") for row in (tmp_path / "log.csv").read_text().splitlines()]
+    for row in rows[2701:2750]:
+        row[1:] = [str(1e4 * float(cell)) for cell in row[1:]]
+    (tmp_path / "log.csv").write_text("\n".join(map(",".join, rows)))
+    fit = ["fit", str(tmp_path / "log.csv"), "--out", str(tmp_path / "m.asm"), *FIT[:2], "--split", "2"]
+    assert main([*fit, "--false-alarms-per-hour", "200"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "could pass" in said
+    assert "log.csv from 54 s" in said

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,6 +18,10 @@ from asm_gym.spec import MOTOR
 
 SHORTEST_S = 0.5
 """Least length of a part between lost rows that is worth learning from [s]."""
+
+
+AROUND_S = 5.0
+"""How near to marked rows nothing is learned from [s]: what led to a stop is no normal motion."""
 
 
 class Kept(NamedTuple):
@@ -54,6 +58,23 @@ def _abnormal(episode: Episode) -> str:
     if episode.label is not None and episode.label.role == "harmless":
         return "under a harmless variation"
     return "" if episode.success else "failed"
+
+
+def unmarked(logs: Iterable[Log]) -> Iterator[Log]:
+    """The same, but of long logs from elsewhere what lies between the rows that a label marks, and not near those."""
+    for log in logs:
+        episode = log.episode
+        if episode.spec.source != "table" or not episode.faults.any():
+            yield log
+            continue
+        near = round(AROUND_S / episode.spec.dt)
+        close = np.convolve(episode.faults, np.ones(2 * near + 1), "same") > 0.5
+        least = max(2, round(SHORTEST_S / episode.spec.dt))
+        for start, stop in spans(~close):
+            if stop - start >= least:
+                yield Log(
+                    log.name, replace(episode, stream=episode.stream[start:stop], faults=episode.faults[start:stop])
+                )
 
 
 def declared_by_all(episodes: list[Episode]) -> list[Episode]:
