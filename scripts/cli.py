@@ -30,6 +30,7 @@ GROUPS: dict[str, dict[str, Command]] = {
         "evaluate": Command("asm_gym.scripts.evaluate", "tasks x monitors x faults: who notices what"),
         "watch": Command("asm_gym.scripts.watch", "a log, or rows as they come: when, where, how surprising"),
         "train": Command("asm_gym.scripts.train", "an agent: cloned, then improved by SAC, TD3 or PPO"),
+        "push": Command("asm_gym.scripts.push", "a memory and its card, to the Hugging Face hub"),
         "completion": Command("asm_gym.scripts.completion", "what makes your shell complete all of this"),
         "warmup": Command("asm_gym.scripts.warmup", "compile ahead what the first guarded step waits for"),
         "doctor": Command("asm_gym.scripts.doctor", "what this machine lacks, and what installs it"),

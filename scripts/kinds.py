@@ -53,7 +53,8 @@ def about_pieces(parts: Sequence[Part], maxima: NDArray[np.float64]) -> list[str
     others = np.delete(maxima, odd).max()
     return [
         f"{len(odd)} of {len(maxima)} pieces are unlike the others, none of which is over {others:.3g}: {named}"
-        f"{', …' if len(odd) > LISTED else ''}; look whether they are healthy; record more of their kind, or ask for a rate that may alarm there"
+        f"{', …' if len(odd) > LISTED else ''}; look whether they are healthy; "
+        "record more of their kind, or ask for a rate that may alarm there"
     ]
 
 

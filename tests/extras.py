@@ -53,6 +53,8 @@ CHECKS = {
     "learners": Check("learners", "tests/test_learners.py"),
     "rllib": Check("cluster", "tests/test_learners.py", "ray[rllib] torch", pins="gymnasium"),
     "cluster": Check("robosuite,report,cluster", "tests/test_parallel.py -k cluster"),
+    "notebooks": Check("robosuite,report,notebooks", "tests/test_notebooks.py"),
+    "hub": Check("hub", "tests/test_hub.py"),
     "environments": Check("environments,report", "tests/test_elsewhere.py"),
     "robosuite": Check("robosuite,report,video", "tests/test_robosuite_env.py -m 'not slow'", "stable-baselines3"),
 }

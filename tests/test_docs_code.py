@@ -40,7 +40,7 @@ SHELL = [p for p in documents.written() if any(b.language == "sh" for b in docum
 RESULTS = [p for p in documents.written() if p.parent.name == "results" and p.name != "index.md"]
 
 RECORDER = "".join(f'{name}() {{ printf "%s\\n" "{name} $*"; }}; ' for name in ("asm-gym", "make", "python"))
-RECORDER += "apt-get() { :; }\n"
+RECORDER += "apt-get() { :; }; pip() { :; }\n"
 """Instead of commands: what they would have been given."""
 
 

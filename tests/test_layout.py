@@ -117,6 +117,7 @@ def test_only_envs_imports_robosuite() -> None:
 def test_no_module_speaks_to_a_network() -> None:
     # Clusters are dask's and ray's to speak to, where an address is named. Live rows are heard on the loopback alone.
     names = "socket", "ssl", "urllib", "http", "ftplib", "smtplib", "requests", "httpx", "aiohttp"
+    # The hub is spoken to by its own library (asm_gym.monitors.hub), where a repository is named.
     # A UR controller is spoken to where its address is named (RTDE).
     assert offences("asm_gym", *names) == ["asm_gym.data.live imports socket", "asm_gym.data.rtde imports socket"]
     assert 'bind(("127.0.0.1", port))' in (ROOT / "asm_gym" / "data/live.py").read_text(encoding="utf-8")

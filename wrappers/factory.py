@@ -73,7 +73,10 @@ def fitted_to(monitor: Monitor, watched: StreamSpec) -> Monitor:
 
     Raises:
         ValueError: the stream has senses that it never met, by name.
+        TypeError: it answers something else than a state and a surprise.
     """
+    if isinstance(monitor, Watches) and not isinstance(monitor, CalibratedMonitor):
+        check_answer(monitor)
     if not isinstance(monitor, DoesWithFewerSenses) or not monitor.spec.difference(watched):
         return monitor
     fewer = monitor.for_stream(watched)
@@ -108,8 +111,6 @@ def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
     if not isinstance(monitor, Watches):
         raise TypeError(f"monitor must have initial_state() and observe(), got {shown(monitor)}")
     monitor.spec.require(watched, "the monitor")
-    if not isinstance(monitor, CalibratedMonitor):
-        check_answer(monitor)
     return check_number("the monitor's threshold", monitor.threshold)
 
 

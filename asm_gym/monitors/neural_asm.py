@@ -27,6 +27,7 @@ from asm_gym.monitors.asked import Asked
 from asm_gym.monitors.base import Progress, Surprise, Told
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.fused import CompiledRow
+from asm_gym.monitors.hub import fetched
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState
@@ -223,6 +224,11 @@ class NeuralASM(CalibratedMonitor):
             ValueError: there is none of that name; the message lists those that there are.
         """
         return cls.load(pretrained_file(name))
+
+    @classmethod
+    def from_hub(cls, repo: str, revision: str | None = None) -> Self:
+        """A memory that ``asm-gym push`` has put on the Hugging Face hub; see ``asm_gym.monitors.hub.fetched``."""
+        return cls.load(fetched(repo, revision))
 
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
         self._fitted()
