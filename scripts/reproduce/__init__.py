@@ -31,7 +31,7 @@ STUDIES = {
     "harm": Study("harm avoided against success kept, under any policy"),
     "attack": Study("what who writes to the senses can hide"),
     "learning_curve": Study("detection by the number of episodes learned from", needs_a_run=True),
-    "one_energy": Study("surprise, completion, reaction and learning by one energy", needs_a_run=True),
+    "one_energy": Study("surprise, completion, reaction by one energy", needs_a_run=True),
     "feedback": Study("what local learning of association costs", needs_a_run=True),
     "diagnosis": Study("what is wrong, of kinds of faults that were never seen", needs_a_run=True),
     "real_arms": Study("faults in recordings of real arms, once downloaded", needs_a_run=True),
