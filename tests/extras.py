@@ -85,7 +85,7 @@ EXTRAS = (
     *("robosuite", "report", "data", "agents", "environments", "learners", "hub", "notebooks"),
     *("cluster", "rerun", "ros", "video"),
 )
-BREAKS = {"mujoco": "3.10", "dm-control": "1.0.41", "numpy": "3", "pyarrow": "22"}
+BREAKS = {"mujoco": "3.10", "dm-control": "1.0.40", "numpy": "3", "pyarrow": "22"}
 """From which version on a package has not been tried, or breaks environments."""
 STILL_RUNS = (
     "import gymnasium as gym; from asm_gym import NeuralASMSafety; e = NeuralASMSafety(gym.make('asm_gym/Lift-v0'));"
