@@ -194,7 +194,9 @@ def test_what_every_install_has_is_needed_and_what_an_extra_brings_is_not(machin
     assert (found["torch"].needed, found["torch"].remedy) == (False, "python -m pip install 'asm-gym[agents]'")
 
 
-@pytest.mark.parametrize(("version", "ok"), [("3.10.14", False), ("3.11.0", True), ("3.12.9", True), ("3.13.0", False)])
+@pytest.mark.parametrize(
+    ("version", "ok"), [("3.10.14", False), ("3.11.0", True), ("3.12.9", True), ("3.13.0", True), ("3.14.0", False)]
+)
 def test_python_is_held_against_requires_python(monkeypatch: pytest.MonkeyPatch, version: str, ok: bool) -> None:
     monkeypatch.setattr(platform, "python_version", lambda: version)
     assert doctor.python().ok is ok

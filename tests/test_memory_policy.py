@@ -15,6 +15,7 @@ from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.episode import Episode
 from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, situation
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.packed import unpacked
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.grip import ENOUGH, FORGETS, CommandReadout
 from asm_gym.policies.memory_policy import StreamReader, common_spec
@@ -270,7 +271,7 @@ def test_learning_to_act_refuses_what_it_cannot_learn_from(pilot):
 def test_a_damaged_motor_association_is_refused(pilot, tmp_path):
     pilot.save(tmp_path / "broken.asm")
     saved = read_checkpoint(tmp_path / "broken.asm", pilot.kind)
-    arrays = saved.arrays | {"motor_D": np.zeros((3, 1), np.float32)}
+    arrays = unpacked(saved.arrays) | {"motor_D": np.zeros((3, 1), np.float32)}
     header = saved.header | {"shapes": {name: list(array.shape) for name, array in arrays.items()}}
     write_checkpoint(tmp_path / "broken.asm", pilot.kind, header, arrays)
     with pytest.raises(ValueError, match="motor_D should be of shape"):
@@ -280,7 +281,7 @@ def test_a_damaged_motor_association_is_refused(pilot, tmp_path):
 def test_a_motor_association_that_read_its_senses_otherwise_is_refused(pilot, tmp_path):
     pilot.save(tmp_path / "before.asm")
     saved = read_checkpoint(tmp_path / "before.asm", pilot.kind)
-    arrays = {name: array for name, array in saved.arrays.items() if name != "motor_kappa"}
+    arrays = {name: array for name, array in unpacked(saved.arrays).items() if name != "motor_kappa"}
     header = saved.header | {"shapes": {name: list(array.shape) for name, array in arrays.items()}}
     write_checkpoint(tmp_path / "before.asm", pilot.kind, header, arrays)
     with pytest.raises(ValueError, match="call learn_to_act with this one"):

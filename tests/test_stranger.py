@@ -45,7 +45,7 @@ def registries():
 
 
 def lines(*rows):
-    return [row[0].tolist() for row, _ in RowReader(SPEC).rows(rows)]
+    return [row.numbers.tolist() for row, _ in RowReader(SPEC).rows(rows)]
 
 
 def test_live_rows_with_units_behind_their_names_are_read_in_those_of_the_memory():

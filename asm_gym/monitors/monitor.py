@@ -23,7 +23,7 @@ from asm_gym.monitors.calibrated import Calibrated
 from asm_gym.monitors.fresh import Marks, check_fresh, sketch
 from asm_gym.monitors.model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.nominal import check_nominal
-from asm_gym.monitors.packed import packed
+from asm_gym.monitors.packed import packed, unpacked
 from asm_gym.monitors.saved import SavedMonitor, calibration_arrays
 from asm_gym.monitors.sighted import require_sight
 from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
@@ -297,7 +297,7 @@ class CalibratedMonitor(Calibrated):
         Raises:
             ValueError: something is missing, or does not fit together.
         """
-        found = SavedMonitor.of(saved)
+        found = SavedMonitor.of(saved._replace(arrays=unpacked(saved.arrays)))
         theirs = {n for d in self.detections.values() for n in d.arrays}
         missing = [n for n in self.detection.arrays if n not in found.arrays]
         if missing:

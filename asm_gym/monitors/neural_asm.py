@@ -32,7 +32,7 @@ from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState
 from asm_gym.monitors.nominal import check_nominal
-from asm_gym.monitors.packed import rounded
+from asm_gym.monitors.packed import rounded, unpacked
 from asm_gym.monitors.saved import restored
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise, apart
@@ -270,7 +270,7 @@ class NeuralASM(CalibratedMonitor):
         return found if self.skill_ is None else found | self.skill_.arrays
 
     def restore(self, saved: Checkpoint) -> Self:
-        own, skill = apart(saved)
+        own, skill = apart(saved._replace(arrays=unpacked(saved.arrays)))
         if "dynamics" not in saved.header["hyperparameters"]:  # saved before there was a choice
             self.dynamics = self.model.dynamics = dynamics_of(saved.header["shapes"])
         super().restore(own)

@@ -36,9 +36,14 @@ def packed(arrays: Mapping[str, NDArray[Any]]) -> Found:
     """The same in less space, as far as nothing is lost."""
     found: Found = {}
     for name, array in arrays.items():
-        if _is_weight(name, array) and np.array_equal(_of(*(parts := _split(array))), array):
+        if _is_weight(name, array) and _of(*(parts := _split(array))).tobytes() == array.tobytes():
             found |= {name + BITS: parts[0], name + SCALE: parts[1]}
-        elif array.ndim == 2 and len(array) > 1 and array.shape[0] == array.shape[1] and (array == array.T).all():
+        elif (
+            array.ndim == 2
+            and len(array) > 1
+            and array.shape[0] == array.shape[1]
+            and array.tobytes() == array.T.tobytes()
+        ):
             found[name + HALF] = array[np.tril_indices(len(array))]
         else:
             found[name] = array
@@ -61,7 +66,7 @@ def unpacked(arrays: Mapping[str, NDArray[Any]]) -> Found:
                 raise ValueError(f"{array.size} numbers are no half of a symmetric {own}")
             found[own] = np.zeros((size, size), array.dtype)
             found[own][np.tril_indices(size)] = array
-            found[own] = np.tril(found[own]) + np.tril(found[own], -1).T
+            found[own].T[np.tril_indices(size)] = array
         elif not name.endswith(SCALE):
             found[name] = array
     return found

@@ -13,7 +13,6 @@ from asm_gym.checkpoint import Checkpoint
 from asm_gym.detection import Blocks
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.conformal import EPISODE, HOUR
-from asm_gym.monitors.packed import unpacked
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_number
 
@@ -97,7 +96,6 @@ def restored(path: str | Path, saved: Checkpoint, make: Callable[..., R]) -> R:
         ValueError: the file is damaged.
     """
     try:
-        saved = saved._replace(arrays=unpacked(saved.arrays))
         return make(StreamSpec.from_json(saved.header["spec"]), **saved.header["hyperparameters"]).restore(saved)
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
