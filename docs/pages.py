@@ -4,7 +4,7 @@ The front matter of a page in ``docs/results`` says so:
 
     command: |
       asm-gym evaluate --quick --out runs/quick
-    printed: runs/quick/results.md   what the command leaves; without it, what the command prints
+    printed: runs/quick/results.md   what the command leaves, one file or several; without it, what the command prints
     figures: {runs/quick/roc.png: docs/img/roc.png}
     reads: {runs/evaluate: detection}   what the command reads, and the page whose command makes that
     check: asm-gym evaluate … --out $CHECK   at most 30 s; says whether the page still holds; CHECK: an empty folder
@@ -142,7 +142,8 @@ def run(page: Page) -> Page:
     for made, kept in page.meta.get("figures", {}).items():
         shutil.copyfile(ROOT / made, ROOT / kept)
     if "printed" in page.meta:
-        page = page.printed_anew((ROOT / page.meta["printed"]).read_text(encoding="utf-8"))
+        left = ((ROOT / path).read_text(encoding="utf-8").strip() for path in page.meta["printed"].split())
+        page = page.printed_anew("\n\n".join(left))
     else:
         page = page.printed_anew(f"```text\n{said}\n```")
     fresh = {"version": __version__, "date": date.today(), "commit": ran.commit(), "machine": ran.machine()}

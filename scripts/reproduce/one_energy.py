@@ -257,7 +257,7 @@ def drawn(records: Sequence[Record]) -> Figure:
         axes[0].set(xlabel="AUROC of faults", xlim=(0.4, 1.0))
         axes[1].set(xlabel="error of completion / that of the last value", xscale="log")
         axes[1].axvline(1.0, color="#444444", linewidth=1)
-        axes[2].set(xlabel="distance from the letter after a push [cm]")
+        axes[2].set(xlabel="off the letter after a push [cm]")
         fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, fontsize=8)
     return fig
 
