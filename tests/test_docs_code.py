@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
@@ -39,7 +40,9 @@ PYTHON = [
 SHELL = [p for p in documents.written() if any(b.language == "sh" for b in documents.blocks(p))]
 RESULTS = [p for p in documents.written() if p.parent.name == "results" and p.name != "index.md"]
 
-RECORDER = "".join(f'{name}() {{ printf "%s\\n" "{name} $*"; }}; ' for name in ("asm-gym", "make", "python"))
+RECORDER = "".join(
+    f'{name}() {{ printf "%q " {name} "$@"; printf "\\n"; }}; ' for name in ("asm-gym", "make", "python")
+)
 RECORDER += "apt-get() { :; }; pip() { :; }\n"
 """Instead of commands: what they would have been given."""
 
@@ -85,7 +88,7 @@ def commands(script: str) -> list[str]:
 
 def check(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Fails unless the command exists and takes these arguments, where the libraries that they name are installed."""
-    program, *argv = command.split()
+    program, *argv = shlex.split(command)
     if not all(map(is_there, re.findall(r" (\w+):[\w/-]+", command))):
         return  # of an environment that an extra brings, as in gymnasium_robotics:FetchReach-v4
     if program == "make":

@@ -48,6 +48,7 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Another scene; the same for the same ``seed``."""
         super().reset(seed=seed)
         if seed is not None or not self._seeded:
             reseed(self.robosuite_env, self.np_random)
@@ -56,10 +57,12 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._read(sensed, self._all), self._info(sensed, np.zeros(self.action_space.shape or (), np.float32))
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """One control step with an action (A,) in the box of the robot's controllers."""
         sensed, reward, _, _ = self.robosuite_env.step(np.asarray(action, np.float64))
         return self._read(sensed, self._all), float(reward), False, False, self._info(sensed, action)
 
     def close(self) -> None:
+        """Ends the simulation."""
         self.robosuite_env.close()
 
     def _info(self, sensed: dict[str, Any], action: NDArray[np.float32]) -> dict[str, Any]:

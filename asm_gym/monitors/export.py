@@ -7,9 +7,8 @@ learned is inside, and the state is passed in and out by name. Skills are not na
 hears of skills beside is not part of it. Rows should be finite: of one that is not the value is infinite, and so are
 those that follow, until the state is begun anew.
 
-Example:
-    write_onnx(NeuralASM.pretrained("panda"), "panda.onnx")
-    # session.run(None, {"row": row, **state}) in onnxruntime; initial_state(asm) has the first
+``write_onnx(NeuralASM.pretrained("panda"), "panda.onnx")`` writes one. In onnxruntime ``session.run`` is given ``row``
+and the arrays of a state by their names; ``initial_state(asm)`` has the first.
 """
 
 from __future__ import annotations
