@@ -29,7 +29,6 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from asm_gym.memory.association import Association
 from asm_gym.memory.inference import Weights
@@ -67,7 +66,7 @@ class Slope(NamedTuple):
     z: Floats  # (H,)
 
 
-class Moment(NamedTuple):
+class Before(NamedTuple):
     """All that was there before a row."""
 
     c: NDArray[np.float32]  # (1, I) what the network through time carries on
@@ -125,36 +124,38 @@ class FreeEnergy:
         tau = max(SMALLEST_SPREAD, float(np.sqrt(2.0 * time / (rows * raw._numbers))))
         return replace(raw, tau=tau, tau_motor=np.maximum(np.sqrt(commands / rows), SMALLEST_SPREAD))
 
-    def moments(self, stream: NDArray[np.floating[Any]]) -> list[tuple[Moment, Floats]]:
+    def moments(self, stream: NDArray[np.floating[Any]]) -> list[tuple[Before, Floats]]:
         """Each row (D,) of an episode (T, D) from the ``2 lag``-th on, and what was there before it."""
         rows, lag = np.asarray(stream, np.float64), self.senses.lag
         c, found = self.network.at_rest(1), []
         for t in range(len(rows)):
-            moment = Moment(c, *(rows[None, max(0, t - k)] for k in (lag, 2 * lag, 1)))
+            moment = Before(c, *(rows[None, max(0, t - k)] for k in (lag, 2 * lag, 1)))
             if t >= 2 * lag:
                 found.append((moment, rows[t]))
             c = self.after(moment, rows[t], turn=t % lag == 0)
         return found
 
-    def inferred(self, moment: Moment, row: Floats) -> Floats:
+    def inferred(self, moment: Before, row: Floats) -> Floats:
         """z (H,), the state that the network through time infers from a row (D,)."""
         read = self.senses.read(row[None], moment.before, moment.earlier)
         z: Floats = self.network.follow(moment.c, read.commands, read.senses, read.seen).z[0].astype(np.float64)
         return z
 
-    def terms(self, moment: Moment, row: Floats, z: Floats) -> Terms:
+    def terms(self, moment: Before, row: Floats, z: Floats) -> Terms:
         """F of a row (D,) and a state (H,), by its parts."""
         return self._of(moment, row, z)[0]
 
-    def slope(self, moment: Moment, row: Floats, z: Floats) -> Slope:
+    def slope(self, moment: Before, row: Floats, z: Floats) -> Slope:
         """∂F of a row (D,) and a state (H,)."""
         return self._of(moment, row, z)[1]
 
-    def settled(self, moment: Moment, row: Floats, free: NDArray[np.bool_]) -> tuple[Floats, Terms]:
+    def settled(self, moment: Before, row: Floats, free: NDArray[np.bool_]) -> tuple[Floats, Terms]:
         """The row (D,) in which F is lowest over its ``free`` (D,) numbers and the state; and F there.
 
         What is free should begin near what is likely, for F has other valleys: see ``expected``.
         """
+        from scipy.optimize import minimize  # a third of a second, that nobody else should wait for
+
         spread, count = self.senses.spread, int(free.sum())
         start = np.concatenate([np.zeros(count), self.inferred(moment, row)])
 
@@ -169,7 +170,7 @@ class FreeEnergy:
         settled[free] += spread[free] * found.x[:count]
         return settled, self.terms(moment, settled, found.x[count:])
 
-    def reaction(self, moment: Moment) -> Floats:
+    def reaction(self, moment: Before) -> Floats:
         """(A,) the command that lets F be lowest over itself and the row that it leads to.
 
         Nothing of the row is there yet: what the network through time expects of it is what it is drawn to.
@@ -192,21 +193,21 @@ class FreeEnergy:
         """N, that the network through time expects."""
         return self.senses.size + len(self.senses.spec.motor)
 
-    def expected(self, moment: Moment) -> Floats:
+    def expected(self, moment: Before) -> Floats:
         """(A,) the command that the motor association expects; that of the row before where there is none."""
         known = moment.last[0, self.senses.spec.motor]
         if self.motor is not None:
             known = self.motor.command(situation(self.senses, moment.last))[0]
         return np.asarray(known, np.float64)
 
-    def after(self, moment: Moment, row: Floats, turn: bool = True) -> NDArray[np.float32]:
+    def after(self, moment: Before, row: Floats, turn: bool = True) -> NDArray[np.float32]:
         """c (1, I) after a row (D,); as it was where it is not the row's ``turn``, for every l-th is taken up."""
         if not turn:
             return moment.c
         read = self.senses.read(row[None], moment.before, moment.earlier)
         return self.network.carry_on(moment.c, read.commands, read.senses, read.seen)[1]
 
-    def _read(self, moment: Moment, row: Floats) -> _Read:
+    def _read(self, moment: Before, row: Floats) -> _Read:
         """What ``StreamScaler.read`` does, unrounded: L-BFGS sees the last digits of single precision as valleys."""
         senses, spec, before = self.senses, self.senses.spec, moment.before[0]
         value, moved = (row - senses.mean) / senses.spread, (row - before) / senses.change
@@ -216,7 +217,7 @@ class FreeEnergy:
         inputs = np.concatenate([(before - senses.mean) / senses.spread, changes, past, u])
         return _Read(x, u, np.where(np.abs(inputs) < FARTHEST, inputs, 0.0), changes)
 
-    def _unexpected(self, moment: Moment, u: Floats) -> Floats:
+    def _unexpected(self, moment: Before, u: Floats) -> Floats:
         """u - û (A,) in spreads of the stream; 0 where there is no motor association."""
         if self.motor is None:
             return np.zeros(len(u))
@@ -224,7 +225,7 @@ class FreeEnergy:
         found: Floats = u - (self.expected(moment) - senses.mean[spec.motor]) / senses.spread[spec.motor]
         return found
 
-    def _of(self, moment: Moment, row: Floats, z: Floats) -> tuple[Terms, Slope]:
+    def _of(self, moment: Before, row: Floats, z: Floats) -> tuple[Terms, Slope]:
         senses, spec, (w, association) = self.senses, self.senses.spec, self._weights
         x, u, a, changes = self._read(moment, row)
         how = float(self.network.prior_precision), float(self.network.sensory_precision)

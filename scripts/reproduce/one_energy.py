@@ -24,7 +24,7 @@ from asm_gym.evaluation.metrics import detected, false_alarms, time_matched_auro
 from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import DYNAMICS
-from asm_gym.memory.free_energy import FreeEnergy, Moment
+from asm_gym.memory.free_energy import Before, FreeEnergy
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
@@ -131,10 +131,10 @@ def carried(energy: FreeEnergy, truth: Floats, missing: NDArray[np.bool_], onset
     return rows
 
 
-def before(rows: Floats, t: int, c: Any, energy: FreeEnergy) -> Moment:
+def before(rows: Floats, t: int, c: Any, energy: FreeEnergy) -> Before:
     """What was there before row ``t``."""
     lag = energy.senses.lag
-    return Moment(c, *(rows[None, max(0, t - k)] for k in (lag, 2 * lag, 1)))
+    return Before(c, *(rows[None, max(0, t - k)] for k in (lag, 2 * lag, 1)))
 
 
 def written(energy: FreeEnergy, model: Episode, way: str, push: Floats) -> Floats:
@@ -152,7 +152,7 @@ def written(energy: FreeEnergy, model: Episode, way: str, push: Floats) -> Float
     return rows[:, :2]
 
 
-def commanded(energy: FreeEnergy, moment: Moment, way: str) -> Floats:
+def commanded(energy: FreeEnergy, moment: Before, way: str) -> Floats:
     """(A,) by one of ``DRIVES``."""
     if way == DRIVES[0]:
         scaler, network = energy.senses, energy.network
