@@ -61,7 +61,7 @@ class Config(kit.Config):
     """Letters."""
     writings: int = option(20, quick=6, least=2)
     """Of each letter to learn from."""
-    tests: int = option(4, quick=2, least=1)
+    tests: int = option(3, quick=2, least=1)
     """Of each letter to be expressed."""
     epochs: int = option(70, quick=20, least=1)
     """Passes over them."""

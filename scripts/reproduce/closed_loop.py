@@ -23,6 +23,8 @@ PUSH = 0.06
 """How far both joints are displaced [rad], over two rows; about 2 cm at the hand."""
 
 WAYS = ("left alone", "pushed", "pushed, lowest F", "stuck", "stuck, left out", "hurried")
+ASKED = (WAYS[0], WAYS[1], WAYS[3])
+"""In which of them F is asked for, in the rows about the event."""
 
 
 @dataclass
@@ -31,7 +33,7 @@ class Course:
 
     path: Floats  # (T, B, 2) where the hand was [cm]
     surprise: Floats  # (T, B)
-    energy: Floats  # (T, B) F, where it was asked for
+    energy: Floats  # (T, B) F; not a number where it was not asked for
     alarm: NDArray[np.intp]  # (B,) the first row in alarm from the event on; T where none
     blamed: list[str] = field(default_factory=list)  # the sense that was most surprising in that row
 
@@ -94,7 +96,7 @@ def written(
     """
     rng, (T, B, _) = np.random.default_rng(seed), cues.shape
     pushes = PUSH * rng.choice([-1.0, 1.0], (B, 2))
-    found = Course(np.zeros((T, B, 2)), np.zeros((T, B)), np.zeros((T, B)), np.full(B, T), [""] * B)
+    found = Course(np.zeros((T, B, 2)), np.zeros((T, B)), np.full((T, B), np.nan), np.full(B, T), [""] * B)
     q, stuck = np.zeros((B, 2)), np.zeros(B)
     for t in range(T):
         if t < CUE:
@@ -116,11 +118,10 @@ def written(
         if way == "stuck, left out":
             for n in np.flatnonzero(found.alarm < t):
                 rows[n, SPEC.slices[found.blamed[n]]] = np.nan
-        if energy is not None and isinstance(drives, Memorised) and t >= 2:
+        if energy is not None and isinstance(drives, Memorised) and way in ASKED and EVENT - 5 <= t < EVENT + WINDOW:
             for n in range(B):
-                if np.isfinite(rows[n]).all():
-                    before = moment(drives.state, n)
-                    found.energy[t, n] = energy.terms(before, rows[n], energy.inferred(before, rows[n])).total
+                before = moment(drives.state, n)
+                found.energy[t, n] = energy.terms(before, rows[n], energy.inferred(before, rows[n])).total
         found.path[t], found.surprise[t] = hand(q), drives.read(rows)
         for n in np.flatnonzero((found.surprise[t] > threshold) & (found.alarm == T)) if t >= EVENT else ():
             found.alarm[n], found.blamed[n] = t, blamed(drives.attribution[n])  # type: ignore[attr-defined]
