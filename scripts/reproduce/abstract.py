@@ -50,7 +50,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 """What each dynamics learned best with, of what was tried on seed 0."""
 
-GRU = {"hidden": 64, "rate": 3e-2}
+GRU: dict[str, Any] = {"hidden": 64, "rate": 3e-2}
 
 
 @dataclass(frozen=True)
@@ -179,5 +179,5 @@ def run(config: Config) -> Findings:
     found = kit.each("learning and writing", partial(one, config=config), jobs, config)
     records = kit.together([own for own, _ in found])
     first = {name: courses for (name, seed), (_, courses) in zip(jobs, found, strict=True) if seed == config.seed}
-    letter = lessons(config.seed, config).tests[0].stream[:, HAND]
+    letter = lessons(config.seed, config).tests[0].stream[:, HAND].astype(np.float64)
     return Findings(records, tables(records, config.skills), drawn(first, letter))
