@@ -93,13 +93,14 @@ class GRU(TorchModel):
         hidden, last = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.senses_.size), np.float32)
         return _Memory(hidden, last, np.zeros((batch, self.spec.size)), np.zeros(batch, np.int64))
 
-    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
+    def advance(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
         before = np.where(state.steps[:, None] > 0, state.before, rows)
         r = self.senses_.read(rows, before, before)
         last = np.where(state.steps[:, None] > 0, state.last, r.senses)
-        inputs = torch.from_numpy(np.hstack([last, r.commands]))[:, None]
+        inputs = torch.as_tensor(np.hstack([last, r.commands]))[:, None]
         mean, log_variance, hidden = (
-            y.numpy()[:, 0] for y in self.module_(inputs, torch.from_numpy(np.ascontiguousarray(state.hidden))[None])
+            y.cpu().numpy()[:, 0]
+            for y in self.module_(inputs, torch.as_tensor(np.ascontiguousarray(state.hidden))[None])
         )
         error = r.whole * (r.changes - mean) * np.exp(-0.5 * log_variance)
         return _Memory(hidden, r.senses, rows, state.steps + 1), ModelOutput(error, hidden)
