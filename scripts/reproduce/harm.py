@@ -6,6 +6,7 @@ sensor of the guard reads. Pairs share their seed: the same scene, policy, and f
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.envs.backend import PHYSICS_FREQ
 from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE
+from asm_gym.files import written_whole
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
 from asm_gym.policies.hostile import HOSTILE
@@ -66,6 +68,8 @@ HEALTHY = {
 FAULTS = ("frozen_encoder", "encoder_bias", "encoder_dropout", "weak_joint", "passing_push")
 """Kinds under which the healthy policies act too; of the suite, but for the last."""
 
+HEALTHY_TASKS = tuple(dict.fromkeys(task for task, _ in HEALTHY.values()))
+
 AGAINST = "hostile", "untrained", "taught", "elsewhere"
 
 ELSEWHERE = ("Sawyer", 20), ("IIWA", 20), ("Panda", 100)
@@ -84,6 +88,8 @@ class Config(kit.Config):
     """Which; elsewhere are hostile ones with the Sawyer, the IIWA, and at 100 Hz."""
     healthy: int = option(40, quick=1, least=0)
     """Episodes of each healthy policy."""
+    healthy_in: tuple[str, ...] = option(HEALTHY_TASKS, known=HEALTHY_TASKS, metavar="TASK")
+    """Where these act."""
     faulty: int = option(0, least=0)
     """Episodes of each healthy policy of Lift and Stack under each kind of fault."""
     guards: tuple[str, ...] = option(
@@ -94,6 +100,8 @@ class Config(kit.Config):
     """Where these act."""
     training: int = fixed(2000, quick=500, least=4)
     """Steps for which those are trained that learn, to hit and to their task; a quarter of them too."""
+    resume: bool = False
+    """Goes on where a run into the same folder, of the same code and options, was interrupted."""
 
 
 class Cell(NamedTuple):
@@ -121,7 +129,7 @@ def cells(config: Config) -> list[tuple[Cell, int]]:
         for task, name, steps in product(tasks, LEARNERS, (n // 4, n))
     ]
     elsewhere = [cell._replace(robot=robot, rate=rate) for (robot, rate), cell in product(ELSEWHERE, hostile)]
-    healthy = [Cell("healthy", task, policy) for task, policy in HEALTHY.values()]
+    healthy = [Cell("healthy", task, policy) for task, policy in HEALTHY.values() if task in config.healthy_in]
     faulty = [
         cell._replace(kind="faulty", fault=fault)
         for cell, fault in product(healthy, FAULTS)
@@ -151,10 +159,17 @@ def policy_of(cell: Cell, env: gym.Env[Any, Any], seed: int, config: Config) -> 
 
 
 def measured(job: tuple[Cell, int], config: Config) -> list[kit.Record]:
-    """One scene under every guard."""
+    """One scene under every guard; kept, for a run that goes on."""
     cell, seed = job
+    kept = config.out / "harm_scenes" / f"{'-'.join(map(str, cell))}-{seed}.json".replace(" ", "_")
+    if config.resume and kept.is_file():
+        found: list[kit.Record] = json.loads(kept.read_text(encoding="utf-8"))
+        return found
     memory = NeuralASM.pretrained(cell.robot.lower() + ("" if cell.rate == 20 else f"_{cell.rate}hz"))
-    return [one(cell, seed, name, memory, config) for name in config.guards]
+    records = [one(cell, seed, name, memory, config) for name in config.guards]
+    with written_whole(kept) as file:
+        file.write(json.dumps(records).encode())
+    return records
 
 
 class Felt:
