@@ -153,7 +153,7 @@ class Guard:
         event = surprise.event(arbiter.threshold)
         knocked = event == KNOCK
         alarm = over or knocked or bool(lost) or contradicts or severity.presses
-        if alarm and lost and not (over or contradicts or severity.presses or failure or severity.fast):
+        if alarm and lost and not (over or knocked or contradicts or severity.presses or failure or severity.fast):
             response = self.responder.missed()
         elif knocked and not (contradicts or severity.presses or failure):
             response = self.responder.knocked()

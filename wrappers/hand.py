@@ -37,6 +37,9 @@ WINDOW = 10
 LEFT = 30.0
 """Of |z|², nine numbers: what no sensor at fault leaves more of."""
 
+SURER = 10.0
+"""How much more of |z|², in all of these rows, the next best sensor leaves; else a moment more is waited for."""
+
 NOBODY = np.zeros(0, np.intp)
 
 Mask = NDArray[np.bool_]
@@ -86,7 +89,7 @@ class HandAgainstJoints:
 
     def reset(self) -> None:
         """A new episode begins."""
-        self._mean, self._left = np.zeros(HAND), 0.0
+        self._mean, self._left, self._waited = np.zeros(HAND), 0.0, 0
         self._rows: list[NDArray[np.float64]] = []  # the last ones that were whole, (2 J + 9,) each
         self._good = np.zeros(len(self._q))  # (J,) angles that were believed last
         self._accused = np.zeros(self._size, bool)  # (D,) what was named, as long as they contradict each other
@@ -100,7 +103,7 @@ class HandAgainstJoints:
             return None
         self._rows = [*self._rows[1 - WINDOW :], now]
         if size <= LIMIT:
-            self._good, self._left = now[: len(self._q)], 0.0
+            self._good, self._left, self._waited = now[: len(self._q)], 0.0, 0
             self._accused[:] = False
             return None
         known = missing[self._q], missing[self._x]
@@ -108,8 +111,9 @@ class HandAgainstJoints:
             self._left += self._gain * (min(self._explained(now, *known)[1], ONE * LEFT / self._gain) - self._left)
             if self._left <= LEFT:
                 return None
-        found, self._left = self._named(*known), 0.0
-        self._accused[found.columns] = True
+        found = self._named(*known)
+        if found is not None:
+            self._left, self._accused[found.columns] = 0.0, True
         return found
 
     @property
@@ -134,16 +138,20 @@ class HandAgainstJoints:
         row[self._q] = self._good
         return row
 
-    def _named(self, free: Mask, unseen: Mask) -> Contradiction:
-        """The one sensor that explains most of the last rows."""
-        best, which = np.inf, 0
-        for n in range(len(self._suspects)):
-            joint, hand = free.copy(), unseen.copy()
-            (joint if n < len(free) else hand)[n if n < len(free) else n - len(free)] = True
-            left = float(np.mean([self._explained(row, joint, hand)[1] for row in self._rows]))
-            if left < best:
-                best, which = left, n
-        return Contradiction(*self._suspects[which]) if best <= LEFT else Contradiction("", NOBODY)
+    def _named(self, free: Mask, unseen: Mask) -> Contradiction | None:
+        """The one sensor that explains most of the last rows; None while that could be another as well."""
+        left = np.zeros(len(self._suspects))
+        for n in range(len(left)):
+            wrong = np.append(free, unseen)
+            wrong[n] = True
+            left[n] = sum(self._explained(row, wrong[: len(free)], wrong[len(free) :])[1] for row in self._rows)
+        best, next_best = np.argsort(left)[:2]
+        self._waited += 1
+        if left[next_best] - left[best] < SURER and self._waited * self._gain <= 1.0:
+            return None
+        self._waited = 0
+        explains = left[best] <= LEFT * len(self._rows)
+        return Contradiction(*self._suspects[best]) if explains else Contradiction("", NOBODY)
 
     def _explained(
         self,

@@ -73,8 +73,6 @@ class Repair:
         """(D,) which columns are completed."""
         self.settling = 0
         """Rows until the monitor has seen nothing but repaired rows of a sense that was found at fault."""
-        self.lost = np.zeros(self._spec.size, bool)
-        """(D,) which numbers of the last row were not finite."""
         self._returned = np.zeros(self._spec.size, np.int64)  # (D,) rows until its changes are those of the sense again
         self._gone: set[str] = set()  # of those that are missing, which said nothing, and are believed when they do
         self._since: dict[str, int] = {}  # rows for which each has been missing
@@ -122,7 +120,6 @@ class Repair:
         self.settling = max(0, self.settling - 1)
         self._returned = np.maximum(self._returned - 1, 0)
         finite = np.isfinite(self._raw)
-        self.lost = ~finite
         if not self._calm and finite.all():  # as nearly always
             self._good = self._before = self._raw
             return row.astype(np.float32)

@@ -150,6 +150,7 @@ class Responder:
         self._rows: list[NDArray[np.float32]] = []
         self._quiet = 0
         self._contradiction: Contradiction | None = None
+        self._lost = np.zeros(0, np.intp)
         self._forget()
         for hand in self._hands:
             hand.reset()
@@ -180,10 +181,8 @@ class Responder:
 
     @property
     def lost(self) -> tuple[str, ...]:
-        """The numbers of the last row that were not finite and are completed."""
-        if self.repair is None or self._map is None or not self.repair.lost.any():
-            return ()
-        return tuple(self._spec.labels[i] for i in np.flatnonzero(self.repair.lost))
+        """The numbers of the last row that were not finite."""
+        return tuple(self._spec.labels[i] for i in self._lost)
 
     @property
     def contradicts(self) -> bool:
@@ -209,6 +208,7 @@ class Responder:
 
     def read(self, row: NDArray[np.float32]) -> NDArray[np.float32]:
         """(D,) the row as the monitor is to see it."""
+        self._lost = np.flatnonzero(~np.isfinite(row))
         found = [hand.read(row, self.missing) for hand in self._hands]
         self._contradiction = next(filter(None, found), None)
         if self.repair is not None and self._map is not None:
@@ -293,6 +293,8 @@ class Responder:
 
     def missed(self) -> Response:
         """What is done about a row in which numbers are missing, and nothing else is wrong: they are completed."""
+        if self._map is None:
+            return Response("", as_info(None))
         said = as_info(None) | {"family": "sensor", "part": ", ".join(self.completed), "probability": 1.0}
         return Response("complete", said, None, "sensor")
 
