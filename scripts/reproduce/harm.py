@@ -28,7 +28,7 @@ from asm_gym.policies.hostile import HOSTILE
 from asm_gym.rollouts.staging import environment, policy_for, staged
 from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.scripts.options import fixed, option
-from asm_gym.scripts.reproduce import harm_agents, harm_braking, harm_report, kit
+from asm_gym.scripts.reproduce import harm_agents, harm_braking, harm_report, harm_speeds, kit
 from asm_gym.scripts.reproduce.harm_agents import EXCESS, HITTERS, LEARNERS
 from asm_gym.spec import control_period
 from asm_gym.tasks import env_id
@@ -92,6 +92,8 @@ class Config(kit.Config):
     """Where these act."""
     faulty: int = option(0, least=0)
     """Episodes of each healthy policy of Lift and Stack under each kind of fault."""
+    speeds: int = option(0, least=0)
+    """Episodes of healthy policies by which speed limits by place, direction and load are compared."""
     guards: tuple[str, ...] = option(
         (POLICY_ALONE, "default", "hold", "terminate"), known=tuple(GUARDS), metavar="NAME"
     )
@@ -156,6 +158,11 @@ def policy_of(cell: Cell, env: gym.Env[Any, Any], seed: int, config: Config) -> 
     if cell.kind == "untrained":
         return harm_agents.untrained(cell.policy, env, seed)
     return policy_for(cell.policy, env, seed)
+
+
+def chosen(name: str, env: gym.Env[Any, Any], seed: int) -> Policy:
+    """A hostile policy at full speed, or a healthy one."""
+    return HOSTILE[name](env, seed, 1.0) if name in HOSTILE else policy_for(name, env, seed)
 
 
 def measured(job: tuple[Cell, int], config: Config) -> list[kit.Record]:
@@ -269,14 +276,11 @@ def hand_speed(arm: Any, infos: Sequence[dict[str, Any]], step: int) -> float:
 
 def run(config: Config) -> kit.Findings:
     """Every cell on its own scenes, under every guard."""
-    chosen = cells(config)
-    taught = [cell for cell, _ in chosen if cell.steps]
+    asked = cells(config)
+    taught = [cell for cell, _ in asked if cell.steps]
     kit.each("training", partial(file_of, config=config), taught, config)
     jobs = [
-        (cell, 10_000 * again + 1000 + n)
-        for again in config.repetitions
-        for cell, count in chosen
-        for n in range(count)
+        (cell, 10_000 * again + 1000 + n) for again in config.repetitions for cell, count in asked for n in range(count)
     ]
     records = kit.together(kit.each("episodes", partial(measured, config=config), jobs, config))
     guards = config.guards
@@ -287,9 +291,12 @@ def run(config: Config) -> kit.Findings:
         harm_report.harm_table(records, guards),
         harm_report.blows_table(records, [g for g in guards if g in (POLICY_ALONE, "default")]),
     ]
-    asked = {r["kind"] for r in records}
     if "elsewhere" in config.against:
         held = kit.together(kit.each("braking", harm_braking.braking, harm_braking.ROBOTS, config))
         tables.append(harm_braking.braking_table(held))
-    tables += [harm_report.kept_table(records, guards, kind) for kind in ("healthy", "faulty") if kind in asked]
+    if config.speeds:
+        by_task = [(t, tuple(p for own, p in HEALTHY.values() if own == t)) for t in config.tasks]
+        compare = partial(harm_speeds.speeds, episodes=config.speeds, make=chosen)
+        tables.append(harm_speeds.speeds_table(kit.together(kit.each("speeds", compare, by_task, config))))
+    tables += [harm_report.kept_table(records, guards, kind) for kind in ("healthy", "faulty")]
     return kit.Findings(records, [table for table in tables if table.rows], harm_report.frontier(records, guards))
