@@ -49,7 +49,7 @@ def rows(arm, count, seed=0):
     """(T, D) of an arm that moves as it likes, with the noise that its sensors have."""
     spec, chain, rng = arm.stream_spec, arm.hand_chains[0], np.random.default_rng(seed)
     where = [spec.slices[n] for n in ("joint_position", "joint_velocity", "hand_position", "hand_orientation")]
-    angles = np.array([0, 0.2, 0, -2.4, 0, 2.9, 0.8]) + rng.normal(0, 0.02, (count, 7)).cumsum(axis=0)
+    angles = np.array([0, 0.2, 0, -2.4, 0, 2.9, 0.8]) + rng.normal(0, 0.004, (count, 7)).cumsum(axis=0)
     speeds = np.gradient(angles, axis=0) / spec.dt
     found = rng.normal(size=(count, spec.size)) * spec.noise
     for row, q, v in zip(found, angles, speeds, strict=True):
@@ -111,6 +111,34 @@ def test_one_reading_that_is_far_off_is_over_soon(lift):
     assert found[0] == 30
     assert found[-1] <= 33
     assert LIMIT > 5.0
+
+
+def test_what_hand_and_joints_agree_upon_is_no_sensor_at_fault(lift):
+    """A memory that named a healthy encoder completed it, and was blind to what the arm did (IIWA, Door, 2,572 N)."""
+    spec = lift.unwrapped.stream_spec
+    (check,) = HandAgainstJoints.of(lift, spec)
+    none = np.zeros(spec.size, bool)
+    stream, _ = rows(lift.unwrapped, 60)
+    assert not check.vouched.any()  # nothing was seen yet
+    for row in stream[:30]:
+        check.read(row, none)
+    encoder, hand = [3, 10], np.arange(spec.size)[spec.slices["hand_position"]]
+    assert check.vouched[encoder].all()
+    assert check.vouched[hand].all()
+    assert not check.vouched[spec.slices["measured_torque"]].any()
+    stream[30:, 10] += 0.5  # a speed that is not that of the angle
+    for row in stream[30:33]:
+        check.read(row, none)
+    assert not check.vouched[encoder].any()
+    assert check.vouched[[2, 9]].all()
+    frozen = stream[33].copy()
+    frozen[encoder] = stream[32][encoder]
+    check.read(frozen, none)
+    assert not check.vouched[encoder].any()
+    frozen[4] += 0.05
+    for _ in range(3):
+        check.read(frozen, none)
+    assert not check.vouched.any()
 
 
 class Forged(gym.Wrapper):

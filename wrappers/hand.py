@@ -40,6 +40,9 @@ LEFT = 30.0
 SURER = 10.0
 """How much more of |z|², in all of these rows, the next best sensor leaves; else a moment more is waited for."""
 
+TURNS = 0.2
+"""The speed that is sensed of a joint is that of its angle where they differ by less [rad/s]."""
+
 NOBODY = np.zeros(0, np.intp)
 
 Mask = NDArray[np.bool_]
@@ -69,7 +72,7 @@ class HandAgainstJoints:
         def columns(*names: str) -> NDArray[np.intp]:
             return np.concatenate([np.arange(spec.size)[spec.slices[chain.prefix + name]] for name in names])
 
-        self._chain, self._size = chain, spec.size
+        self._chain, self._size, self._dt = chain, spec.size, spec.dt
         self._q, self._v = columns("joint_position"), columns("joint_velocity")
         self._x = columns("hand_position", "hand_orientation")
         self._at = np.concatenate([self._q, self._v, self._x])
@@ -90,6 +93,7 @@ class HandAgainstJoints:
     def reset(self) -> None:
         """A new episode begins."""
         self._mean, self._left, self._waited = np.zeros(HAND), 0.0, 0
+        self._whole = 0  # rows since a number was missing
         self._rows: list[NDArray[np.float64]] = []  # the last ones that were whole, (2 J + 9,) each
         self._good = np.zeros(len(self._q))  # (J,) angles that were believed last
         self._accused = np.zeros(self._size, bool)  # (D,) what was named, as long as they contradict each other
@@ -99,6 +103,7 @@ class HandAgainstJoints:
         now = np.asarray(row[self._at], np.float64)
         c, cap = self._chain, ONE * LIMIT / self._gain
         size = _follow(now, c.axes, c.anchors, c.hand, c.late_s, self._one_over, self._gain, cap, self._mean)
+        self._whole = 0 if size < 0.0 else self._whole + 1
         if size < 0.0:  # a number is missing
             return None
         self._rows = [*self._rows[1 - WINDOW :], now]
@@ -115,6 +120,20 @@ class HandAgainstJoints:
         if found is not None:
             self._left, self._accused[found.columns] = 0.0, True
         return found
+
+    @property
+    def vouched(self) -> Mask:
+        """(D,) what is right by the last row: each tells the same of the hand, and of a joint's speed, and none repeats
+        itself."""
+        J, right = len(self._q), np.zeros(self._size, bool)
+        if self._whole < 2 or np.linalg.norm(self._mean) > LIMIT / 2:
+            return right
+        before, now = self._rows[-2:]
+        turned = (now[:J] - before[:J]) / self._dt
+        moves = np.abs(turned - (now[J : 2 * J] + before[J : 2 * J]) / 2) < TURNS
+        moves &= (now[:J] != before[:J]) | (now[J : 2 * J] != before[J : 2 * J])
+        right[self._q], right[self._v], right[self._x] = moves, moves, True
+        return right
 
     @property
     def accused(self) -> Mask:

@@ -318,7 +318,8 @@ class Responder:
         if failed or self._diagnosis is None or not np.isfinite(rows).all():
             return None
         try:
-            return self._diagnosis(rows, attribution, self.missing)
+            vouched = [hand.vouched for hand in self._hands]
+            return self._diagnosis(rows, attribution, np.logical_or.reduce([self.missing, *vouched]))
         except Exception as error:
             # Whatever goes wrong here, an alarm is answered: by what is done about the unknown.
             gym.logger.warn(f"diagnosis: {error!r}; the cause counts as unknown")
