@@ -18,6 +18,7 @@ from asm_gym.spec import StreamSpec
 from asm_gym.stream_source import StreamSource
 from asm_gym.validation import check_number, shown, typed
 from asm_gym.wrappers.factory import check_monitor
+from asm_gym.wrappers.hand import HandAgainstJoints
 from asm_gym.wrappers.observer import Observer
 
 WELL_AFTER_S = 1.0
@@ -49,10 +50,17 @@ class Repair:
         completion: of the memory that watches the stream.
         trust_s: how long a sense that nothing else tells of is completed [s].
         read: (D,) which columns the policy reads, of whose completion something depends; all where that is not known.
+        hands: tell of missing angles better than the memory, and which senses are not to be believed again yet.
     """
 
-    def __init__(self, completion: Completion, trust_s: float = TRUST_S, read: NDArray[np.bool_] | None = None) -> None:
-        self._completion, spec = completion, completion.spec
+    def __init__(
+        self,
+        completion: Completion,
+        trust_s: float = TRUST_S,
+        read: NDArray[np.bool_] | None = None,
+        hands: Sequence[HandAgainstJoints] = (),
+    ) -> None:
+        self._completion, spec, self._hands = completion, completion.spec, hands
         self._read = np.ones(spec.size, bool) if read is None else read
         self._spec, self._patience = spec, round(check_number("trust_s", trust_s, low=0) / spec.dt)
         self._well_after, self._longest = max(1, round(WELL_AFTER_S / spec.dt)), round(LONGEST_S / spec.dt)
@@ -65,8 +73,6 @@ class Repair:
         """(D,) which columns are completed."""
         self.settling = 0
         """Rows until the monitor has seen nothing but repaired rows of a sense that was found at fault."""
-        self.lost = np.zeros(self._spec.size, bool)
-        """(D,) which numbers of the last row were not finite."""
         self._returned = np.zeros(self._spec.size, np.int64)  # (D,) rows until its changes are those of the sense again
         self._gone: set[str] = set()  # of those that are missing, which said nothing, and are believed when they do
         self._since: dict[str, int] = {}  # rows for which each has been missing
@@ -114,7 +120,6 @@ class Repair:
         self.settling = max(0, self.settling - 1)
         self._returned = np.maximum(self._returned - 1, 0)
         finite = np.isfinite(self._raw)
-        self.lost = ~finite
         if not self._calm and finite.all():  # as nearly always
             self._good = self._before = self._raw
             return row.astype(np.float32)
@@ -171,6 +176,8 @@ class Repair:
             value = np.where(self._guessed, last[columns], value)
         mean, spread = self._completion.senses.mean[columns], self._completion.senses.spread[columns]
         repaired[columns] = np.clip(value, mean - FARTHEST * spread, mean + FARTHEST * spread)
+        for hand in self._hands:
+            repaired = hand.refined(repaired, self.missing, self._completion.error * self._completion.senses.spread)
         return repaired
 
     def _judge(self, repaired: NDArray[np.float64]) -> None:
@@ -179,6 +186,8 @@ class Repair:
         self._unchecked = self._unchecked + 1 if self._guessed.any() else 0
         close = np.abs(self._raw[columns] - repaired[columns]) <= limit  # False for what is not finite
         repeats = (self._raw[columns] == self._earlier[columns]) & (self._spec.noise[columns] > 0)
+        for hand in self._hands:
+            close &= ~hand.accused[columns]
         back = np.isfinite(self._raw[columns]) & (close | self._untold)
         fine = dict(zip(columns.tolist(), (close & ~repeats & ~self._untold).tolist(), strict=True))
         there = dict(zip(columns.tolist(), back.tolist(), strict=True))

@@ -20,12 +20,12 @@ from asm_gym.wrappers.severity import Severity
 NO_SEVERITY = Severity()
 
 
-CONTACT, FAILURE, SURPRISE, MISSING = "contact", "failure", "surprise", "missing"
-"""Reasons of an alarm: a contact limit was passed, something failed, surprise is over its threshold, a number is not
-finite."""
+CONTACT, FAILURE, SURPRISE, CONTRADICTION, MISSING = "contact", "failure", "surprise", "contradiction", "missing"
+"""Reasons of an alarm: a contact limit was passed, something failed, surprise is over its threshold, a hand is not
+where its joints say, a number is not finite."""
 
 
-REASONS = CONTACT, FAILURE, SURPRISE, MISSING
+REASONS = CONTACT, FAILURE, SURPRISE, CONTRADICTION, MISSING
 
 
 class RowReport(NamedTuple):
@@ -63,7 +63,8 @@ def report(
         ``surprise``: the largest of this step; infinite where something failed. ``surprise_body`` and
         ``surprise_skill``: the largest at what no body does, and at what no skill that was shown does, not a number
         where the monitor does not listen for it. ``threshold``. ``alarm``, and its ``reason``: ``"surprise"`` is over
-        the threshold, a ``"contact"`` limit was passed, a number of the stream is ``"missing"``, or a ``"failure"``.
+        the threshold, a ``"contact"`` limit was passed, hand and joints are in ``"contradiction"``, a number of the
+        stream is ``"missing"``, or a ``"failure"``.
         ``event``: ``"fault"`` of the body, its senses or its commands; ``"knock"``, from which the policy goes on after
         a pause; ``"stop"``, a joint at its stop, which is said and is no alarm; or empty.
         ``intervened``: something else than the policy acted, in a part of this step at least.

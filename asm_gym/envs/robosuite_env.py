@@ -15,6 +15,7 @@ from asm_gym.contact_limits import NO_LIMITS, ContactLimits
 from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.cameras import RENDER_MODES, Pictures
+from asm_gym.envs.chains import chains_of
 from asm_gym.envs.edits import SimulatorEdits
 from asm_gym.envs.layout import Layout
 from asm_gym.envs.rewards import Rewards, RewardTerms
@@ -161,6 +162,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         # Episodes are given their motion by the joints alone, so the initial noise is one number for every robot.
         self._qpos_noise = self.robosuite_env.robots[0].initialization_noise["magnitude"]
         self._bind()
+        self.hand_chains = chains_of(self.simulation.parts, self.simulation.model, self.sensor_noise)
+        """Of the arms, as they were made."""
         self._actions = Actions(self.robosuite_env, self.task.name, self.controller)
         self.action_space = self._actions.space
         self.gripper_actions = self._actions.grippers

@@ -45,17 +45,17 @@ class Simulation:
         self.model: mujoco.MjModel = env.sim.model._model
         self.data: mujoco.MjData = env.sim.data._data
         self._rotations = importlib.import_module("robosuite.utils.transform_utils")
-        self._parts = [(robot, arm) for robot in env.robots for arm in robot.arms]
+        self.parts = [(robot, arm) for robot in env.robots for arm in robot.arms]
         self._views = Views.of(self.model, self.data)
-        robots = np.unique(np.concatenate([bodies(self.model, robot) for robot, _ in self._parts]))
+        robots = np.unique(np.concatenate([bodies(self.model, robot) for robot, _ in self.parts]))
         self.nominal = NominalDynamics(self.model, self._views, robots)
         """What the robot believes of itself."""
-        self._samples = np.zeros((len(self._parts), substeps, kernels.SAMPLE))
-        n = len(self._parts)
+        self._samples = np.zeros((len(self.parts), substeps, kernels.SAMPLE))
+        n = len(self.parts)
         self._band = SubstepBand(
             *(np.zeros((n, FELT)), np.zeros((n, FELT)), np.full((n, FELT), np.inf)), np.zeros(1), np.zeros(5, np.int64)
         )
-        self.proprioception = Proprioception(self._parts, self._views, self.data)
+        self.proprioception = Proprioception(self.parts, self._views, self.data)
         self.contact_force = self.external_force = self.mean_external_force = 0.0
         """The largest net contact force on an arm within the control step [N]: the norm of the summed contact forces on
         its bodies. A grasp's own squeeze cancels in the sum, and loads that a fault applies are left out."""
@@ -70,15 +70,15 @@ class Simulation:
         self._felt = (0.0, 0.0, 0.0)
         self._fresh = False
         self._action = np.zeros(sum(robot.action_dim for robot in robots))
-        self._controllers = [robot.composite_controller.part_controllers[arm] for robot, arm in self._parts]
-        self.compiled = all(compilable(robot, arm) for robot, arm in self._parts)
+        self._controllers = [robot.composite_controller.part_controllers[arm] for robot, arm in self.parts]
+        self.compiled = all(compilable(robot, arm) for robot, arm in self.parts)
         """Whether control runs compiled."""
-        self._arms = describe(self._parts, self.model)
+        self._arms = describe(self.parts, self.model)
         self._joints, self._dofs = (
-            np.concatenate([getattr(robot, name) for robot, _ in self._parts])
+            np.concatenate([getattr(robot, name) for robot, _ in self.parts])
             for name in ("_ref_joint_pos_indexes", "_ref_joint_vel_indexes")
         )
-        n = len(self._parts)
+        n = len(self.parts)
         self._band.state[:] = 0, 0, 0, -1, 0
         # Where the numbers of ``felt`` stand in a band: arm, and place.
         self._felt_places = np.nonzero([[i >= JOINTS or i < n for i in range(FELT)] for n in self._arms.joints])
@@ -114,7 +114,7 @@ class Simulation:
                 to, a pose is kept by turning joints, a torque of zero brakes nothing. So the arms are braked beneath
                 their controllers, and held where they were when they were first told to (``control.brake``).
         """
-        for a in range(len(self._parts)):
+        for a in range(len(self.parts)):
             if hold:
                 hold_at(self._views, self._arms, self._goals, a)
             else:
@@ -123,7 +123,7 @@ class Simulation:
         self._fresh = True
         if self.compiled:
             start = 0
-            for a, (robot, arm) in enumerate(self._parts):
+            for a, (robot, arm) in enumerate(self.parts):
                 part = self._action[start : start + robot.action_dim]
                 low, high = robot._action_split_indexes[arm]
                 self._deltas[a, : high - low] = self._controllers[a].scale_action(part[low:high])
@@ -148,7 +148,7 @@ class Simulation:
                 kernels.sample(self._views, self.nominal.now(), self._arms, k - self._row_began, self._samples)
                 kernels.feel(self._arms, self._band, k - self._row_began, self._samples)
                 if kernels.must_stay(self._band):
-                    for a in range(len(self._parts)):
+                    for a in range(len(self.parts)):
                         hold_at(self._views, self._arms, self._goals, a)
                 self._fresh = False
         self._fresh = False
@@ -198,7 +198,7 @@ class Simulation:
 
     def _remember(self, wrenches: list[NDArray[np.float64]]) -> None:
         """Fills the buffers that robosuite fills in the first substep; the acceleration is its running estimate."""
-        for (robot, arm), wrench, sample in zip(self._parts, wrenches, self._samples[:, 0], strict=True):
+        for (robot, arm), wrench, sample in zip(self.parts, wrenches, self._samples[:, 0], strict=True):
             velocities = robot.recent_ee_vel_buffer[arm]
             robot.recent_ee_forcetorques[arm].push(wrench)
             velocities.push(sample[kernels.VELOCITY])
@@ -236,7 +236,7 @@ class Simulation:
         Kp/Kd Δx. Actions of controllers that take anything else are left as they are.
         """
         found, start = [], 0
-        for a, (robot, arm) in enumerate(self._parts):
+        for a, (robot, arm) in enumerate(self.parts):
             low, high = robot._action_split_indexes[arm]
             controller, part = self._controllers[a], slice(start + low, start + high)
             start += robot.action_dim
@@ -256,7 +256,7 @@ class Simulation:
     def motions(self, turns: NDArray[np.float64]) -> list[tuple[slice, NDArray[np.float64]]]:
         """For each arm, its part of the action, and that part's values for a change of its joints [rad]."""
         found, joint, start = [], 0, 0
-        for a, (robot, arm) in enumerate(self._parts):
+        for a, (robot, arm) in enumerate(self.parts):
             low, high = robot._action_split_indexes[arm]
             n, controller = int(self._arms.joints[a]), self._controllers[a]
             move = turns[joint : joint + n]
@@ -294,7 +294,7 @@ class Simulation:
     @property
     def motors(self) -> NDArray[np.intp]:
         """The actuators of the arms' joints, from the base on."""
-        return np.concatenate([robot._ref_actuators_indexes_dict[arm] for robot, arm in self._parts])
+        return np.concatenate([robot._ref_actuators_indexes_dict[arm] for robot, arm in self.parts])
 
 
 def _larger(now: float, before: float) -> float:
