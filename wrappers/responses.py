@@ -167,6 +167,11 @@ class Responder:
         return np.zeros(self._spec.size, bool) if self.repair is None else self.repair.missing
 
     @property
+    def judged(self) -> bool:
+        """Whether somebody is surprised at every number."""
+        return self.repair is None or self.repair.judged
+
+    @property
     def unjudged(self) -> NDArray[np.bool_]:
         """(D,) the numbers at which nobody is surprised, for they are completed or were a moment ago."""
         return np.zeros(self._spec.size, bool) if self.repair is None else self.repair.unjudged
@@ -174,7 +179,7 @@ class Responder:
     @property
     def lost(self) -> tuple[str, ...]:
         """The numbers of the last row that were not finite and are completed."""
-        if self.repair is None or self._map is None or not self.repair.lost.any():
+        if self.repair is None or self._map is None or self.repair.whole:
             return ()
         return tuple(self._spec.labels[i] for i in np.flatnonzero(self.repair.lost))
 
@@ -201,13 +206,14 @@ class Responder:
             known = self.completed
             try:
                 row = self.repair.read(row)
-                if lost := ", ".join(name for name in self.completed if name not in known):
+                if self.repair.names and (lost := ", ".join(name for name in self.completed if name not in known)):
                     _log.info("complete: %s says nothing any more", lost)
             except Exception as error:
                 # Nobody knows what the row should say: what is not finite is an alarm, and nothing explains it.
                 gym.logger.warn(f"completion: {error!r}; the row counts as lost")
                 row = np.full_like(row, np.nan)
-        self._rows = [*self._rows[1 - self._kept :], row]
+        self._rows.append(row)
+        del self._rows[: -self._kept]
         return row
 
     def observed(self, observation: Any) -> Any:
@@ -239,7 +245,7 @@ class Responder:
         for family in self._since:
             self._since[family] += 1
         if not alarm:
-            return NO_RESPONSE._replace(touched=touched)
+            return NO_RESPONSE if touched is None else NO_RESPONSE._replace(touched=touched)
         cause = self._believed(self._cause(failed, attribution))
         family = cause.family if cause is not None and cause.probability >= SURE else "unknown"
         self._touched = severity.presses or (cause is not None and cause.family == "contact")

@@ -20,7 +20,6 @@ from asm_gym.envs.nominal import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
 from asm_gym.envs.views import ACTS, ARMED, FELT, JOINTS, LEFT, Goals, SubstepBand, Views
 
-
 SURELY = 1.0 - 1e-9
 """Share of a limit of speed below which rounding decides nothing."""
 
