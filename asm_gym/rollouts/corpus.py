@@ -61,7 +61,7 @@ PARTS: dict[str, tuple[Source, ...]] = {
         *(Source("PickPlaceBread", nominal=360), Source("PickPlaceCereal", nominal=360)),
     ),
 }
-"""The experts' six skills, to learn, to calibrate and to test on; and more healthy motion, of agents and other tasks."""
+"""Six skills of experts, to learn, to calibrate and to test on; and healthy motion of agents and in other tasks."""
 ROUNDS = 5
 QUICK = {"skills": (Source("Lift", "scripted", 2, 2, 2, faults=True),), "hours": (Source("Lift", "lift_sac", 0, 0, 2),)}
 """To see that everything runs."""
@@ -198,6 +198,19 @@ class Episodes(Sequence[Episode]):
 
     def __iter__(self) -> Iterator[Episode]:
         return (self[k] for k in range(len(self)))
+
+    def check(self) -> None:
+        """Raises ValueError where a file is damaged."""
+        for entry in self.entries:
+            self._whole(entry)
+
+    def _whole(self, entry: Entry) -> Path:
+        path = self.folder / entry.path
+        if digest(path) != entry.sha256:
+            raise ValueError(
+                f"{path} is damaged: its bytes are not what the manifest says; delete it, and record it anew"
+            )
+        return path
 
 
 @dataclass(frozen=True)
