@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.episode import save_episode
+from asm_gym.episode import EpisodeLabel, save_episode
 from asm_gym.rollouts import corpus as module
-from asm_gym.rollouts.corpus import MANIFEST, PARTS, ROUNDS, VERSION, Corpus, Source, record_corpus, wanted
+from asm_gym.rollouts.corpus import MANIFEST, PARTS, ROUNDS, VERSION, Corpus, Entry, Source, record_corpus, wanted
 from asm_gym.rollouts.parallel import THIS_PROCESS
 from asm_gym.rollouts.run_folder import unread
 from asm_gym.scripts.corpus import contents
@@ -86,6 +86,32 @@ def test_one_bit_is_enough_to_be_refused(recorded):
     corpus.episodes()[2]
     with pytest.raises(ValueError, match=f"{path.name} is damaged"):
         corpus.episodes()[3]
+
+
+def test_monitors_are_judged_by_it_and_have_cards(tmp_path, monkeypatch):
+    entries = wanted(Source("Lift", fit=6, calibration=24, nominal=8), 0, 1)
+    seeds = [e.label.seed for e in entries if e.label.role == "nominal"][:4]
+    entries += [Entry("scripted", EpisodeLabel("Lift", "faulty", "push", "strong", s, 20)) for s in seeds]
+
+    def record(label, config, folder):
+        (episode,) = sine_episodes(1, label.seed % 1000, steps=(60, 60))
+        stream = episode.stream.copy()
+        stream[20 if label.role == "faulty" else 60 :, :12] += 3.0
+        made = replace(episode, stream=stream, faults=np.arange(60) >= (label.onset or 60), label=label, success=True)
+        return save_episode(folder / label.path, made)
+
+    monkeypatch.setattr(module, "record", record)
+    monkeypatch.setattr(module, "wanted", lambda *_: entries)
+    record_corpus(tmp_path / "corpus", SOURCES[:1], 0, 1, THIS_PROCESS, lambda done, total: None)
+    asked = ["--corpus", str(tmp_path / "corpus"), "--monitors", "kalman+evidence", "window_pca", "--workers", "1"]
+    assert evaluate([*asked, "--false-alarm-rate", "0.05", "--out", str(tmp_path / "out")]) == 0
+    card = json.loads((tmp_path / "out/cards/kalman+evidence.json").read_text())
+    assert (card["faults"], card["nominal"], card["auroc"][0], card["aucpdt"]) == (4, 8, 1.0, 0.0)
+    assert card["found"]["0.05"] == [1.0, 1.0, 1.0]
+    text = (tmp_path / "out/results.md").read_text()
+    assert "within chance" in text
+    assert "| kalman+evidence, in calibration | 0 of 24 |" in text
+    assert not (tmp_path / "corpus/scripted/monitors").exists()
 
 
 @pytest.mark.parametrize(

@@ -60,6 +60,7 @@ class MonitorResult:
         maxima: (n,) the greatest surprise in each calibration episode.
         hourly: thresholds again, by the false alarms an hour that they were set for.
         blocks: the maxima by the hour; None where it was not calibrated so.
+        calibration_tasks: (n,) of those episodes, where they are known.
     """
 
     traces: Sequence[ScoredEpisode]
@@ -69,6 +70,7 @@ class MonitorResult:
     maxima: Floats = field(default_factory=lambda: np.zeros(0))
     hourly: Mapping[float, float] = field(default_factory=dict)
     blocks: Blocks | None = None
+    calibration_tasks: Sequence[str] = ()
 
 
 class LeftOut(NamedTuple):

@@ -138,6 +138,7 @@ def judged(
         np.zeros(0) if monitor.maxima_ is None else monitor.maxima_,
         hourly,
         monitor.blocks_,
+        [episode.labelled.task for episode in by_role["calibration"]],
     )
 
 
