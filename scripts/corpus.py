@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from asm_gym.evaluation.tables import Column, console_table, tabulate
+from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.rollouts.corpus import PARTS, QUICK, ROUNDS, VERSION, Corpus, record_corpus
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.progress import stage
@@ -63,11 +63,8 @@ def make(args: Args, console: Console) -> None:
                     sources = (QUICK if args.quick else PARTS)[part]
                     record_corpus(args.out, sources, number, total, ParallelConfig.named(args.workers), progress)
     titles = "", "fit", "calibration", "nominal", "faulty", "healthy hours"
-    columns = [Column(title, lambda row, k=k: row[k]) for k, title in enumerate(titles)]
     corpus = Corpus.open(args.out)
-    console.print(
-        console_table(tabulate(f"Corpus {VERSION}: {len(corpus.entries)} episodes.", columns, contents(corpus)))
-    )
+    console.print(console_table(Table(f"Corpus {VERSION}: {len(corpus.entries)} episodes.", titles, contents(corpus))))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -64,13 +64,15 @@ def benchmark(
     models: dict[str, list[str]] = {}
     for name in monitors:
         models.setdefault(name.removesuffix(EVIDENCE), []).append(name)
-    how = {"folder": folder.resolve(), "recorded": recorded, "labels": tuple(labels)}
-    ask = partial(_results, **how, rate=rate, seed=seed, settings=settings)
+    of = tuple(labels)
+    ask = partial(
+        _results, folder=folder.resolve(), recorded=recorded, labels=of, rate=rate, seed=seed, settings=settings
+    )
     made = parallel_map(
         ask, list(models.values()), parallel, lambda k, n: progress(k * len(monitors) // n, len(monitors))
     )
     found = {name: result for results in made for name, result in results.items()}
-    by_role, left_out, twins = read(recorded, tuple(labels))
+    by_role, left_out, twins = read(recorded, of)
     return BenchmarkResult(
         {name: found[name] for name in monitors},
         detectability_of(twins, by_role.get("faulty", []), window_s),

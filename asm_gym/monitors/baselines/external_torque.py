@@ -107,7 +107,9 @@ class NEXT(TorchModel):
 
         def loss(chosen: NDArray[np.intp]) -> Tensor:
             x, torques, free = batch(chosen)
-            return (((module(x)[0] - torques) ** 2).mean(dim=-1, keepdim=True) * free).sum() / free.sum()
+            squared = ((module(x)[0] - torques) ** 2).mean(dim=-1, keepdim=True)
+            mean: Tensor = (squared * free).sum() / free.sum()
+            return mean
 
         def epoch(optimiser: torch.optim.Optimizer) -> None:
             module.train()
