@@ -229,7 +229,8 @@ def labels(args: Args) -> list[EpisodeLabel]:
     if args.corpus is not None:
         skills = Corpus.open(args.corpus).episodes(policies=("scripted",), tasks=SKILLS)
         skills.check()
-        return [entry.label for entry in skills.entries]
+        kinds = [(kind, severity) for kind in ("", *KINDS) for severity in ("", *SEVERITIES)]
+        return sorted((e.label for e in skills.entries), key=lambda label: kinds.index((label.kind, label.severity)))
     made: list[EpisodeLabel] = []
     for task in args.tasks:
         env = gym.make(env_id(task), **dict(args.config.settings))
