@@ -50,7 +50,8 @@ class Chain(NamedTuple):
     def slope(self, angles: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """(9, J) how the hand changes with each angle."""
         moved = [self.at(angles + STEP * own) - self.at(angles - STEP * own) for own in np.eye(len(self.axes))]
-        return np.stack(moved, axis=1) / (2 * STEP)
+        slope: NDArray[np.float64] = np.stack(moved, axis=1) / (2 * STEP)
+        return slope
 
 
 @compiled

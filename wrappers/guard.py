@@ -183,7 +183,7 @@ class Guard:
                 self.substeps.pressed()
             elif beneath is not None:
                 self.substeps.acted()
-        told = (severity.presses, CONTACT), (failure, FAILURE), (over or knocked, SURPRISE)
+        told: tuple[tuple[Any, str], ...] = (severity.presses, CONTACT), (failure, FAILURE), (over or knocked, SURPRISE)
         told += (contradicts, CONTRADICTION), (lost, MISSING)
         reason = next((name for holds, name in told if holds), "")
         if alarm:

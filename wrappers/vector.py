@@ -257,7 +257,8 @@ class VectorNeuralASMSafety(VectorWrapper):
         """(n, D) what was sensed in this step, and what failed at that in each; of episodes that were in their ``last``
         one, before they began anew."""
         n, size = self.num_envs, self.monitor.spec.size
-        stream, told = infos.get("stream"), infos.get("_stream", np.ones(n, bool))
+        stream: Any = infos.get("stream")
+        told = infos.get("_stream", np.ones(n, bool))
         if self._own_stream and not last.any() and np.all(told) and np.shape(stream) == (n, size):
             return np.array(as_float32(stream)), [""] * n
         rows, failures = np.full((n, size), np.nan, np.float32), [""] * n

@@ -188,9 +188,14 @@ class ScoredEpisode:
         return replace(self, threshold=threshold, top_channel="")
 
     def attributed(self, attribution: Floats, channels: Sequence[str]) -> ScoredEpisode:
-        """The trace with its ``top_channel``, read from the shares (T, D) of the surprise of D ``channels``."""
+        """The trace with its ``top_channel``, read from the shares (T, D) of the surprise of D ``channels``.
+
+        Where several have the largest share alike, none is blamed.
+        """
         step = self.first_alarm
-        return self if step is None else replace(self, top_channel=channels[int(np.argmax(attribution[step]))])
+        if step is None or (attribution[step] == attribution[step].max()).sum() > 1:
+            return self
+        return replace(self, top_channel=channels[int(np.argmax(attribution[step]))])
 
 
 def window_steps(window_s: float, dt: float) -> int:

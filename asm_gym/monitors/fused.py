@@ -80,7 +80,7 @@ class CompiledRow:
         old = (*model, *evidence, *repetition)
         new, B = [np.empty_like(a) for a in old], len(rows)
         found = np.empty(B), np.empty_like(rows)
-        arrays = (rows, *old, *new, *found)
+        arrays: tuple[Any, ...] = (rows, *old, *new, *found)
         if B <= A_THREAD:
             _observe(*arrays, *self._learned)
         else:
