@@ -20,6 +20,7 @@ class Study(NamedTuple):
 
 STUDIES = {
     "memorise_and_recall": Study("one network learns skills, recalls each from a cue"),
+    "abstract": Study("one network, six skills, no label: what the abstract says of it"),
     "contextual_inference": Study("the state says which skill is running, untold"),
     "express_skills": Study("one memory's own motor prediction drives the arm"),
     "tracking": Study("the settling network against the Kalman filter"),
