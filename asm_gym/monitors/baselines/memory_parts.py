@@ -1,6 +1,6 @@
 """The parts of the Neural ASM, each alone: what one finds without the other is what it is worth.
 
-memory_temporal      ε_t = (x_t - x̂_t)/s    x̂_t from traces or a settled state, and the command; the state is the context
+memory_temporal      ε_t = (x_t - x̂_t)/s    x̂_t from traces or a settled state, and the command; context: the state
 memory_association   ε_t as in the memory    from the other senses, what came before and the command; no context
 
 ``association_linear`` is association without hidden units. All are judged by the detection of the memory.
