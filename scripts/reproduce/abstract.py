@@ -61,9 +61,9 @@ class Config(kit.Config):
     """Letters."""
     writings: int = option(20, quick=6, least=2)
     """Of each letter to learn from."""
-    tests: int = option(3, quick=2, least=1)
+    tests: int = option(3, quick=1, least=1)
     """Of each letter to be expressed."""
-    epochs: int = option(70, quick=20, least=1)
+    epochs: int = option(70, quick=10, least=1)
     """Passes over them."""
     updates: int = option(600, quick=20, least=1)
     """Of the GRU."""
