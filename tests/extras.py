@@ -48,9 +48,12 @@ CHECKS = {
     "rerun": Check("report,rerun", "tests/test_rerun.py"),
     "onnx": Check("onnx", "tests/test_export.py"),
     "data": Check("robosuite,data,report", "tests/test_datasets.py"),
-    "agents": Check("agents", "tests/test_learners.py"),
-    "learners": Check("learners", "tests/test_learners.py"),
-    "rllib": Check("cluster", "tests/test_learners.py", "ray[rllib] torch", pins="gymnasium"),
+    "agents": Check("agents", "tests/test_learners.py tests/test_learners_train.py"),
+    "learners": Check("learners", "tests/test_learners.py tests/test_learners_train.py"),
+    "tianshou": Check("agents", "tests/test_learners_train.py", "tianshou"),
+    "rllib": Check(
+        "cluster", "tests/test_learners.py tests/test_learners_train.py", "ray[rllib] torch", pins="gymnasium"
+    ),
     "cluster": Check("robosuite,report,cluster", "tests/test_parallel.py -k cluster"),
     "notebooks": Check("robosuite,report,notebooks", "tests/test_notebooks.py"),
     "hub": Check("hub", "tests/test_hub.py"),

@@ -65,7 +65,7 @@ td.text { white-space: normal; min-width: 9rem; }
 thead th { border-bottom: 2px solid var(--rule); font-weight: 600; vertical-align: bottom; }
 tbody th { font-weight: 600; white-space: nowrap; }
 tbody tr { border-bottom: 1px solid var(--rule); }
-tbody tr:nth-child(even) { background: var(--even); }
+tbody tr:nth-child(even), tbody tr:nth-child(even) th { background: var(--even); }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.25rem 1.5rem; font-size: 0.9rem; }
 dt { color: var(--soft); }
 dd { margin: 0; overflow-wrap: anywhere; font-family: ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }

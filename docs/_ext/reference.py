@@ -51,16 +51,14 @@ def public(room: str) -> str:
     rows = []
     for name in sorted(getattr(module, "__all__", ()), key=str.lower):
         value = getattr(module, name)
-        home = getattr(value, "__module__", room)
-        link = f"{{py:obj}}`{name} <{home}.{name}>`" if callable(value) else f"`{name}`"
-        rows.append(f"| {link} | {_first(value)} |")
+        if callable(value):  # constants stand below
+            rows.append(f"| {{py:obj}}`{name} <{value.__module__}.{name}>` | {_first(value)} |")
     return "\n".join((f"`from {room} import …`:", "", "| name | |", "|---|---|", *rows)) if rows else ""
 
 
 def _first(value: object) -> str:
-    """The first sentence of a docstring as Markdown; nothing of a constant's, which is that of its class."""
-    text = (inspect.getdoc(value) or "") if callable(value) else ""
-    line = " ".join(text.split("\n\n")[0].split()).split(". ")[0].rstrip(".")
+    """The first sentence of a docstring as Markdown."""
+    line = " ".join((inspect.getdoc(value) or "").split("\n\n")[0].split()).split(". ")[0].rstrip(".")
     return re.sub(r":\w+:`~?([^`]*)`|``([^`]*)``", lambda m: f"`{m[1] or m[2]}`", line).replace("|", r"\|")
 
 
