@@ -140,17 +140,18 @@ def test_torchrl_collects_and_meets_every_cost():
     def make():
         return envs.GymWrapper(FlatInfo(watched())).auto_register_info_dict()
 
-    collector = collectors.SyncDataCollector(make, None, frames_per_batch=64, total_frames=STEPS)
+    kind = getattr(collectors, "Collector", None) or collectors.SyncDataCollector  # the name of before
+    collector = kind(make, None, frames_per_batch=64, total_frames=STEPS)
     assert sum(float(batch["next", "cost"].sum()) for batch in collector) == COST
     collector.shutdown()
 
 
 def test_tianshou_collects_and_meets_every_cost():
-    data, env, policy = needs("tianshou.data"), needs("tianshou.env"), needs("tianshou.policy")
+    data, env, algorithm = needs("tianshou.data"), needs("tianshou.env"), needs("tianshou.algorithm.algorithm_base")
     envs = env.DummyVectorEnv([watched] * SIDE_BY_SIDE)
     buffer = data.VectorReplayBuffer(STEPS, SIDE_BY_SIDE)
-    collector = data.Collector(policy.RandomPolicy(action_space=watched().action_space), envs, buffer)
-    collector.collect(n_step=STEPS, random=True)
+    collector = data.Collector(algorithm.RandomActionPolicy(watched().action_space), envs, buffer)
+    collector.collect(n_step=STEPS, random=True, reset_before_collect=True)
     assert buffer.info["cost"].sum() == COST
 
 
