@@ -72,7 +72,7 @@ wheel: $(stamp) ## the wheel and the source archive, in dist/
 	$(bin)/python -c "from setuptools.build_meta import build_sdist as b; print('make: dist/' + b('dist'))"
 
 clean: ## removes .venv, builds and caches; runs/ stays
-	rm -rf .venv build dist docs/_build docs/reference/api *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist docs/_build docs/reference/api docs/environments *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Still there, finished once, and its Python still runs: not interrupted half-way, nor left by a Python since removed.

@@ -6,7 +6,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
+
+from packaging.version import Version
 
 BROUGHT_BY = {
     **dict.fromkeys(("mujoco", "robosuite"), "robosuite"),
@@ -32,6 +35,22 @@ NOT_ON_3_13 = {
     "dm_control": "its labmaze has no build",
 }
 """Why no extra brings a package to Python 3.13 and later."""
+
+
+MUJOCO_BELOW = "3.10"
+"""The first version of MuJoCo with which robosuite's environments are not tried; with 4.0 they cannot be made."""
+
+
+def check_mujoco() -> None:
+    """Raises ImportError where another package has brought a MuJoCo that robosuite does not work with."""
+    try:
+        found = version("mujoco")
+    except PackageNotFoundError:  # which whoever imports it says
+        return
+    if Version(found) >= Version(MUJOCO_BELOW):
+        raise ImportError(
+            f"robosuite needs MuJoCo below {MUJOCO_BELOW}, got {found}: pip install 'mujoco<{MUJOCO_BELOW}'"
+        )
 
 
 def require(module: str, *, what: str, extra: str = "") -> Any:

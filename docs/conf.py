@@ -20,6 +20,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "mathml",
     "docstrings",
+    "environments",
     "printed",
     "reference",
 ]

@@ -52,7 +52,10 @@ REGISTERED: dict[str, Callable[..., Policy]] = registry("asm_gym.policies.regist
 """What ``register_policy`` added."""
 
 SHIPPED = Path(__file__).resolve().parent / "agents"
-"""Trained agents that come with the package."""
+"""Trained agents that come with the package.
+
+:meta hide-value:
+"""
 
 
 def register_policy(name: str, make: Callable[..., Policy] | str) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
@@ -190,8 +191,8 @@ def observe_latency_us(memory: NeuralASM, calls: int = 2000) -> dict[str, float]
     return {"median": round(float(median), 1), "p95": round(float(p95), 1)}
 
 
-def draw(rows: Sequence[DetectionMetrics], folder: Path) -> dict[str, Path]:
-    """Draws and saves every plot: {caption: PNG}."""
+def draw(rows: Sequence[DetectionMetrics], folder: Path) -> dict[str, Figure]:
+    """Draws every plot, and saves it as PNG too: {caption: figure}."""
     examples = [typical(m.watched) for m in rows]
     frozen = next(t for t in examples if t.kind == "frozen encoder")
     drawn = {
@@ -204,7 +205,9 @@ def draw(rows: Sequence[DetectionMetrics], folder: Path) -> dict[str, Path]:
         "Faults told from nominal episodes at the same time": ("roc", figures.roc_figure(rows)),
         "Where the surprise came from when an encoder froze": ("attribution", figures.attribution_figure(frozen)),
     }
-    return {caption: figures.save(figure, folder / f"{name}.png") for caption, (name, figure) in drawn.items()}
+    for name, figure in drawn.values():
+        figures.save(figure, folder / f"{name}.png")
+    return {caption: figure for caption, (_, figure) in drawn.items()}
 
 
 def as_json(m: DetectionMetrics) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from asm_gym.graphics import GET_ENCODER, GET_RENDERING, encoder_problem, loads,
 from asm_gym.scripts.command import run
 
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "mujoco", "robosuite", "stable-baselines3", "torch")
-REINSTALL = "make clean, then make doctor (or: python -m pip install -c constraints.txt -e .)"
+REINSTALL = "install asm-gym anew (in a clone: make clean, then make doctor)"
 COMPILER = "apt-get install gcc libc6-dev linux-libc-dev python3-dev"
 
 # opencv-python links to these, and `import robosuite` imports it.
@@ -64,7 +64,13 @@ def python() -> Check:
     wanted = supported_python()
     ok = SpecifierSet(wanted).contains(version, prereleases=True)
     detail = version if ok else f"{version}, but asm-gym needs {wanted}"
-    return Check("Python", ok, True, detail, "" if ok else "make clean, then make demo PYTHON=python3.11")
+    return Check(
+        "Python",
+        ok,
+        True,
+        detail,
+        "" if ok else "python3.12 -m venv, and install there (in a clone: make doctor PYTHON=python3.12)",
+    )
 
 
 def supported_python() -> str:
@@ -89,8 +95,9 @@ def package(name: str) -> Check:
         if name == "robosuite":  # it brings evdev, which is compiled
             remedy = f"{COMPILER}, then {remedy}"
         return Check(name, False, not extra, "not installed", remedy)
-    ok = wanted.contains(version, prereleases=True)
-    return Check(name, ok, True, version if ok else f"{version}, but needs {wanted}", "" if ok else REINSTALL)
+    if wanted.contains(version, prereleases=True):
+        return Check(name, True, True, version)
+    return Check(name, False, True, f"{version}, but needs {wanted}", f"python -m pip install '{name}{wanted}'")
 
 
 def wanted_versions(name: str) -> SpecifierSet:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -43,24 +47,42 @@ def watch() -> None:
         asm.observe(asm.initial_state(batch), np.zeros((batch, asm.spec.size)))
 
 
-def step() -> None:
-    """What a guarded step of an environment of this package calls."""
-    with NeuralASMSafety(gym.make("asm_gym/Lift-v0"), on_overrun="ignore") as env:
+def simulate(guarded: bool = False) -> None:
+    """What a step of an environment of this package calls."""
+    env: gym.Env[Any, Any] = gym.make("asm_gym/Lift-v0")
+    with NeuralASMSafety(env, on_overrun="ignore") if guarded else env:
         env.reset(seed=0)
         for _ in range(3):
             env.step(np.zeros(env.unwrapped.action_space.shape or (), np.float32))
 
 
+@contextmanager
+def beside(function: str) -> Iterator[None]:
+    """Another process runs a function of this module meanwhile; what it fails at is compiled here, and says so."""
+    command = [sys.executable, "-c", f"from asm_gym.scripts.warmup import {function}; {function}()"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield
+        process.wait()
+    finally:
+        process.kill()
+
+
 def warm_up(args: Args, console: Console) -> None:
-    """Compiles each part, and says where it is kept."""
-    parts = {"watching": watch, "learning": learn}
-    if find_spec("robosuite"):
-        parts["guarded steps of robosuite"] = step
+    """Compiles each part, the simulation on another core, and says where it is kept."""
+    simulated = find_spec("robosuite") is not None
     start = time.perf_counter()
-    for name, part in parts.items():
+
+    def timed(name: str, part: Callable[[], None]) -> None:
         with stage(f"compiling {name}", console, {}) as progress:
             part()
             progress(1, 1)
+
+    with beside("simulate") if simulated else nullcontext():
+        timed("watching", watch)
+        timed("learning", learn)
+    if simulated:
+        timed("guarded steps of robosuite", partial(simulate, guarded=True))
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     say(f"Compiled after {time.perf_counter() - start:.0f} s; kept in {kept_in(_observe) or 'memory only'}")
 

@@ -28,7 +28,7 @@ class Block(NamedTuple):
 
 def written() -> list[Path]:
     """README, CONTRIBUTING, and every page of the documentation that is not made by a build."""
-    made = (DOCS / "_build", DOCS / "reference" / "api")
+    made = (DOCS / "_build", DOCS / "reference" / "api", DOCS / "environments")
     pages = [p for p in sorted(DOCS.rglob("*.md")) if not any(p.is_relative_to(folder) for folder in made)]
     return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *pages]
 

@@ -9,7 +9,6 @@ A test may be skipped where it says another extra that it needs, and for no othe
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import subprocess
@@ -49,9 +48,12 @@ CHECKS = {
     "rerun": Check("report,rerun", "tests/test_rerun.py"),
     "onnx": Check("onnx", "tests/test_export.py"),
     "data": Check("robosuite,data,report", "tests/test_datasets.py"),
-    "agents": Check("agents", "tests/test_learners.py"),
-    "learners": Check("learners", "tests/test_learners.py"),
-    "rllib": Check("cluster", "tests/test_learners.py", "ray[rllib] torch", pins="gymnasium"),
+    "agents": Check("agents", "tests/test_learners.py tests/test_learners_train.py"),
+    "learners": Check("learners", "tests/test_learners.py tests/test_learners_train.py"),
+    "tianshou": Check("agents", "tests/test_learners_train.py", "tianshou"),
+    "rllib": Check(
+        "cluster", "tests/test_learners.py tests/test_learners_train.py", "ray[rllib] torch", pins="gymnasium"
+    ),
     "cluster": Check("robosuite,report,cluster", "tests/test_parallel.py -k cluster"),
     "notebooks": Check("robosuite,report,notebooks", "tests/test_notebooks.py"),
     "hub": Check("hub", "tests/test_hub.py"),
@@ -83,7 +85,7 @@ def check(name: str, wheel: Path) -> str:
 
 EXTRAS = (
     *("robosuite", "report", "data", "agents", "environments", "learners", "hub", "notebooks"),
-    *("cluster", "rerun", "ros", "video"),
+    *("cluster", "rerun", "ros", "video", "onnx", "dds"),
 )
 BREAKS = {"mujoco": "3.10", "dm-control": "1.0.40", "numpy": "3", "pyarrow": "22"}
 """From which version on a package has not been tried, or breaks environments."""
@@ -96,24 +98,32 @@ STILL_RUNS = (
 def pairs(wheel: Path) -> str:
     """What is wrong with two extras at once, by the newest versions there are; or with one after robosuite."""
     wrong = []
+    there = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    there |= {"UV_FIND_LINKS": os.environ.get("PIP_FIND_LINKS", "")}
     with TemporaryDirectory() as folder:
         venv.create(folder, with_pip=True)
-        pip, plan = f"{folder}/bin/python -m pip install -q", Path(folder, "plan.json")
+        python, uv = f"{folder}/bin/python", [f"{folder}/bin/uv", "pip"]
+        subprocess.run([python, "-m", "pip", "install", "-q", "uv"], check=True)
+        resolve = [*uv, "compile", "-q", "--no-annotate", "--no-header", "--python", python, "-"]
         for two in combinations(EXTRAS, 2):
-            wanted = f"'{wheel}[{','.join(two)}]'"
-            plan.unlink(missing_ok=True)
-            subprocess.run(f"{pip} --dry-run --ignore-installed --report {plan} {wanted}", shell=True, cwd=ROOT)
-            found = json.loads(plan.read_text())["install"] if plan.is_file() else []
-            versions = {re.sub("_", "-", i["metadata"]["name"].lower()): i["metadata"]["version"] for i in found}
+            wanted = f"asm-gym[{','.join(two)}] @ {wheel.as_uri()}"
+            done = subprocess.run(resolve, input=wanted, env=there, capture_output=True, text=True)
+            versions = dict(line.split("==") for line in done.stdout.splitlines() if "==" in line)
             late = [f"{n} {v}" for n, v in versions.items() if n in BREAKS and Version(v) >= Version(BREAKS[n])]
-            wrong += [f"{'+'.join(two)}: {', '.join(late) or 'cannot be installed'}"] if late or not found else []
+            if late or done.returncode:
+                wrong.append(f"{'+'.join(two)}: {', '.join(late) or done.stderr.strip()}")
             print("+".join(two), *(f"{n} {versions.get(n)}" for n in ("mujoco", "numpy", "torch")), flush=True)
+        # PyTorch as in constraints.txt, of which this machine may have the small build.
+        tested = Path(folder, "constraints.txt")
+        lines = (ROOT / "constraints.txt").read_text().splitlines()
+        tested.write_text("".join(f"{line}\n" for line in lines if line.startswith("torch==")))
+        install = [*uv, "install", "-q", "--python", python, "-c", str(tested)]
         for extra in EXTRAS:
-            python = f"{folder}/bin/python"
-            tried = f"{pip} '{wheel}[{extra}]' && {python} -m pip check -q && {python} -c \"{STILL_RUNS}\""
-            there = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-            done = subprocess.run(tried, shell=True, cwd=folder, env=there)
-            wrong += [f"{extra} after robosuite"] if done.returncode else []
+            checked, runs = [*uv, "check", "-q", "--python", python], [python, "-c", STILL_RUNS]
+            steps = ([*install, f"asm-gym[{extra}] @ {wheel.as_uri()}"], checked, runs)
+            if any(subprocess.run(step, cwd=folder, env=there).returncode for step in steps):
+                wrong.append(f"{extra} after robosuite")
+            print(f"{extra} after robosuite", flush=True)
     return "; ".join(wrong)
 
 

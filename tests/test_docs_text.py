@@ -46,7 +46,7 @@ def test_links_within_the_repository_lead_somewhere(page: Path):
             continue
         place, _, anchor = target.partition("#")
         there = (page.parent / place).resolve() if place else page
-        if "reference/api" in place or place.startswith("api/"):  # made by a build, which checks it
+        if re.match(r"(\.\./)*(reference/api|api|environments)/", place):  # made by a build, which checks it
             continue
         assert there.is_file(), f"{documents.name(page)}: {target}"
         assert not anchor or anchor in anchors(there), f"{documents.name(page)}: {target}; there are {anchors(there)}"
@@ -88,7 +88,7 @@ def test_sentences_are_short(page: Path):
 
 
 def test_the_readme_is_short():
-    assert len((documents.ROOT / "README.md").read_text().splitlines()) < 110
+    assert len((documents.ROOT / "README.md").read_text().splitlines()) < 100
 
 
 def test_a_cell_of_the_readme_holds_one_number():
@@ -102,17 +102,12 @@ def test_a_cell_of_the_readme_holds_one_number():
 def test_figures_in_the_readme_stand_on_the_page_that_was_printed():
     text = (documents.ROOT / "README.md").read_text()
     detection = documents.body(documents.DOCS / "results" / "detection.md")
-    demo = documents.body(documents.DOCS / "results" / "demo.md")
-    found, again = (_table(text, heading) for heading in ("| monitor |", "| condition |"))
-    assert len(found) > 5
-    assert len(again) == 5
+    found = _table(text, "| monitor |")
+    assert len(found) == 4
     for cells in found:
         auroc, seldom, often, alarms = (c.strip("* ") for c in cells[1:])
         false = rf".*\| {alarms} of 154 \|" if alarms else ""
         assert re.search(rf"\| {auroc} [|(].*\| {seldom} [|(].*\| {often} [|(]{false}", detection), cells
-    for cells in again:
-        numbers = [c for c in cells[1:] if c]
-        assert any(all(re.search(rf"\b{n}\b", line) for n in numbers) for line in demo.splitlines()), cells
 
 
 def _table(text: str, head: str) -> list[list[str]]:

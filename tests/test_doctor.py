@@ -8,6 +8,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from asm_gym import graphics
+from asm_gym import extras, graphics
 from asm_gym.scripts import cli, doctor
 
 PACKAGE_OF = {"libGL.so.1": "libgl1", "libglib-2.0.so.0": "libglib2.0-0", "libgthread-2.0.so.0": "libglib2.0-0"}
@@ -166,7 +167,20 @@ def test_a_version_out_of_range_is_needed_and_says_the_range(machine: Any, name:
     check = failed().pop(name)
     assert check.needed
     assert check.detail.startswith(f"{version}, but needs ")
-    assert check.remedy == doctor.REINSTALL
+    wanted = check.detail.removeprefix(f"{version}, but needs ")
+    assert check.remedy == f"python -m pip install '{name}{wanted}'"
+
+
+@pytest.mark.parametrize(("version", "ok"), [("3.9.0", True), ("3.10.0", False), ("4.0.0", False)])
+def test_a_mujoco_that_another_package_brought_is_named_before_it_is_imported(
+    monkeypatch: pytest.MonkeyPatch, version: str, ok: bool
+) -> None:
+    monkeypatch.setattr(extras, "version", lambda name: version)
+    with nullcontext() if ok else pytest.raises(ImportError, match=f"got {version}: pip install 'mujoco<3.10'"):
+        extras.check_mujoco()
+    bounds = [r for r in metadata.requires("asm-gym") or [] if r.startswith("mujoco")]
+    assert bounds
+    assert all(f"<{extras.MUJOCO_BELOW}" in bound for bound in bounds)
 
 
 def test_a_torch_that_is_too_old_is_needed(machine: Any) -> None:

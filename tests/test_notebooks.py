@@ -42,3 +42,16 @@ def test_the_code_of_a_notebook_runs_without_a_notebook(path, tmp_path, monkeypa
     names: dict[str, object] = {"__name__": "__main__"}
     for cell in cells(path):
         exec(compile("".join(cell["source"]), str(path), "exec", dont_inherit=True), names)
+
+
+def test_collecting_in_a_notebook_shows_a_bar():
+    if not find_spec("nbclient") or not find_spec("ipykernel") or not find_spec("ipywidgets"):
+        pytest.skip("pip install 'asm-gym[notebooks]'")
+    from nbclient import NotebookClient
+    from nbformat.v4 import new_code_cell, new_notebook
+
+    code = "from asm_gym import collect\nlen(collect('asm_gym/SyntheticArm-v0', 'sway', episodes=2, workers=1))"
+    notebook = new_notebook(cells=[new_code_cell(code)])
+    NotebookClient(notebook, timeout=600, kernel_name="python3").execute()
+    shown = [kind for output in notebook.cells[0].outputs for kind in output.get("data", {})]
+    assert "application/vnd.jupyter.widget-view+json" in shown

@@ -200,16 +200,28 @@ def test_a_report_holds_everything_and_fetches_nothing(traces: list[ScoredEpisod
     page = _Page(source)
 
     images = page.all("img")
-    assert [i["alt"] for i in images] == ["As a figure", "As a file"]
-    assert base64.b64decode(images[1]["src"].removeprefix("data:image/png;base64,")) == saved.read_bytes()
+    assert [i["alt"] for i in images] == ["As a file"]
+    assert [s["aria-label"] for s in page.all("svg")] == ["As a figure"]
+    assert base64.b64decode(images[0]["src"].removeprefix("data:image/png;base64,")) == saved.read_bytes()
     assert base64.b64decode(page.all("video")[0]["src"].removeprefix("data:video/mp4;base64,")) == film.read_bytes()
     assert len(page.all("table")) == len(page.all("caption")) == 2
     assert {a.get("scope") for a in page.all("th")} == {"col", "row"}
     assert len(page.all("p")) == 2
     assert not page.all("script")
     assert not page.all("link")
-    assert not re.search(r"https?://|@import|url\(", source)
+    assert not re.search(r"https?://|@import|url\((?!#)", source)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["film.mp4", "report.html", "roc.png"]  # nothing unfinished
+
+
+def test_a_figure_says_its_numbers_under_the_pointer(traces: list[ScoredEpisode], tmp_path: Path):
+    trace = traces[0]
+    write_report(tmp_path / "r.html", "A", "", [], {"Seen": figures.surprise_figure([trace])})
+    said = re.findall(
+        r"<title>([\d.]+) s: surprise ([\d.e+-]+), threshold 20(, in alarm)?<", (tmp_path / "r.html").read_text()
+    )
+    assert [float(s) for _, s, _ in said] == pytest.approx(list(trace.surprise), rel=5e-3)
+    assert [bool(a) for _, _, a in said] == trace.alarm.tolist()
+    assert float(said[-1][0]) == pytest.approx(len(trace) * trace.dt)
 
 
 def test_whatever_is_written_is_escaped(tmp_path: Path):
@@ -218,7 +230,7 @@ def test_whatever_is_written_is_escaped(tmp_path: Path):
     out = write_report(tmp_path / "r.html", evil, evil, [table], {evil: Figure()}, None, {evil: evil})
     page = _Page(out.read_text(encoding="utf-8"))
     assert not page.all("script")
-    assert page.all("img")[0]["alt"] == evil
+    assert page.all("svg")[0]["aria-label"] == evil
     # In <title>, <h1>, <p>, <caption>, two <th>, one <td>, <figcaption>, <dt> and <dd>.
     assert page.text.count(evil) == 10
 

@@ -12,6 +12,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import ImageColor
 
+from asm_gym import FaultInjection
+from asm_gym.faults import Push
 from asm_gym.view import chart as drawing
 from asm_gym.view.chart import StripChart, arrow, compose, project
 from asm_gym.wrappers.overlay import SurpriseOverlay
@@ -175,6 +177,14 @@ def says(surprise: float = 1.0, alarm: bool = False, fault: Any = None, interven
     return {"asm": asm} if fault is None else {"asm": asm, "fault": fault}
 
 
+class AddSays(gym.Wrapper[Any, Any, Any, Any]):
+    """Any environment, watched by nobody."""
+
+    def step(self, action: Any) -> Any:
+        *out, info = self.env.step(action)
+        return *out, info | says()
+
+
 def played(script: list[dict[str, Any]], **arguments: Any) -> SurpriseOverlay:
     env = SurpriseOverlay(ScriptedEnv(script), **arguments)
     env.reset(seed=0)
@@ -191,6 +201,29 @@ def test_a_rendered_frame_shows_alarm_and_fault():
     assert not has(calm, ORANGE).any()
     assert has(faulty[:120], RED)[0].all()
     assert has(faulty[120:], ORANGE).any()
+
+
+@pytest.mark.parametrize(
+    ("family", "probability", "named"),
+    [("contact", 0.95, True), ("contact", 0.85, False), ("unknown", 0.95, False)],
+)
+def test_a_cause_is_named_only_where_it_is_sure(family: str, probability: float, named: bool):
+    said = says(9.0, True)
+    said["asm"]["cause"] = {"family": family, "part": "body", "probability": probability}
+    assert ("contact body" in played([said])._line()) is named
+    assert "unknown" not in played([said])._line()
+
+
+def test_a_push_is_an_arrow_while_it_acts_and_no_longer():
+    push = Push(newtons=20, onset=2, duration=2)
+    env = gym.make("asm_gym/Lift-v0", render_mode="rgb_array", render_size=(192, 240), camera="frontview")
+    with SurpriseOverlay(AddSays(FaultInjection(env, [push])), camera="frontview") as watched:
+        watched.reset(seed=0)
+        seen = []
+        for _ in range(6):
+            watched.step(np.zeros(7, np.float32))
+            seen.append(has(watched.render()[:192], ORANGE).any())
+    assert seen == [False, False, True, True, False, False]
 
 
 @pytest.mark.parametrize("fault", [{}, (), None, []])

@@ -18,6 +18,12 @@ ARROW_M = 0.01
 ARROW_S = 0.5
 """How long it is shown after the alarm that named the force [s]."""
 
+SURE = 0.9
+"""Least probability at which a cause is named."""
+
+FELT = 1.0
+"""Least force that a fault presses with for an arrow [N]."""
+
 
 class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Draws surprise, threshold, alarm and ground-truth fault under the pictures of a watched environment.
@@ -31,8 +37,8 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         caption: what to call the episode, such as the condition.
         seconds: time the chart shows [s].
         chart_height: [px]; a quarter of the picture where None.
-        camera: of the pictures; where it is given, an arrow shows the force that the monitor takes a contact for, in
-            environments of this package.
+        camera: of the pictures; where it is given, an arrow shows the force that a fault presses with, or else that
+            the monitor takes a contact for, in environments of this package.
     """
 
     def __init__(
@@ -92,7 +98,8 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._intervened = bool(asm["intervened"])
         cause = asm.get("cause") or {}
         if cause.get("family"):
-            self._cause = " ".join(filter(None, (cause["family"], cause["part"])))
+            sure = cause["family"] != "unknown" and cause["probability"] >= SURE
+            self._cause = " ".join(filter(None, (cause["family"], cause["part"]))) if sure else ""
         self._since_force += 1
         if cause.get("force", {}).get("link"):
             self._force, self._since_force = cause["force"], 0
@@ -113,22 +120,28 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return compose(frame, strip, bool(self._alarm and self._alarm[-1]), self._line())
 
     def _with_arrow(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """An arrow that ends at the link which is pressed."""
-        if self._camera is None or self._force is None:
+        """An arrow that ends where the arm is pressed: by a fault, or else by what the monitor named."""
+        if self._camera is None:
             return frame
         from asm_gym.envs.robosuite_env import RobosuiteEnv  # charts need no robosuite
 
         inner = self.env.unwrapped
         if not isinstance(inner, RobosuiteEnv):
             return frame
-        if self._since_force * self._dt >= ARROW_S:
-            return frame
         model, data = inner.simulation.model, inner.simulation.data
-        eye, link = model.camera(self._camera).id, data.body(self._force["link"]).xpos
-        ends = np.stack([link - ARROW_M * np.asarray(self._force["vector"]), link])
+        pressed = int(np.argmax(np.linalg.norm(data.xfrc_applied[:, :3], axis=1)))
+        force, where = data.xfrc_applied[pressed, :3], data.xipos[pressed]
+        newtons = float(np.linalg.norm(force))
+        if newtons < FELT:
+            if self._force is None or self._since_force * self._dt >= ARROW_S:
+                return frame
+            force, where = np.asarray(self._force["vector"]), data.body(self._force["link"]).xpos
+            newtons = self._force["newtons"]
+        eye = model.camera(self._camera).id
         axes, size = data.cam_xmat[eye].reshape(3, 3), (frame.shape[0], frame.shape[1])
+        ends = np.stack([where - ARROW_M * force, where])
         seen = project(ends, data.cam_xpos[eye], axes, float(model.cam_fovy[eye]), size)
-        return arrow(frame, seen, f"{self._force['newtons']:.0f} N")
+        return arrow(frame, seen, f"{newtons:.0f} N")
 
     def _line(self) -> str:
         time = f"{len(self._ratio) * self._dt:.2f} s"

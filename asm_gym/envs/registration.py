@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from asm_gym.envs.robosuite_env import RobosuiteEnv
+from asm_gym.extras import check_mujoco
 from asm_gym.tasks import TASKS
 from asm_gym.validation import shown
+
+check_mujoco()  # before anything imports it
+
+from asm_gym.envs.robosuite_env import RobosuiteEnv  # noqa: E402
 
 
 class Maker:

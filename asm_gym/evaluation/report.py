@@ -5,17 +5,20 @@ from __future__ import annotations
 import base64
 import io
 import json
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from string import Template
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability
+from asm_gym.evaluation.figures.style import SAYS
 from asm_gym.evaluation.scored import ScoredEpisode, window_steps
 from asm_gym.evaluation.standing import card, coverage_table, kept_table, lead_table
 from asm_gym.evaluation.tables import Table, harmless_table, kinds_table, markdown, monitors_table
@@ -35,17 +38,23 @@ _PAGE = Template("""<!doctype html>
   :root { --paper: #15181c; --ink: #e8eaed; --soft: #a0a8b2; --rule: #343a42; --even: #1c2026; }
 }
 * { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 64rem; padding: 3rem 1.5rem; background: var(--paper); color: var(--ink);
+body { margin: 0 auto; max-width: 100rem; padding: 3rem 1.5rem; background: var(--paper); color: var(--ink);
        font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
 h1 { font-size: 1.9rem; line-height: 1.2; font-weight: 650; margin: 0 0 1rem; }
 h2 { font-size: 1.2rem; font-weight: 600; margin: 3rem 0 1rem; break-after: avoid; }
 p { max-width: 44rem; margin: 0 0 0.8rem; }
 figure { margin: 0 0 2.5rem; break-inside: avoid; }
 figcaption { color: var(--soft); font-size: 0.9rem; max-width: 44rem; margin-top: 0.5rem; }
-img { display: block; max-width: 100%; height: auto; background: #fff; border-radius: 6px; padding: 0.6rem;
+img, figure svg { display: block; max-width: 100%; height: auto; background: #fff; border-radius: 6px; padding: 0.6rem;
       border: 1px solid var(--rule); }
 video { display: block; width: 100%; max-width: 42rem; border-radius: 6px; }
-.scroll { overflow-x: auto; margin-bottom: 2.5rem; break-inside: avoid; }
+.figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(42rem, 100%), 1fr)); gap: 0 2.5rem;
+           align-items: start; }
+.scroll { overflow-x: auto; margin-bottom: 2.5rem; break-inside: avoid; max-width: max-content; }
+.scroll::-webkit-scrollbar { height: 0.7rem; }
+.scroll::-webkit-scrollbar-track { background: var(--even); border-radius: 0.35rem; }
+.scroll::-webkit-scrollbar-thumb { background: var(--soft); border-radius: 0.35rem; }
+.scroll tbody th { position: sticky; left: 0; background: var(--paper); }
 table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
 caption { caption-side: top; text-align: left; color: var(--soft); padding-bottom: 0.6rem;
           max-width: min(44rem, 90vw); }
@@ -56,7 +65,7 @@ td.text { white-space: normal; min-width: 9rem; }
 thead th { border-bottom: 2px solid var(--rule); font-weight: 600; vertical-align: bottom; }
 tbody th { font-weight: 600; white-space: nowrap; }
 tbody tr { border-bottom: 1px solid var(--rule); }
-tbody tr:nth-child(even) { background: var(--even); }
+tbody tr:nth-child(even), tbody tr:nth-child(even) th { background: var(--even); }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.25rem 1.5rem; font-size: 0.9rem; }
 dt { color: var(--soft); }
 dd { margin: 0; overflow-wrap: anywhere; font-family: ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
@@ -95,7 +104,7 @@ def write_report(
         title: one line.
         intro: plain text; an empty line starts a new paragraph.
         tables: in order.
-        drawn: caption to a PNG file, or to a Figure.
+        drawn: caption to a PNG file, or to a Figure, which tells its numbers under the pointer.
         video: an MP4 file.
         details: what it takes to make the report again: arguments, seed, versions.
     """
@@ -110,7 +119,7 @@ def write_report(
         parts.append("<section><h2>Results</h2>\n" + "\n".join(map(_table, tables)) + "</section>")
     if drawn:
         shown = "\n".join(_shown(caption, figure) for caption, figure in drawn.items())
-        parts.append(f"<section><h2>Figures</h2>\n{shown}</section>")
+        parts.append(f'<section><h2>Figures</h2>\n<div class="figures">{shown}</div></section>')
     if details:
         items = "\n".join(f"<dt>{escape(k)}</dt><dd>{escape(str(v))}</dd>" for k, v in details.items())
         parts.append(f"<section><h2>How this was made</h2>\n<dl>{items}</dl></section>")
@@ -145,16 +154,23 @@ def _is_text(cell: object) -> bool:
 
 def _shown(caption: str, figure: Path | Figure) -> str:
     if isinstance(figure, Figure):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
-        png = buffer.getvalue()
+        picture = _svg(figure, caption)
     else:
         png = Path(figure).read_bytes()
-    width = int.from_bytes(png[16:20], "big") * 3 // 4  # 150 dpi on a screen of about 112
-    return (
-        f'<figure><img alt="{escape(caption)}" width="{width}" src="{_uri("image/png", png)}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )
+        width = int.from_bytes(png[16:20], "big") * 3 // 4  # 150 dpi on a screen of about 112
+        picture = f'<img alt="{escape(caption)}" width="{width}" src="{_uri("image/png", png)}">'
+    return f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def _svg(figure: Figure, caption: str) -> str:
+    """As SVG, in which what has a text for an id (``figures.style.says``) says it under the pointer."""
+    buffer = io.StringIO()
+    with mpl.rc_context({"svg.hashsalt": caption}):  # ids are the same each time, and no other figure's
+        figure.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    svg = buffer.getvalue()[buffer.getvalue().index("<svg") :]
+    svg = re.sub(r' xmlns(:xlink)?="[^"]*"', "", svg)  # HTML needs none
+    svg = re.sub(rf'<g id="{SAYS}([^"]*)">', r"<g><title>\1</title>", svg)
+    return svg.replace("<svg ", f'<svg role="img" aria-label="{escape(caption)}" ', 1)
 
 
 def _uri(kind: str, content: bytes) -> str:

@@ -56,7 +56,7 @@ class CompiledRow:
         network, d, s = model.network, detection.detector_, model.senses_
         assert d is not None
         if must_compile(_observe):
-            print("asm-gym: compiling the memory, once on this machine (about half a minute)", file=sys.stderr)
+            print("asm-gym: compiling the memory, once on this machine (about a minute)", file=sys.stderr)
         skills = [model.learned_[n] for n in ("W_K", "b_K")] if model.skills_ else [np.zeros((0, 0)), np.zeros(0)]
         detector = d.whitening, d.ceiling, d.tail, d.context_quantile, d.context_range, d.gains
         singles, where_singles = _side_by_side(np.float32, *network.weights, *network.association, *skills)

@@ -13,7 +13,10 @@ from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, typed
 
 SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
-"""Where they lie."""
+"""Where they lie.
+
+:meta hide-value:
+"""
 MAKE = "asm-gym babble"
 """The command that makes one."""
 USUAL = 20

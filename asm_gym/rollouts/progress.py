@@ -1,4 +1,4 @@
-"""How far a stage of a command has come: a bar in a terminal, elsewhere a line at least every ten seconds."""
+"""How far a stage has come: a bar in a terminal or a notebook, elsewhere a line at least every ten seconds."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -25,9 +26,24 @@ def stage(name: str, console: Console, seconds: dict[str, float]) -> Iterator[Pr
         What the block calls as (done, total).
     """
     start = time.perf_counter()
-    with (_bar if console.is_terminal else _lines)(name, console) as progress:
+    with (_bar if console.is_terminal or _has_widgets(console) else _lines)(name, console) as progress:
         yield progress
     seconds[name] = round(time.perf_counter() - start, 1)
+
+
+@contextmanager
+def in_a_notebook(name: str, progress: Progress | None) -> Iterator[Progress | None]:
+    """``progress``; where there is none, and this is a notebook with widgets, a bar."""
+    console = Console()
+    if progress is None and _has_widgets(console):
+        with _bar(name, console) as bar:
+            yield bar
+    else:
+        yield progress
+
+
+def _has_widgets(console: Console) -> bool:
+    return console.is_jupyter and find_spec("ipywidgets") is not None
 
 
 @contextmanager

@@ -45,6 +45,11 @@ def setup(app: Sphinx) -> dict[str, bool]:
         if what in ("attribute", "data", "property"):  # napoleon takes what stands before a colon for a type
             lines[:] = kept[name]
 
+    def nameless(app: Sphinx, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
+        """Leaves out fields of named tuples that the docstring of their class explains."""
+        return True if (getattr(obj, "__doc__", None) or "").startswith("Alias for field number") else None
+
+    app.connect("autodoc-skip-member", nameless)
     app.connect("autodoc-process-docstring", before, priority=400)
     app.connect("autodoc-process-docstring", after, priority=600)  # napoleon reads the sections between them
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from asm_gym.episode import spans
-from asm_gym.evaluation.figures.style import BLACK, BLUE, ORANGE, VERMILLION, figure, require_some
+from asm_gym.evaluation.figures.style import BLACK, BLUE, ORANGE, VERMILLION, figure, require_some, says
 from asm_gym.evaluation.scored import ScoredEpisode, TraceDetail
 
 
@@ -60,6 +60,9 @@ def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
         rug = ax.get_xaxis_transform()
         ax.plot(ends, [0.96, 0.96], color=VERMILLION, linewidth=4, solid_capstyle="butt", transform=rug)
         ax.plot(ends[0], 0.86, "v", color=VERMILLION, markersize=7, transform=rug)
+    begun = np.append(0.0, time)
+    says(ax, begun, [f"{t:.2f} s: surprise {s:.3g}, threshold {trace.threshold:.3g}" + ", in alarm" * bool(a)
+                     for t, s, a in zip(time, trace.surprise, trace.alarm, strict=True)])  # fmt: skip
     late = "" if trace.delay is None else f": alarm {1e3 * trace.delay:.0f} ms after the onset"
     missed = ": missed" if trace.onset is not None and trace.delay is None else ""
     ax.set_title(f"{trace.title}{late}{missed}")

@@ -5,13 +5,16 @@ Colours are those of Okabe & Ito, chosen to be told apart with any colour vision
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sized
+from collections.abc import Iterator, Sequence, Sized
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK = (
     "#0072B2",
@@ -37,6 +40,22 @@ _STYLE: dict[Any, Any] = {
     "figure.facecolor": "white",
     "axes.facecolor": "white",
 }
+
+
+SAYS = "says: "
+"""Begins the id of what is not seen, and says the rest where a pointer is over it."""
+
+_MOST_SAID = 200
+
+
+def says(ax: Axes, ends: NDArray[np.float64], texts: Sequence[str]) -> None:
+    """What a report says where a pointer is over a panel: a text for each span of time, from ``ends[i]`` on.
+
+    Of more than a few hundred, some are said.
+    """
+    every = max(1, len(texts) // _MOST_SAID)
+    for i in range(0, len(texts), every):
+        ax.axvspan(ends[i], ends[min(i + every, len(ends) - 1)], alpha=0, linewidth=0, gid=SAYS + texts[i])
 
 
 @contextmanager
