@@ -105,7 +105,8 @@ class Deadline:
             ("all cores busy, nothing collected", (load, no_garbage)),
             ("all cores busy, nothing collected, SCHED_FIFO", (load, no_garbage, first)),
         ]
-        rows, wall, own = [], time.perf_counter(), time.process_time()
+        rows: list[tuple[str, ...]] = []
+        wall, own = time.perf_counter(), time.process_time()
         for name, meanwhile in kinds:
             with ExitStack() as stack:
                 try:

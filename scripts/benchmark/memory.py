@@ -21,6 +21,7 @@ from asm_gym.detection.repetition import evidence_steps
 from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.episode import Episode
 from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.extras import require
 from asm_gym.memory.traces import DECAYS
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.contact_band import ContactBand
@@ -152,8 +153,7 @@ def watching_plainly(asm: NeuralASM, episode: Episode) -> Callable[[], Any]:
 
 def watching_in_onnx(asm: NeuralASM, episode: Episode) -> Callable[[], Any]:
     """The same in ONNX Runtime, on one thread, by the graph that ``write_onnx`` makes."""
-    import onnxruntime
-
+    onnxruntime = require("onnxruntime", what="this rival")
     with TemporaryDirectory() as folder:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
