@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.vector import SyncVectorEnv
 from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
@@ -30,7 +31,7 @@ from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.substeps import felt_episodes
 from asm_gym.scripts.benchmark.turns import again, take_turns
 from asm_gym.spec import MOTOR, Channel, StreamSpec
-from asm_gym.wrappers import NeuralASMSafety
+from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 
 ACTIONS = 7
 STEPS = 60
@@ -251,6 +252,8 @@ class Safety:
     """Control steps of each rival."""
     monitor_freq: int = 100
     """Rows watched a second, where it watches within control steps [Hz]."""
+    members: int = 4
+    """Environments side by side under one wrapper, against as many without; 0 for none."""
     even_if_busy: bool = False
     """Print figures though the machine has too much else to do."""
 
@@ -277,8 +280,23 @@ class Safety:
         ]
         console.print(console_table(Table(caption, ("", "ms", "p99", "against step"), rows)))
         console.print(f"A band takes {turns.times(banded, guarded)} as long as the wrapper without.")
+        if self.members:
+            console.print(self._side_by_side(memory, console))
         console.print(turns.where())
         return 0
+
+    def _side_by_side(self, memory: NeuralASM, console: Console) -> str:
+        """What share of its speed a vector environment keeps under the wrapper."""
+        n = self.members
+        bare, inner = (SyncVectorEnv([partial(self._make, None)] * n) for _ in range(2))
+        guarded = VectorNeuralASMSafety(inner, memory)
+        for envs in (bare, guarded):
+            envs.reset(seed=0)
+        actions = np.zeros(bare.action_space.shape or (), np.float32)
+        rivals = {"bare": partial(bare.step, actions), "guarded": partial(guarded.step, actions)}
+        turns = take_turns(rivals, max(1, self.steps // n), console, self.even_if_busy)
+        kept = turns.ratio("bare", "guarded")
+        return f"{n} side by side under one wrapper keep {kept.text(digits=2)} of their speed."
 
     def _make(self, rate: int | None) -> gym.Env[Any, Any]:
         env_id = f"asm_gym/{self.task}-v0"
