@@ -71,8 +71,8 @@ class Safety:
         n = self.members
         bare, inner = (SyncVectorEnv([partial(self._make, None)] * n) for _ in range(2))
         guarded = VectorNeuralASMSafety(inner, memory)
-        for envs in (bare, guarded):
-            envs.reset(seed=0)
+        bare.reset(seed=0)
+        guarded.reset(seed=0)
         actions = np.zeros(bare.action_space.shape or (), np.float32)
         rivals: dict[str, Callable[[], Any]] = {
             "bare": partial(bare.step, actions),
