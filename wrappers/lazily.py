@@ -29,10 +29,10 @@ class Lazily(dict[str, Any]):
     def make(self) -> None:
         """Makes the rest now."""
         if self._later is not None:
-            later, self._later = self._later, None
-            known = dict.copy(self)
+            whole = {**self._later(), **dict.copy(self)}
             dict.clear(self)
-            dict.update(self, later(), **known)
+            dict.update(self, whole)
+            self._later = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         return dict, (dict(self),)
