@@ -29,10 +29,10 @@ class Lazily(dict[str, Any]):
     def make(self) -> None:
         """Makes the rest now."""
         if self._later is not None:
-            whole = {**self._later(), **dict.copy(self)}
+            later, self._later = self._later, None  # first, for a copy of a part asks for all of it
+            known = dict.copy(self)
             dict.clear(self)
-            dict.update(self, whole)
-            self._later = None
+            dict.update(self, later(), **known)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return dict, (dict(self),)

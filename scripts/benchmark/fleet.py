@@ -35,7 +35,8 @@ class Fleet:
     """
 
     def __init__(self, memory: NeuralASM, streams: int) -> None:
-        self._memory, self._state = memory, memory.initial_state(streams)
+        self._memory = memory
+        self._state = _some(memory.initial_state(streams), np.arange(streams))  # of which no two parts are one array
 
     def observe(self, streams: NDArray[np.int64], rows: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """The surprise (N,) at rows (N, D), each the next of its stream (N,), in the order in which they came."""
