@@ -85,6 +85,11 @@ class Inbox:
         self._buffers = [bytearray(self.kind.itemsize) for _ in range(ROOM)]
         self._came = 0
 
+    @property
+    def full(self) -> bool:
+        """Whether there is no more room."""
+        return self._came == ROOM
+
     def drain(self) -> None:
         """Takes in what has come, as far as there is room; the socket keeps the rest."""
         try:
@@ -107,11 +112,17 @@ async def watch(fleet: Fleet, inbox: Inbox, period: float, seconds: float) -> ND
     The compiled call runs beside the loop, which reads on meanwhile.
     """
     loop, late = asyncio.get_running_loop(), []
-    loop.add_reader(inbox.socket, inbox.drain)
+
+    def read() -> None:
+        inbox.drain()
+        if inbox.full:  # or the loop would turn and turn
+            loop.remove_reader(inbox.socket)
+
     start = time.time()
     while time.time() < start + seconds:
         began = time.time()
         rows = inbox.taken()
+        loop.add_reader(inbox.socket, read)
         if len(rows):
             await loop.run_in_executor(None, fleet.observe, rows["stream"], rows["row"])
             late.append((time.time() - rows["sent"])[rows["sent"] > start + WARM_UP_S])
