@@ -15,6 +15,7 @@ from asm_gym.monitors.model import model_outputs
 from asm_gym.scripts.benchmark import main
 from asm_gym.scripts.benchmark.experts import Attempt, _row, attempt
 from asm_gym.scripts.benchmark.fit import errors, repeated
+from asm_gym.scripts.benchmark.fleet import Fleet
 from asm_gym.scripts.benchmark.memory import PlainTorch, synthetic
 from asm_gym.scripts.benchmark.turns import BusyError, Turns, check_quiet
 from asm_gym.scripts.benchmark.vector import vector_table
@@ -34,12 +35,15 @@ def test_the_torch_rival_computes_the_same_surprise(channels):
 
 def test_both_print_their_ratios(capsys):
     assert main(["memory", "--hidden", "16", "--channels", "10", "--steps", "5", "--no-sweep", "--even-if-busy"]) == 0
-    assert main(["safety", "--hidden", "16", "--steps", "3", "--even-if-busy"]) == 0
+    assert main(["safety", "--hidden", "16", "--steps", "3", "--members", "2", "--even-if-busy"]) == 0
     shown = capsys.readouterr().out
     assert shown.count("×") >= 5
     assert "plain torch" in shown
     assert "under the wrapper" in shown
     assert "A band takes" in shown
+    assert "2 side by side under one wrapper keep" in shown
+    assert "ONNX Runtime" in shown
+    assert "warm" in shown
     assert "cores, of which this process kept" in shown
 
 
@@ -153,3 +157,25 @@ def test_vector_environments_are_compared_on_a_quiet_machine_alone(monkeypatch):
     monkeypatch.setattr("asm_gym.scripts.benchmark.vector.os.getloadavg", lambda: (9.0, 9.0, 9.0))
     with pytest.raises(BusyError):
         vector_table(make, (1,), 1, Console(), even_if_busy=False)
+
+
+def test_a_fleet_is_watched_as_each_robot_alone_is():
+    episodes = synthetic(5, 12)
+    asm = NeuralASM(episodes[0].spec, hidden_size=8, association_size=8, epochs=1).fit(episodes[:8])
+    alone = [asm.score(e).value for e in episodes[8:]]
+    fleet, found = Fleet(asm, 4), [[], [], [], []]
+    waiting = [(robot, row) for t in range(60) for robot in range(4) for row in (episodes[8 + robot].stream[t],)]
+    rng = np.random.default_rng(0)
+    while waiting:  # some robots have several rows at a time, and some none
+        now, waiting = waiting[: (n := int(rng.integers(1, 12)))], waiting[n:]
+        robots = np.array([robot for robot, _ in now])
+        for robot, value in zip(robots, fleet.observe(robots, np.array([row for _, row in now])), strict=True):
+            found[robot].append(value)
+    np.testing.assert_allclose(found, alone, rtol=1e-4)
+
+
+def test_rows_are_timed_against_their_deadline(capsys):
+    assert main(["deadline", "--rows", "10", "--rate", "200"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("all cores busy") == 3
+    assert "as it is" in shown

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.fused import A_THREAD
+from asm_gym.monitors.fused import _ONE_THREAD, A_THREAD
 from asm_gym.monitors.monitor import CalibratedMonitor
 from asm_gym.scripts.benchmark.memory import synthetic
 
@@ -98,3 +99,12 @@ def test_what_was_learned_since_counts():
     other = asm.with_threshold(1.0)
     other.adapt(state, rows[10, :1], before._replace(value=np.zeros(1)), rate=1.0)
     both(other, rows[:, :1], other.initial_state(1))
+
+
+def test_many_streams_leave_the_threads_of_blas_as_they_were():
+    before = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+    inside = []
+    with _ONE_THREAD, _ONE_THREAD:
+        inside = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+    assert set(inside) == {1}
+    assert [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"] == before

@@ -29,7 +29,7 @@ class Lazily(dict[str, Any]):
     def make(self) -> None:
         """Makes the rest now."""
         if self._later is not None:
-            later, self._later = self._later, None
+            later, self._later = self._later, None  # first, for a copy of a part asks for all of it
             known = dict.copy(self)
             dict.clear(self)
             dict.update(self, later(), **known)

@@ -34,7 +34,9 @@ from asm_gym.wrappers.vector_utils import (
     refuse_changes,
     refuse_running_statistics,
     replace,
+    said_by,
     set_attribute,
+    stacked,
 )
 
 FELT = "contact_load", "contact_left_s", "contact_felt"
@@ -277,7 +279,7 @@ class VectorNeuralASMSafety(VectorWrapper):
     ) -> NDArray[np.float32]:
         """(D,) of one environment."""
         if self._own_stream:
-            said = _said(infos, i, last, ("stream",))
+            said = said_by(infos, i, last, ("stream",))
             if "stream" not in said:
                 raise KeyError('info has no "stream"')
             return as_float32(said["stream"])
@@ -310,7 +312,7 @@ class VectorNeuralASMSafety(VectorWrapper):
             if begun[i]:
                 reports.append(nothing(own.silenced(np.ones(1, bool))))
                 continue
-            beneath = guard.substeps.came(rows[i], _said(infos, i, bool(last[i]), FELT))
+            beneath = guard.substeps.came(rows[i], said_by(infos, i, bool(last[i]), FELT))
             said = None if expected is None else expected[i]
             heard = guard.heard(own, bool(failed[i]))
             report = guard.judge(heard, rows[i], executed[i], failed[i], beneath, said, latency)
@@ -405,7 +407,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         said: dict[str, Any] = {f"asm_{name}": value for name, value in now.items()}
         said |= {"cost": now["alarm"].astype(np.float64), "cost_sum": self._alarms.astype(np.float64)}
         if self._full:
-            said["asm"] = Lazily(now, lambda: {n: _stacked([one[n] for one in each]) for n in each[0]} | same)
+            said["asm"] = Lazily(now, lambda: {n: stacked([one[n] for one in each]) for n in each[0]} | same)
         infos.update(said | {f"_{key}": present for key in said})
 
     def _nothing(self) -> list[RowReport]:
@@ -415,25 +417,3 @@ class VectorNeuralASMSafety(VectorWrapper):
     def _no_actions(self) -> NDArray[np.float32]:
         shape = self.env.single_action_space.shape or ()
         return np.full((self.num_envs, *shape), np.nan, np.float32)
-
-
-def _said(infos: dict[str, Any], i: int, last: bool, names: tuple[str, ...]) -> dict[str, Any]:
-    """What environment ``i`` said of ``names`` in its step, the ``last`` of an episode or not."""
-    said = infos.get("final_info", {}) if last else infos
-    there = {name: said.get(f"_{name}") for name in names if name in said}
-    return {name: said[name][i] for name, mask in there.items() if mask is None or mask[i]}
-
-
-def _stacked(values: list[Any]) -> Any:
-    """One array whose first axis is n; of dicts, a dict of such where all have the same keys and hold numbers."""
-    if isinstance(values[0], dict) and len({tuple(v) for v in values}) == 1 and _numbers(values):
-        return {key: np.array([v[key] for v in values]) for key in values[0]}
-    if isinstance(values[0], dict | tuple) or values[0] is None:
-        array = np.empty(len(values), object)
-        array[:] = values
-        return array
-    return np.array(values)
-
-
-def _numbers(values: list[dict[str, Any]]) -> bool:
-    return all(isinstance(x, float | int | bool | np.number) for v in values for x in v.values())

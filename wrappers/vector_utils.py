@@ -181,3 +181,25 @@ def final(infos: dict[str, Any], observations: Sequence[Any], mask: Mask) -> dic
 
 def _blank(like: Any) -> NDArray[Any]:
     return np.full(like.shape, None, object) if like.dtype == object else np.zeros_like(like)
+
+
+def said_by(infos: dict[str, Any], i: int, last: bool, names: tuple[str, ...]) -> dict[str, Any]:
+    """What environment ``i`` said of ``names`` in its step, the ``last`` of an episode or not."""
+    said = infos.get("final_info", {}) if last else infos
+    there = {name: said.get(f"_{name}") for name in names if name in said}
+    return {name: said[name][i] for name, mask in there.items() if mask is None or mask[i]}
+
+
+def stacked(values: list[Any]) -> Any:
+    """One array whose first axis is n; of dicts, a dict of such where all have the same keys and hold numbers."""
+    if isinstance(values[0], dict) and len({tuple(v) for v in values}) == 1 and _numbers(values):
+        return {key: np.array([v[key] for v in values]) for key in values[0]}
+    if isinstance(values[0], dict | tuple) or values[0] is None:
+        array = np.empty(len(values), object)
+        array[:] = values
+        return array
+    return np.array(values)
+
+
+def _numbers(values: list[dict[str, Any]]) -> bool:
+    return all(isinstance(x, float | int | bool | np.number) for v in values for x in v.values())

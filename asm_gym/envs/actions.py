@@ -53,7 +53,7 @@ class Actions:
 
     def slowed(self, simulation: Simulation, action: NDArray[np.float32], most: float) -> NDArray[np.float32]:
         """(A,) the action at which no hand is commanded to go faster than ``most`` [m/s]; the same where none is."""
-        shares = [(part, s) for part, s in simulation.slowed(self.scaled(action), most) if s < 1.0]
+        shares = simulation.speeds.slowed(self.scaled(action), most)
         if not shares:
             return action
         slow, rest = action.copy(), self.resting(simulation, action)

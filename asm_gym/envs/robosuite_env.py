@@ -11,16 +11,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.contact_limits import NO_LIMITS, ContactLimits
+from asm_gym.contact_limits import ContactLimits
 from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.cameras import RENDER_MODES, Pictures
 from asm_gym.envs.chains import chains_of
 from asm_gym.envs.edits import SimulatorEdits
+from asm_gym.envs.expectation import Expectation
 from asm_gym.envs.layout import Layout
 from asm_gym.envs.rewards import Rewards, RewardTerms
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Corruption, SensorErrors
-from asm_gym.envs.simulation import Expected, Simulation
+from asm_gym.envs.simulation import Simulation
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import as_float32, check_choice, check_flag, check_number, check_numbers, check_text, shown
@@ -140,9 +141,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """What the arms may feel and how fast they may go in this episode; ``reset`` forgets it. ``info`` then holds
         ``contact_load``, the largest share of a limit that was felt within the step, ``contact_left_s``, when in it a
         limit was passed [s], not a number where none was, and ``contact_felt``, the step's mean of what was felt."""
-        self._within: tuple[ContactLimits | None, Expected | None] = None, None
-        self._band: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        self._stays = False
+        self._expectation = Expectation()
         self.substeps = backend.PHYSICS_FREQ // control_freq
         self._groups = tuple(stream)
         self._flat = observation == "flat"
@@ -269,7 +268,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             self.simulation.begin_episode()
         self._warnings = self._bad_count()
         self._steps, self.holding = 0, False
-        self.contact_limits = self._band = None
+        self.contact_limits = None
+        self._expectation.forget()
         self._action = np.zeros(self._actions.size, np.float32)
         self._row = self.measure()
         self._ended = False
@@ -297,7 +297,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
         env = self.robosuite_env
         env.timestep += 1
-        expected = self._expected()
+        expected = self._expectation.taken(self.felt_channels, self.contact_limits)
         self.simulation.begin(expected)
         self._command(action)
         self._rows: list[NDArray[np.float32]] = []
@@ -360,21 +360,6 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             return action
         return self._actions.slowed(self.simulation, action, limits.hand_speed)
 
-    def _expected(self) -> Expected | None:
-        """What the arms are to feel in the step that begins: a band that was sent down for it, within the limits."""
-        band, self._band, limits = self._band, None, self.contact_limits
-        if band is None and limits is None:
-            return None
-        known, within = self._within
-        if within is None or limits is not known:
-            most = (limits or NO_LIMITS).most(self.felt_channels)
-            within = Expected(-most, most, most, limits is not None and limits.stays)
-            self._within = limits, within
-        if band is None:
-            return within
-        low, high = np.maximum(band[0], within.low), np.minimum(band[1], within.high)
-        return Expected(low, high, within.most, self._stays or within.stays)
-
     def expect(self, low: NDArray[np.float64], high: NDArray[np.float64], stays: bool = True) -> None:
         """Says what the arms are to feel in every physics substep of the next control step, and of that alone.
 
@@ -385,11 +370,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         Raises:
             ValueError: a wrong shape, or a band that is empty or not a number.
         """
-        bounds = np.asarray(low, np.float64), np.asarray(high, np.float64)
-        size = sum(c.size for c in self.felt_channels)
-        if any(b.shape != (size,) for b in bounds) or not (bounds[0] <= bounds[1]).all():
-            raise ValueError(f"a band needs a least and a most for each of {size} numbers, got {shown(bounds)}")
-        self._band, self._stays = bounds, stays
+        self._expectation.expect(self.felt_channels, low, high, stays)
 
     @property
     def felt(self) -> NDArray[np.float64]:
@@ -461,8 +442,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
     def _bad_count(self) -> int:
         """How often MuJoCo found the simulation unstable; it resets itself then, and says so nowhere else."""
-        counts = self._warning_counts
-        return sum(int(counts[w]) for w in _BAD)
+        return sum(int(self._warning_counts[w]) for w in _BAD)
 
     @property
     def stream_spec(self) -> StreamSpec:

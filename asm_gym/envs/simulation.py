@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import importlib
-import math
 import sys
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,21 +15,11 @@ from asm_gym.compilation import must_compile
 from asm_gym.envs import kernels
 from asm_gym.envs.arms import bodies, compilable, describe
 from asm_gym.envs.control import hold_at
+from asm_gym.envs.expectation import Expected
 from asm_gym.envs.nominal import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
+from asm_gym.envs.speeds import HandSpeeds
 from asm_gym.envs.views import ACTS, ARMED, FELT, JOINTS, LEFT, Goals, SubstepBand, Views
-
-SURELY = 1.0 - 1e-9
-"""Share of a limit of speed below which rounding decides nothing."""
-
-
-class Expected(NamedTuple):
-    """What the arms are to feel in the substeps of a control step, as ``Simulation.felt`` lays it out."""
-
-    low: NDArray[np.float64]  # (N,) [N m], [N]
-    high: NDArray[np.float64]  # (N,)
-    most: NDArray[np.float64]  # (N,) contact limits, infinite where there are none
-    stays: bool  # the arms stay from the substep after that in which they felt anything else
 
 
 class Simulation:
@@ -81,10 +70,10 @@ class Simulation:
         splits = [robot._action_split_indexes[arm] for robot, arm in self.parts]
         self._moves = [slice(start + low, start + high) for start, (low, high) in zip(starts, splits, strict=False)]
         self._grips = [self._gripper(start, *part) for start, part in zip(starts, self.parts, strict=False)]
-        self._speeds = [self._speed(a) for a in range(len(self.parts))]
         self.compiled = all(compilable(robot, arm) for robot, arm in self.parts)
         """Whether control runs compiled."""
         self._arms = describe(self.parts, self.model)
+        self.speeds = HandSpeeds(self.model, self.data, self._controllers, self._moves, self._arms)
         self._joints, self._dofs = (
             np.concatenate([getattr(robot, name) for robot, _ in self.parts])
             for name in ("_ref_joint_pos_indexes", "_ref_joint_vel_indexes")
@@ -252,47 +241,6 @@ class Simulation:
         return move
 
     # ------------------------------------------------------------------ knowledge of the robot
-
-    def slowed(self, action: NDArray[np.float64], most: float) -> list[tuple[slice, float]]:
-        """For each arm, its part of the action, and what share of it keeps its hand below ``most`` [m/s].
-
-        A controller that is asked for a change Δx of pose again and again, from where it is, comes to the velocity
-        Kp/Kd Δx. Actions of controllers that take anything else are left as they are.
-        """
-        found = []
-        for a, (controller, part, speed_of) in enumerate(
-            zip(self._controllers, self._moves, self._speeds, strict=True)
-        ):
-            if controller.name not in ("OSC_POSE", "JOINT_POSITION") or controller.input_type != "delta":
-                continue
-            if speed_of is not None and speed_of(action[part].tolist()) < SURELY * most:
-                found.append((part, 1.0))
-                continue
-            delta = np.asarray(controller.scale_action(action[part]), np.float64)
-            if controller.name == "JOINT_POSITION":
-                jacobian = np.zeros((3, self.model.nv))
-                mujoco.mj_jacSite(self.model, self.data, jacobian, None, int(self._arms.site[a]))
-                delta = jacobian[:, self._arms.dofs[a, : int(self._arms.joints[a])]] @ delta
-            gain = float(np.mean(controller.kp[:3] / controller.kd[:3]))
-            speed = gain * float(np.linalg.norm(delta[:3]))
-            found.append((part, 1.0 if speed <= most else most / speed))
-        return found
-
-    def _speed(self, a: int) -> Callable[[list[float]], float] | None:
-        """What says how fast a command would have a hand go [m/s], to rounding; None but under a fixed OSC_POSE."""
-        c = self._controllers[a]
-        if c.name != "OSC_POSE" or c.impedance_mode != "fixed":
-            return None
-        gain = float(np.mean(c.kp[:3] / c.kd[:3]))
-        scale = abs(c.output_max - c.output_min) / abs(c.input_max - c.input_min)
-        bounds = c.input_min, c.input_max, (c.input_max + c.input_min) / 2, scale, (c.output_max + c.output_min) / 2
-        axes = [tuple(float(b[i]) for b in bounds) for i in range(3)]
-
-        def speed(command: list[float]) -> float:
-            moves = zip(command, axes, strict=False)
-            return gain * math.hypot(*((min(max(x, low), high) - m) * s + o for x, (low, high, m, s, o) in moves))
-
-        return speed
 
     def motions(self, turns: NDArray[np.float64]) -> list[tuple[slice, NDArray[np.float64]]]:
         """For each arm, its part of the action, and that part's values for a change of its joints [rad]."""

@@ -11,10 +11,12 @@ from __future__ import annotations
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from threading import Lock
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from asm_gym.compilation import compiled, must_compile
 from asm_gym.detection import Detection, EvidenceDetection
@@ -39,6 +41,32 @@ SENSORY, MOTOR, SLOW, SPANS = range(26, 30)
 
 A_THREAD = 256
 """Streams that one thread observes at a time."""
+
+
+class _OneThread:
+    """While anybody is in such a block BLAS uses one thread: several are slower at products this small, and by tens of
+    times where they share cores with others."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside = Lock(), 0
+        self._blas: ThreadpoolController | None = None
+        self._limit: Any = None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._blas = self._blas or ThreadpoolController()  # looks through all libraries, once
+                self._limit = self._blas.limit(limits=1, user_api="blas")
+            self._inside += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._limit.restore_original_limits()
+
+
+_ONE_THREAD = _OneThread()
 
 
 class CompiledRow:
@@ -88,12 +116,16 @@ class CompiledRow:
         new, B = [np.empty_like(a) for a in old], len(rows)
         found = np.empty(B), np.empty_like(rows)
         arrays: tuple[Any, ...] = (rows, *old, *new, *found)
-        if B <= A_THREAD:
+        if B == 1:  # calls no BLAS
             _observe(*arrays, *self._learned)
         else:
-            with ThreadPoolExecutor() as threads:
-                parts = [[a[n : n + A_THREAD] for a in arrays] for n in range(0, B, A_THREAD)]
-                list(threads.map(lambda part: _observe(*part, *self._learned), parts))
+            parts = [[a[n : n + A_THREAD] for a in arrays] for n in range(0, B, A_THREAD)]
+            with _ONE_THREAD:
+                if len(parts) == 1:
+                    _observe(*parts[0], *self._learned)
+                else:
+                    with ThreadPoolExecutor() as threads:
+                        list(threads.map(lambda part: _observe(*part, *self._learned), parts))
         detection = EvidenceState(Evidence(*new[6:9]), Repetition(*new[9:]))
         return MonitorState(MemoryState(*new[:6]), detection), Surprise(*found)
 

@@ -22,9 +22,12 @@ import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
 from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.scripts.benchmark.coverage import CoverageCheck
+from asm_gym.scripts.benchmark.deadline import Deadline
 from asm_gym.scripts.benchmark.experts import Experts
 from asm_gym.scripts.benchmark.fit import FitCost
-from asm_gym.scripts.benchmark.memory import Memory, Safety
+from asm_gym.scripts.benchmark.fleet import Robots
+from asm_gym.scripts.benchmark.memory import Memory
+from asm_gym.scripts.benchmark.safety import Safety
 from asm_gym.scripts.benchmark.turns import GROWTH, BusyError, resident, take_turns
 from asm_gym.scripts.benchmark.vector import vector_table
 from asm_gym.scripts.benchmark.watch import Watch
@@ -202,6 +205,8 @@ BENCHMARKS: dict[str, type[Any]] = {
     "fit": FitCost,
     "safety": Safety,
     "watch": Watch,
+    "fleet": Robots,
+    "deadline": Deadline,
 }
 
 

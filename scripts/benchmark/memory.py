@@ -1,13 +1,13 @@
-"""What watching costs: ``asm-gym benchmark memory``, against plain torch, and ``asm-gym benchmark safety``."""
+"""``asm-gym benchmark memory``: what a row costs, against plain torch and ONNX Runtime."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from importlib.util import find_spec
+from tempfile import TemporaryDirectory
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,14 +19,12 @@ from asm_gym.detection.repetition import evidence_steps
 from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.episode import Episode
 from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.extras import require
 from asm_gym.memory.traces import DECAYS
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.contact_band import ContactBand
-from asm_gym.rollouts.collect import collect
-from asm_gym.rollouts.substeps import felt_episodes
-from asm_gym.scripts.benchmark.turns import take_turns
+from asm_gym.monitors.export import STATE, initial_state, write_onnx
+from asm_gym.scripts.benchmark.turns import again, take_turns
 from asm_gym.spec import MOTOR, Channel, StreamSpec
-from asm_gym.wrappers import NeuralASMSafety
 
 ACTIONS = 7
 STEPS = 60
@@ -147,6 +145,26 @@ def watching_plainly(asm: NeuralASM, episode: Episode) -> Callable[[], Any]:
     return call
 
 
+def watching_in_onnx(asm: NeuralASM, episode: Episode) -> Callable[[], Any]:
+    """The same in ONNX Runtime, on one thread, by the graph that ``write_onnx`` makes."""
+    onnxruntime = require("onnxruntime", what="this rival")
+    with TemporaryDirectory() as folder:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        graph = write_onnx(asm, f"{folder}/memory.onnx").read_bytes()
+    session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+    said = [output.name for output in session.get_outputs()]
+    rows, state, n = [row[None].astype(np.float64) for row in episode.stream], initial_state(asm), 0
+
+    def call() -> None:
+        nonlocal state, n
+        found = dict(zip(said, session.run(said, {"row": rows[n % len(rows)], **state}), strict=True))
+        state = {name: found[f"next_{name}"] for name in STATE}
+        n += 1
+
+    return call
+
+
 def _fitted(hidden: int, channels: int, skills: int = 1) -> tuple[NeuralASM, Episode]:
     """A memory that has learned little: the cost is the same. It names skills where there are several."""
     episodes = synthetic(channels, max(10, skills + 2), skills)
@@ -178,18 +196,25 @@ class Memory:
         try:
             asm, episode = _fitted(self.hidden, self.channels)
             rivals = {
-                "asm_gym, one stream": watching(asm, episode, 1),
+                "asm_gym, one stream, others between": watching(asm, episode, 1),
                 "asm_gym, 64 streams": watching(asm, episode, 64),
                 "plain torch, one stream": watching_plainly(asm, episode),
             }
+            if find_spec("onnxruntime") and find_spec("onnx"):
+                rivals["ONNX Runtime, one stream"] = watching_in_onnx(asm, episode)
             turns = take_turns(rivals, self.steps, console, self.even_if_busy)
         finally:
             torch.set_num_threads(threads)
         turns.seconds["asm_gym, 64 streams"] /= 64
         title = f"{self.hidden} hidden units, {self.channels} channels: a stream's row, of which nothing is missing"
+        # Called again and again while everything is in the cache, as no rival that takes turns is.
+        turns.seconds["asm_gym, one stream, warm"] = again(watching(asm, episode, 1), self.steps)
         plain = "plain torch, one stream"
-        rows = [(name, f"{1e6 * turns.median(name):.0f}", turns.faster(name, plain)) for name in turns.seconds]
-        console.print(console_table(Table(title, ("", "µs", "against torch"), rows)))
+        rows = [
+            (name, *(f"{1e6 * turns.quantile(name, q):.0f}" for q in (0.5, 0.99, 0.999)), turns.faster(name, plain))
+            for name in turns.seconds
+        ]
+        console.print(console_table(Table(title, ("", "µs", "p99", "p99.9", "against torch"), rows)))
         console.print(turns.where())
         if self.sweep:
             self._sweep(console)
@@ -206,59 +231,3 @@ class Memory:
             turns = take_turns(rivals, max(1, self.steps // 4), console, self.even_if_busy)
             rows = [(name, f"{1e6 * turns.median(name):.0f}", turns.times(name, str(sizes[0]))) for name in rivals]
             console.print(console_table(Table(f"one stream, by {what}", (what, "µs", f"against {sizes[0]}"), rows)))
-
-
-@dataclass
-class Safety:
-    """What the safety wrapper adds to a control step, at the control rate and within control steps."""
-
-    task: str = "Lift"
-    """Name of the task."""
-    hidden: int = 256
-    """Hidden units of the memory."""
-    steps: int = 400
-    """Control steps of each rival."""
-    monitor_freq: int = 100
-    """Rows watched a second, where it watches within control steps [Hz]."""
-    even_if_busy: bool = False
-    """Print figures though the machine has too much else to do."""
-
-    def run(self, console: Console) -> int:
-        """Prints the table."""
-        plain = self._make(None)
-        memory = self._memory(None)
-        guarded, banded = "step under the wrapper", "step under the wrapper and a band"
-        envs = {"step": plain, guarded: NeuralASMSafety(self._make(None), memory)}
-        envs[banded] = NeuralASMSafety(self._make(None), memory, band=self._band(memory))
-        rate = self.monitor_freq
-        watched = NeuralASMSafety(self._make(rate), self._memory(rate), monitor_freq=rate)
-        envs |= {f"step, stream at {rate} Hz": self._make(rate), f"step under the wrapper at {rate} Hz": watched}
-        action = np.zeros(plain.action_space.shape or (), np.float32)
-        for env in envs.values():
-            env.reset(seed=0)
-        rivals: dict[str, Callable[[], Any]] = {name: partial(env.step, action) for name, env in envs.items()}
-        turns = take_turns(rivals, self.steps, console, self.even_if_busy)
-        caption = f"{self.task}, 20 Hz, {self.hidden} hidden units: a control step"
-        rows = [(name, f"{1e3 * turns.median(name):.2f}", turns.times(name, "step")) for name in rivals]
-        console.print(console_table(Table(caption, ("", "ms", "against step"), rows)))
-        console.print(f"A band takes {turns.times(banded, guarded)} as long as the wrapper without.")
-        console.print(turns.where())
-        return 0
-
-    def _make(self, rate: int | None) -> gym.Env[Any, Any]:
-        env_id = f"asm_gym/{self.task}-v0"
-        return gym.make(env_id, horizon=10**9, stream_freq=rate, disable_env_checker=True)
-
-    def _memory(self, rate: int | None) -> NeuralASM:
-        """One that has learned little, and whose threshold is out of reach: the cost is the same."""
-        env_id = f"asm_gym/{self.task}-v0"
-        episodes = collect(env_id, episodes=4, workers=1, horizon=40, stream_freq=rate)
-        asm = NeuralASM(episodes[0].spec, hidden_size=self.hidden, epochs=1).fit(episodes)
-        return asm.with_threshold(1e300)  # beyond any surprise of these rows: nothing is to be held
-
-    def _band(self, memory: NeuralASM) -> ContactBand:
-        """One that has learned little and is as wide as can be: the cost is the same."""
-        felt = felt_episodes(self._make(None), range(6), steps=20)
-        band = ContactBand(memory).fit(felt[:4]).calibrate(felt[4:], 0.5)
-        band.scale_ = 1e30
-        return band

@@ -48,6 +48,10 @@ class Turns(NamedTuple):
         """Of a rival's calls [s]."""
         return float(np.median(self.seconds[name]))
 
+    def quantile(self, name: str, q: float) -> float:
+        """Of a rival's calls [s]."""
+        return float(np.quantile(self.seconds[name], q))
+
     def ratio(self, name: str, to: str) -> Spread:
         """How many times as long a call took as another rival's: of medians, its mean and spread over repetitions."""
         parts = min(REPETITIONS, len(self.seconds[name]))
@@ -90,6 +94,16 @@ def take_turns(rivals: dict[str, Callable[[], Any]], turns: int, console: Consol
     if not even_if_busy:
         check_quiet(found.share, os.getloadavg()[0], os.cpu_count() or 1)
     return found
+
+
+def again(call: Callable[[], Any], times: int) -> NDArray[np.float64]:
+    """(times,) what a call takes that nothing comes between [s]; the first tenth does not count."""
+    seconds = np.empty(times + times // 10)
+    for n in range(len(seconds)):
+        start = time.perf_counter()
+        call()
+        seconds[n] = time.perf_counter() - start
+    return seconds[-times:]
 
 
 def machine(share: float) -> str:
