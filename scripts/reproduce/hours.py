@@ -73,7 +73,7 @@ def examined(corpus: Corpus, memory: NeuralASM, known: Sequence[str]) -> list[Ma
             tell(n, len(places))
             if policy == EXPERT and task in known:
                 continue
-            own = list(corpus.episodes("nominal", "faulty", policies=(policy,), tasks=(task,)))
+            own = list(corpus.episodes(policies=(policy,), tasks=(task,)))
             usual = usual_force(list(corpus.episodes("nominal", policies=(EXPERT,), tasks=(task,))[:100]))
             marks.append(examine(memory, Exam(task, policy, known=False).name, own, WINDOW_S, usual))
     return marks
