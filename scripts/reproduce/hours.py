@@ -61,7 +61,7 @@ def run(config: Config) -> Findings:
     anew = {r: memory.threshold_at(false_alarms_per_hour=r) for r in PROMISES if r * hours >= 1.0}
     settings = [shipped, Setting(f"from {hours:.1f} hours of {len(healthy)} episodes", anew)]
     marks = examined(corpus, memory, known)
-    return Findings(records(marks, settings), [kept(marks, settings), each(marks, settings[-1])])
+    return Findings(records(marks, settings), [kept(marks, settings), *(each(marks, setting) for setting in settings)])
 
 
 def examined(corpus: Corpus, memory: NeuralASM, known: Sequence[str]) -> list[Marks]:
