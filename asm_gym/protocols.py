@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
+from asm_gym.kinematics import Chain
 from asm_gym.spec import Channel, StreamSpec
 
 
@@ -107,3 +108,10 @@ class LocatesForces(Protocol):
     def force_behind(self, torques: NDArray[np.floating[Any]]) -> tuple[str, NDArray[np.float64]]:
         """The link on which a force would explain external torques (J,) best [N m], and that force (3,) [N]."""
         ...
+
+
+@runtime_checkable
+class KnowsItsArms(Protocol):
+    """It knows where its hands are by the angles of their arms' joints, and senses them by themselves too."""
+
+    hand_chains: tuple[Chain, ...]

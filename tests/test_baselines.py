@@ -1,5 +1,6 @@
 """Every monitor keeps one contract, and each baseline does what its source says."""
 
+import copy
 from functools import cache
 
 import numpy as np
@@ -145,6 +146,7 @@ def test_unknown_names_and_hyperparameters_list_the_known():
     [
         ("window_pca", {"rows": 3, "kept": 0.9}),
         ("kalman", {"ridge": 0.5}),
+        ("memory_temporal", {"dynamics": "settling"}),
         ("gru", {"hidden_size": 8}),
         ("lstm_vae", {"hidden_size": 8, "latent_size": 3}),
     ],
@@ -223,3 +225,27 @@ def test_boosted_trees_say_what_scikit_learn_says_of_them():
     fresh = rng.normal(size=(100, 5))
     expected = np.stack([trees.predict(fresh[:, own]) for trees, own in zip(boosted, seen, strict=True)], axis=1)
     np.testing.assert_allclose(_said(fresh, **forest.arrays), expected, atol=1e-12)
+
+
+TORCH = ["gru", "lstm_vae", "association_mlp", "logpzo", "rnd", "rapt"]  # and ``next``, of other streams
+
+
+@pytest.mark.parametrize("name", TORCH)
+def test_all_that_a_network_computes_with_is_on_its_device(name):
+    pytest.importorskip("torch")
+    model = copy.copy(fitted(name).model)
+    model.module_ = copy.deepcopy(model.module_)
+    assert model.to("meta") is model  # which has no numbers, and refuses tensors of any other device
+    with pytest.raises(NotImplementedError, match="Cannot copy out of meta tensor"):
+        model.predict(model.start(2), np.zeros((2, SPEC.size)))
+
+
+def test_a_device_that_there_is_not_is_refused_in_one_line(tmp_path):
+    pytest.importorskip("torch")
+    with pytest.raises(ValueError, match=r"^device 'warp' cannot be used: [^\n]+$"):
+        make_monitor("gru", SPEC, device="warp")
+    with pytest.raises(ValueError, match="kalman runs on a CPU alone, got device 'cuda'"):
+        make_monitor("kalman", SPEC, device="cuda")
+    fitted("gru").save(tmp_path / "gru.asm")
+    with pytest.raises(ValueError, match="device 'warp' cannot be used"):
+        load_monitor(tmp_path / "gru.asm", device="warp")

@@ -172,6 +172,27 @@ def test_a_fault_is_acted_on_and_ends_an_episode_that_a_knock_does_not():
     assert len(said) == 15
 
 
+class Losing(FakeEnv):
+    """Loses a number in the fifth row."""
+
+    def _out(self, action):
+        observation, info = super()._out(action)
+        info["stream"][1] = np.nan if info["stream"][0] == 5 else info["stream"][1]
+        return observation, info
+
+
+@pytest.mark.parametrize("reaction", ["terminate", "hold", "graded"])
+def test_a_knock_hides_no_number_that_is_missing(reaction):
+    """A knock ended nothing where alarms end the episode, though a number was missing in the same row."""
+    said, total = lived(NeuralASMSafety(Losing(), Eventful([5]), reaction, release_after=3))
+    assert said[4][:2] == ("fault", True)
+    assert total.faults == 1
+    if reaction == "terminate":
+        assert len(said) == 5
+    else:
+        assert said[4][2] == "reflex"
+
+
 def test_many_environments_say_the_same():
     envs = SyncVectorEnv([lambda: FakeEnv(), lambda: FakeEnv(first=100)])
     watched = VectorNeuralASMSafety(envs, Eventful([5]), "hold", release_after=3)

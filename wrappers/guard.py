@@ -26,7 +26,7 @@ from asm_gym.wrappers.factory import (
     names_causes,
 )
 from asm_gym.wrappers.observer import joined
-from asm_gym.wrappers.reports import CONTACT, FAILURE, MISSING, SURPRISE, RowReport
+from asm_gym.wrappers.reports import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPRISE, RowReport
 from asm_gym.wrappers.responses import NO_RESPONSE, Responder, responses_from
 from asm_gym.wrappers.severity import AGAIN, LEANS_S, Severity, SeverityEstimator
 from asm_gym.wrappers.substeps import Beneath, SubstepGuard
@@ -113,12 +113,13 @@ class Guard:
 
     def read(self, row: NDArray[np.float32], failure: str) -> tuple[NDArray[np.float32], str]:
         """(D,) the next row as the monitor is to see it, and what failed so far."""
-        row = self.responder.read(row)
-        return row, joined(failure, self.responder.doubt)
+        row, doubt = self.responder.read(row), self.responder.doubt
+        return row, joined(failure, doubt) if doubt else failure
 
     def heard(self, surprise: Surprise, failed: bool) -> Surprise:
         """What counts of the surprise at that row, one in a batch."""
-        surprise = surprise.without(self.responder.unjudged)
+        if not self.responder.judged:
+            surprise = surprise.without(self.responder.unjudged)
         if self.responder.settling and not failed:
             surprise = surprise.silenced(np.ones(1, np.bool_))
         return surprise
@@ -149,13 +150,13 @@ class Guard:
             arbiter.warn(failure, "which counts as an alarm")
         held = arbiter.overriding
         severity = self._severity.of(row, beneath, held, LEANS_S / (1 + AGAIN * arbiter.strikes))
-        over, lost = not value <= arbiter.threshold, self.responder.lost
+        over, lost, contradicts = not value <= arbiter.threshold, self.responder.lost, self.responder.contradicts
         event = surprise.event(arbiter.threshold)
         knocked = event == KNOCK
-        alarm = over or knocked or bool(lost) or severity.presses
-        if alarm and lost and not (over or severity.presses or failure or severity.fast):
+        alarm = over or knocked or bool(lost) or contradicts or severity.presses
+        if alarm and lost and not (over or knocked or contradicts or severity.presses or failure or severity.fast):
             response = self.responder.missed()
-        elif knocked and not (severity.presses or failure):
+        elif knocked and not (contradicts or severity.presses or failure):
             response = self.responder.knocked()
         else:
             response = self.responder.respond(
@@ -182,11 +183,13 @@ class Guard:
                 self.substeps.pressed()
             elif beneath is not None:
                 self.substeps.acted()
-        reasons = {CONTACT: severity.presses, FAILURE: bool(failure), SURPRISE: over or knocked, MISSING: bool(lost)}
-        reason = next((name for name, holds in reasons.items() if holds), "")
-        if alarm and not (over or knocked):
-            event = KNOCK if severity.presses else FAULT
-        failure = joined(failure, decision.failure)
+        told: tuple[tuple[Any, str], ...] = (severity.presses, CONTACT), (failure, FAILURE), (over or knocked, SURPRISE)
+        told += (contradicts, CONTRADICTION), (lost, MISSING)
+        reason = next((name for holds, name in told if holds), "")
+        if alarm:
+            event = FAULT if over or lost or contradicts else KNOCK
+        if decision.failure:
+            failure = joined(failure, decision.failure)
         return RowReport(surprise, decision, latency, failure, response, severity, reason, event)
 
     @property

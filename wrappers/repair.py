@@ -18,6 +18,7 @@ from asm_gym.spec import StreamSpec
 from asm_gym.stream_source import StreamSource
 from asm_gym.validation import check_number, shown, typed
 from asm_gym.wrappers.factory import check_monitor
+from asm_gym.wrappers.hand import HandAgainstJoints
 from asm_gym.wrappers.observer import Observer
 
 WELL_AFTER_S = 1.0
@@ -49,10 +50,17 @@ class Repair:
         completion: of the memory that watches the stream.
         trust_s: how long a sense that nothing else tells of is completed [s].
         read: (D,) which columns the policy reads, of whose completion something depends; all where that is not known.
+        hands: tell of missing angles better than the memory, and which senses are not to be believed again yet.
     """
 
-    def __init__(self, completion: Completion, trust_s: float = TRUST_S, read: NDArray[np.bool_] | None = None) -> None:
-        self._completion, spec = completion, completion.spec
+    def __init__(
+        self,
+        completion: Completion,
+        trust_s: float = TRUST_S,
+        read: NDArray[np.bool_] | None = None,
+        hands: Sequence[HandAgainstJoints] = (),
+    ) -> None:
+        self._completion, spec, self._hands = completion, completion.spec, hands
         self._read = np.ones(spec.size, bool) if read is None else read
         self._spec, self._patience = spec, round(check_number("trust_s", trust_s, low=0) / spec.dt)
         self._well_after, self._longest = max(1, round(WELL_AFTER_S / spec.dt)), round(LONGEST_S / spec.dt)
@@ -65,9 +73,8 @@ class Repair:
         """(D,) which columns are completed."""
         self.settling = 0
         """Rows until the monitor has seen nothing but repaired rows of a sense that was found at fault."""
-        self.lost = np.zeros(self._spec.size, bool)
-        """(D,) which numbers of the last row were not finite."""
         self._returned = np.zeros(self._spec.size, np.int64)  # (D,) rows until its changes are those of the sense again
+        self._returning = 0  # the most of them
         self._gone: set[str] = set()  # of those that are missing, which said nothing, and are believed when they do
         self._since: dict[str, int] = {}  # rows for which each has been missing
         self._good: NDArray[np.float64] | None = None  # (D,) the last row before something was missing
@@ -98,9 +105,16 @@ class Repair:
 
         False once a sense that nothing else tells of is missing for long, any for very long, or too many at a time.
         """
+        if not self._calm:  # as nearly always
+            return self._unchecked <= self._patience
         sensory = self._spec.sensory
         few = self.missing[sensory].mean() <= MOST_MISSING if len(sensory) else True
         return bool(few and self._unchecked <= self._patience and max(self._since.values(), default=0) <= self._longest)
+
+    @property
+    def judged(self) -> bool:
+        """Whether every number is."""
+        return not (self._calm or self._returning)
 
     @property
     def unjudged(self) -> NDArray[np.bool_]:
@@ -112,10 +126,10 @@ class Repair:
         """(D,) the next row, as it should be."""
         self._earlier, self._raw = self._raw, np.array(row, np.float64)
         self.settling = max(0, self.settling - 1)
-        self._returned = np.maximum(self._returned - 1, 0)
+        if self._returning:
+            self._returned, self._returning = np.maximum(self._returned - 1, 0), self._returning - 1
         finite = np.isfinite(self._raw)
-        self.lost = ~finite
-        if not self._calm and finite.all():  # as nearly always
+        if finite.all() and not self._calm:  # as nearly always
             self._good = self._before = self._raw
             return row.astype(np.float32)
         self._since = {name: self._since.get(name, 0) + 1 for name in self._calm}
@@ -171,6 +185,8 @@ class Repair:
             value = np.where(self._guessed, last[columns], value)
         mean, spread = self._completion.senses.mean[columns], self._completion.senses.spread[columns]
         repaired[columns] = np.clip(value, mean - FARTHEST * spread, mean + FARTHEST * spread)
+        for hand in self._hands:
+            repaired = hand.refined(repaired, self.missing, self._completion.error * self._completion.senses.spread)
         return repaired
 
     def _judge(self, repaired: NDArray[np.float64]) -> None:
@@ -179,6 +195,8 @@ class Repair:
         self._unchecked = self._unchecked + 1 if self._guessed.any() else 0
         close = np.abs(self._raw[columns] - repaired[columns]) <= limit  # False for what is not finite
         repeats = (self._raw[columns] == self._earlier[columns]) & (self._spec.noise[columns] > 0)
+        for hand in self._hands:
+            close &= ~hand.accused[columns]
         back = np.isfinite(self._raw[columns]) & (close | self._untold)
         fine = dict(zip(columns.tolist(), (close & ~repeats & ~self._untold).tolist(), strict=True))
         there = dict(zip(columns.tolist(), back.tolist(), strict=True))
@@ -189,7 +207,7 @@ class Repair:
                 # What said nothing, and says what is expected again, is believed at once; what was wrong is not.
                 if self._calm[name] >= self._well_after or (name in self._gone and all(there[int(c)] for c in own)):
                     well.append(name)
-                    self._returned[own] = self._settle
+                    self._returned[own] = self._returning = self._settle
                     repaired[own] = self._raw[own]
         if well:
             self._gone -= set(well)

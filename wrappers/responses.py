@@ -14,6 +14,7 @@ from asm_gym.monitors import ExplainsItself, Monitor
 from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, as_info, averaged
 from asm_gym.validation import check_choice, shown
 from asm_gym.wrappers.contact import ContactEstimator
+from asm_gym.wrappers.hand import Contradiction, HandAgainstJoints
 from asm_gym.wrappers.repair import ObservationMap, Repair
 from asm_gym.wrappers.severity import FREE_FORCE, Severity
 from asm_gym.wrappers.transitions import GOING_ON
@@ -87,6 +88,7 @@ class Response(NamedTuple):
         return f"{part}, {self.cause['probability']:.2f}"
 
 
+NONE = np.zeros(0, np.intp)
 NO_RESPONSE = Response("", as_info(None))
 """Where nothing is to be done."""
 
@@ -126,11 +128,14 @@ class Responder:
         self.repair: Repair | None = None
         self._map: ObservationMap | None = None
         self._touch: ContactEstimator | None = None
+        self._hands = HandAgainstJoints.of(env, self._spec)
         self._kept = WINDOW + 1 + round(LASTING["actuator"] / self._spec.dt)
         if self._diagnosis is not None:
             self._touch = ContactEstimator.where_measured(env, self._diagnosis.completion)
             self._map = self._mapped(env) if repairs else None
-            self.repair = Repair(self._diagnosis.completion, read=None if self._map is None else self._map.shown)
+            self.repair = Repair(
+                self._diagnosis.completion, read=None if self._map is None else self._map.shown, hands=self._hands
+            )
         self.reset()
 
     def _mapped(self, env: gym.Env[Any, Any]) -> ObservationMap | None:
@@ -145,7 +150,11 @@ class Responder:
         """A new episode begins."""
         self._rows: list[NDArray[np.float32]] = []
         self._quiet = 0
+        self._contradiction: Contradiction | None = None
+        self._lost = NONE
         self._forget()
+        for hand in self._hands:
+            hand.reset()
         if self.repair is not None:
             self.repair.reset()
 
@@ -167,16 +176,24 @@ class Responder:
         return np.zeros(self._spec.size, bool) if self.repair is None else self.repair.missing
 
     @property
+    def judged(self) -> bool:
+        """Whether somebody is surprised at every number."""
+        return self.repair is None or self.repair.judged
+
+    @property
     def unjudged(self) -> NDArray[np.bool_]:
         """(D,) the numbers at which nobody is surprised, for they are completed or were a moment ago."""
         return np.zeros(self._spec.size, bool) if self.repair is None else self.repair.unjudged
 
     @property
     def lost(self) -> tuple[str, ...]:
-        """The numbers of the last row that were not finite and are completed."""
-        if self.repair is None or self._map is None or not self.repair.lost.any():
-            return ()
-        return tuple(self._spec.labels[i] for i in np.flatnonzero(self.repair.lost))
+        """The numbers of the last row that were not finite."""
+        return tuple(self._spec.labels[i] for i in self._lost) if len(self._lost) else ()
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the last row says of a hand what its joints do not, beside what is completed."""
+        return self._contradiction is not None
 
     @property
     def doubt(self) -> str:
@@ -197,17 +214,22 @@ class Responder:
 
     def read(self, row: NDArray[np.float32]) -> NDArray[np.float32]:
         """(D,) the row as the monitor is to see it."""
+        finite = np.isfinite(row)
+        self._lost = NONE if finite.all() else np.flatnonzero(~finite)
+        found = [hand.read(row, self.missing) for hand in self._hands]
+        self._contradiction = next(filter(None, found), None)
         if self.repair is not None and self._map is not None:
             known = self.completed
             try:
                 row = self.repair.read(row)
-                if lost := ", ".join(name for name in self.completed if name not in known):
+                if self.repair.names and (lost := ", ".join(name for name in self.completed if name not in known)):
                     _log.info("complete: %s says nothing any more", lost)
             except Exception as error:
                 # Nobody knows what the row should say: what is not finite is an alarm, and nothing explains it.
                 gym.logger.warn(f"completion: {error!r}; the row counts as lost")
                 row = np.full_like(row, np.nan)
-        self._rows = [*self._rows[1 - self._kept :], row]
+        self._rows.append(row)
+        del self._rows[: -self._kept]
         return row
 
     def observed(self, observation: Any) -> Any:
@@ -239,8 +261,10 @@ class Responder:
         for family in self._since:
             self._since[family] += 1
         if not alarm:
-            return NO_RESPONSE._replace(touched=touched)
-        cause = self._believed(self._cause(failed, attribution))
+            return NO_RESPONSE if touched is None else NO_RESPONSE._replace(touched=touched)
+        cause = self._contradicted()
+        if cause is None or failed:
+            cause = self._believed(self._cause(failed, attribution))
         family = cause.family if cause is not None and cause.probability >= SURE else "unknown"
         self._touched = severity.presses or (cause is not None and cause.family == "contact")
         self._since.setdefault(PRESSING if severity.presses else family, 0)
@@ -277,6 +301,8 @@ class Responder:
 
     def missed(self) -> Response:
         """What is done about a row in which numbers are missing, and nothing else is wrong: they are completed."""
+        if self._map is None:
+            return Response("", as_info(None))
         said = as_info(None) | {"family": "sensor", "part": ", ".join(self.completed), "probability": 1.0}
         return Response("complete", said, None, "sensor")
 
@@ -300,11 +326,19 @@ class Responder:
         if failed or self._diagnosis is None or not np.isfinite(rows).all():
             return None
         try:
-            return self._diagnosis(rows, attribution, self.missing)
+            vouched = [hand.vouched for hand in self._hands]
+            return self._diagnosis(rows, attribution, np.logical_or.reduce([self.missing, *vouched]))
         except Exception as error:
             # Whatever goes wrong here, an alarm is answered: by what is done about the unknown.
             gym.logger.warn(f"diagnosis: {error!r}; the cause counts as unknown")
             return None
+
+    def _contradicted(self) -> Cause | None:
+        """What hand and joints say is wrong: a sensor, beyond doubt, though it may not be known which."""
+        if self._contradiction is None:
+            return None
+        part, columns = self._contradiction
+        return Cause("sensor", part, 1.0, {name: float(name == "sensor") for name in FAMILIES}, columns)
 
     def _believed(self, cause: Cause | None) -> Cause | None:
         """The cause by all diagnoses since it was quiet for a second, the newest of which counts a tenth at least."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Mask = NDArray[np.bool_]
 ATTRIBUTES = (
     *("stream_spec", "gripper_actions", "controller", "dt", "holding", "keeps_holding"),
-    *("felt_channels", "contact_limits", "observation_layout", "laid_out_space"),
+    *("felt_channels", "contact_limits", "observation_layout", "laid_out_space", "hand_chains"),
 )
 """What monitors and reflexes ask an environment for."""
 

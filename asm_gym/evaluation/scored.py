@@ -205,7 +205,7 @@ def window_steps(window_s: float, dt: float) -> int:
     return max(1, math.floor(window_s / dt + 1e-6))  # 0.3 / 0.1 is a hair below 3
 
 
-class Moment(NamedTuple):
+class AlarmMoment(NamedTuple):
     """An alarm, and how it began.
 
     Attributes:
@@ -222,12 +222,14 @@ class Moment(NamedTuple):
     excess: float
 
 
-def moments_of(trace: ScoredEpisode) -> list[Moment]:
+def moments_of(trace: ScoredEpisode) -> list[AlarmMoment]:
     """The alarms of an episode, in order. Raises ValueError where the trace has no detail."""
     if trace.detail is None:
         raise ValueError("this trace was kept without the detail that says which channel surprised")
     found = []
     for start, stop in spans(trace.alarm):
         channel = int(np.argmax(trace.detail.attribution[start]))
-        found.append(Moment(trace, start, stop, channel, float(trace.surprise[start:stop].max() / trace.threshold)))
+        found.append(
+            AlarmMoment(trace, start, stop, channel, float(trace.surprise[start:stop].max() / trace.threshold))
+        )
     return found

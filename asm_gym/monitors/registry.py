@@ -220,7 +220,11 @@ def monitor_class(name: str) -> MonitorKind:
 
 @typed
 def make_monitor(
-    name: str, spec: StreamSpec, detection: str | Detection | None = None, **hyperparameters: Any
+    name: str,
+    spec: StreamSpec,
+    detection: str | Detection | None = None,
+    device: str = "cpu",
+    **hyperparameters: Any,
 ) -> CalibratedMonitor:
     """A monitor by name, not yet fitted.
 
@@ -228,10 +232,12 @@ def make_monitor(
         name: for example ``neural_asm``, or ``gru+evidence``, which is ``gru`` with the detection ``evidence``.
         spec: the stream it is to watch.
         detection: what judges the model's errors, by name or one's own; where None, what the name says.
+        device: where it learns and predicts, as in ``cuda``, if its model is a PyTorch network.
         **hyperparameters: of that monitor.
 
     Raises:
-        ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists.
+        ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists;
+            or the device cannot be used, or not by this monitor.
 
     Example:
         >>> import numpy as np
@@ -246,13 +252,13 @@ def make_monitor(
     kind = monitor_class(name if not isinstance(detection, str) else f"{model_of(name)}+{detection}")
     for parameter in hyperparameters:
         check_choice(f"hyperparameter of {name}", parameter, kind.hyperparameters)
-    made = kind(spec, **hyperparameters)
+    made = _placed(kind(spec, **hyperparameters), device)
     return made if detection is None or isinstance(detection, str) else made.with_detection(detection)
 
 
 @typed
-def load_monitor(path: str | Path) -> CalibratedMonitor:
-    """Reads what any monitor has saved, with the detection that it had.
+def load_monitor(path: str | Path, device: str = "cpu") -> CalibratedMonitor:
+    """Reads what any monitor has saved, with the detection that it had, to predict on a device as in ``make_monitor``.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -260,4 +266,13 @@ def load_monitor(path: str | Path) -> CalibratedMonitor:
     """
     kind = monitor_class(kind_of(path))
     saved = read_checkpoint(path, kind.model_class.kind)
-    return restored(path, saved, kind.under(saved.header.get("detection", kind.detection)))
+    return _placed(restored(path, saved, kind.under(saved.header.get("detection", kind.detection))), device)
+
+
+def _placed(monitor: CalibratedMonitor, device: str) -> CalibratedMonitor:
+    """The same, its model on the device."""
+    if device != "cpu":
+        if not hasattr(monitor.model, "to"):
+            raise ValueError(f"{monitor.model.kind} runs on a CPU alone, got device {device!r}")
+        monitor.model.to(device)
+    return monitor

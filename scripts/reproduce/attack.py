@@ -1,6 +1,7 @@
-"""What who writes to the senses can hide from the memory: slow drifts, a replayed recording, senses that say the mean.
+"""What who writes to the senses can hide: slow drifts, a replayed recording, senses that say the mean.
 
-The robot itself is healthy, and the guard only watches. From a step on, what reaches the memory is another's.
+The robot itself is healthy, and the guard only watches. From a step on, what reaches it is another's; after a knock,
+which excuses surprise for a second, too.
 """
 
 from __future__ import annotations
@@ -11,11 +12,10 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.evaluation.tables import Column, tabulate
+from asm_gym.evaluation.tables import Column, Table, tabulate
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy, rollout
 from asm_gym.rollouts.staging import environment
@@ -45,14 +45,17 @@ class Config(kit.Config):
     """Episodes of each attack."""
     rates: tuple[float, ...] = option((0.005, 0.02, 0.1), quick=(0.1,), least=1, metavar="RAD/S")
     """How fast encoders drift."""
+    after_knock: tuple[float, ...] = option((0.1, 1.0), quick=(1.0,), least=1, metavar="RAD/S")
+    """How fast they do after a knock."""
 
 
 class Attack(NamedTuple):
-    """One attack: on a joint at a rate [rad/s], or on all senses."""
+    """One attack: on a joint at a rate [rad/s], or on all senses; the wrist says of its first row that it was hit."""
 
     what: str
     joint: int = -1
     rate: float = 0.0
+    knock: bool = False
 
 
 class Forging(gym.Wrapper[Any, Any, Any, Any]):
@@ -77,18 +80,21 @@ class Forging(gym.Wrapper[Any, Any, Any, Any]):
 ONSET = 20
 """Row from which on somebody else speaks."""
 
-DIFFERS = 2.0
-"""Hand and joints contradict each other where they are so many times as far apart as they ever were before."""
+BLOW = 60.0
+"""Of a knock that is only said [N]."""
 
 
 def forging(attack: Attack, spec: StreamSpec, recorded: NDArray[np.float32]) -> Forged:
     """What an attack makes of rows; ``recorded`` (T, D) is another healthy episode of the same task."""
     position, velocity = (spec.slices[name].start for name in ("joint_position", "joint_velocity"))
     senses = spec.sensory
+    wrist = [spec.slices[name].start for name in ("wrist_force", "wrist_force_peak")]
 
     def drift(row: NDArray[np.float32], t: int) -> NDArray[np.float32]:
         row[position + attack.joint] += attack.rate * spec.dt * t
         row[velocity + attack.joint] += attack.rate * (attack.what == BOTH)
+        if attack.knock and t == 1:
+            row[wrist] = BLOW
         return row
 
     def replay(row: NDArray[np.float32], t: int) -> NDArray[np.float32]:
@@ -107,79 +113,77 @@ def attacked(job: tuple[Attack, int], config: Config) -> kit.Record:
     attack, seed = job
     memory = NeuralASM.load(config.memory) if config.memory.endswith(".asm") else NeuralASM.pretrained(config.memory)
     env = environment(env_id(config.task))
-    recorder = StreamRecorder(env)
-    rollout(recorder, make_policy("scripted", env, seed=seed + 500), seed + 500)
-    forged = forging(attack, memory.spec, recorder.finish().stream)
+    recorded = np.zeros((1, memory.spec.size), np.float32)
+    if attack.joint < 0:
+        recorder = StreamRecorder(env)
+        rollout(recorder, make_policy("scripted", env, seed=seed + 500), seed + 500)
+        recorded = recorder.finish().stream
+    forged = forging(attack, memory.spec, recorded)
     watched = NeuralASMSafety(Forging(env, forged, ONSET), memory, "monitor", on_overrun="ignore")
     infos: list[dict[str, Any]] = []
     rollout(watched, make_policy("scripted", env, seed=seed), seed, infos.append)
-    apart = hand_off(env.unwrapped, memory.spec, np.stack([info["stream"] for info in infos]))
-    differs = np.flatnonzero(apart[ONSET:] > DIFFERS * apart[:ONSET].max())
-    alarm = next((t for t, i in enumerate(infos) if t >= ONSET and i["asm"]["reason"] == "surprise"), None)
-    took = (len(infos) if alarm is None else alarm + 1) - ONSET
+    said = [info["asm"] for info in infos[ONSET:]]
+    by_memory = next((t for t, asm in enumerate(said) if asm["surprise"] > asm["threshold"]), None)
+    by_guard = next((t for t, asm in enumerate(said) if asm["event"] == "fault"), None)
+    rows = {"memory": by_memory, "guard": by_guard}
+    took = {who: len(said) if t is None else t + 1 for who, t in rows.items()}
+    named = by_guard is not None and said[by_guard]["cause"]["part"] == f"encoder[{attack.joint}]"
     return {
         **attack._asdict(),
         "seed": seed,
-        "found": alarm is not None,
-        "seconds": took * memory.spec.dt,
-        "drift": attack.rate * took * memory.spec.dt,
-        "differs": attack.rate * (differs[0] + 1) * memory.spec.dt if differs.size else np.nan,
+        "named": named,
+        **{f"found_by_{who}": t is not None for who, t in rows.items()},
+        **{f"seconds_{who}": took[who] * memory.spec.dt for who in rows},
+        **{f"drift_{who}": attack.rate * took[who] * memory.spec.dt for who in rows},
     }
-
-
-def hand_off(arm: Any, spec: StreamSpec, rows: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(T,) how far the hand's place in ``rows`` (T, D) is from where the joints' angles in them put it [m]."""
-    robot, model = arm.robosuite_env.robots[0], arm.simulation.model
-    data, found = mujoco.MjData(model), np.zeros(len(rows))
-    data.qpos[:] = arm.simulation.data.qpos
-    for t, row in enumerate(rows):
-        data.qpos[robot._ref_joint_pos_indexes] = row[spec.slices["joint_position"]]
-        mujoco.mj_kinematics(model, data)
-        place = data.site_xpos[robot.eef_site_id["right"]]
-        found[t] = np.linalg.norm(row[spec.slices["hand_position"]] - place)
-    return found
 
 
 def run(config: Config) -> kit.Findings:
     """Every attack on its own episodes."""
-    joints = range(7)
-    attacks = [Attack(how, j, rate) for how in (POSITION, BOTH) for rate in config.rates for j in joints]
+    joints, hows = range(7), (POSITION, BOTH)
+    attacks = [Attack(how, j, rate) for how in hows for rate in config.rates for j in joints]
+    attacks += [Attack(how, j, rate, True) for how in hows for rate in config.after_knock for j in joints]
     attacks += [Attack("replay"), Attack("means")]
     jobs = [
         (a, 2000 + 100 * again + n) for again in config.repetitions for a in attacks for n in range(config.episodes)
     ]
     records = kit.each("episodes", partial(attacked, config=config), jobs, config)
 
-    def cell(how: str, rate: float, joint: int) -> str:
-        own = [r for r in records if (r["what"], r["rate"], r["joint"]) == (how, rate, joint)]
-        found = [r["drift"] for r in own if r["found"]]
-        most = max(r["drift"] for r in own)
+    def of(**which: Any) -> list[kit.Record]:
+        return [r for r in records if all(r[name] == value for name, value in which.items())]
+
+    def cell(who: str, how: str, rate: float, knock: bool, joint: int) -> str:
+        own = of(what=how, rate=rate, joint=joint, knock=knock)
+        found = [r[f"drift_{who}"] for r in own if r[f"found_by_{who}"]]
+        most = max(r[f"drift_{who}"] for r in own)
         return f"never ({most:.2f})" if not found else f"{np.median(found):.3f} ({len(found)} of {len(own)})"
 
-    columns: list[Column[int]] = [Column("joint", str)]
-    columns += [
-        Column(f"{how}, {rate:g} rad/s", partial(cell, how, rate)) for how in (POSITION, BOTH) for rate in config.rates
-    ]
-    drifts = tabulate(
-        "Drift that is reached before the first alarm [rad]; where there is none, by the end", columns, joints
-    )
+    def drifts(caption: str, who: str, rates: tuple[float, ...], knock: bool = False) -> Table:
+        columns: list[Column[int]] = [Column("joint", str)]
+        columns += [
+            Column(f"{how}, {rate:g} rad/s", partial(cell, who, how, rate, knock)) for how in hows for rate in rates
+        ]
+        if who == "guard":
+            columns.append(Column("named", partial(named, knock)))
+        return tabulate(caption, columns, joints)
 
-    def against(rate: float, joint: int) -> str:
-        own = [r["differs"] for r in records if (r["what"], r["rate"], r["joint"]) == (POSITION, rate, joint)]
-        return "never" if np.isnan(own).any() else f"{np.median(own):.3f}"
+    def named(knock: bool, joint: int) -> str:
+        own = of(joint=joint, knock=knock, found_by_guard=True)
+        return f"{sum(r['named'] for r in own)} of {len(own)}"
 
-    columns = [Column("joint", str), *(Column(f"{rate:g} rad/s", partial(against, rate)) for rate in config.rates)]
-    kinematic = tabulate(
-        "Drift at which the hand's place, if it is not computed from the encoders, contradicts them [rad]",
-        columns,
-        joints,
-    )
-
-    def whole(what: str) -> str:
-        own = [r for r in records if r["what"] == what]
-        found = [r["seconds"] for r in own if r["found"]]
+    def whole(who: str, what: str) -> str:
+        own = of(what=what)
+        found = [r[f"seconds_{who}"] for r in own if r[f"found_by_{who}"]]
         return f"{len(found)} of {len(own)}" + (f", after {np.median(found):.2f} s" if found else "")
 
-    others: list[Column[str]] = [Column("all senses replaced by", str), Column("found", whole)]
-    names = tabulate("Whole senses", others, ("replay", "means"))
-    return kit.Findings(records, [drifts, kinematic, names])
+    replaced: list[Column[str]] = [Column("all senses replaced by", str)]
+    replaced += [Column(f"found by the {who}", partial(whole, who)) for who in ("memory", "guard")]
+    before = "Drift that is reached before the first fault [rad]; where there is none, by the end: "
+    tables = [
+        drifts(f"{before}the memory alone", "memory", config.rates),
+        drifts(f"{before}the guard, which holds the hand against the joints", "guard", config.rates),
+        drifts(f"{before}the memory alone, after a knock", "memory", config.after_knock, True),
+        drifts(f"{before}the guard, after a knock", "guard", config.after_knock, True),
+        tabulate("Whole senses", replaced, ("replay", "means")),
+    ]
+    return kit.Findings(records, tables)

@@ -6,6 +6,7 @@ sensor of the guard reads. Pairs share their seed: the same scene, policy, and f
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,13 +21,14 @@ from numpy.typing import NDArray
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.envs.backend import PHYSICS_FREQ
 from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE
+from asm_gym.files import written_whole
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
 from asm_gym.policies.hostile import HOSTILE
 from asm_gym.rollouts.staging import environment, policy_for, staged
 from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.scripts.options import fixed, option
-from asm_gym.scripts.reproduce import harm_agents, harm_braking, harm_report, kit
+from asm_gym.scripts.reproduce import harm_agents, harm_braking, harm_report, harm_speeds, kit
 from asm_gym.scripts.reproduce.harm_agents import EXCESS, HITTERS, LEARNERS
 from asm_gym.spec import control_period
 from asm_gym.tasks import env_id
@@ -66,6 +68,8 @@ HEALTHY = {
 FAULTS = ("frozen_encoder", "encoder_bias", "encoder_dropout", "weak_joint", "passing_push")
 """Kinds under which the healthy policies act too; of the suite, but for the last."""
 
+HEALTHY_TASKS = tuple(dict.fromkeys(task for task, _ in HEALTHY.values()))
+
 AGAINST = "hostile", "untrained", "taught", "elsewhere"
 
 ELSEWHERE = ("Sawyer", 20), ("IIWA", 20), ("Panda", 100)
@@ -84,8 +88,12 @@ class Config(kit.Config):
     """Which; elsewhere are hostile ones with the Sawyer, the IIWA, and at 100 Hz."""
     healthy: int = option(40, quick=1, least=0)
     """Episodes of each healthy policy."""
+    healthy_in: tuple[str, ...] = option(HEALTHY_TASKS, known=HEALTHY_TASKS, metavar="TASK")
+    """Where these act."""
     faulty: int = option(0, least=0)
     """Episodes of each healthy policy of Lift and Stack under each kind of fault."""
+    speeds: int = option(0, least=0)
+    """Episodes of healthy policies by which speed limits by place, direction and load are compared."""
     guards: tuple[str, ...] = option(
         (POLICY_ALONE, "default", "hold", "terminate"), known=tuple(GUARDS), metavar="NAME"
     )
@@ -94,6 +102,8 @@ class Config(kit.Config):
     """Where these act."""
     training: int = fixed(2000, quick=500, least=4)
     """Steps for which those are trained that learn, to hit and to their task; a quarter of them too."""
+    resume: bool = False
+    """Goes on where a run into the same folder, of the same code and options, was interrupted."""
 
 
 class Cell(NamedTuple):
@@ -121,7 +131,7 @@ def cells(config: Config) -> list[tuple[Cell, int]]:
         for task, name, steps in product(tasks, LEARNERS, (n // 4, n))
     ]
     elsewhere = [cell._replace(robot=robot, rate=rate) for (robot, rate), cell in product(ELSEWHERE, hostile)]
-    healthy = [Cell("healthy", task, policy) for task, policy in HEALTHY.values()]
+    healthy = [Cell("healthy", task, policy) for task, policy in HEALTHY.values() if task in config.healthy_in]
     faulty = [
         cell._replace(kind="faulty", fault=fault)
         for cell, fault in product(healthy, FAULTS)
@@ -150,11 +160,23 @@ def policy_of(cell: Cell, env: gym.Env[Any, Any], seed: int, config: Config) -> 
     return policy_for(cell.policy, env, seed)
 
 
+def chosen(name: str, env: gym.Env[Any, Any], seed: int) -> Policy:
+    """A hostile policy at full speed, or a healthy one."""
+    return HOSTILE[name](env, seed, 1.0) if name in HOSTILE else policy_for(name, env, seed)
+
+
 def measured(job: tuple[Cell, int], config: Config) -> list[kit.Record]:
-    """One scene under every guard."""
+    """One scene under every guard; kept, for a run that goes on."""
     cell, seed = job
+    kept = config.out / "harm_scenes" / f"{'-'.join(map(str, cell))}-{seed}.json".replace(" ", "_")
+    if config.resume and kept.is_file():
+        found: list[kit.Record] = json.loads(kept.read_text(encoding="utf-8"))
+        return found
     memory = NeuralASM.pretrained(cell.robot.lower() + ("" if cell.rate == 20 else f"_{cell.rate}hz"))
-    return [one(cell, seed, name, memory, config) for name in config.guards]
+    records = [one(cell, seed, name, memory, config) for name in config.guards]
+    with written_whole(kept) as file:
+        file.write(json.dumps(records).encode())
+    return records
 
 
 class Felt:
@@ -254,14 +276,11 @@ def hand_speed(arm: Any, infos: Sequence[dict[str, Any]], step: int) -> float:
 
 def run(config: Config) -> kit.Findings:
     """Every cell on its own scenes, under every guard."""
-    chosen = cells(config)
-    taught = [cell for cell, _ in chosen if cell.steps]
+    asked = cells(config)
+    taught = [cell for cell, _ in asked if cell.steps]
     kit.each("training", partial(file_of, config=config), taught, config)
     jobs = [
-        (cell, 10_000 * again + 1000 + n)
-        for again in config.repetitions
-        for cell, count in chosen
-        for n in range(count)
+        (cell, 10_000 * again + 1000 + n) for again in config.repetitions for cell, count in asked for n in range(count)
     ]
     records = kit.together(kit.each("episodes", partial(measured, config=config), jobs, config))
     guards = config.guards
@@ -272,9 +291,12 @@ def run(config: Config) -> kit.Findings:
         harm_report.harm_table(records, guards),
         harm_report.blows_table(records, [g for g in guards if g in (POLICY_ALONE, "default")]),
     ]
-    asked = {r["kind"] for r in records}
     if "elsewhere" in config.against:
         held = kit.together(kit.each("braking", harm_braking.braking, harm_braking.ROBOTS, config))
         tables.append(harm_braking.braking_table(held))
-    tables += [harm_report.kept_table(records, guards, kind) for kind in ("healthy", "faulty") if kind in asked]
+    if config.speeds:
+        by_task = [(t, tuple(p for own, p in HEALTHY.values() if own == t)) for t in config.tasks]
+        compare = partial(harm_speeds.speeds, episodes=config.speeds, make=chosen)
+        tables.append(harm_speeds.speeds_table(kit.together(kit.each("speeds", compare, by_task, config))))
+    tables += [harm_report.kept_table(records, guards, kind) for kind in ("healthy", "faulty")]
     return kit.Findings(records, [table for table in tables if table.rows], harm_report.frontier(records, guards))

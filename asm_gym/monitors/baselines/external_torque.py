@@ -127,13 +127,13 @@ class NEXT(TorchModel):
     def start(self, batch: int, told: Sequence[Told] = ()) -> _Memory:
         return _Memory(np.zeros((batch, 2, LAYERS, self.hidden_size), np.float32))
 
-    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
+    def advance(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
         assert isinstance(self.module_, _Module)
         r = self.senses_.read(rows, rows, rows)
-        before = torch.from_numpy(np.ascontiguousarray(state.hidden.transpose(1, 2, 0, 3)))
-        torques, hidden, cell = self.module_(torch.from_numpy(self._inputs(r))[:, None], (before[0], before[1]))
-        error = r.whole * (r.senses[:, self._judged] - torques.numpy()[:, 0]) / self.module_.usual.numpy()  # type: ignore[operator]
-        now = torch.stack([hidden, cell]).numpy().transpose(2, 0, 1, 3)
+        before = torch.as_tensor(np.ascontiguousarray(state.hidden.transpose(1, 2, 0, 3)))
+        torques, hidden, cell = self.module_(torch.as_tensor(self._inputs(r))[:, None], (before[0], before[1]))
+        error = r.whole * (r.senses[:, self._judged] - torques.cpu().numpy()[:, 0]) / self.module_.usual.cpu().numpy()  # type: ignore[operator]
+        now = torch.stack([hidden, cell]).cpu().numpy().transpose(2, 0, 1, 3)
         return _Memory(now), ModelOutput(error, np.ascontiguousarray(now[:, 0, -1]))
 
     def _inputs(self, reading: ScaledRows) -> NDArray[np.float32]:

@@ -104,14 +104,15 @@ class GRU(TorchModel):
         last = self.sensed(self.senses_.read(rows, rows, rows))
         return _Memory(hidden, last, rows, np.zeros(batch, np.int64))
 
-    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
+    def advance(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
         before = np.where(state.steps[:, None] > 0, state.before, rows)
         r = self.senses_.read(rows, before, before)
         sensed = self.sensed(r)
         last = np.where(state.steps[:, None] > 0, state.last, sensed)
-        inputs = torch.from_numpy(np.hstack([last, r.commands]))[:, None]
+        inputs = torch.as_tensor(np.hstack([last, r.commands]))[:, None]
         mean, log_variance, hidden = (
-            y.numpy()[:, 0] for y in self.module_(inputs, torch.from_numpy(np.ascontiguousarray(state.hidden))[None])
+            y.cpu().numpy()[:, 0]
+            for y in self.module_(inputs, torch.as_tensor(np.ascontiguousarray(state.hidden))[None])
         )
         error = r.whole * (self.judged(r) - mean) * np.exp(-0.5 * log_variance)
         return _Memory(hidden, sensed, rows, state.steps + 1), ModelOutput(error, hidden)
