@@ -11,6 +11,7 @@ from asm_gym.monitors import MONITORS, make_monitor, monitor_class
 from asm_gym.monitors.estimators import adapted
 from asm_gym.rollouts import parallel_map
 from tests.streams import sine_episodes
+from tests.test_composition import Persistence
 
 NAME = "sklearn.ensemble:IsolationForest"
 
@@ -24,6 +25,16 @@ class Wordy(IsolationForest):
 
     def score_samples(self, X):
         return np.zeros((len(X), 2))
+
+
+class Lopsided(Persistence):
+    """Forgets a sense."""
+
+    kind = "lopsided"
+
+    def predict(self, state, rows):
+        state, output = super().predict(state, rows)
+        return state, output._replace(errors=output.errors[:, 1:])
 
 
 @pytest.fixture(autouse=True)
@@ -66,6 +77,11 @@ def test_what_is_no_model_is_refused_in_a_line():
         monitor_class("tests.test_estimators:Mute")
     with pytest.raises(ValueError, match=r"score_samples of Wordy must give \(\d+,\).*got \(\d+, 2\)"):
         judged("tests.test_estimators:Wordy")
+
+
+def test_errors_of_another_shape_are_refused_in_a_line():
+    with pytest.raises(ValueError, match=r"predict of lopsided must give errors \(\d+, 12\), got \(\d+, 11\)"):
+        judged("tests.test_estimators:Lopsided")
 
 
 def test_its_score_is_of_rows_that_were_not_learned():

@@ -114,9 +114,16 @@ def running(episode: Episode) -> NDArray[np.str_]:
 
 
 def model_outputs(model: Model, episodes: Sequence[Episode]) -> list[ModelOutput]:
-    """What a model says of each episode: errors (T, X) and contexts (T, C)."""
+    """What a model says of each episode: errors (T, X) and contexts (T, C).
+
+    Raises:
+        ValueError: errors of another shape.
+    """
     outputs: dict[int, ModelOutput] = {}
     for group, steps in side_by_side(episodes, model.start, model.predict):
+        wanted = len(group), len(model.error_columns)
+        if np.shape(steps[0].errors) != wanted:
+            raise ValueError(f"predict of {model.kind} must give errors {wanted}, got {np.shape(steps[0].errors)}")
         for n, i in enumerate(group):
             mine = steps[: len(episodes[i])]
             outputs[i] = ModelOutput(np.array([s.errors[n] for s in mine]), np.array([s.contexts[n] for s in mine]))

@@ -61,7 +61,7 @@ def run(config: Config) -> Findings:
     anew = {r: memory.threshold_at(false_alarms_per_hour=r) for r in PROMISES if r * hours >= 1.0}
     settings = [shipped, Setting(f"from {hours:.1f} hours of {len(healthy)} episodes", anew)]
     marks = examined(corpus, memory, known)
-    return Findings(records(marks, settings), [kept(marks, settings), each(marks, settings[-1])])
+    return Findings(records(marks, settings), [kept(marks, settings), *(each(marks, setting) for setting in settings)])
 
 
 def examined(corpus: Corpus, memory: NeuralASM, known: Sequence[str]) -> list[Marks]:
@@ -73,7 +73,7 @@ def examined(corpus: Corpus, memory: NeuralASM, known: Sequence[str]) -> list[Ma
             tell(n, len(places))
             if policy == EXPERT and task in known:
                 continue
-            own = list(corpus.episodes("nominal", "faulty", policies=(policy,), tasks=(task,)))
+            own = list(corpus.episodes(policies=(policy,), tasks=(task,)))
             usual = usual_force(list(corpus.episodes("nominal", policies=(EXPERT,), tasks=(task,))[:100]))
             marks.append(examine(memory, Exam(task, policy, known=False).name, own, WINDOW_S, usual))
     return marks
