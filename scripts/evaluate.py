@@ -25,6 +25,7 @@ from asm_gym.episode import EpisodeLabel
 from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_S
 from asm_gym.evaluation.report import publish
+from asm_gym.evaluation.standing import coverage_table, kept_table
 from asm_gym.evaluation.tables import brief_monitors_table, console_table, harmless_table, kinds_table
 from asm_gym.faults import anywhere
 from asm_gym.faults.interface import FaultyInterface
@@ -32,6 +33,7 @@ from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of, possible
 from asm_gym.monitors import MONITORS, PARTS, make_monitor, monitor_class
 from asm_gym.monitors.registry import check_monitor, model_of
 from asm_gym.policies import make_policy
+from asm_gym.rollouts.corpus import SKILLS, VERSION, Corpus
 from asm_gym.rollouts.parallel import ParallelConfig, Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.record import record
@@ -109,6 +111,8 @@ class Args:
     """Folder of the run."""
     quick: bool = False
     """To see that everything runs, not to judge the figures."""
+    corpus: Path | None = option(None, metavar="FOLDER")
+    """Judges by what asm-gym corpus has recorded there, all of its skills, faults and splits; nothing is recorded."""
     window: float = fixed(WINDOW_S, check=partial(check_number, "window", above=0))
     """How soon after its onset a fault must be noticed [s]."""
 
@@ -217,7 +221,16 @@ def able(args: Args, console: Console) -> Args:
 
 
 def labels(args: Args) -> list[EpisodeLabel]:
-    """Every episode of the run, task by task. Raises ValueError or OSError where the policy cannot act in one."""
+    """Every episode of the run, task by task.
+
+    Raises:
+        ValueError, OSError: the policy cannot act in one; or the corpus is damaged, of another version or cut off.
+    """
+    if args.corpus is not None:
+        skills = Corpus.open(args.corpus).episodes(policies=("scripted",), tasks=SKILLS)
+        skills.check()
+        kinds = [(kind, severity) for kind in ("", *KINDS) for severity in ("", *SEVERITIES)]
+        return sorted((e.label for e in skills.entries), key=lambda label: kinds.index((label.kind, label.severity)))
     made: list[EpisodeLabel] = []
     for task in args.tasks:
         env = gym.make(env_id(task), **dict(args.config.settings))
@@ -259,18 +272,21 @@ def evaluate(args: Args, console: Console) -> BenchmarkResult:
     seconds: dict[str, float] = {}
     with stage("listing episodes", console, seconds):
         wanted = labels(args)
-    with claimed(
-        args.out, "recordings.json", {name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")}
-    ):
-        with stage("recording", console, seconds) as progress:
-            make = partial(record, config=args.config, folder=args.out.resolve())
-            make_missing(make, wanted, lambda label: args.out / label.path, args.parallel, progress)
+    claim = {name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")}
+    claim |= {} if args.corpus is None else {"corpus": VERSION}
+    with claimed(args.out, "recordings.json", claim):
+        if args.corpus is None:
+            with stage("recording", console, seconds) as progress:
+                make = partial(record, config=args.config, folder=args.out.resolve())
+                make_missing(make, wanted, lambda label: args.out / label.path, args.parallel, progress)
         with stage("fitting and judging", console, seconds) as progress:
             how = args.false_alarm_rate, args.window, args.seed, args.parallel
-            result = benchmark(args.out, wanted, args.monitors, *how, progress, args.hyperparameters)
+            recorded = None if args.corpus is None else args.corpus / "scripted"
+            result = benchmark(args.out, wanted, args.monitors, *how, progress, args.hyperparameters, recorded)
         video = None
         if (
             args.video
+            and args.corpus is None
             and not args.elsewhere
             and result.monitors[args.monitors[0]].examples
             and can_record_video(console)
@@ -287,8 +303,9 @@ def evaluate(args: Args, console: Console) -> BenchmarkResult:
 def evaluate_and_report(args: Args, console: Console) -> None:
     """Evaluates, and prints the tables in brief."""
     result = evaluate(args, console)
-    details = kinds_table(result) if args.elsewhere else harmless_table(result, args.monitors[:1])
-    for table in (brief_monitors_table(result), details):
+    harmless = any(monitor.harmless for monitor in result.monitors.values())
+    details = [harmless_table(result, args.monitors[:1])] if harmless else [kept_table(result), coverage_table(result)]
+    for table in (brief_monitors_table(result), *(details if not args.elsewhere else [kinds_table(result)])):
         console.print(console_table(table))
     console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.parquet'}")
 

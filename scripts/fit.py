@@ -20,7 +20,7 @@ from rich.console import Console
 from asm_gym.data.commands import feedback
 from asm_gym.data.gaps import filled
 from asm_gym.data.live import is_live, lines_from
-from asm_gym.data.logs import Layout, read_logs
+from asm_gym.data.logs import LogLayout, read_logs
 from asm_gym.data.notes import noted
 from asm_gym.data.selection import (
     SHORTEST_S,
@@ -90,8 +90,6 @@ class Args:
     """Gaps up to so long are filled, on the line between their ends, such as 0.05; a log is cut at others."""
     split: float | None = option(None, check=partial(check_number, "split", above=0), metavar="SECONDS")
     """Length of the pieces that long logs are cut into; each then counts as an episode."""
-    keep_failures: bool = False
-    """Learn from episodes that did not succeed, too."""
     minutes: float = option(10.0, check=partial(check_number, "minutes", above=0))
     """For how long a live source is recorded at most; it ends sooner once enough was heard."""
     seed: int = option(0, least=0)
@@ -240,10 +238,12 @@ def fit(args: Args, console: Console) -> None:
         args = recorded(args, partial(console.print, soft_wrap=True, highlight=False, markup=False))
     start = time.perf_counter()
     with stage("reading", console, {}) as progress:
-        layout = Layout(None, args.rate, args.action, args.channels, args.label, args.columns, args.join, by_name=True)
+        layout = LogLayout(
+            None, args.rate, args.action, args.channels, args.label, args.columns, args.join, by_name=True
+        )
         with noted() as notes:
             logs = read_logs(args.data, layout)
-            kept = normal_episodes(logs if args.split is None else unmarked(logs), args.keep_failures, progress)
+            kept = normal_episodes(logs if args.split is None else unmarked(logs), progress=progress)
     gone = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
     if not kept.episodes:
         hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""

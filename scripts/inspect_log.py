@@ -16,7 +16,7 @@ from pathlib import Path
 from rich.console import Console
 
 from asm_gym.data.inspection import ChannelFound, Inspection, in_time, inspected
-from asm_gym.data.logs import Layout, read_tables
+from asm_gym.data.logs import LogLayout, read_tables
 from asm_gym.data.notes import noted
 from asm_gym.evaluation import figures
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
@@ -54,7 +54,7 @@ class Args:
 def inspect(args: Args, console: Console) -> int:
     """Reads, prints a table a log, and draws a picture of each."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-    layout = Layout(None, args.rate, args.action, (), args.label, args.columns, args.join)
+    layout = LogLayout(None, args.rate, args.action, (), args.label, args.columns, args.join)
     code = DONE
     with noted() as notes:
         shown = [

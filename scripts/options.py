@@ -132,7 +132,7 @@ def shortened(options: Any) -> str:
     return f"--quick: {', '.join(changed)}" if changed else ""
 
 
-class Row(NamedTuple):
+class OptionRow(NamedTuple):
     """An option in the help."""
 
     name: str  # as typed
@@ -141,13 +141,13 @@ class Row(NamedTuple):
     required: bool
 
 
-def rows(kind: type[Any]) -> Iterator[Row]:
+def rows(kind: type[Any]) -> Iterator[OptionRow]:
     """The options of a command, those that are given without a name first."""
     found = list(_rows(kind))
     yield from sorted(found, key=lambda row: not row.positional)
 
 
-def _rows(kind: Any) -> Iterator[Row]:
+def _rows(kind: Any) -> Iterator[OptionRow]:
     hints, said = get_type_hints(kind, include_extras=True), docstrings(kind)
     for each in fields(kind):
         about = each.metadata
@@ -165,7 +165,7 @@ def _rows(kind: Any) -> Iterator[Row]:
         positional = bool(about.get("positional")) or any("POSITIONAL" in str(e).upper() for e in extras)
         required = each.default is MISSING and each.default_factory is MISSING
         told = _said(each, kind, said.get(each.name, ""))
-        yield Row(_typed(each, hint, metavar, positional), told, positional, required)
+        yield OptionRow(_typed(each, hint, metavar, positional), told, positional, required)
 
 
 def _typed(each: Field[Any], hint: Any, metavar: str, positional: bool) -> str:

@@ -21,7 +21,7 @@ from typing import Any
 from rich.console import Console
 
 from asm_gym.data.live import RETURNING, is_live, lines_from
-from asm_gym.data.logs import Layout, Log, read_logs
+from asm_gym.data.logs import Log, LogLayout, read_logs
 from asm_gym.data.notes import noted
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, traces_of
 from asm_gym.evaluation.scored import ScoredEpisode, moments_of
@@ -88,7 +88,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     alarms: list[Alarm] = []
     worst: list[ScoredEpisode] = []
     episodes = 0
-    layout = Layout(monitor.spec, args.rate, columns=args.columns, join=args.join)
+    layout = LogLayout(monitor.spec, args.rate, columns=args.columns, join=args.join)
     with stage("watching", console, {}) as progress, noted() as notes:
         for group in in_groups(read_logs(args.source, layout), AT_ONCE):
             traces = traces_of(group, monitor, args.bridge)

@@ -1,5 +1,6 @@
 """Every monitor keeps one contract, and each baseline does what its source says."""
 
+import copy
 from functools import cache
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from asm_gym.checkpoint import read_checkpoint
 from asm_gym.episode import Episode
 from asm_gym.monitors import MONITORS, load_monitor, make_monitor, monitor_class
-from asm_gym.monitors.baselines import association_mlp, gru, lstm_vae
+from asm_gym.monitors.baselines import association_mlp, external_torque, gru, lstm_vae
 from asm_gym.monitors.saved import restored
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.needs import needs
@@ -18,6 +19,8 @@ SPEC = StreamSpec(
     (
         Channel("external_torque_peak", 3, "N m", 0.1, "torque"),
         Channel("wrist_force_peak", 3, "N", 0.2, "wrench"),
+        *(Channel(f"joint_{name}", 2, "rad", 0.02, "joint") for name in ("position", "velocity")),
+        Channel("measured_torque", 2, "N m", 0.02, "torque"),
         Channel("command", 2, group=MOTOR),
     ),
     0.05,
@@ -38,6 +41,7 @@ def fitted(model):
             (association_mlp, "UPDATES", 300),
             (gru, "EPOCHS", 100),
             (lstm_vae, "EPOCHS", 100),
+            (external_torque, "EPOCHS", 30),
         ):
             less.setattr(module, how_much, count)
         return make_monitor(model, SPEC, **few.get(model, {}), seed=1).fit(episodes(20))
@@ -113,7 +117,7 @@ def test_limits_are_what_they_say():
     force = make_monitor("force_limit", SPEC).fit(episodes(5))
     torque = make_monitor("external_torque_limit", SPEC).fit(episodes(5))
     rows = np.concatenate([e.stream for e in episodes(5)]).astype(float)
-    row = np.arange(8.0)[None]
+    row = np.arange(float(SPEC.size))[None]
     weight, mean, spread = rows[:, 3:6].mean(axis=0), rows[:, :3].mean(axis=0), rows[:, :3].std(axis=0)
     assert force.observe(force.initial_state(), row)[1].value[0] == pytest.approx(((row[0, 3:6] - weight) ** 2).sum())
     expected = np.abs(row[0, :3] - mean) / spread
@@ -220,3 +224,27 @@ def test_boosted_trees_say_what_scikit_learn_says_of_them():
     fresh = rng.normal(size=(100, 5))
     expected = np.stack([trees.predict(fresh[:, own]) for trees, own in zip(boosted, seen, strict=True)], axis=1)
     np.testing.assert_allclose(_said(fresh, **forest.arrays), expected, atol=1e-12)
+
+
+TORCH = ["gru", "lstm_vae", "association_mlp", "logpzo", "rnd", "rapt"]  # and ``next``, of other streams
+
+
+@pytest.mark.parametrize("name", TORCH)
+def test_all_that_a_network_computes_with_is_on_its_device(name):
+    pytest.importorskip("torch")
+    model = copy.copy(fitted(name).model)
+    model.module_ = copy.deepcopy(model.module_)
+    assert model.to("meta") is model  # which has no numbers, and refuses tensors of any other device
+    with pytest.raises(NotImplementedError, match="Cannot copy out of meta tensor"):
+        model.predict(model.start(2), np.zeros((2, SPEC.size)))
+
+
+def test_a_device_that_there_is_not_is_refused_in_one_line(tmp_path):
+    pytest.importorskip("torch")
+    with pytest.raises(ValueError, match=r"^device 'warp' cannot be used: [^\n]+$"):
+        make_monitor("gru", SPEC, device="warp")
+    with pytest.raises(ValueError, match="kalman runs on a CPU alone, got device 'cuda'"):
+        make_monitor("kalman", SPEC, device="cuda")
+    fitted("gru").save(tmp_path / "gru.asm")
+    with pytest.raises(ValueError, match="device 'warp' cannot be used"):
+        load_monitor(tmp_path / "gru.asm", device="warp")

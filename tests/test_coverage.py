@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import betabinom
 
 from asm_gym.detection import conformal_threshold
-from asm_gym.scripts.benchmark.coverage import CONFIDENCE, Coverage, covered
+from asm_gym.scripts.benchmark.coverage import CONFIDENCE, CoverageCheck, covered
 
 RATES = (0.01, 0.05, 0.2)
 
@@ -49,4 +49,4 @@ def test_on_average_over_calibration_sets_the_promise_holds_exactly():
 
 def test_a_rate_that_the_calibration_episodes_cannot_promise_is_refused():
     with pytest.raises(ValueError, match=r"a rate of 0\.001 needs 999 calibration_episodes, got 200"):
-        Coverage(rates=(0.001,))
+        CoverageCheck(rates=(0.001,))

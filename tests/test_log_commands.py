@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from asm_gym.data.commands import REACTS, feedback, is_command
-from asm_gym.data.logs import Layout, read_logs
+from asm_gym.data.logs import LogLayout, read_logs
 from asm_gym.episode import Episode
 from asm_gym.scripts.cli import main
 
@@ -89,7 +89,7 @@ def write(path, columns):
 def test_fit_says_what_it_takes_for_a_command_what_answers_and_what_none_costs(logs, tmp_path, capsys):
     for n, log in enumerate(logs):
         write(tmp_path / f"{n}.csv", {"q": log["q"], "target_q": log["plan"], "desired_torque": log["output"]})
-    (first, *_) = read_logs(tmp_path, Layout(by_name=True))
+    (first, *_) = read_logs(tmp_path, LogLayout(by_name=True))
     assert [first.episode.spec.labels[i] for i in first.episode.spec.motor][:1] == ["target_q[0]"]
     fit = ["fit", str(tmp_path), "--out", str(tmp_path / "m.asm"), "--monitor", "kalman", "--split", "1"]
     fit += ["--false-alarm-rate", "0.1"]

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from asm_gym.data.lerobot import write_lerobot
-from asm_gym.data.logs import Layout, read_logs
+from asm_gym.data.logs import LogLayout, read_logs
 from asm_gym.data.tabular import as_array, read_parquet
 from asm_gym.data.text import read_table
 from asm_gym.data.timing import regular
@@ -122,13 +122,13 @@ def test_every_format_of_a_table_gives_the_same_rows(tmp_path):
     lists = {n: pa.array(arm(0)[n].tolist()) for n in ("q", "cmd")} | {"time": pa.array(arm(0)["time"])}
     pq.write_table(pa.table(lists), tmp_path / "c.parquet")
     np.savez(tmp_path / "d.npz", **arm(0))
-    found = {log.name: log.episode for log in read_logs(tmp_path, Layout(action=["cmd"]))}
+    found = {log.name: log.episode for log in read_logs(tmp_path, LogLayout(action=["cmd"]))}
     assert list(found) == ["a.csv", "b.parquet", "c.parquet", "d.npz"]
     for episode in found.values():
         np.testing.assert_allclose(episode.stream, wanted.stream, rtol=1e-6)
         assert episode.spec.labels == wanted.spec.labels
     np.save(tmp_path / "e.npy", wanted.stream)
-    ((_, bare),) = read_logs(tmp_path / "e.npy", Layout(rate=RATE))
+    ((_, bare),) = read_logs(tmp_path / "e.npy", LogLayout(rate=RATE))
     np.testing.assert_array_equal(bare.stream, wanted.stream)
 
 
@@ -315,7 +315,7 @@ def bag(folder: Path, plugin: str, lost: tuple[int, ...] = (), joints: bool = Tr
 @pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
 def test_a_bag_is_a_table_at_the_rate_of_its_joints(plugin, tmp_path):
     folder = bag(tmp_path / "bag", plugin)
-    ((name, episode),) = read_logs(folder, Layout(action=["target*"]))
+    ((name, episode),) = read_logs(folder, LogLayout(action=["target*"]))
     assert Path(name).suffix == {"SQLITE3": ".db3", "MCAP": ".mcap"}[plugin]
     assert episode.spec.labels[:2] == ("wrist.force[x]", "wrist.force[y]")
     column = {label: episode.stream[:, k] for k, label in enumerate(episode.spec.labels)}

@@ -13,7 +13,7 @@ import pytest
 from asm_gym.data.channels import read_recorded
 from asm_gym.data.clock import clock_among, is_clock
 from asm_gym.data.lerobot import write_lerobot
-from asm_gym.data.logs import Layout, read_logs
+from asm_gym.data.logs import LogLayout, read_logs
 from asm_gym.data.notes import LogWarning
 from asm_gym.data.selection import normal_episodes
 from asm_gym.data.text import read_table
@@ -28,7 +28,7 @@ real = pytest.mark.skipif(not REAL.is_dir(), reason="ASM_GYM_REAL names no folde
 
 
 def read(path: Path, **layout: object) -> Episode:
-    ((_, episode),) = read_logs(path, Layout(**layout))  # type: ignore[arg-type]
+    ((_, episode),) = read_logs(path, LogLayout(**layout))  # type: ignore[arg-type]
     return episode
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from asm_gym.episode import spans
 from asm_gym.evaluation import metrics
+from asm_gym.evaluation.earliness import aucpdt
 from asm_gym.evaluation.metrics import (
     Delays,
-    average_precision,
     by_condition,
     delays_ms,
     detected,
@@ -236,16 +236,6 @@ def test_episodes_of_another_task_are_not_compared():
     assert placements([a_trace([0, 9], onset=2)], nominal, 0.2).size == 0  # ended before it began
 
 
-def test_average_precision_of_a_hand_computed_case():
-    # Recalls 1/2 and 1 at false-alarm rates 0 and 0.5: precisions 1 and 2/3.
-    assert average_precision(np.array([0.5, 0.0])) == pytest.approx((1 + 2 / 3) / 2)
-    assert math.isnan(average_precision(np.array([])))
-
-
-def test_average_precision_of_chance_is_one_half():
-    assert average_precision(np.linspace(0, 1, 1001)) == pytest.approx(0.5, abs=0.01)
-
-
 def test_a_fault_is_detected_by_an_alarm_that_is_raised_in_the_window():
     faulty = [
         a_trace([0, 0, 20, 0, 0], onset=2),  # at once: 100 ms
@@ -258,14 +248,6 @@ def test_a_fault_is_detected_by_an_alarm_that_is_raised_in_the_window():
     assert late == pytest.approx(Delays(200.0, math.inf, 2, 2))
 
 
-def test_accuracies():
-    nominal = [a_trace([0, 0, 0, 0]), a_trace([20, 0, 0, 0])]
-    faulty = [a_trace([0, 0, 0, 20, 0], onset=1), a_trace([0, 0, 0, 0, 0], onset=1)]
-    assert metrics.balanced_accuracy(faulty, nominal, 1.0) == pytest.approx(0.5)
-    # One of two faults found, 2 of 4 steps after its onset.
-    assert metrics.timestep_weighted_accuracy(faulty, nominal) == pytest.approx(0.5 * (0.25 + 0.5))
-
-
 def test_attribution_counts_alarms_alone():
     affected = frozenset({"a", "b"})
     faulty = [a_trace([20], onset=0, top_channel=c, affected_channels=affected) for c in ("a", "c", "")]
@@ -275,3 +257,24 @@ def test_attribution_counts_alarms_alone():
 def test_the_typical_episode_has_the_median_of_the_greatest_surprises_since_the_onset():
     traces = [a_trace([99, 0, peak], onset=1, seed=peak) for peak in (5, 1, 9)]
     assert typical(traces).seed == 5
+
+
+def test_precision_recall_and_delay_in_one_number_are_what_every_threshold_gives():
+    rng = np.random.default_rng(0)
+    nominal = [a_trace(rng.integers(0, 6, 8)) for _ in range(7)]
+    faulty = [a_trace(rng.integers(2, 9, 8), onset=2) for _ in range(5)]
+    points = []
+    for q in np.arange(-1, 9) + 0.5:
+        rows = [[t.surprise[2 : 2 + k + 1].max() > q for k in range(4)] for t in faulty]
+        late = np.mean([[not up for up in row] for row in rows])
+        recall, alarms = np.mean([row[-1] for row in rows]), np.mean([t.surprise.max() > q for t in nominal])
+        if recall:
+            points.append((recall / (recall + alarms), late))
+    grid = (np.arange(20000) + 0.5) / 20000
+    expected = np.mean([min((late for p, late in points if p >= level), default=1.0) for level in grid])
+    assert aucpdt(faulty, nominal, 0.4) == pytest.approx(expected, abs=1e-3)
+    assert math.isnan(aucpdt([], nominal, 0.4))
+
+
+def test_a_fault_that_is_told_at_once_by_a_wide_margin_scores_nothing():
+    assert aucpdt([a_trace([0, 9, 9], onset=1)], [a_trace([1, 1, 1])], 0.2) == 0.0

@@ -22,7 +22,7 @@ from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
 from asm_gym.rollouts.training.learners import ALGORITHMS, RECIPES, export, make_learner, warm_critic
 from asm_gym.rollouts.training.recurrent import clone_recurrent
-from asm_gym.rollouts.training.run import Plan, Standard, TrainingRun
+from asm_gym.rollouts.training.run import ObservationScale, Plan, TrainingRun
 from asm_gym.rollouts.training.state import TrainingState, newest, resume, save
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.train import Args, train_and_report
@@ -70,7 +70,7 @@ def test_cloning_finds_the_experts_rule(algorithm, env):
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_the_exported_agent_acts_as_the_learner_does_on_standardised_observations(algorithm, env):
     learner = small(algorithm, env)
-    standard = Standard.of(np.random.default_rng(0).normal(2.0, 3.0, (100, 3)).astype(np.float32))
+    standard = ObservationScale.of(np.random.default_rng(0).normal(2.0, 3.0, (100, 3)).astype(np.float32))
     agent = export(learner, algorithm, standard.mean, standard.scale, env)
     wrapped = standard.around(gym.make("Pendulum-v1"))
     seen, _ = wrapped.reset(seed=3)

@@ -97,8 +97,10 @@ def running(adaptive: AdaptiveThreshold | None, threshold: float) -> RunningThre
 
 def fitted_parts(monitor: Monitor) -> tuple[Any, ...]:
     """What of a monitor ``fit`` replaces; compared by identity."""
-    # Asked for every row: whether an object has what a protocol asks for takes longer than all of this.
-    return monitor, getattr(monitor, "diagnosis_", None), monitor.network_ if isinstance(monitor, NeuralASM) else None
+    # Asked in every step: whether an object has what a protocol asks for takes longer than all of this.
+    if isinstance(monitor, NeuralASM):
+        return monitor, monitor.model.completion_, monitor.model.network_
+    return monitor, getattr(monitor, "diagnosis_", None), None
 
 
 def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:

@@ -113,12 +113,13 @@ class Guard:
 
     def read(self, row: NDArray[np.float32], failure: str) -> tuple[NDArray[np.float32], str]:
         """(D,) the next row as the monitor is to see it, and what failed so far."""
-        row = self.responder.read(row)
-        return row, joined(failure, self.responder.doubt)
+        row, doubt = self.responder.read(row), self.responder.doubt
+        return row, joined(failure, doubt) if doubt else failure
 
     def heard(self, surprise: Surprise, failed: bool) -> Surprise:
         """What counts of the surprise at that row, one in a batch."""
-        surprise = surprise.without(self.responder.unjudged)
+        if not self.responder.judged:
+            surprise = surprise.without(self.responder.unjudged)
         if self.responder.settling and not failed:
             surprise = surprise.silenced(np.ones(1, np.bool_))
         return surprise
@@ -182,12 +183,13 @@ class Guard:
                 self.substeps.pressed()
             elif beneath is not None:
                 self.substeps.acted()
-        reasons = {CONTACT: severity.presses, FAILURE: bool(failure), SURPRISE: over or knocked}
-        reasons |= {CONTRADICTION: contradicts, MISSING: bool(lost)}
-        reason = next((name for name, holds in reasons.items() if holds), "")
+        told: tuple[tuple[Any, str], ...] = (severity.presses, CONTACT), (failure, FAILURE), (over or knocked, SURPRISE)
+        told += (contradicts, CONTRADICTION), (lost, MISSING)
+        reason = next((name for holds, name in told if holds), "")
         if alarm:
             event = FAULT if over or lost or contradicts else KNOCK
-        failure = joined(failure, decision.failure)
+        if decision.failure:
+            failure = joined(failure, decision.failure)
         return RowReport(surprise, decision, latency, failure, response, severity, reason, event)
 
     @property

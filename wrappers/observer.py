@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.monitors import ExpectsActions, ForgetsEvidence, LearnsOnTheJob, Monitor, Surprise
+from asm_gym.monitors import ExpectsActions, ForgetsEvidence, LearnsOnTheJob, Monitor, NeuralASM, Surprise
+from asm_gym.monitors.monitor import CalibratedMonitor
 from asm_gym.wrappers.vector_utils import Mask, choose
 
 
@@ -39,6 +40,7 @@ class Observer:
 
     def __init__(self, monitor: Monitor, batch: int = 1, recalls: bool = False) -> None:
         self._monitor, self._batch = monitor, batch
+        self._own = type(monitor) in (CalibratedMonitor, NeuralASM)
         # Asked once: whether an object has what a protocol asks for takes longer than most of what follows.
         self._forgets = monitor if isinstance(monitor, ForgetsEvidence) else None
         self._learns = monitor if isinstance(monitor, LearnsOnTheJob) else None
@@ -101,13 +103,15 @@ class Observer:
 
     def _checked(self, surprise: Surprise) -> Surprise:
         shapes = (self._batch,), (self._batch, self._monitor.spec.size)
-        value, attribution = np.array(surprise.value, np.float64), np.array(surprise.attribution, np.float64)
+        value, attribution = surprise.value, surprise.attribution
+        if not self._own:  # another's may be buffers that it uses again
+            value, attribution = np.array(value, np.float64), np.array(attribution, np.float64)
         if (value.shape, attribution.shape) != shapes:
             raise ValueError(
                 f"a surprise must have values of shape {shapes[0]} and attributions of shape {shapes[1]}, "
                 f"got {value.shape} and {attribution.shape}"
             )
-        return surprise._replace(value=value, attribution=attribution)
+        return surprise if self._own else surprise._replace(value=value, attribution=attribution)
 
     def _expected(self, state: Any) -> NDArray[np.float32] | None:
         if self._recalls is None:

@@ -74,6 +74,7 @@ class Repair:
         self.settling = 0
         """Rows until the monitor has seen nothing but repaired rows of a sense that was found at fault."""
         self._returned = np.zeros(self._spec.size, np.int64)  # (D,) rows until its changes are those of the sense again
+        self._returning = 0  # the most of them
         self._gone: set[str] = set()  # of those that are missing, which said nothing, and are believed when they do
         self._since: dict[str, int] = {}  # rows for which each has been missing
         self._good: NDArray[np.float64] | None = None  # (D,) the last row before something was missing
@@ -104,9 +105,16 @@ class Repair:
 
         False once a sense that nothing else tells of is missing for long, any for very long, or too many at a time.
         """
+        if not self._calm:  # as nearly always
+            return self._unchecked <= self._patience
         sensory = self._spec.sensory
         few = self.missing[sensory].mean() <= MOST_MISSING if len(sensory) else True
         return bool(few and self._unchecked <= self._patience and max(self._since.values(), default=0) <= self._longest)
+
+    @property
+    def judged(self) -> bool:
+        """Whether every number is."""
+        return not (self._calm or self._returning)
 
     @property
     def unjudged(self) -> NDArray[np.bool_]:
@@ -118,9 +126,10 @@ class Repair:
         """(D,) the next row, as it should be."""
         self._earlier, self._raw = self._raw, np.array(row, np.float64)
         self.settling = max(0, self.settling - 1)
-        self._returned = np.maximum(self._returned - 1, 0)
+        if self._returning:
+            self._returned, self._returning = np.maximum(self._returned - 1, 0), self._returning - 1
         finite = np.isfinite(self._raw)
-        if not self._calm and finite.all():  # as nearly always
+        if finite.all() and not self._calm:  # as nearly always
             self._good = self._before = self._raw
             return row.astype(np.float32)
         self._since = {name: self._since.get(name, 0) + 1 for name in self._calm}
@@ -198,7 +207,7 @@ class Repair:
                 # What said nothing, and says what is expected again, is believed at once; what was wrong is not.
                 if self._calm[name] >= self._well_after or (name in self._gone and all(there[int(c)] for c in own)):
                     well.append(name)
-                    self._returned[own] = self._settle
+                    self._returned[own] = self._returning = self._settle
                     repaired[own] = self._raw[own]
         if well:
             self._gone -= set(well)

@@ -13,6 +13,7 @@ from asm_gym.detection.events import EVENTS, KNOCK, NO_EVENT
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec
 from asm_gym.wrappers.arbiter import Decision
+from asm_gym.wrappers.lazily import Lazily
 from asm_gym.wrappers.observer import joined
 from asm_gym.wrappers.responses import NO_RESPONSE, Response
 from asm_gym.wrappers.severity import Severity
@@ -26,6 +27,10 @@ where its joints say, a number is not finite."""
 
 
 REASONS = CONTACT, FAILURE, SURPRISE, CONTRADICTION, MISSING
+INFO = "full", "flat"
+"""How much stands in ``info``."""
+
+STALE = "monitor: it was fitted while it watched; reset() takes it over"
 
 
 class RowReport(NamedTuple):
@@ -52,10 +57,11 @@ def report(
     threshold: float,
     executed: NDArray[np.float32] | None,
     failed: str,
-) -> dict[str, Any]:
-    """What to say of the rows of a step.
+) -> Lazily:
+    """What to say of the rows of a step, put together when it is read.
 
     Args:
+        rows: left alone from now on.
         executed: (A,) the action that was done last; None before the first step.
         failed: what failed before the step; empty where nothing did.
 
@@ -86,6 +92,24 @@ def report(
         for wrappers outside that skip steps.
     """
     surprises = [float(row.surprise.value[0]) for row in rows]
+    now = {
+        "surprise": max(surprises),
+        "alarm": any(row.decision.alarm for row in rows),
+        "intervened": any(row.decision.intervened for row in rows),
+        "gave_up": any(row.decision.gave_up for row in rows),
+    }
+    done = None if executed is None else np.array(executed)
+    return Lazily(now, lambda: _all_of(rows, surprises, spec, threshold, done, failed) | now)
+
+
+def _all_of(
+    rows: Sequence[RowReport],
+    surprises: list[float],
+    spec: StreamSpec,
+    threshold: float,
+    executed: NDArray[np.float32] | None,
+    failed: str,
+) -> dict[str, Any]:
     largest = max(surprises)
     worst = rows[surprises.index(largest)].surprise
     caused = next((row.response for row in reversed(rows) if row.response.why), NO_RESPONSE)
@@ -94,19 +118,19 @@ def report(
         "surprise_body": _largest((row.surprise.of_body for row in rows), largest),
         "surprise_skill": _largest((row.surprise.of_skill for row in rows), math.nan),
         "threshold": threshold,
-        "alarm": any(row.decision.alarm for row in rows),
+        "alarm": False,
         "reason": next((r for r in REASONS if any(row.reason == r for row in rows)), ""),
         "event": max((row.event for row in rows), key=EVENTS.index),
         "state": str(rows[-1].decision.state),
-        "intervened": any(row.decision.intervened for row in rows),
-        "gave_up": any(row.decision.gave_up for row in rows),
+        "intervened": False,
+        "gave_up": False,
         "transition": next((t for row in reversed(rows) if (t := row.decision.transition)), ""),
         "failure": joined(failed, *(row.failure for row in rows)),
         "cause": caused.cause,
         "response": caused.name,
         "case": caused.case,
         "severity": rows[-1].severity._asdict(),
-        "executed_action": None if executed is None else np.array(executed),
+        "executed_action": executed,
         "attribution": dict(zip(spec.labels, worst.attribution[0].tolist(), strict=True)),
         "surprises": np.array(surprises),
         "latency_us": 1e6 * max(row.latency for row in rows),

@@ -88,6 +88,7 @@ class Response(NamedTuple):
         return f"{part}, {self.cause['probability']:.2f}"
 
 
+NONE = np.zeros(0, np.intp)
 NO_RESPONSE = Response("", as_info(None))
 """Where nothing is to be done."""
 
@@ -150,7 +151,7 @@ class Responder:
         self._rows: list[NDArray[np.float32]] = []
         self._quiet = 0
         self._contradiction: Contradiction | None = None
-        self._lost = np.zeros(0, np.intp)
+        self._lost = NONE
         self._forget()
         for hand in self._hands:
             hand.reset()
@@ -175,6 +176,11 @@ class Responder:
         return np.zeros(self._spec.size, bool) if self.repair is None else self.repair.missing
 
     @property
+    def judged(self) -> bool:
+        """Whether somebody is surprised at every number."""
+        return self.repair is None or self.repair.judged
+
+    @property
     def unjudged(self) -> NDArray[np.bool_]:
         """(D,) the numbers at which nobody is surprised, for they are completed or were a moment ago."""
         return np.zeros(self._spec.size, bool) if self.repair is None else self.repair.unjudged
@@ -182,7 +188,7 @@ class Responder:
     @property
     def lost(self) -> tuple[str, ...]:
         """The numbers of the last row that were not finite."""
-        return tuple(self._spec.labels[i] for i in self._lost)
+        return tuple(self._spec.labels[i] for i in self._lost) if len(self._lost) else ()
 
     @property
     def contradicts(self) -> bool:
@@ -208,20 +214,22 @@ class Responder:
 
     def read(self, row: NDArray[np.float32]) -> NDArray[np.float32]:
         """(D,) the row as the monitor is to see it."""
-        self._lost = np.flatnonzero(~np.isfinite(row))
+        finite = np.isfinite(row)
+        self._lost = NONE if finite.all() else np.flatnonzero(~finite)
         found = [hand.read(row, self.missing) for hand in self._hands]
         self._contradiction = next(filter(None, found), None)
         if self.repair is not None and self._map is not None:
             known = self.completed
             try:
                 row = self.repair.read(row)
-                if lost := ", ".join(name for name in self.completed if name not in known):
+                if self.repair.names and (lost := ", ".join(name for name in self.completed if name not in known)):
                     _log.info("complete: %s says nothing any more", lost)
             except Exception as error:
                 # Nobody knows what the row should say: what is not finite is an alarm, and nothing explains it.
                 gym.logger.warn(f"completion: {error!r}; the row counts as lost")
                 row = np.full_like(row, np.nan)
-        self._rows = [*self._rows[1 - self._kept :], row]
+        self._rows.append(row)
+        del self._rows[: -self._kept]
         return row
 
     def observed(self, observation: Any) -> Any:
@@ -253,7 +261,7 @@ class Responder:
         for family in self._since:
             self._since[family] += 1
         if not alarm:
-            return NO_RESPONSE._replace(touched=touched)
+            return NO_RESPONSE if touched is None else NO_RESPONSE._replace(touched=touched)
         cause = self._contradicted()
         if cause is None or failed:
             cause = self._believed(self._cause(failed, attribution))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
@@ -31,7 +30,7 @@ from asm_gym.wrappers.factory import (
 )
 from asm_gym.wrappers.guard import Guard, GuardOptions, nothing
 from asm_gym.wrappers.observer import Observer, joined
-from asm_gym.wrappers.reports import RowReport, ends, report
+from asm_gym.wrappers.reports import INFO, STALE, RowReport, ends, report
 from asm_gym.wrappers.substeps import Beneath
 
 
@@ -98,6 +97,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         contact_limits: what an arm may feel and how fast its hand may go. ``"memory"`` for the usual ones, and more
             where the monitor's calibration episodes have shown that healthy motion here does. None for none: then
             nobody knows what presses, and ``"graded"`` holds at every alarm but a sensor's.
+        info: ``"full"``, or ``"flat"`` for the scalars that stand beside ``info["asm"]`` and not that itself. It costs
+            little in steps in which nobody reads it, for most of it is put together then.
         band: a calibrated band on what the arm feels, made with ``monitor``, compared within the limits in every
             physics substep of the policy's steps. What it promises comes beside what ``monitor`` does. Elsewhere than
             in this package it is compared once a step, and a warning says so.
@@ -138,6 +139,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         responses: Mapping[str, str] | None = None,
         contact_limits: ContactLimits | Literal["memory"] | None = "memory",
         band: ContactBand | None = None,
+        info: Literal["full", "flat"] = "full",
     ) -> None:
         given: dict[str, Any] = {
             "on_alarm": on_alarm,
@@ -158,6 +160,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             monitor_freq=monitor_freq,
             on_overrun=on_overrun,
             adaptive_threshold=adaptive_threshold,
+            info=info,
             **given,
         )
         gym.Wrapper.__init__(self, env)
@@ -168,6 +171,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 'only be watched, on_alarm="monitor", or ended, "terminate"'
             )
         check_choice("on_overrun", on_overrun, ("warn", "alarm", "ignore"))
+        check_choice("info", info, INFO)
+        self._full = info == "full"
         self._options = GuardOptions(**given)
         self.online_learning_rate = check_number("online_learning_rate", online_learning_rate, low=0, high=1)
         self._source, self._monitor_freq = StreamSource(env), monitor_freq
@@ -238,7 +243,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._alarms = 0
         none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))
         self._ended = False
-        return observation, self._report(info, [nothing(none)], None)
+        self._report(info, [nothing(none)], None)
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         if self._ended:
@@ -253,8 +259,9 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         overridden = self._guard.arbiter.overriding or self._refused
         self._rows: list[RowReport] = []
         self._guard.substeps.send(self._observer.state, self._executed, overridden)
-        with self._within_steps(), self._held_throughout():
-            observation, reward, terminated, truncated, info = self.env.step(self._executed)
+        parts = zip(fitted_parts(self._monitor), self._parts, strict=True)
+        self._stale = "" if all(a is b for a, b in parts) else STALE
+        observation, reward, terminated, truncated, info = self._run()
         info = dict(info)  # an environment may use its own again
         row, failure = self._sensed(observation, info)
         self._look(row, failure, self._guard.substeps.came(row, info))
@@ -263,7 +270,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if repaired is not None and "stream" in info:
             info["stream"] = repaired
         info["overridden"] = overridden or bool(info.get("overridden"))
-        asm = self._report(info, self._rows, self._executed)["asm"]
+        asm = self._report(info, self._rows, self._executed)
         if asm["gave_up"] or (self._guard.ends_on_alarm and any(map(ends, self._rows))):
             terminated, truncated = terminated or not self._options.truncate, truncated or self._options.truncate
         self._ended = bool(terminated or truncated)
@@ -286,30 +293,21 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._executed, failure, self._refused = self._guard.arbiter.command(action, self._observation)
         self._failed = joined(self._failed, failure)
 
-    @contextmanager
-    def _within_steps(self) -> Iterator[None]:
-        """Watches the rows that come before the end of a control step, while the block runs."""
-        if self._rows_per_step == 1:
-            yield
-            return
-        hooks = self.env.get_wrapper_attr("row_hooks")
-        hooks.append(self._look)
+    def _run(self) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """The step of the environment. Rows that come before its end are watched meanwhile, and who is held is held in
+        all steps that wrappers in between make of one."""
+        hooks: Any = self.env.get_wrapper_attr("row_hooks") if self._rows_per_step > 1 else None
+        if hooks is not None:
+            hooks.append(self._look)
+        if self._holds is not None:
+            self._holds.keeps_holding = True
         try:
-            yield
+            return self.env.step(self._executed)
         finally:
-            hooks.remove(self._look)
-
-    @contextmanager
-    def _held_throughout(self) -> Iterator[None]:
-        """While the block runs, who is held is held in all steps that wrappers in between make of one."""
-        if self._holds is None:
-            yield
-            return
-        self._holds.keeps_holding = True
-        try:
-            yield
-        finally:
-            self._holds.keeps_holding = self._holds.holding = False
+            if self._holds is not None:
+                self._holds.keeps_holding = self._holds.holding = False
+            if hooks is not None:
+                hooks.remove(self._look)
 
     def _sensed(self, observation: Any, info: dict[str, Any]) -> tuple[NDArray[np.float32], str]:
         """The row (D,) that ends a step, or NaN and what failed."""
@@ -326,8 +324,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         guard = self._guard
         if self._refused:
             failure, self._refused = joined(self._failed, failure), False
-        if any(a is not b for a, b in zip(fitted_parts(self._monitor), self._parts, strict=True)):
-            failure = joined(failure, "monitor: it was fitted while it watched; reset() takes it over")
+        if self._stale:
+            failure = joined(failure, self._stale)
         row, failure = guard.read(row, failure)
         surprise, expected, (failure,), latency = self._observer.observe(row[None], (failure,))
         if self._late(latency):
@@ -357,15 +355,16 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return late and self._on_overrun == "alarm"
 
     def _report(self, info: dict[str, Any], rows: list[RowReport], executed: Any) -> dict[str, Any]:
+        """Says in ``info`` what came of a step."""
         failed, responder = self._failed if executed is not None else "", self._guard.responder
         asm = report(rows, self.monitor.spec, self.threshold, executed, failed)
         self._alarms += asm["alarm"]
-        asm |= {"completed": responder.completed, "unread": responder.unread, "lost": responder.lost}
-        asm["alarms"] = self._alarms
+        asm.update(completed=responder.completed, unread=responder.unread, lost=responder.lost, alarms=self._alarms)
         if self._running is not None:
-            asm |= {"ceiling": self._running.ceiling, "level": self._running.level}
-        info["asm"] = asm
+            asm.update(ceiling=self._running.ceiling, level=self._running.level)
+        if self._full:
+            info["asm"] = asm
         info["asm_surprise"], info["asm_alarm"] = np.float64(asm["surprise"]), np.bool_(asm["alarm"])
         info["asm_intervened"], info["cost"] = np.bool_(asm["intervened"]), np.float64(asm["alarm"])
         info["cost_sum"] = np.float64(self._alarms)
-        return info
+        return asm

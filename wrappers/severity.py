@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
@@ -61,7 +62,7 @@ class Severity(NamedTuple):
     @property
     def felt(self) -> bool:
         """Whether anybody would know if the arm pressed."""
-        return bool(np.isfinite(self.load) or np.isfinite(self.force))
+        return math.isfinite(self.load) or math.isfinite(self.force)
 
     @property
     def fast(self) -> bool:
@@ -78,7 +79,7 @@ class ContactForce:
     """
 
     def __init__(self, wrists: NDArray[np.intp], joints: NDArray[np.intp]) -> None:
-        self._wrists, self._joints = wrists, joints
+        self._wrists, self._joints = wrists.tolist(), joints.tolist()
 
     @classmethod
     def felt_by(cls, channels: Sequence[Channel]) -> Self:
@@ -91,10 +92,10 @@ class ContactForce:
 
     def __call__(self, felt: NDArray[np.floating[Any]]) -> float:
         """[N] of (N,); not a number where neither is felt."""
-        wrist = _largest_norm(felt, self._wrists)  # with the weight of the hand, 5 to 10 N
-        torques = np.abs(felt[self._joints].astype(np.float64))
-        joints = float(np.max(torques, initial=0.0)) / LEVER if self._joints.size else np.nan
-        return float(np.fmax(wrist, joints))
+        numbers = felt.tolist()
+        wrist = _largest_norm(numbers, self._wrists)  # with the weight of the hand, 5 to 10 N
+        joints = _largest(abs(numbers[j]) for j in self._joints) / LEVER
+        return wrist if joints != joints or wrist >= joints else joints
 
 
 class SeverityEstimator:
@@ -106,7 +107,7 @@ class SeverityEstimator:
 
     def __init__(self, spec: StreamSpec) -> None:
         self._dt = spec.dt
-        self._force, self._speeds = ContactForce.felt_by(spec.channels), _triples(spec, "hand_velocity")
+        self._force, self._speeds = ContactForce.felt_by(spec.channels), _triples(spec, "hand_velocity").tolist()
         self.reset()
 
     def reset(self) -> None:
@@ -125,12 +126,12 @@ class SeverityEstimator:
         """
         load, left_s, force = (np.nan, np.nan, np.nan) if beneath is None else beneath
         # What the arm feels itself is not what a faulty sensor says of it; where nobody else says, the row does.
-        force = self._force(row) if np.isnan(force) else force
-        more = max(force - FREE_FORCE, 0.0) if np.isfinite(force) else 0.0
+        force = self._force(row) if math.isnan(force) else force
+        more = max(force - FREE_FORCE, 0.0) if math.isfinite(force) else 0.0
         self._impulse += more * self._dt
         self._leant = self._leant + self._dt if more else 0.0
         speed = _largest_norm(row, self._speeds)
-        presses = bool(load > 1.0 or np.isfinite(left_s) or self._leant > leans_s)
+        presses = load > 1.0 or math.isfinite(left_s) or self._leant > leans_s
         return Severity(load, presses, force, self._impulse, speed, BLOW * speed, held, left_s)
 
 
@@ -140,9 +141,16 @@ def _triples(spec: StreamSpec, name: str) -> NDArray[np.intp]:
     return np.array([f for f in found if f.size == 3], np.intp).reshape(-1, 3)
 
 
-def _largest_norm(row: NDArray[np.floating[Any]], triples: NDArray[np.intp]) -> float:
+def _largest_norm(numbers: Sequence[float] | NDArray[np.floating[Any]], triples: list[list[int]]) -> float:
     """Not a number where there are none."""
-    if not len(triples):
-        return np.nan
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.max(np.linalg.norm(row[triples].astype(np.float64), axis=1)))
+    vectors = [(float(numbers[i]), float(numbers[j]), float(numbers[k])) for i, j, k in triples]
+    return _largest(math.sqrt(x * x + y * y + z * z) for x, y, z in vectors)
+
+
+def _largest(numbers: Iterable[float]) -> float:
+    """Not a number where one is none, or there are none."""
+    found = -math.inf
+    for number in numbers:
+        if not number <= found and found == found:
+            found = number
+    return found if found != -math.inf else math.nan

@@ -85,9 +85,12 @@ TRANSITIONS = (
 """What leads from one state to another: the first that holds. Where none does, nothing changes."""
 
 
+_FROM = {state: tuple(t for t in TRANSITIONS if state in t.within) for state in State}
+
+
 def following(state: State, situation: Situation) -> Transition | None:
     """The first of ``TRANSITIONS`` that holds; None where nothing changes."""
-    return next((t for t in TRANSITIONS if state in t.within and t.when(situation)), None)
+    return next((t for t in _FROM[state] if t.when(situation)), None)
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,13 @@ from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.reflexes import Graded, Hold, Reflex, nearest_to_rest
 from asm_gym.protocols import HoldsItself, LimitsContact
 from asm_gym.stream_source import StreamSource
-from asm_gym.validation import as_float32
+from asm_gym.validation import as_float32, check_choice
 from asm_gym.wrappers.arbiter import Command
 from asm_gym.wrappers.factory import LOG, OnAlarm, body_memory, check_monitor, fitted_parts, fitted_to, running
 from asm_gym.wrappers.guard import Guard, GuardOptions, nothing
+from asm_gym.wrappers.lazily import Lazily
 from asm_gym.wrappers.observer import Observer, joined
-from asm_gym.wrappers.reports import RowReport, ends, report
+from asm_gym.wrappers.reports import INFO, STALE, RowReport, ends, report
 from asm_gym.wrappers.vector_utils import (
     Mask,
     Member,
@@ -56,8 +57,8 @@ class VectorNeuralASMSafety(VectorWrapper):
         env: of ``gym.make_vec``; where ``info`` has no ``"stream"``, observation and action are the stream.
         monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that they move.
         on_alarm: as in ``NeuralASMSafety``; a policy of yours is shared, and must keep what it knows in its state.
-        release_after, release_below, max_override, try_after, truncate, responses, contact_limits: as there. Nor is a
-            band sent down: for ``band``, wrap each member and put those side by side in ``ThreadVectorEnv``.
+        release_after, release_below, max_override, try_after, truncate, responses, contact_limits, info: as there. Nor
+            is a band sent down: for ``band``, wrap each member and put those side by side in ``ThreadVectorEnv``.
         adaptive_threshold: as there; all environments share one running threshold, and an episode keeps what it began
             with.
 
@@ -92,6 +93,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         adaptive_threshold: AdaptiveThreshold | None = None,
         responses: Mapping[str, str] | None = None,
         contact_limits: ContactLimits | Literal["memory"] | None = "memory",
+        info: Literal["full", "flat"] = "full",
     ) -> None:
         super().__init__(env)
         if not isinstance(env.single_action_space, gym.spaces.Box):
@@ -100,6 +102,8 @@ class VectorNeuralASMSafety(VectorWrapper):
         if isinstance(on_alarm, Reflex) and not (isinstance(on_alarm, Hold) and on_alarm.explicit):
             raise ValueError(f"one {type(on_alarm).__name__} cannot act in several environments: give its name instead")
         refuse_running_statistics(env)
+        check_choice("info", info, INFO)
+        self._full = info == "full"
         self._options = GuardOptions(
             on_alarm, release_after, release_below, max_override, try_after, truncate, responses, contact_limits
         )
@@ -253,6 +257,10 @@ class VectorNeuralASMSafety(VectorWrapper):
         """(n, D) what was sensed in this step, and what failed at that in each; of episodes that were in their ``last``
         one, before they began anew."""
         n, size = self.num_envs, self.monitor.spec.size
+        stream: Any = infos.get("stream")
+        told = infos.get("_stream", np.ones(n, bool))
+        if self._own_stream and not last.any() and np.all(told) and np.shape(stream) == (n, size):
+            return np.array(as_float32(stream)), [""] * n
         rows, failures = np.full((n, size), np.nan, np.float32), [""] * n
         for i in range(n):
             try:
@@ -292,7 +300,7 @@ class VectorNeuralASMSafety(VectorWrapper):
             for c, f, b in zip(commands, failures, begun, strict=True)
         ]
         if any(a is not b for a, b in zip(fitted_parts(self._monitor), self._parts, strict=True)):
-            known = [joined(f, "monitor: it was fitted while it watched; reset() takes it over") for f in known]
+            known = [joined(f, STALE) for f in known]
         for i in np.flatnonzero(~begun):
             rows[i], known[i] = self._guards[i].read(rows[i], known[i])
         surprise, expected, failed, latency = self._observer.observe(rows, tuple(known))
@@ -302,9 +310,7 @@ class VectorNeuralASMSafety(VectorWrapper):
             if begun[i]:
                 reports.append(nothing(own.silenced(np.ones(1, bool))))
                 continue
-            beneath = guard.substeps.came(
-                rows[i], _said(infos, i, bool(last[i]), ("contact_load", "contact_left_s", "contact_felt"))
-            )
+            beneath = guard.substeps.came(rows[i], _said(infos, i, bool(last[i]), FELT))
             said = None if expected is None else expected[i]
             heard = guard.heard(own, bool(failed[i]))
             report = guard.judge(heard, rows[i], executed[i], failed[i], beneath, said, latency)
@@ -388,22 +394,19 @@ class VectorNeuralASMSafety(VectorWrapper):
         """Adds ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
         spec, responders = self.monitor.spec, [guard.responder for guard in self._guards]
         self._alarms += [r.decision.alarm for r in reports]
-        each = [
-            report([r], spec, guard.arbiter.threshold, None, "")
-            | {"completed": s.completed, "unread": s.unread, "lost": s.lost, "alarms": int(n)}
-            for r, s, n, guard in zip(reports, responders, self._alarms, self._guards, strict=True)
-        ]
-        asm = {name: _stacked([one[name] for one in each]) for name in each[0]}
-        asm["executed_action"] = executed.copy()
+        each = [report([r], spec, g.arbiter.threshold, None, "") for r, g in zip(reports, self._guards, strict=True)]
+        for one, s, n in zip(each, responders, self._alarms, strict=True):
+            one.update(completed=s.completed, unread=s.unread, lost=s.lost, alarms=int(n))
+        same = {"executed_action": executed.copy()}
         if self._running is not None:
             both = {"ceiling": self._running.ceiling, "level": self._running.level}
-            asm |= {name: np.full(self.num_envs, value) for name, value in both.items()}
-        infos["asm"] = asm
-        alarm = asm["alarm"]
-        flat = {"asm_surprise": asm["surprise"], "asm_alarm": alarm, "asm_intervened": asm["intervened"]}
-        flat |= {"cost": alarm.astype(np.float64), "cost_sum": self._alarms.astype(np.float64)}
-        infos.update(flat)
-        infos.update({f"_{key}": present for key in ("asm", *flat)})
+            same |= {name: np.full(self.num_envs, value) for name, value in both.items()}
+        now = {name: np.array([one[name] for one in each]) for name in ("surprise", "alarm", "intervened")}
+        said: dict[str, Any] = {f"asm_{name}": value for name, value in now.items()}
+        said |= {"cost": now["alarm"].astype(np.float64), "cost_sum": self._alarms.astype(np.float64)}
+        if self._full:
+            said["asm"] = Lazily(now, lambda: {n: _stacked([one[n] for one in each]) for n in each[0]} | same)
+        infos.update(said | {f"_{key}": present for key in said})
 
     def _nothing(self) -> list[RowReport]:
         none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))

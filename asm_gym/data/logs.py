@@ -39,7 +39,7 @@ class Log(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Layout:
+class LogLayout:
     """How to read logs that do not name their channels as this package does; arguments of ``stream_of``.
 
     Args:
@@ -82,15 +82,15 @@ class Layout:
 Columns = dict[str, NDArray[Any]]
 
 
-def _text(path: Path, layout: Layout) -> Columns:
+def _text(path: Path, layout: LogLayout) -> Columns:
     return read_table(path, layout.columns, layout.keeps)
 
 
-def _json(path: Path, layout: Layout) -> Columns:
+def _json(path: Path, layout: LogLayout) -> Columns:
     return read_json_lines(path, layout.columns, layout.keeps)
 
 
-TABLES: dict[str, Callable[[Path, Layout], Columns]] = {
+TABLES: dict[str, Callable[[Path, LogLayout], Columns]] = {
     ".npz": lambda path, layout: read_arrays(path),
     ".npy": lambda path, layout: read_array(path, layout.columns),
     ".csv": _text,
@@ -105,7 +105,7 @@ ASKED_FOR = (".txt",)
 """Files that are read where they are named, and not where they lie in a folder: most are no logs."""
 
 
-def _arrays(path: Path, layout: Layout) -> Episode:
+def _arrays(path: Path, layout: LogLayout) -> Episode:
     """An episode that this package wrote, or arrays by name, (T,) or (T, k) each."""
     try:
         with zipfile.ZipFile(path) as file:
@@ -115,16 +115,16 @@ def _arrays(path: Path, layout: Layout) -> Episode:
     return load_episode(path) if ours else layout.episode(read_arrays(path))
 
 
-def _table(path: Path, layout: Layout) -> Episode:
+def _table(path: Path, layout: LogLayout) -> Episode:
     return layout.episode(TABLES[path.suffix](path, layout))
 
 
-READERS: dict[str, Callable[[Path, Layout], Episode]] = {**dict.fromkeys(TABLES, _table), ".npz": _arrays}
+READERS: dict[str, Callable[[Path, LogLayout], Episode]] = {**dict.fromkeys(TABLES, _table), ".npz": _arrays}
 """The episode of a file, by its suffix."""
 
 
 @typed
-def read_logs(path: str | Path, layout: Layout | None = None) -> Iterator[Log]:
+def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log]:
     """The episodes at ``path``, in the order of their names, each read when it is asked for.
 
     Args:
@@ -136,7 +136,7 @@ def read_logs(path: str | Path, layout: Layout | None = None) -> Iterator[Log]:
         FileNotFoundError: there is nothing of the kind.
         ValueError: a file cannot be read; the message names it.
     """
-    path, layout = Path(path), layout or Layout()
+    path, layout = Path(path), layout or LogLayout()
     if not path.exists():
         raise FileNotFoundError(f"there is no {path}")
     if path.is_file() and path.suffix not in READERS:
@@ -166,7 +166,7 @@ def read_logs(path: str | Path, layout: Layout | None = None) -> Iterator[Log]:
         yield Log(f"episode {n}", episode)
 
 
-def read_tables(path: str | Path, layout: Layout) -> Iterator[tuple[str, Columns]]:
+def read_tables(path: str | Path, layout: LogLayout) -> Iterator[tuple[str, Columns]]:
     """The columns of the logs at ``path`` as they are in their files, by name; of data sets, those of their streams.
 
     Raises:
@@ -190,7 +190,7 @@ def read_tables(path: str | Path, layout: Layout) -> Iterator[tuple[str, Columns
             raise ValueError(f"{file}: {error}") from error
 
 
-def _lerobot(folder: Path, layout: Layout) -> Iterator[Log]:
+def _lerobot(folder: Path, layout: LogLayout) -> Iterator[Log]:
     for n, (columns, rate, success) in enumerate(read_lerobot(folder)):
         known = replace(layout, rate=layout.rate or rate, action=layout.action or ("action*",))
         episode = replace(known.episode(columns), success=success)
@@ -198,7 +198,7 @@ def _lerobot(folder: Path, layout: Layout) -> Iterator[Log]:
         yield Log(f"episode {n}", episode)
 
 
-def _parts(folder: Path, layout: Layout) -> dict[str, Columns]:
+def _parts(folder: Path, layout: LogLayout) -> dict[str, Columns]:
     """The columns of each table in a folder, by its name."""
     found = {}
     files = sorted(f for f in folder.iterdir() if f.suffix in TABLES) if folder.is_dir() else []

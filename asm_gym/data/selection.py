@@ -24,7 +24,7 @@ AROUND_S = 5.0
 """How near to marked rows nothing is learned from [s]: what led to a stop is no normal motion."""
 
 
-class Kept(NamedTuple):
+class NormalEpisodes(NamedTuple):
     """The episodes that are learned from, how many others were left out, by why, and the logs of the first."""
 
     episodes: list[Episode]
@@ -32,18 +32,13 @@ class Kept(NamedTuple):
     logs: list[str]
 
 
-def normal_episodes(
-    logs: Iterable[Log], keep_failures: bool = False, progress: Callable[[int, int], object] | None = None
-) -> Kept:
+def normal_episodes(logs: Iterable[Log], progress: Callable[[int, int], object] | None = None) -> NormalEpisodes:
     """The normal episodes among ``logs``."""
-    kept = Kept([], Counter(), [])
+    kept = NormalEpisodes([], Counter(), [])
     for n, (name, episode) in enumerate(logs, 1):
         if progress is not None:
             progress(n, n)  # how many there are is known at the end
-        why = _abnormal(episode)
-        if why == "failed" and keep_failures:
-            why = ""
-        if why:
+        if why := _abnormal(episode):
             kept.left_out[why] += 1
         else:
             kept.episodes.append(episode)

@@ -62,7 +62,7 @@ class Excuses:
         self._joints = _columns(spec, lambda c: bool(c.stops))
         self._ends = np.array([pair for c in spec.channels for pair in c.stops], np.float64).reshape(-1, 2)
         self._fingers = _columns(spec, lambda c: c.name.endswith("gripper_velocity") and c.unit == "m/s")
-        self._rows = tuple(max(1, round(seconds / spec.dt)) for seconds in (KNOCKED_S, MOVED_S))
+        self._rows = np.array([max(1, round(seconds / spec.dt)) for seconds in (KNOCKED_S, MOVED_S)])
 
     def start(self, batch: int) -> NDArray[np.int64]:
         """(B, 2) for how many rows a knock is still felt, and fingers have just moved: none."""

@@ -4,8 +4,10 @@
     mahalanobis    ‖M ε‖²                       M whitens the errors of nominal steps
     moving_mean    mean over 5 steps of ε_i²    summed over i
     largest        max_i |ε_i|
+    per_dimension  max_i |ε_i| / q_i            q_i: what |ε_i| exceeds in one of a thousand nominal rows
 
-Source: Xu et al. 2025 (RSS) for the moving mean; Haddadin, De Luca and Albu-Schäffer 2017, Eq. 31, for the largest.
+Source: Xu et al. 2025 (RSS) for the moving mean; Haddadin, De Luca and Albu-Schäffer 2017, Eq. 31, for the largest;
+Munn et al. 2026 (arXiv 2602.01515) for dimensions that are calibrated each by itself.
 """
 
 from __future__ import annotations
@@ -23,6 +25,9 @@ from asm_gym.validation import check_number
 
 WINDOW = 5
 """Rows that the moving mean is taken over."""
+
+SELDOM, TINY = 1e-3, 1e-6
+"""Share of nominal rows in which an error is larger than what it is measured by; the least that it is measured by."""
 
 
 class Squares:
@@ -109,3 +114,17 @@ class Largest(Squares):
     def parts(self, output: ModelOutput) -> NDArray[np.float64]:
         sizes = np.abs(np.asarray(output.errors, np.float64))
         return np.where(np.arange(sizes.shape[1]) == sizes.argmax(axis=1)[:, None], sizes, 0.0)
+
+
+class PerDimension(Largest):
+    """The largest error, each measured by what it seldom exceeds in nominal rows that the model has not learned."""
+
+    name = "per_dimension"
+    arrays = ("seldom",)
+
+    def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
+        errors = np.abs(np.concatenate([r.errors for r in nominal.outputs(nominal.held_out)]))
+        return self.restore({"seldom": np.maximum(np.quantile(errors, 1.0 - SELDOM, axis=0), TINY).astype(np.float64)})
+
+    def parts(self, output: ModelOutput) -> NDArray[np.float64]:
+        return super().parts(output._replace(errors=np.asarray(output.errors) / self.learned_["seldom"]))

@@ -183,14 +183,15 @@ class ObjectSensors:
             Channel(o.name, size, "1", 0.0, "object") for o, size in zip(self._observables, sizes, strict=True)
         )
         self._rest = [np.zeros(size) for size in sizes]
+        # Relative poses are computed from absolute ones, which robosuite lists after them.
+        self._in_order = sorted(self._observables, key=lambda o: "_to_" in o.name)
 
     def read(self) -> list[NDArray[np.float64]]:
         """One array for each of ``channels``."""
         seen: dict[str, Any] = {}
         for observable in self._inputs:
             seen[observable.name] = observable._sensor(seen)
-        # Relative poses are computed from absolute ones, which robosuite lists after them.
-        for observable in sorted(self._observables, key=lambda o: "_to_" in o.name):
+        for observable in self._in_order:
             if observable.is_active():
                 seen[observable.name] = observable._sensor(seen)
         return [

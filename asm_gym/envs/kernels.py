@@ -224,6 +224,16 @@ def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Flo
 
 
 @compiled
+def mean_felt(samples: Floats, count: int, arms: Ints, columns: Ints, out: Floats) -> None:
+    """Writes the mean of the first ``count`` samples of ``arms`` (N,) at ``columns`` (N,) into out."""
+    for n in range(len(out)):
+        total = samples[arms[n], 0, columns[n]]
+        for k in range(1, count):
+            total += samples[arms[n], k, columns[n]]
+        out[n] = total / count
+
+
+@compiled
 def edited(live: Floats, frozen: Floats, rows: Ints) -> bool:
     """Whether two arrays (N, M) differ in any of ``rows``."""
     for r in rows:

@@ -54,15 +54,21 @@ class Layout:
 
     def observation(self, row: NDArray[np.float64], pictures: dict[str, NDArray[np.uint8]]) -> Any:
         """What a policy sees of a row; finite whatever the row holds."""
-        row32 = np.clip(np.nan_to_num(row), -_BOUND, _BOUND).astype(np.float32)
         if not self._flat:
+            row32 = _shown(row)
             return {name: row32[s] for name, s in self._slices.items()} | pictures
-        state = row32[self._to_observation]
+        state = _shown(row[self._to_observation])
         return {"state": state} | pictures if pictures else state
 
     def stream(self, row: NDArray[np.float64]) -> NDArray[np.float32]:
         """(D,) what of a row the stream carries."""
         return as_float32(row[self._to_stream])  # what is too large becomes infinite, which ends the episode
+
+
+def _shown(row: NDArray[np.float64]) -> NDArray[np.float32]:
+    if not np.isfinite(row).all():
+        row = np.nan_to_num(row)
+    return row.clip(-_BOUND, _BOUND).astype(np.float32)
 
 
 def _box(size: int) -> spaces.Space[Any]:

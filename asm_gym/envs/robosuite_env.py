@@ -140,7 +140,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """What the arms may feel and how fast they may go in this episode; ``reset`` forgets it. ``info`` then holds
         ``contact_load``, the largest share of a limit that was felt within the step, ``contact_left_s``, when in it a
         limit was passed [s], not a number where none was, and ``contact_felt``, the step's mean of what was felt."""
-        self._most: tuple[ContactLimits | None, NDArray[np.float64]] = NO_LIMITS, np.zeros(0)
+        self._within: tuple[ContactLimits | None, Expected | None] = None, None
         self._band: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._stays = False
         self.substeps = backend.PHYSICS_FREQ // control_freq
@@ -185,6 +185,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         backend.free_first_joints(self.robosuite_env)
         self.simulation = Simulation(self.robosuite_env, self.substeps)
         """Physics, controllers and sensors of the loaded model."""
+        self._warning_counts: Any = self.simulation.data.warning.number  # a view
         self._objects = backend.ObjectSensors(self.robosuite_env, self.task)
         self._rewards = Rewards(self.task.name, self.robosuite_env)
         self.simulation.keeps_history = self._rewards.reads_history
@@ -200,6 +201,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """Of what the arms feel: external torque of the joints and force at the wrist, of one arm after another."""
         self._errors = SensorErrors(self.measured_spec, self.sensor_noise)
         self._layout = Layout(self.measured_spec, self._groups, self._flat)
+        self._overlooked = "object" not in self._groups
         self.observation_layout = self._layout.sizes
         """The observation's parts in order, and how many numbers each has."""
         self.observation_space = self.laid_out_space = self._layout.space(self._pictures.spaces)
@@ -297,7 +299,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         env.timestep += 1
         expected = self._expected()
         self.simulation.begin(expected)
-        self.command(action)
+        self._command(action)
         self._rows: list[NDArray[np.float32]] = []
         self._advance()
         if expected is not None and expected.stays and self.simulation.left_band is not None:
@@ -332,7 +334,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             for hook in self.substep_hooks:
                 hook(done - 1)
             if done % self._row_substeps == 0 and done < self.substeps:
-                row = self.to_stream(self.measure()) if self._layout.stream_spec else np.zeros(0, np.float32)
+                row = self.to_stream(self._read(within=True)) if self._layout.stream_spec else np.zeros(0, np.float32)
                 self.simulation.begin_row()
                 self._rows.append(row)
                 for feel in self.row_hooks:
@@ -344,7 +346,9 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         Raises:
             ValueError: a wrong shape, or an action that is not finite.
         """
-        action = self._actions.checked(action)
+        self._command(self._actions.checked(action))
+
+    def _command(self, action: NDArray[np.float32]) -> None:
         held, self.holding = self.holding, self.holding and self.keeps_holding
         self._action = self._actions.resting(self.simulation, self._action) if held else self.slowed(action)
         self.simulation.command(self._delivered(self._action), held)
@@ -361,12 +365,15 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         band, self._band, limits = self._band, None, self.contact_limits
         if band is None and limits is None:
             return None
-        if limits is not self._most[0]:
-            self._most = limits, (limits or NO_LIMITS).most(self.felt_channels)
-        most = self._most[1]
-        low, high = (-most, most) if band is None else (np.maximum(band[0], -most), np.minimum(band[1], most))
-        stays = (band is not None and self._stays) or (limits is not None and limits.stays)
-        return Expected(low, high, most, stays)
+        known, within = self._within
+        if within is None or limits is not known:
+            most = (limits or NO_LIMITS).most(self.felt_channels)
+            within = Expected(-most, most, most, limits is not None and limits.stays)
+            self._within = limits, within
+        if band is None:
+            return within
+        low, high = np.maximum(band[0], within.low), np.minimum(band[1], within.high)
+        return Expected(low, high, within.most, self._stays or within.stays)
 
     def expect(self, low: NDArray[np.float64], high: NDArray[np.float64], stays: bool = True) -> None:
         """Says what the arms are to feel in every physics substep of the next control step, and of that alone.
@@ -423,7 +430,13 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         Returns:
             (M,) as ``measured_spec`` names it.
         """
-        row = np.concatenate([self.simulation.sense(), *self._objects.read(), self._action])
+        return self._read()
+
+    def _read(self, within: bool = False) -> NDArray[np.float64]:
+        """As ``measure``; ``within`` a control step objects stay where they were seen last, if nobody looks at them."""
+        if not (within and self._overlooked and not self.corruptions):
+            self._seen = self._objects.read()
+        row = np.concatenate([self.simulation.sense(), *self._seen, self._action])
         return self._errors.added(row, self.corruptions, self.np_random)
 
     def to_stream(self, row: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -443,12 +456,13 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             left = self.left_band_s
             info["contact_load"] = np.inf if unstable else sim.load
             info["contact_left_s"] = np.nan if left is None else left
-            info["contact_felt"] = sim.felt.mean(axis=0)
+            info["contact_felt"] = sim.mean_felt
         return info | {"success": success, **forces, "unstable": unstable}
 
     def _bad_count(self) -> int:
         """How often MuJoCo found the simulation unstable; it resets itself then, and says so nowhere else."""
-        return sum(int(self.simulation.data.warning[w].number) for w in _BAD)
+        counts = self._warning_counts
+        return sum(int(counts[w]) for w in _BAD)
 
     @property
     def stream_spec(self) -> StreamSpec:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import math
 import sys
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import mujoco
@@ -17,6 +19,9 @@ from asm_gym.envs.control import hold_at
 from asm_gym.envs.nominal import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
 from asm_gym.envs.views import ACTS, ARMED, FELT, JOINTS, LEFT, Goals, SubstepBand, Views
+
+SURELY = 1.0 - 1e-9
+"""Share of a limit of speed below which rounding decides nothing."""
 
 
 class Expected(NamedTuple):
@@ -71,6 +76,12 @@ class Simulation:
         self._fresh = False
         self._action = np.zeros(sum(robot.action_dim for robot in robots))
         self._controllers = [robot.composite_controller.part_controllers[arm] for robot, arm in self.parts]
+        # Asked once an episode: robosuite puts these together anew at every look.
+        starts = np.cumsum([0, *(robot.action_dim for robot, _ in self.parts)]).tolist()
+        splits = [robot._action_split_indexes[arm] for robot, arm in self.parts]
+        self._moves = [slice(start + low, start + high) for start, (low, high) in zip(starts, splits, strict=False)]
+        self._grips = [self._gripper(start, *part) for start, part in zip(starts, self.parts, strict=False)]
+        self._speeds = [self._speed(a) for a in range(len(self.parts))]
         self.compiled = all(compilable(robot, arm) for robot, arm in self.parts)
         """Whether control runs compiled."""
         self._arms = describe(self.parts, self.model)
@@ -80,8 +91,12 @@ class Simulation:
         )
         n = len(self.parts)
         self._band.state[:] = 0, 0, 0, -1, 0
+        self._expected: Expected | None = None
         # Where the numbers of ``felt`` stand in a band: arm, and place.
         self._felt_places = np.nonzero([[i >= JOINTS or i < n for i in range(FELT)] for n in self._arms.joints])
+        self._felt_columns = np.where(
+            self._felt_places[1] < JOINTS, self._felt_places[1], self._felt_places[1] - JOINTS + kernels.WRENCH.start
+        )
         joints = np.zeros((n, JOINTS))
         self._goals = Goals(np.zeros((n, 3)), np.zeros((n, 3, 3)), joints, joints.copy(), np.zeros(n, np.int64))
         self._deltas = np.zeros((n, JOINTS))
@@ -101,9 +116,11 @@ class Simulation:
         self._band.state[:] = 0, 0, 0, -1, 0
         self._band.load[0] = 0.0
         if expected is not None:
-            for bound, values in zip(self._band[:3], expected, strict=False):
-                bound[self._felt_places] = values
-            self._band.state[[ARMED, ACTS]] = 1, expected.stays
+            if expected is not self._expected:  # as in every other step
+                for bound, values in zip(self._band[:3], expected, strict=False):
+                    bound[self._felt_places] = values
+                self._expected = expected
+            self._band.state[ARMED], self._band.state[ACTS] = 1, expected.stays
         self._felt = (0.0, 0.0, 0.0)
 
     def command(self, action: NDArray[np.float64], hold: bool = False) -> None:
@@ -122,15 +139,14 @@ class Simulation:
         self._action = action
         self._fresh = True
         if self.compiled:
-            start = 0
-            for a, (robot, arm) in enumerate(self.parts):
-                part = self._action[start : start + robot.action_dim]
-                low, high = robot._action_split_indexes[arm]
-                self._deltas[a, : high - low] = self._controllers[a].scale_action(part[low:high])
+            for a, (controller, moves, grip) in enumerate(
+                zip(self._controllers, self._moves, self._grips, strict=True)
+            ):
+                self._deltas[a, : moves.stop - moves.start] = controller.scale_action(action[moves])
                 # robosuite rounds this rotation to single precision, which shows after a while.
                 self._turns[a] = self._rotations.quat2mat(self._rotations.axisangle2quat(self._deltas[a, 3:6]))
-                self._move_gripper(robot, arm, part)
-                start += robot.action_dim
+                if grip is not None:
+                    grip(action)
 
     def advance(self, count: int) -> None:
         """Runs ``count`` substeps of the control step that was begun."""
@@ -179,9 +195,14 @@ class Simulation:
     def felt(self) -> NDArray[np.float64]:
         """(K, N) what the arms felt in each substep since the row began, noiseless: of each arm the external torque of
         its joints [N m], then the force at its wrist [N]."""
-        count, wrist = self._done - self._row_began, slice(kernels.WRENCH.start, kernels.WRENCH.start + 3)
-        parts = [[s[:count, :n], s[:count, wrist]] for s, n in zip(self._samples, self._arms.joints, strict=True)]
-        return np.hstack([part for arm in parts for part in arm])
+        return self._samples[self._felt_places[0], : self._done - self._row_began, self._felt_columns].T
+
+    @property
+    def mean_felt(self) -> NDArray[np.float64]:
+        """(N,) the mean of ``felt``."""
+        found = np.empty(len(self._felt_columns))
+        kernels.mean_felt(self._samples, self._done - self._row_began, self._felt_places[0], self._felt_columns, found)
+        return found
 
     @property
     def contact_forces(self) -> NDArray[np.float64]:
@@ -214,18 +235,21 @@ class Simulation:
         self.external_force = _larger(external, external_before)
         self.mean_external_force = (sum_before + count * mean) / (self._row_began + count)
 
-    def _move_gripper(self, robot: Any, arm: str, action: NDArray[np.float64]) -> None:
+    def _gripper(self, start: int, robot: Any, arm: str) -> Callable[[NDArray[np.float64]], None] | None:
+        """What moves the gripper of an arm by an action whose part for this robot begins at ``start``."""
         name = robot.get_gripper_name(arm)
-        if name not in robot._action_split_indexes:
-            return
-        low, high = robot._action_split_indexes[name]
+        low, high = robot._action_split_indexes.get(name, (0, 0))
         if low == high:
-            return
-        controller = robot.composite_controller.part_controllers[name]
-        controller.set_goal(robot.gripper[arm].format_action(action[low:high]))
-        motors = robot._ref_actuators_indexes_dict[name]
-        limits = self.model.actuator_ctrlrange[motors]
-        self.data.ctrl[motors] = np.clip(controller.run_controller(), limits[:, 0], limits[:, 1])
+            return None
+        controller, motors = robot.composite_controller.part_controllers[name], robot._ref_actuators_indexes_dict[name]
+        gripper, limits, ctrl = robot.gripper[arm], self._views.ctrlrange, self._views.ctrl
+
+        def move(action: NDArray[np.float64]) -> None:
+            controller.set_goal(gripper.format_action(action[start + low : start + high]))
+            bounds = limits[motors]
+            ctrl[motors] = np.clip(controller.run_controller(), bounds[:, 0], bounds[:, 1])
+
+        return move
 
     # ------------------------------------------------------------------ knowledge of the robot
 
@@ -235,29 +259,45 @@ class Simulation:
         A controller that is asked for a change Δx of pose again and again, from where it is, comes to the velocity
         Kp/Kd Δx. Actions of controllers that take anything else are left as they are.
         """
-        found, start = [], 0
-        for a, (robot, arm) in enumerate(self.parts):
-            low, high = robot._action_split_indexes[arm]
-            controller, part = self._controllers[a], slice(start + low, start + high)
-            start += robot.action_dim
-            kind, n = controller.name, int(self._arms.joints[a])
-            if kind not in ("OSC_POSE", "JOINT_POSITION") or controller.input_type != "delta":
+        found = []
+        for a, (controller, part, speed_of) in enumerate(
+            zip(self._controllers, self._moves, self._speeds, strict=True)
+        ):
+            if controller.name not in ("OSC_POSE", "JOINT_POSITION") or controller.input_type != "delta":
+                continue
+            if speed_of is not None and speed_of(action[part].tolist()) < SURELY * most:
+                found.append((part, 1.0))
                 continue
             delta = np.asarray(controller.scale_action(action[part]), np.float64)
-            if kind == "JOINT_POSITION":
+            if controller.name == "JOINT_POSITION":
                 jacobian = np.zeros((3, self.model.nv))
                 mujoco.mj_jacSite(self.model, self.data, jacobian, None, int(self._arms.site[a]))
-                delta = jacobian[:, self._arms.dofs[a, :n]] @ delta
+                delta = jacobian[:, self._arms.dofs[a, : int(self._arms.joints[a])]] @ delta
             gain = float(np.mean(controller.kp[:3] / controller.kd[:3]))
             speed = gain * float(np.linalg.norm(delta[:3]))
             found.append((part, 1.0 if speed <= most else most / speed))
         return found
 
+    def _speed(self, a: int) -> Callable[[list[float]], float] | None:
+        """What says how fast a command would have a hand go [m/s], to rounding; None but under a fixed OSC_POSE."""
+        c = self._controllers[a]
+        if c.name != "OSC_POSE" or c.impedance_mode != "fixed":
+            return None
+        gain = float(np.mean(c.kp[:3] / c.kd[:3]))
+        scale = abs(c.output_max - c.output_min) / abs(c.input_max - c.input_min)
+        bounds = c.input_min, c.input_max, (c.input_max + c.input_min) / 2, scale, (c.output_max + c.output_min) / 2
+        axes = [tuple(float(b[i]) for b in bounds) for i in range(3)]
+
+        def speed(command: list[float]) -> float:
+            moves = zip(command, axes, strict=False)
+            return gain * math.hypot(*((min(max(x, low), high) - m) * s + o for x, (low, high, m, s, o) in moves))
+
+        return speed
+
     def motions(self, turns: NDArray[np.float64]) -> list[tuple[slice, NDArray[np.float64]]]:
         """For each arm, its part of the action, and that part's values for a change of its joints [rad]."""
-        found, joint, start = [], 0, 0
-        for a, (robot, arm) in enumerate(self.parts):
-            low, high = robot._action_split_indexes[arm]
+        found, joint = [], 0
+        for a, part in enumerate(self._moves):
             n, controller = int(self._arms.joints[a]), self._controllers[a]
             move = turns[joint : joint + n]
             if controller.name != "JOINT_POSITION":
@@ -268,9 +308,8 @@ class Simulation:
                 frame = np.eye(3) if base < 0 else self.data.site_xmat[base].reshape(3, 3)
                 move = np.concatenate([frame.T @ hand[:3], frame.T @ hand[3:]])
             middle, half = (f(controller.output_max, controller.output_min) / 2 for f in (np.add, np.subtract))
-            found.append((slice(start + low, start + high), (move - middle) / half))
+            found.append((part, (move - middle) / half))
             joint += n
-            start += robot.action_dim
         return found
 
     def force_behind(self, torques: NDArray[np.float64]) -> tuple[str, NDArray[np.float64]]:

@@ -28,8 +28,8 @@ class ThreadVectorEnv(SyncVectorEnv[Any, Any]):
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], **arguments: Any) -> None:
-        super().__init__([partial(Member, make) for make in env_fns], **arguments)
-        self._members = [env for env in self.envs if isinstance(env, Member)]
+        super().__init__([partial(ThreadedEnv, make) for make in env_fns], **arguments)
+        self._members = [env for env in self.envs if isinstance(env, ThreadedEnv)]
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Every member steps, or is reset where its episode had ended, as the mode of autoreset has it."""
@@ -47,7 +47,7 @@ class ThreadVectorEnv(SyncVectorEnv[Any, Any]):
                 member.begun = None
 
 
-class Member(gym.Wrapper[Any, Any, Any, Any]):
+class ThreadedEnv(gym.Wrapper[Any, Any, Any, Any]):
     """One environment, made, stepped, rendered and closed on one thread, which graphics contexts ask for."""
 
     def __init__(self, make: Callable[[], gym.Env[Any, Any]]) -> None:

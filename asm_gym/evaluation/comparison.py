@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from asm_gym.detection import Blocks
 from asm_gym.evaluation.defaults import RATES
 from asm_gym.evaluation.ideal import auroc_bound, power_bound
 from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Kind, KindMetrics, false_alarms, in_words
@@ -57,6 +58,9 @@ class MonitorResult:
         thresholds: by the false-alarm rate they were set for.
         examples: typical faulty episodes with all that figures need.
         maxima: (n,) the greatest surprise in each calibration episode.
+        hourly: thresholds again, by the false alarms an hour that they were set for.
+        blocks: the maxima by the hour; None where it was not calibrated so.
+        calibration_tasks: (n,) of those episodes, where they are known.
     """
 
     traces: Sequence[ScoredEpisode]
@@ -64,6 +68,9 @@ class MonitorResult:
     thresholds: Mapping[float, float]
     examples: Sequence[ScoredEpisode] = ()
     maxima: Floats = field(default_factory=lambda: np.zeros(0))
+    hourly: Mapping[float, float] = field(default_factory=dict)
+    blocks: Blocks | None = None
+    calibration_tasks: Sequence[str] = ()
 
 
 class LeftOut(NamedTuple):
@@ -145,15 +152,11 @@ def visible_kinds(detectability: Sequence[Detectability]) -> dict[Kind, bool]:
 
 
 def ideal_metrics(name: str, detectability: Sequence[Detectability], rates: Sequence[float] = RATES) -> KindMetrics:
-    """The bound on what any monitor can score on these faults.
-
-    The bound on average precision is not known in closed form and left out.
-    """
+    """The bound on what any monitor can score on these faults."""
     separations = np.array([d.separation for d in detectability])
     return KindMetrics(
         name=name,
         auroc=float(np.mean(auroc_bound(separations))) if len(separations) else math.nan,
-        average_precision=math.nan,
         found={
             r: Share(round(len(separations) * _mean_power(detectability, r)), len(separations))
             for r in rates
@@ -171,7 +174,8 @@ def monitor_metrics(
     faulty = [t for t in result.traces if t.onset is not None]
     if visible is not None:
         faulty = [t for t in faulty if visible.get((t.kind, t.severity), False)]
-    return DetectionMetrics(name, faulty, nominal, window_s, result.thresholds, result.maxima)
+    kept = result.thresholds, result.maxima, result.hourly, result.blocks
+    return DetectionMetrics(name, faulty, nominal, window_s, *kept)
 
 
 def _mean_power(detectability: Sequence[Detectability], rate: float) -> float:

@@ -11,3 +11,6 @@ REPORTED_RATE = 0.01
 
 RATES = (0.005, REPORTED_RATE, FALSE_ALARM_RATE)
 """Shares of nominal episodes with an alarm, at which detection is compared."""
+
+PER_HOUR = (10.0, 1.0)
+"""False alarms in an hour of nominal episodes, at which it is compared too where there are hours enough."""

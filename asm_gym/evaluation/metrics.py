@@ -22,8 +22,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection import alarms_in
-from asm_gym.evaluation.resampling import Draws, drawn_anew
+from asm_gym.detection import Blocks, alarms_in
+from asm_gym.evaluation.earliness import aucpdt
+from asm_gym.evaluation.resampling import Calibration, Draws, drawn_anew
 from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE, ScoredEpisode, window_steps
 from asm_gym.evaluation.statistics import Floats, Rate, Share, auroc
 
@@ -64,16 +65,6 @@ def time_matched_auroc(faulty: Sequence[ScoredEpisode], nominal: Sequence[Scored
     """
     values = placements(faulty, nominal, window_s)
     return float(1.0 - values.mean()) if values.size else math.nan
-
-
-def average_precision(placements: Floats) -> float:
-    """Area under the precision-recall curve, where as many episodes are faulty as nominal.
-
-    At the k-th smallest placement u the recall is k/F and the false-alarm rate u: precision (k/F) / (k/F + u).
-    """
-    u = np.sort(np.asarray(placements, np.float64))
-    recall = (np.arange(len(u)) + 1) / len(u)
-    return float((recall / (recall + u)).mean()) if len(u) else math.nan
 
 
 class Delays(NamedTuple):
@@ -140,21 +131,6 @@ def _hourly(traces: Sequence[tuple[ScoredEpisode, Floats]]) -> Rate:
     return Rate(alarms, sum(until * t.dt for t, _, until in nominal) / 3600)
 
 
-def balanced_accuracy(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float) -> float:
-    """Mean of the share of faults detected and the share of nominal episodes without an alarm."""
-    return 0.5 * (detected(faulty, window_s).value + 1.0 - false_alarms(nominal).value)
-
-
-def timestep_weighted_accuracy(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode]) -> float:
-    """Balanced accuracy in which a detection counts the less the later it comes (FIPER; Römer et al. 2025).
-
-    ½ (share of nominal episodes without an alarm + mean over faults of 1 - t/T), where t of the T steps left at the
-    onset had passed at the alarm; an undetected fault counts 0.
-    """
-    early = [0.0 if (k := t.detected_after) is None else 1.0 - k / (len(t) - (t.onset or 0)) for t in faulty]
-    return 0.5 * (float(np.mean(early)) + 1.0 - false_alarms(nominal).value) if early else math.nan
-
-
 def attribution_accuracy(faulty: Sequence[ScoredEpisode]) -> Share:
     """Of the faults that raised an alarm, those whose most surprising channel belonged to the fault."""
     return Share.of([t.top_channel in t.affected_channels for t in faulty if t.top_channel and t.affected_channels])
@@ -171,14 +147,12 @@ class KindMetrics(NamedTuple):
     Attributes:
         name: in words.
         auroc: over matched steps.
-        average_precision: likewise; NaN where it is not known.
         found: faults detected within the window, by the false-alarm rate that the threshold was set for.
         delays: at the threshold of the traces; None without faults.
     """
 
     name: str
     auroc: float
-    average_precision: float
     found: Mapping[float, Share]
     delays: Delays | None
 
@@ -210,6 +184,8 @@ class DetectionMetrics:
         window_s: how soon an alarm must come to count as detection [s].
         thresholds: others to detect by, by the false-alarm rate that each was set for.
         maxima: (n,) the greatest surprise in each calibration episode, from which thresholds are set.
+        hourly: others again, by the false alarms an hour that each was set for.
+        blocks: the same by the hour, as the monitor was calibrated on it.
     """
 
     name: str
@@ -218,11 +194,14 @@ class DetectionMetrics:
     window_s: float
     thresholds: Mapping[float, float] = field(default_factory=dict)
     maxima: Floats = field(default_factory=lambda: np.zeros(0))
+    hourly: Mapping[float, float] = field(default_factory=dict)
+    blocks: Blocks | None = None
 
     @cached_property
     def draws(self) -> Draws:
         """The same figures over scenes and calibration episodes drawn anew."""
-        return drawn_anew(self.faulty, self.nominal, self.maxima, list(self.thresholds), self.window_s)
+        how = Calibration(self.maxima, self.blocks, tuple(self.thresholds), tuple(self.hourly))
+        return drawn_anew(self.faulty, self.nominal, how, self.window_s)
 
     @cached_property
     def watched(self) -> list[ScoredEpisode]:
@@ -246,7 +225,6 @@ class DetectionMetrics:
         return KindMetrics(
             name=in_words(kind),
             auroc=float(1.0 - placed.mean()) if placed.size else math.nan,
-            average_precision=average_precision(placed),
             found={r: detected([t.at(q) for t in faulty], self.window_s) for r, q in self.thresholds.items()},
             delays=Delays.of(delays_ms(faulty, self.window_s)),
         )
@@ -266,15 +244,20 @@ class DetectionMetrics:
         return float(np.mean([auroc(own, nominal) for own in peaks.values()])) if peaks and nominal else math.nan
 
     @property
-    def average_precision(self) -> float:
-        """Mean over kinds; NaN without faults."""
-        return float(np.mean([k.average_precision for k in self.kinds.values()])) if self.kinds else math.nan
-
-    @property
     def found(self) -> dict[float, Share]:
         """All faults detected within the window, by false-alarm rate."""
         each = [k.found for k in self.kinds.values()]
         return {r: Share(sum(f[r].k for f in each), sum(f[r].n for f in each)) for r in self.thresholds}
+
+    @cached_property
+    def found_hourly(self) -> dict[float, Share]:
+        """All faults detected within the window, by the false alarms an hour that the threshold was set for."""
+        return {r: detected([t.at(q) for t in self.faulty], self.window_s) for r, q in self.hourly.items()}
+
+    @cached_property
+    def aucpdt(self) -> float:
+        """Precision, recall and delay in one number, the lower the better."""
+        return aucpdt(self.faulty, self.nominal, self.window_s)
 
     @cached_property
     def delays(self) -> Delays | None:

@@ -17,7 +17,8 @@ from matplotlib.figure import Figure
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability
 from asm_gym.evaluation.scored import ScoredEpisode, window_steps
-from asm_gym.evaluation.tables import Table, harmless_table, kinds_table, lead_table, markdown, monitors_table
+from asm_gym.evaluation.standing import card, coverage_table, kept_table, lead_table
+from asm_gym.evaluation.tables import Table, harmless_table, kinds_table, markdown, monitors_table
 from asm_gym.extras import needed_for
 from asm_gym.files import written_whole
 
@@ -177,12 +178,16 @@ def _finite(value: Any) -> Any:
 
 
 def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any], video: Path | None = None) -> None:
-    """Writes ``results.parquet``, ``results.json``, ``results.md`` and ``report.html``."""
+    """Writes ``results.parquet``, ``results.json``, ``results.md``, ``report.html``, and a card for each monitor."""
     _write_parquet(folder / "results.parquet", result)
     tables = [monitors_table(result)]
     if len(result.monitors) > 1:
         tables.append(lead_table(result))
-    tables += [kinds_table(result), harmless_table(result, list(result.monitors))]
+    tables += [kept_table(result), coverage_table(result), kinds_table(result)]
+    if any(monitor.harmless for monitor in result.monitors.values()):
+        tables.append(harmless_table(result, list(result.monitors)))
+    for metrics in result.on_visible:
+        write_json(folder / "cards" / f"{metrics.name.replace(':', '.')}.json", {**card(metrics), "settings": details})
     (folder / "results.md").write_text("\n\n".join(map(markdown, tables)) + "\n", encoding="utf-8")
     summary = {"settings": details, "tables": [{"headings": t.headings, "rows": t.rows} for t in tables]}
     (folder / "results.json").write_text(json.dumps(summary, indent=1, default=str) + "\n", encoding="utf-8")

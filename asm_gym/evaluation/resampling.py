@@ -15,12 +15,40 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection import conformal_episodes, conformal_threshold
+from asm_gym.detection import Blocks, conformal_episodes, conformal_threshold, hourly_threshold
 from asm_gym.evaluation.scored import ScoredEpisode, window_steps
 from asm_gym.evaluation.statistics import Estimate, Floats
 
 DRAWS = 400
 """How often everything is drawn anew."""
+
+
+class Calibration(NamedTuple):
+    """From what a monitor's thresholds are set, and for which promises.
+
+    Attributes:
+        maxima: (n,) the greatest surprise in each calibration episode.
+        blocks: the same by the hour; None where nothing is promised by it.
+        rates: of nominal episodes with an alarm; those that n is too small for are left out.
+        hourly: of alarms an hour.
+    """
+
+    maxima: Floats
+    blocks: Blocks | None = None
+    rates: tuple[float, ...] = ()
+    hourly: tuple[float, ...] = ()
+
+    def anew(self, rng: np.random.Generator) -> tuple[dict[float, float], dict[float, float]]:
+        """Thresholds from episodes, and from blocks, drawn anew with replacement: by rate, and by alarms an hour."""
+        again = rng.integers(len(self.maxima), size=len(self.maxima))
+        possible = [r for r in self.rates if len(self.maxima) >= conformal_episodes(r)]
+        by_rate = {r: conformal_threshold(self.maxima[again], r) for r in possible}
+        if self.blocks is None or not self.hourly:
+            return by_rate, {}
+        again = rng.integers(len(self.blocks.maxima), size=len(self.blocks.maxima))
+        # As many hours as there were: short episodes drawn more often promise nothing else.
+        drawn = self.blocks._replace(maxima=self.blocks.maxima[again])
+        return by_rate, {r: hourly_threshold(drawn, r) for r in self.hourly}
 
 
 class Draws(NamedTuple):
@@ -29,10 +57,12 @@ class Draws(NamedTuple):
     Attributes:
         auroc: (R,) over matched steps, the mean over kinds.
         found: (R,) share of faults detected within the window, by the false-alarm rate the threshold was set for.
+        hourly: (R,) the same, by the false alarms an hour that it was set for.
     """
 
     auroc: Floats
     found: Mapping[float, Floats]
+    hourly: Mapping[float, Floats]
 
 
 def interval(value: float, draws: Floats) -> Estimate:
@@ -46,8 +76,7 @@ def interval(value: float, draws: Floats) -> Estimate:
 def drawn_anew(
     faulty: Sequence[ScoredEpisode],
     nominal: Sequence[ScoredEpisode],
-    maxima: Floats,
-    rates: Sequence[float],
+    calibration: Calibration,
     window_s: float,
     seed: int = 0,
     draws: int = DRAWS,
@@ -57,8 +86,7 @@ def drawn_anew(
     Args:
         faulty: traces with an onset; twins of nominal ones share their seed.
         nominal: traces without one; each is a scene of its task.
-        maxima: (n,) the greatest surprise in each calibration episode.
-        rates: for which thresholds are set anew; those that n is too small for are left out.
+        calibration: by which thresholds are set anew.
         window_s: how soon an alarm must come to count as detection [s].
         seed: of what is drawn; the same for all monitors that are to be compared.
     """
@@ -72,19 +100,18 @@ def drawn_anew(
     beaten = _beaten(faulty, nominal, place, window_s)
     known, beaten = ~np.isnan(beaten), np.nan_to_num(beaten)
     alarms = _Alarms(faulty, window_s)
-    possible = [r for r in rates if len(maxima) >= conformal_episodes(r)]
-    auroc, found = np.full(draws, math.nan), {r: np.full(draws, math.nan) for r in possible}
+    own = [np.array([i for i, name in enumerate(tasks) if name == task]) for task in dict.fromkeys(tasks)]
+    auroc = np.full(draws, math.nan)
+    found: tuple[dict[float, Floats], dict[float, Floats]] = {}, {}
     for k in range(draws):
         weights = np.zeros(len(names))  # how often each scene was drawn
-        for task in dict.fromkeys(tasks):
-            own = np.array([i for i, name in enumerate(tasks) if name == task])
-            np.add.at(weights, rng.choice(own, len(own)), 1.0)
-        again = rng.integers(len(maxima), size=len(maxima))
+        for scenes in own:
+            np.add.at(weights, rng.choice(scenes, len(scenes)), 1.0)
         auroc[k] = _mean_auroc(beaten, known, weights, weights[scene], kind, len(kinds))
-        for rate, shares in found.items():
-            threshold = conformal_threshold(maxima[again], rate)
-            shares[k] = _mean(alarms.over(threshold), weights[scene])
-    return Draws(auroc, found)
+        for kept, thresholds in zip(found, calibration.anew(rng), strict=True):
+            for rate, threshold in thresholds.items():
+                kept.setdefault(rate, np.full(draws, math.nan))[k] = _mean(alarms.over(threshold), weights[scene])
+    return Draws(auroc, *found)
 
 
 def _beaten(

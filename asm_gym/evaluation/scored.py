@@ -188,9 +188,14 @@ class ScoredEpisode:
         return replace(self, threshold=threshold, top_channel="")
 
     def attributed(self, attribution: Floats, channels: Sequence[str]) -> ScoredEpisode:
-        """The trace with its ``top_channel``, read from the shares (T, D) of the surprise of D ``channels``."""
+        """The trace with its ``top_channel``, read from the shares (T, D) of the surprise of D ``channels``.
+
+        Where several have the largest share alike, none is blamed.
+        """
         step = self.first_alarm
-        return self if step is None else replace(self, top_channel=channels[int(np.argmax(attribution[step]))])
+        if step is None or (attribution[step] == attribution[step].max()).sum() > 1:
+            return self
+        return replace(self, top_channel=channels[int(np.argmax(attribution[step]))])
 
 
 def window_steps(window_s: float, dt: float) -> int:
@@ -200,7 +205,7 @@ def window_steps(window_s: float, dt: float) -> int:
     return max(1, math.floor(window_s / dt + 1e-6))  # 0.3 / 0.1 is a hair below 3
 
 
-class Moment(NamedTuple):
+class AlarmMoment(NamedTuple):
     """An alarm, and how it began.
 
     Attributes:
@@ -217,12 +222,14 @@ class Moment(NamedTuple):
     excess: float
 
 
-def moments_of(trace: ScoredEpisode) -> list[Moment]:
+def moments_of(trace: ScoredEpisode) -> list[AlarmMoment]:
     """The alarms of an episode, in order. Raises ValueError where the trace has no detail."""
     if trace.detail is None:
         raise ValueError("this trace was kept without the detail that says which channel surprised")
     found = []
     for start, stop in spans(trace.alarm):
         channel = int(np.argmax(trace.detail.attribution[start]))
-        found.append(Moment(trace, start, stop, channel, float(trace.surprise[start:stop].max() / trace.threshold)))
+        found.append(
+            AlarmMoment(trace, start, stop, channel, float(trace.surprise[start:stop].max() / trace.threshold))
+        )
     return found

@@ -16,7 +16,7 @@ from rich.table import Table as ConsoleTable
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import metrics
 from asm_gym.evaluation.comparison import BenchmarkResult
-from asm_gym.evaluation.defaults import RATES
+from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import ActingMetrics, Delays, DetectionMetrics, KindMetrics, in_words
 from asm_gym.evaluation.resampling import interval
 from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE
@@ -200,12 +200,17 @@ def _found(rate: float) -> Callable[[Compared], str]:
     return cell
 
 
+def _found_hourly(rate: float) -> Callable[[DetectionMetrics], str]:
+    def cell(m: DetectionMetrics) -> str:
+        if rate not in m.found_hourly:
+            return ""
+        return _percent(interval(m.found_hourly[rate].value, m.draws.hourly[rate]))
+
+    return cell
+
+
 def _percent(estimate: Estimate) -> str:
     return f"{100 * estimate.value:.0f} % ({100 * estimate.low:.0f}–{100 * estimate.high:.0f})"
-
-
-def _points(estimate: Estimate) -> str:
-    return f"{100 * estimate.value:+.1f} ({100 * estimate.low:+.1f} to {100 * estimate.high:+.1f})"
 
 
 def _auroc(m: Compared) -> str:
@@ -221,19 +226,13 @@ MONITOR_COLUMNS: Sequence[Column[Compared]] = (
     Column("Monitor", lambda m: m.name),
     Column("AUROC, same steps", _auroc),
     Column("AUROC, whole episodes", _of_monitor(lambda m: number(m.unmatched_auroc, 3))),
-    Column("AP", lambda m: number(m.average_precision, 3)),
+    Column("AUCPDT", _of_monitor(lambda m: number(m.aucpdt, 3))),
     *(Column(f"{'Found ' * (rate == RATES[0])}at {100 * rate:g} %", _found(rate)) for rate in RATES),
+    *(Column(f"at {rate:g} an hour", _of_monitor(_found_hourly(rate))) for rate in PER_HOUR),
     Column("Median delay [ms]", lambda m: milliseconds(m.delays, "median_ms")),
     Column("p95 [ms]", lambda m: milliseconds(m.delays, "p95_ms")),
-    Column("False alarms", _of_monitor(lambda m: count(metrics.false_alarms(m.nominal)))),
+    Column("False alarms", _of_monitor(lambda m: count_within(metrics.false_alarms(m.nominal)))),
     Column("per hour", _of_monitor(lambda m: metrics.hourly_alarms(m.nominal).text)),
-    Column(
-        "Balanced accuracy",
-        _of_monitor(lambda m: f"{metrics.balanced_accuracy(m.faulty, m.nominal, m.window_s):.3f}"),
-    ),
-    Column(
-        "Timestep-weighted", _of_monitor(lambda m: f"{metrics.timestep_weighted_accuracy(m.faulty, m.nominal):.3f}")
-    ),
     Column("Right channel", _right_channel),
 )
 
@@ -253,7 +252,8 @@ def monitors_table(result: BenchmarkResult) -> Table:
         f"ideal observer can see; thresholds from separate nominal episodes, delays and accuracies at a false-alarm "
         f"rate of {100 * result.rate:g} % of episodes; in brackets 95 % intervals, from scenes and calibration "
         f"episodes drawn anew. AUROC: against nominal episodes over the same steps, and against the greatest surprise "
-        f"of whole ones, as a threshold sees it. Left out are nominal episodes in which the policy failed "
+        f"of whole ones, as a threshold sees it. AUCPDT: precision, recall and delay in one number, the lower the "
+        f"better. Left out are nominal episodes in which the policy failed "
         f"({result.left_out.failed}) or hit something by itself ({result.left_out.crashed}), and faults in such "
         f"scenes.{hidden_kinds}{needed}",
         MONITOR_COLUMNS,
@@ -273,24 +273,6 @@ def brief_monitors_table(result: BenchmarkResult) -> Table:
     )
     caption = f"found within {result.window_s:g} s at a false-alarm rate of {100 * result.rate:g} %"
     return tabulate(caption, columns, _compared(result))
-
-
-def lead_table(result: BenchmarkResult) -> Table:
-    """How far the first monitor is ahead of each other, on the same scenes and calibration episodes."""
-    first, *others = result.on_visible
-    rows = []
-    for other in others:
-        auroc = interval(first.auroc - other.auroc, first.draws.auroc - other.draws.auroc)
-        cells = [f"{auroc.value:+.3f} ({auroc.low:+.3f} to {auroc.high:+.3f})", ""]
-        if result.rate in first.draws.found.keys() & other.draws.found.keys():
-            ahead = first.found[result.rate].value - other.found[result.rate].value
-            cells[1] = _points(interval(ahead, first.draws.found[result.rate] - other.draws.found[result.rate]))
-        rows.append((other.name, *cells))
-    return Table(
-        f"How far {first.name} is ahead of each other monitor; 95 % intervals of the paired difference.",
-        ("Monitor", "AUROC", f"Found at {100 * result.rate:g} % [points]"),
-        rows,
-    )
 
 
 def kinds_table(result: BenchmarkResult) -> Table:

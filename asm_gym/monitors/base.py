@@ -88,7 +88,9 @@ class Surprise(NamedTuple):
 
     def excused(self, by: Excused) -> Surprise:
         """What is left of it where the senses excuse some."""
-        shares, value = self.attribution / by.divisor[:, None], self.value / by.divisor
+        shares, value = self.attribution, self.value
+        if (by.divisor != 1.0).any():
+            shares, value = shares / by.divisor[:, None], value / by.divisor
         return self._replace(value=value, attribution=shares, raw=self.value, excuse=by.kind)
 
     def silenced(self, where: NDArray[np.bool_]) -> Surprise:

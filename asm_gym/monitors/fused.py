@@ -32,12 +32,20 @@ from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.monitor import MonitorState
 from asm_gym.scaling import _read
 
+(W_C, W_F, W_D, KEPT, V, U, LINEAR, W_S, B_S, SPAN_S, REMAINDER, W_K, B_K) = range(13)
+(MEAN, SPREAD, CHANGE, WHITENING, CEILING, TAIL, USUAL, BETWEEN, GAINS, REPEATS, MOST, OFFSET, BOUND) = range(13, 26)
+SENSORY, MOTOR, SLOW, SPANS = range(26, 30)
+"""Places of what was learned in ``CompiledRow``."""
+
 A_THREAD = 256
 """Streams that one thread observes at a time."""
 
 
 class CompiledRow:
     """``observe`` of a memory under the detection of evidence.
+
+    What was learned lies in three arrays, one a kind of number: a row finds it in one piece, and handing over sixty
+    arrays took longer than adding them up.
 
     Args:
         model: fitted, and one of traces.
@@ -50,15 +58,15 @@ class CompiledRow:
         if must_compile(_observe):
             print("asm-gym: compiling the memory, once on this machine (about half a minute)", file=sys.stderr)
         skills = [model.learned_[n] for n in ("W_K", "b_K")] if model.skills_ else [np.zeros((0, 0)), np.zeros(0)]
-        self._learned = (
-            (s.mean, s.spread, s.change, model.spec.sensory, model.spec.motor, s.slow),
-            tuple(network.weights),
-            (*network.inference, bool(d.context_quantile[:-1].any())),
-            (*network.association, network.spans),
-            tuple(np.ascontiguousarray(W, np.float32) for W in skills),
-            (d.whitening, d.ceiling, d.tail, d.context_quantile, d.context_range, d.gains, d.bound),
-            detection.repeating,
+        detector = d.whitening, d.ceiling, d.tail, d.context_quantile, d.context_range, d.gains
+        singles, where_singles = _side_by_side(np.float32, *network.weights, *network.association, *skills)
+        doubles, where_doubles = _side_by_side(
+            np.float64, s.mean, s.spread, s.change, *detector, *detection.repeating, np.array([d.bound])
         )
+        spec = model.spec
+        whole, where_whole = _side_by_side(np.int64, spec.sensory, spec.motor, s.slow, network.spans)
+        where = np.stack([*where_singles, *where_doubles, *where_whole])
+        self._learned = (singles, doubles, whole, where, *network.inference, bool(d.context_quantile[:-1].any()))
 
     @classmethod
     def of(cls, model: MemoryModel, detection: Detection) -> CompiledRow | None:
@@ -70,51 +78,99 @@ class CompiledRow:
         """The new state, and the surprise of the next rows (B, D), some of which may not be finite."""
         model, (evidence, repetition) = state.model, state.detection
         old = (*model, *evidence, *repetition)
-        new, found = tuple(map(np.empty_like, old)), (np.empty(len(rows)), np.empty_like(rows))
-
-        def observe(part: slice) -> None:
-            before, after, said = (tuple(a[part] for a in arrays) for arrays in (old, new, found))
-            _observe(rows[part], before, after, said, *self._learned)
-
-        parts = _parts(len(rows))
-        if len(parts) == 1:
-            observe(parts[0])
+        new, B = [np.empty_like(a) for a in old], len(rows)
+        found = np.empty(B), np.empty_like(rows)
+        arrays: tuple[Any, ...] = (rows, *old, *new, *found)
+        if B <= A_THREAD:
+            _observe(*arrays, *self._learned)
         else:
             with ThreadPoolExecutor() as threads:
-                list(threads.map(observe, parts))
+                parts = [[a[n : n + A_THREAD] for a in arrays] for n in range(0, B, A_THREAD)]
+                list(threads.map(lambda part: _observe(*part, *self._learned), parts))
         detection = EvidenceState(Evidence(*new[6:9]), Repetition(*new[9:]))
         return MonitorState(MemoryState(*new[:6]), detection), Surprise(*found)
 
 
-def _parts(streams: int) -> list[slice]:
-    """What each thread observes: as many whatever the machine is, for products of other sizes have other last bits."""
-    return [slice(a, a + A_THREAD) for a in range(0, max(streams, 1), A_THREAD)]
+def _side_by_side(kind: Any, *arrays: Any) -> tuple[NDArray[Any], list[tuple[int, int, int]]]:
+    """Arrays end to end, and of each where it begins and its shape, as a matrix; every one begins a line of cache."""
+    where, parts, begins, line = [], [], 0, 64 // np.dtype(kind).itemsize
+    for array in arrays:
+        flat = np.asarray(array, kind).ravel()
+        columns = array.shape[-1]
+        where.append((begins, flat.size // max(columns, 1), columns))
+        parts += [flat, np.zeros(-flat.size % line, kind)]
+        begins += flat.size + parts[-1].size
+    return np.concatenate(parts), where
+
+
+@compiled
+def _matrix(flat: Any, where: Any, k: int) -> Any:
+    begins, rows, columns = where[k]
+    return flat[begins : begins + rows * columns].reshape((rows, columns))
+
+
+@compiled
+def _vector(flat: Any, where: Any, k: int) -> Any:
+    begins, rows, columns = where[k]
+    return flat[begins : begins + rows * columns]
 
 
 @partial(compiled, calls=("memory", "detection", "."), nogil=True)
 def _observe(
     rows: Any,
-    old: Any,
-    new: Any,
-    found: Any,
-    scaler: Any,
-    weights: Any,
-    inference: Any,
-    association: Any,
-    readout: Any,
-    detector: Any,
-    repeating: Any,
+    traces: Any,
+    expected: Any,
+    before: Any,
+    earlier: Any,
+    steps: Any,
+    skill: Any,
+    vector: Any,
+    lately: Any,
+    counted: Any,
+    said: Any,
+    again: Any,
+    unlikely: Any,
+    new_traces: Any,
+    new_expected: Any,
+    new_before: Any,
+    new_earlier: Any,
+    new_steps: Any,
+    new_skill: Any,
+    new_vector: Any,
+    new_lately: Any,
+    new_counted: Any,
+    new_said: Any,
+    new_again: Any,
+    new_unlikely: Any,
+    value: Any,
+    attribution: Any,
+    singles: Any,
+    doubles: Any,
+    whole_numbers: Any,
+    where: Any,
+    pi_z: Any,
+    pi_x: Any,
+    curvature: Any,
+    iterations: int,
+    looks: bool,
 ) -> None:
-    """Writes the ``new`` state and what was ``found``, value (B,) and attribution (B, D).
+    """Writes the new state, ``value`` (B,) and ``attribution`` (B, D).
 
     Args:
         rows: (B, D).
-        old: the state: the fields of ``MemoryState``, ``Evidence`` and ``Repetition``; so is ``new``.
-        inference: and whether anybody looks at the context.
+        traces: and on to ``unlikely`` the old state: the fields of ``MemoryState``, ``Evidence`` and ``Repetition``;
+            after them, as ``new``, the new one.
+        singles, doubles, whole_numbers, where: what was learned, as ``CompiledRow`` lays it out.
+        looks: whether anybody looks at the context.
     """
-    traces, expected, before, earlier, steps, skill, vector, lately, counted, said, again, unlikely = old
-    B = len(rows)
-    sensory, lag = scaler[3], before.shape[1]
+    S, D, I, w = singles, doubles, whole_numbers, where  # noqa: E741
+    sensory, motor, slow, spans = (
+        _vector(I, w, SENSORY),
+        _vector(I, w, MOTOR),
+        _vector(I, w, SLOW),
+        _matrix(I, w, SPANS),
+    )
+    B, lag = len(rows), before.shape[1]
     last, past = rows.copy(), rows.copy()  # what rows are compared with: at first nothing moves
     due = 0
     for n in range(B):
@@ -122,30 +178,38 @@ def _observe(
             last[n] = before[n, 0]
         past[n] = earlier[n, 0] if steps[n] >= 2 * lag else last[n]
         due += steps[n] % lag == 0
-        new[2][n, : lag - 1], new[3][n, : lag - 1] = before[n, 1:], earlier[n, 1:]
-        new[2][n, lag - 1], new[3][n, lag - 1] = rows[n], last[n]
-        new[4][n] = steps[n] + 1
-    senses, seen, commands, inputs, changes, whole, finite = _read(rows, last, past, *scaler)
+        new_before[n, : lag - 1], new_earlier[n, : lag - 1] = before[n, 1:], earlier[n, 1:]
+        new_before[n, lag - 1], new_earlier[n, lag - 1] = rows[n], last[n]
+        new_steps[n] = steps[n] + 1
+    scales = _vector(D, w, MEAN), _vector(D, w, SPREAD), _vector(D, w, CHANGE)
+    senses, seen, commands, inputs, changes, whole, finite = _read(rows, last, past, *scales, sensory, motor, slow)
 
-    new[0][:], new[1][:] = traces, expected
+    new_traces[:], new_expected[:] = traces, expected
     if due:
-        f, c = carry(traces, commands, senses, seen, *weights, *inference)
+        weights = _matrix(S, w, W_C), _matrix(S, w, W_F), _matrix(S, w, W_D), _vector(S, w, KEPT)
+        f, c = carry(traces, commands, senses, seen, *weights, pi_z, pi_x, curvature, iterations, looks)
         for n in range(B):
             if steps[n] % lag == 0:
-                new[0][n], new[1][n] = c[n], f[n]
+                new_traces[n], new_expected[n] = c[n], f[n]
 
-    error, units = normalised_errors(inputs, changes, whole, *association)
+    predicts = _matrix(S, w, V), _matrix(S, w, U), _matrix(S, w, LINEAR)
+    spread = _matrix(S, w, W_S), _vector(S, w, B_S), _matrix(S, w, SPAN_S), _vector(S, w, REMAINDER)
+    error, units = normalised_errors(inputs, changes, whole, *predicts, *spread, spans)
     for n in range(B):
         if steps[n] < lag:
             error[n] = 0.0  # nothing came before, so that no change is known
-    if len(readout[1]):
-        new[5][:] = add_up(skill, units, new[1], *readout)
+    if skill.shape[1]:
+        new_skill[:] = add_up(skill, units, new_expected, _matrix(S, w, W_K), _vector(S, w, B_K))
 
-    errors, context = error.astype(np.float64), new[1].astype(np.float64)
-    (new[6][:], new[7][:], new[8][:]), _, shares = _step(vector, lately, counted, errors, context, *detector)
-    now = rows[:, sensory]
-    new[9][:], new[10][:], new[11][:] = repeated(said, again, unlikely, now, repeating[0], repeating[1])
-    _attribute(shares, new[11], repeating[2], sensory, finite, *found)
+    errors, context = error.astype(np.float64), new_expected.astype(np.float64)
+    detector = _matrix(D, w, WHITENING), _matrix(D, w, CEILING), _matrix(D, w, TAIL)
+    usual = _vector(D, w, USUAL), _vector(D, w, BETWEEN), _vector(D, w, GAINS), _vector(D, w, BOUND)[0]
+    (new_vector[:], new_lately[:], new_counted[:]), _, shares = _step(
+        vector, lately, counted, errors, context, *detector, *usual
+    )
+    now, adds = rows[:, sensory], _vector(D, w, REPEATS).reshape((2, 2, len(sensory)))
+    new_said[:], new_again[:], new_unlikely[:] = repeated(said, again, unlikely, now, adds, _vector(D, w, MOST))
+    _attribute(shares, new_unlikely, _vector(D, w, OFFSET), sensory, finite, value, attribution)
 
 
 @compiled

@@ -247,10 +247,9 @@ class NeuralASM(CalibratedMonitor):
 
     def _compiled(self) -> CompiledRow | None:
         """``observe`` in one call, of the weights as they are now."""
-        evidence = self.detection
+        evidence, of = self.detection, self._row_of
         now = self.model.network_, evidence.detector_ if isinstance(evidence, EvidenceDetection) else None, self.skills_
-        if self._row_of is None or any(a is not b for a, b in zip(self._row_of, now, strict=True)):
-            self._fitted()
+        if of is None or of[0] is not now[0] or of[1] is not now[1] or of[2] is not now[2]:
             self._row, self._row_of = CompiledRow.of(self.model, self.detection), now
         return self._row
 

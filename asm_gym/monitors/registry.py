@@ -9,6 +9,7 @@ from typing import Any
 from asm_gym.checkpoint import kind_of, read_checkpoint
 from asm_gym.detection import Detection, EvidenceDetection
 from asm_gym.extras import needed_for
+from asm_gym.monitors.estimators import adapted
 from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import CalibratedMonitor
 from asm_gym.monitors.saved import restored
@@ -25,6 +26,7 @@ DETECTIONS: dict[str, Any] = {
     "mahalanobis": "asm_gym.detection.scores:Mahalanobis",
     "moving_mean": "asm_gym.detection.scores:MovingMean",
     "largest": "asm_gym.detection.scores:Largest",
+    "per_dimension": "asm_gym.detection.scores:PerDimension",
     "band": "asm_gym.detection.functional_band:FunctionalBand",
     "latent_threshold": "asm_gym.monitors.baselines.lstm_vae:LatentThreshold",
 }
@@ -102,6 +104,8 @@ _BASELINES = {
     "rnd": _row("fail_detect:RND", "moving_mean"),
     "lstm_vae": _row("lstm_vae:LSTMVAE", "latent_threshold"),
     "gru": _row("gru:GRU", "mahalanobis"),
+    "rapt": _row("rapt:RAPT", "per_dimension"),
+    "next": _row("external_torque:NEXT", "largest"),
     "kalman": _row("kalman:Kalman", "mahalanobis"),
     "association_linear": _row("association_linear:LinearAssociation", "mahalanobis"),
     "association_values": _row("association_values:ValueAssociation", "mahalanobis"),
@@ -170,17 +174,32 @@ def check_monitor(name: str) -> None:
     """Raises ValueError unless there is such a monitor, or such a model and detection.
 
     A model that goes by ``module:class`` is imported and registered by its kind, by which its files are known; nothing
-    else is imported.
+    else is imported. An estimator of scikit-learn becomes a model.
     """
     model, plus, detection = name.partition("+")
     if ":" in model and model not in MONITORS:
-        own = target(model)
-        register_monitor(getattr(own, "kind", ""), own)
+        own = _model_class(target(model), model)
+        if own.kind not in MONITORS:
+            register_monitor(own.kind, own, getattr(own, "detection", "evidence"))
         MONITORS[model] = MONITORS[own.kind]
     if plus and name not in MONITORS and model in MONITORS:
         check_choice("detection", detection, DETECTIONS)
     else:
         check_choice("monitor", name, MONITORS)
+
+
+def _model_class(own: Any, name: str) -> Any:
+    """A class of models or of whole monitors. Raises ValueError where it lacks what it takes."""
+    if hasattr(own, "score_samples") and not hasattr(own, "kind"):
+        return adapted(own)
+    whole = isinstance(own, type) and issubclass(own, CalibratedMonitor)
+    missing = [n for n in ("kind", "fit", *(() if whole else ("start", "predict", "restore"))) if not hasattr(own, n)]
+    if missing:
+        raise ValueError(
+            f"{name} is no model: it has no {', '.join(missing)}; derive from asm_gym.monitors.model.StreamModel, or "
+            "give an estimator with fit and score_samples"
+        )
+    return own
 
 
 @typed
@@ -201,7 +220,11 @@ def monitor_class(name: str) -> MonitorKind:
 
 @typed
 def make_monitor(
-    name: str, spec: StreamSpec, detection: str | Detection | None = None, **hyperparameters: Any
+    name: str,
+    spec: StreamSpec,
+    detection: str | Detection | None = None,
+    device: str = "cpu",
+    **hyperparameters: Any,
 ) -> CalibratedMonitor:
     """A monitor by name, not yet fitted.
 
@@ -209,10 +232,12 @@ def make_monitor(
         name: for example ``neural_asm``, or ``gru+evidence``, which is ``gru`` with the detection ``evidence``.
         spec: the stream it is to watch.
         detection: what judges the model's errors, by name or one's own; where None, what the name says.
+        device: where it learns and predicts, as in ``cuda``, if its model is a PyTorch network.
         **hyperparameters: of that monitor.
 
     Raises:
-        ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists.
+        ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists;
+            or the device cannot be used, or not by this monitor.
 
     Example:
         >>> import numpy as np
@@ -227,13 +252,13 @@ def make_monitor(
     kind = monitor_class(name if not isinstance(detection, str) else f"{model_of(name)}+{detection}")
     for parameter in hyperparameters:
         check_choice(f"hyperparameter of {name}", parameter, kind.hyperparameters)
-    made = kind(spec, **hyperparameters)
+    made = _placed(kind(spec, **hyperparameters), device)
     return made if detection is None or isinstance(detection, str) else made.with_detection(detection)
 
 
 @typed
-def load_monitor(path: str | Path) -> CalibratedMonitor:
-    """Reads what any monitor has saved, with the detection that it had.
+def load_monitor(path: str | Path, device: str = "cpu") -> CalibratedMonitor:
+    """Reads what any monitor has saved, with the detection that it had, to predict on a device as in ``make_monitor``.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -241,4 +266,13 @@ def load_monitor(path: str | Path) -> CalibratedMonitor:
     """
     kind = monitor_class(kind_of(path))
     saved = read_checkpoint(path, kind.model_class.kind)
-    return restored(path, saved, kind.under(saved.header.get("detection", kind.detection)))
+    return _placed(restored(path, saved, kind.under(saved.header.get("detection", kind.detection))), device)
+
+
+def _placed(monitor: CalibratedMonitor, device: str) -> CalibratedMonitor:
+    """The same, its model on the device."""
+    if device != "cpu":
+        if not hasattr(monitor.model, "to"):
+            raise ValueError(f"{monitor.model.kind} runs on a CPU alone, got device {device!r}")
+        monitor.model.to(device)
+    return monitor

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -167,14 +168,51 @@ class Recordings(NamedTuple):
 
 
 def crashes(recordings: Sequence[Episode]) -> set[tuple[str, int]]:
-    """Tasks and seeds of nominal episodes that succeed, and press ``CRASH`` times as hard as others of their task."""
+    """Tasks and seeds of nominal episodes that succeed, and press ``CRASH`` times as hard as others of their task.
+
+    What is usual is told by those that are learned from and calibrated on, not by what is tested on, where there are.
+    """
     hardest: dict[str, dict[int, float]] = {}
+    told: dict[str, list[float]] = {}
     for recording in recordings:
         label, force = recording.labelled, recording.contact_force
         if label.role in NOMINAL_ROLES and recording.success and np.isfinite(force).any():
-            hardest.setdefault(label.task, {})[label.seed] = float(np.nanmax(force))
-    usual = {task: float(np.median(list(forces.values()))) for task, forces in hardest.items()}
+            hardest.setdefault(label.task, {})[label.seed] = most = float(np.nanmax(force))
+            if label.role != "nominal":
+                told.setdefault(label.task, []).append(most)
+    usual = {task: float(np.median(told.get(task, list(forces.values())))) for task, forces in hardest.items()}
     return {(task, seed) for task, forces in hardest.items() for seed, f in forces.items() if f > CRASH * usual[task]}
+
+
+_UNREAD: list[tuple[Path, str]] = []
+
+
+@contextmanager
+def unread(folder: Path, who: str) -> Iterator[None]:
+    """Nothing in ``folder`` is opened while the block runs, by no Python code of this process.
+
+    Raises:
+        PermissionError: something was; whoever learns is handed what may be learned from.
+    """
+    if not _WATCHING:
+        sys.addaudithook(_refuse)  # none can be taken away again
+        _WATCHING.append(True)
+    _UNREAD.append((folder.resolve() / "episodes", who))
+    try:
+        yield
+    finally:
+        _UNREAD.pop()
+
+
+_WATCHING: list[bool] = []
+
+
+def _refuse(event: str, arguments: tuple[Any, ...]) -> None:
+    if event == "open" and _UNREAD and isinstance(arguments[0], str | bytes | os.PathLike):
+        path = Path(os.path.realpath(os.fsdecode(arguments[0])))
+        for folder, who in _UNREAD:
+            if folder in path.parents:
+                raise PermissionError(f"{who} opened {path}: it may learn from what fit and calibrate are given alone")
 
 
 def labelled(run: Path, labels: Sequence[EpisodeLabel]) -> list[Episode]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,14 @@ import asm_gym
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
-from asm_gym.evaluation.defaults import RATES
+from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.ideal import earliest, noise_floor, separation
 from asm_gym.evaluation.metrics import typical
 from asm_gym.evaluation.scored import NOMINAL, InterventionOutcome, ScoredEpisode, TraceDetail, window_steps
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
 from asm_gym.monitors.registry import model_of
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
-from asm_gym.rollouts.run_folder import NOMINAL_ROLES, Recordings, labelled
+from asm_gym.rollouts.run_folder import NOMINAL_ROLES, Recordings, labelled, unread
 
 EXAMPLES = ("push", "collision", "weak_joint", "frozen_encoder", "snatch")
 """Kinds of which the report shows an episode."""
@@ -44,6 +44,7 @@ def benchmark(
     parallel: ParallelConfig,
     progress: Progress,
     settings: Mapping[str, Mapping[str, Any]] = NO_SETTINGS,
+    recorded: Path | None = None,
 ) -> BenchmarkResult:
     """Reads the recordings, and lets every monitor judge them.
 
@@ -55,18 +56,23 @@ def benchmark(
         seed: of the monitors.
         parallel: who judges; each monitor is one task.
         settings: by the names of models, hyperparameters that are not their own.
+        recorded: where the recordings are; in the folder of the run by default.
     """
+    recorded = (recorded or folder).resolve()
     progress(0, len(monitors))
     # One that is judged in two ways is fitted once.
     models: dict[str, list[str]] = {}
     for name in monitors:
         models.setdefault(name.removesuffix(EVIDENCE), []).append(name)
-    ask = partial(_results, folder=folder.resolve(), labels=tuple(labels), rate=rate, seed=seed, settings=settings)
+    of = tuple(labels)
+    ask = partial(
+        _results, folder=folder.resolve(), recorded=recorded, labels=of, rate=rate, seed=seed, settings=settings
+    )
     made = parallel_map(
         ask, list(models.values()), parallel, lambda k, n: progress(k * len(monitors) // n, len(monitors))
     )
     found = {name: result for results in made for name, result in results.items()}
-    by_role, left_out, twins = Recordings.of(labelled(folder, labels))
+    by_role, left_out, twins = read(recorded, of)
     return BenchmarkResult(
         {name: found[name] for name in monitors},
         detectability_of(twins, by_role.get("faulty", []), window_s),
@@ -76,16 +82,24 @@ def benchmark(
     )
 
 
+@lru_cache(maxsize=1)
+def read(recorded: Path, labels: tuple[EpisodeLabel, ...]) -> Recordings:
+    """The recordings of a run; those asked for last are kept, for the next monitor."""
+    return Recordings.of(labelled(recorded, labels))
+
+
 def _results(
     names: Sequence[str],
     folder: Path,
-    labels: Sequence[EpisodeLabel],
+    recorded: Path,
+    labels: tuple[EpisodeLabel, ...],
     rate: float,
     seed: int,
     settings: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, MonitorResult]:
-    by_role = Recordings.of(labelled(folder, labels)).roles
-    return {name: result_of(name, folder, by_role, rate, seed, settings.get(model_of(name))) for name in names}
+    by_role = read(recorded, labels).roles
+    with unread(recorded, "a monitor"):
+        return {name: result_of(name, folder, by_role, rate, seed, settings.get(model_of(name))) for name in names}
 
 
 def result_of(
@@ -114,6 +128,8 @@ def judged(
     monitor.calibrate(by_role["calibration"], rate)
     rates = sorted({rate, *(r for r in RATES if len(by_role["calibration"]) >= conformal_episodes(r))})
     thresholds = {r: monitor.threshold_at(r) for r in rates}
+    hours = 0.0 if monitor.blocks_ is None else monitor.blocks_.total
+    hourly = {r: monitor.threshold_at(false_alarms_per_hour=r) for r in PER_HOUR if r * hours >= 1.0}
     tested = [*by_role["nominal"], *by_role.get("faulty", [])]
     traces = traces_of(name, monitor, tested, thresholds[rate])
     return MonitorResult(
@@ -122,6 +138,9 @@ def judged(
         thresholds,
         _examples(monitor, traces, tested),
         np.zeros(0) if monitor.maxima_ is None else monitor.maxima_,
+        hourly,
+        monitor.blocks_,
+        [episode.labelled.task for episode in by_role["calibration"]],
     )
 
 
@@ -177,8 +196,13 @@ def calibrated(
     return fitted(folder, name, nominal.roles["fit"], seed, settings).with_threshold(threshold)
 
 
-def _scores(monitor: CalibratedMonitor, recordings: Sequence[Episode]) -> list[Any]:
-    return list(monitor.score_episodes(recordings)) if recordings else []
+AT_ONCE = 256
+"""Episodes scored together: what each number of all rows had a share of would fill the memory."""
+
+
+def _scores(monitor: CalibratedMonitor, recordings: Sequence[Episode]) -> Iterator[Any]:
+    for first in range(0, len(recordings), AT_ONCE):
+        yield from monitor.score_episodes(recordings[first : first + AT_ONCE])
 
 
 def onset_row(episode: Episode) -> int | None:

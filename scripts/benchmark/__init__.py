@@ -21,9 +21,9 @@ from rich.progress import track
 import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
 from asm_gym.evaluation.tables import Table, console_table
-from asm_gym.scripts.benchmark.coverage import Coverage
+from asm_gym.scripts.benchmark.coverage import CoverageCheck
 from asm_gym.scripts.benchmark.experts import Experts
-from asm_gym.scripts.benchmark.fit import Fit
+from asm_gym.scripts.benchmark.fit import FitCost
 from asm_gym.scripts.benchmark.memory import Memory, Safety
 from asm_gym.scripts.benchmark.turns import GROWTH, BusyError, resident, take_turns
 from asm_gym.scripts.benchmark.vector import vector_table
@@ -197,9 +197,9 @@ BENCHMARKS: dict[str, type[Any]] = {
     "env": Env,
     "leaks": Leaks,
     "experts": Experts,
-    "coverage": Coverage,
+    "coverage": CoverageCheck,
     "memory": Memory,
-    "fit": Fit,
+    "fit": FitCost,
     "safety": Safety,
     "watch": Watch,
 }

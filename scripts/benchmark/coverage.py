@@ -83,7 +83,7 @@ def covered(
 
 
 @dataclass
-class Coverage:
+class CoverageCheck:
     """Alarms in fresh nominal episodes against the rates that were promised, and the law of their number."""
 
     task: str = "Lift"
@@ -154,7 +154,7 @@ class Coverage:
         return [episode for episode in map(load_episode, files) if episode.success]
 
 
-def _table(args: Coverage, found: list[Covered], calibration: int, fresh: int) -> Table:
+def _table(args: CoverageCheck, found: list[Covered], calibration: int, fresh: int) -> Table:
     rows = []
     for c in found:
         low, high = c.alarms.interval

@@ -29,7 +29,7 @@ HELD_OUT = 6
 
 
 @dataclass
-class Fit:
+class FitCost:
     """How long a memory takes to learn some skills, and how far off its expectations are, against a GRU."""
 
     tasks: tuple[str, ...] = ("Lift", "Stack", "PickPlaceCan")

@@ -30,6 +30,7 @@ STUDIES = {
     "failure": Study("does surprise tell that a policy will fail"),
     "harm": Study("harm avoided against success kept, under any policy"),
     "attack": Study("what who writes to the senses can hide"),
+    "hours": Study("alarms an hour of a shipped memory, as promised and as they come", needs_a_run=True),
     "learning_curve": Study("detection by the number of episodes learned from", needs_a_run=True),
     "one_energy": Study("surprise, completion, reaction by one energy", needs_a_run=True),
     "feedback": Study("what local learning of association costs", needs_a_run=True),

@@ -22,7 +22,8 @@ from asm_gym.evaluation import defaults
 from asm_gym.evaluation.comparison import BenchmarkResult, MonitorResult
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.resampling import interval
-from asm_gym.evaluation.tables import lead_table, monitors_table
+from asm_gym.evaluation.standing import lead_table
+from asm_gym.evaluation.tables import monitors_table
 from asm_gym.faults.suite import KINDS, kinds_of
 from asm_gym.memory.association import Association, learn_association, normalised_errors, spans
 from asm_gym.memory.feedback import FEEDBACK

@@ -29,7 +29,7 @@ MOVES = 0.02
 """Radians that an encoder must move by after the onset, or nothing shows that it is frozen."""
 
 
-class Table(NamedTuple):
+class PushedTable(NamedTuple):
     """Denavit-Hartenberg parameters, a row a joint."""
 
     a: tuple[float, ...]  # [m]
@@ -40,13 +40,13 @@ class Table(NamedTuple):
 
 RIGHT = np.pi / 2
 TABLES = {
-    "panda": Table(
+    "panda": PushedTable(
         (0, 0, 0, 0.0825, -0.0825, 0, 0.088),
         (0.333, 0, 0.316, 0, 0.384, 0, 0.107 + 0.1034),  # to between the fingers
         (0, -RIGHT, RIGHT, RIGHT, -RIGHT, RIGHT, RIGHT),
         True,
     ),
-    "ur10": Table(
+    "ur10": PushedTable(
         (0, -0.612, -0.5723, 0, 0, 0),
         (0.1273, 0, 0, 0.163941, 0.1157, 0.0922),
         (RIGHT, 0, 0, RIGHT, -RIGHT, 0),
@@ -55,7 +55,7 @@ TABLES = {
 }
 
 
-def jacobian(table: Table, q: Floats) -> Floats:
+def jacobian(table: PushedTable, q: Floats) -> Floats:
     """(3, J) of the hand's velocity [m/s] by the joints' [rad/s], at angles q (J,)."""
     pose, axes, places = np.eye(4), [], []
     for a, d, alpha, angle in zip(table.a, table.d, table.alpha, q, strict=True):

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from asm_gym.episode import spans
 from asm_gym.evaluation.figures.style import BLACK, BLUE, VERMILLION, figure, require_some
-from asm_gym.evaluation.scored import Moment
+from asm_gym.evaluation.scored import AlarmMoment
 
 AROUND_S, AROUND_ROWS = 0.5, 10
 """How much is shown before and after [s], and at least how many rows."""
@@ -19,7 +19,7 @@ ACROSS = 3
 """Panels side by side."""
 
 
-def moments_figure(moments: Sequence[Moment]) -> Figure:
+def moments_figure(moments: Sequence[AlarmMoment]) -> Figure:
     """What the channel that raised each alarm sensed about its beginning."""
     require_some(moments)
     down = math.ceil(len(moments) / ACROSS)

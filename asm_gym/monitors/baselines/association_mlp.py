@@ -44,8 +44,8 @@ class _Module(nn.Module):
         G = int(senses.groups.max()) + 1
         each = max(1, units // G)
         exists = synapses(senses.groups, senses.changes, senses.inputs, each).V
-        self.register_buffer("exists", torch.from_numpy(exists), persistent=False)
-        self.register_buffer("group", torch.from_numpy(senses.groups), persistent=False)
+        self.register_buffer("exists", torch.as_tensor(exists), persistent=False)
+        self.register_buffer("group", torch.as_tensor(senses.groups), persistent=False)
         self.V = nn.Parameter(torch.randn(G * each, senses.inputs) / senses.inputs**0.5)
         self.W = nn.Parameter(torch.randn(G, each, each) / each**0.5)
         self.out = nn.Parameter(torch.zeros(2, len(senses.groups), each))
@@ -87,7 +87,7 @@ class MLPAssociation(TorchModel):
     ) -> None:
         kept = len(readings) // FRESH
         learned = np.concatenate([_both(r, self.lag) for r in readings[kept:]])
-        fresh = torch.from_numpy(np.concatenate([_both(r, self.lag) for r in readings[:kept] or readings]))
+        fresh = torch.as_tensor(np.concatenate([_both(r, self.lag) for r in readings[:kept] or readings]))
         X, optimiser = len(self.spec.sensory), torch.optim.Adam(module.parameters(), self.learning_rate)
         best, lasted, kept_weights = float("inf"), 0, copy.deepcopy(module.state_dict())
         for n, rows in enumerate(steps_of(learned, BATCH, UPDATES, rng), 1):
@@ -110,9 +110,9 @@ class MLPAssociation(TorchModel):
     def start(self, batch: int, told: Sequence[Told] = ()) -> Lagged:
         return nothing_before(batch, self.lag, self.spec.size)
 
-    def predict(self, state: Lagged, rows: NDArray[np.float64]) -> tuple[Lagged, ModelOutput]:
+    def advance(self, state: Lagged, rows: NDArray[np.float64]) -> tuple[Lagged, ModelOutput]:
         state, r, known = associated(self.senses_, state, rows)
-        mean, log_variance = (y.numpy() for y in self.module_(torch.from_numpy(r.inputs)))
+        mean, log_variance = (y.cpu().numpy() for y in self.module_(torch.as_tensor(r.inputs)))
         error = known * (r.changes - mean) * np.exp(-0.5 * log_variance)
         return state, ModelOutput(error, no_context(rows))
 

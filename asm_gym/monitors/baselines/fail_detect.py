@@ -64,9 +64,9 @@ class _Rowwise(TorchModel):
     def errors(self, x: Tensor) -> Tensor:
         """(B, X) of rows (B, N)."""
 
-    def predict(self, state: Rows, rows: NDArray[np.float64]) -> tuple[Rows, ModelOutput]:
+    def advance(self, state: Rows, rows: NDArray[np.float64]) -> tuple[Rows, ModelOutput]:
         reading = read(self.senses_, state, rows)
-        error = self.errors(torch.from_numpy(_features(reading))).numpy().astype(np.float64)
+        error = self.errors(torch.as_tensor(_features(reading))).cpu().numpy().astype(np.float64)
         return state.then(rows), ModelOutput(error, no_context(rows))
 
     def size(self, senses: StreamScaler) -> int:

@@ -71,16 +71,26 @@ class GRU(TorchModel):
     def module(self, senses: StreamScaler) -> nn.Module:
         return _Module(senses.size, len(self.spec.motor) + 1, len(self.spec.sensory), self.hidden_size)
 
+    def sensed(self, reading: ScaledRows) -> NDArray[np.float32]:
+        """(T, S) what it is shown of rows, besides the commands."""
+        return reading.senses
+
+    def judged(self, reading: ScaledRows) -> NDArray[np.float32]:
+        """(T, X) what it is to expect of them."""
+        return reading.changes
+
     def train(
         self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
     ) -> None:
         assert isinstance(module, _Module)
-        inputs = [np.hstack([np.vstack([r.senses[:1], r.senses[:-1]]), r.commands]) for r in readings]
+        shown = [self.sensed(r) for r in readings]
+        inputs = [np.hstack([np.vstack([x[:1], x[:-1]]), r.commands]) for x, r in zip(shown, readings, strict=True)]
+        expected = [self.judged(r) for r in readings]
         trained, fresh = parted(len(readings), rng)
 
         def loss(chosen: NDArray[np.intp]) -> Tensor:
             x, real = padded([inputs[i] for i in chosen])
-            return _loss(module, x, padded([readings[i].changes for i in chosen])[0], real)
+            return _loss(module, x, padded([expected[i] for i in chosen])[0], real)
 
         def epoch(optimiser: torch.optim.Optimizer) -> None:
             order = rng.permutation(trained)
@@ -90,19 +100,22 @@ class GRU(TorchModel):
         converge(module, epoch, lambda: loss(fresh), EPOCHS, tell, self.learning_rate)
 
     def start(self, batch: int, told: Sequence[Told] = ()) -> _Memory:
-        hidden, last = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.senses_.size), np.float32)
-        return _Memory(hidden, last, np.zeros((batch, self.spec.size)), np.zeros(batch, np.int64))
+        hidden, rows = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.spec.size))
+        last = self.sensed(self.senses_.read(rows, rows, rows))
+        return _Memory(hidden, last, rows, np.zeros(batch, np.int64))
 
-    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
+    def advance(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
         before = np.where(state.steps[:, None] > 0, state.before, rows)
         r = self.senses_.read(rows, before, before)
-        last = np.where(state.steps[:, None] > 0, state.last, r.senses)
-        inputs = torch.from_numpy(np.hstack([last, r.commands]))[:, None]
+        sensed = self.sensed(r)
+        last = np.where(state.steps[:, None] > 0, state.last, sensed)
+        inputs = torch.as_tensor(np.hstack([last, r.commands]))[:, None]
         mean, log_variance, hidden = (
-            y.numpy()[:, 0] for y in self.module_(inputs, torch.from_numpy(np.ascontiguousarray(state.hidden))[None])
+            y.cpu().numpy()[:, 0]
+            for y in self.module_(inputs, torch.as_tensor(np.ascontiguousarray(state.hidden))[None])
         )
-        error = r.whole * (r.changes - mean) * np.exp(-0.5 * log_variance)
-        return _Memory(hidden, r.senses, rows, state.steps + 1), ModelOutput(error, hidden)
+        error = r.whole * (self.judged(r) - mean) * np.exp(-0.5 * log_variance)
+        return _Memory(hidden, sensed, rows, state.steps + 1), ModelOutput(error, hidden)
 
 
 def _loss(module: _Module, inputs: Tensor, changes: Tensor, real: Tensor) -> Tensor:

@@ -123,13 +123,15 @@ class LSTMVAE(TorchModel):
         nothing = _Cell(*np.zeros((2, batch, self.hidden_size), np.float32))
         return _Memory(nothing, nothing, no_rows(batch, self.spec.size))
 
-    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
+    def advance(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
         assert isinstance(self.module_, _Module)
         r = read(self.senses_, state.seen, rows)
-        z, _, encoder = self.module_.encode(torch.from_numpy(r.senses)[:, None], _torch(state.encoder))
+        z, _, encoder = self.module_.encode(torch.as_tensor(r.senses)[:, None], _torch(state.encoder))
         mean, log_variance, decoder = self.module_.decode(z, _torch(state.decoder))
-        error = r.seen * (r.senses - mean.numpy()[:, 0]) * np.exp(-0.5 * log_variance.numpy()[:, 0])
-        return _Memory(_numpy(encoder), _numpy(decoder), state.seen.then(rows)), ModelOutput(error, z.numpy()[:, 0])
+        error = r.seen * (r.senses - mean.cpu().numpy()[:, 0]) * np.exp(-0.5 * log_variance.cpu().numpy()[:, 0])
+        return _Memory(_numpy(encoder), _numpy(decoder), state.seen.then(rows)), ModelOutput(
+            error, z.cpu().numpy()[:, 0]
+        )
 
 
 class LatentThreshold(Squares):
@@ -175,9 +177,9 @@ class LatentThreshold(Squares):
 
 
 def _torch(state: _Cell) -> tuple[Tensor, Tensor]:
-    hidden, cell = (torch.from_numpy(np.ascontiguousarray(s))[None] for s in state)
+    hidden, cell = (torch.as_tensor(np.ascontiguousarray(s))[None] for s in state)
     return hidden, cell
 
 
 def _numpy(state: tuple[Tensor, Tensor]) -> _Cell:
-    return _Cell(state[0].numpy()[0], state[1].numpy()[0])
+    return _Cell(state[0].cpu().numpy()[0], state[1].cpu().numpy()[0])

@@ -6,6 +6,7 @@ import copy
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Self
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.learning import shuffled
@@ -31,6 +33,8 @@ class TorchModel(StreamModel):
 
     lag: int = 1
     """How many rows later the change of a row is taken."""
+    device: str = "cpu"
+    """Where it learns and predicts, in PyTorch's words; no file keeps it."""
 
     senses_: StreamScaler
     module_: nn.Module
@@ -45,24 +49,49 @@ class TorchModel(StreamModel):
     ) -> None:
         """Trains it on whole nominal episodes."""
 
+    def to(self, device: str) -> Self:
+        """Learns and predicts there from now on, as in ``cuda``. Raises ValueError where there is no such device."""
+        try:
+            torch.empty(0, device=device)
+        except (RuntimeError, AssertionError) as error:  # a build without CUDA asserts
+            raise ValueError(f"device {device!r} cannot be used: {str(error).splitlines()[0]}") from error
+        self.device = device
+        if hasattr(self, "module_"):
+            self.module_.to(device)
+        return self
+
+    def placed(self) -> AbstractContextManager[Any]:
+        """In which tensors are made on the device; nothing on a CPU, where the context would cost every call."""
+        return nullcontext() if self.device == "cpu" else torch.device(self.device)
+
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams = [e.stream for e in episodes]
         senses = StreamScaler.fit(self.spec, streams, self.lag)
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # as for every other monitor, so that times compare
         try:
-            with torch.random.fork_rng(devices=[]):
+            with torch.random.fork_rng(devices=[]), self.placed():
                 torch.manual_seed(int(rng.integers(2**31)))
                 module = self.module(senses)
                 self.train(module, [senses.read_episode(s) for s in streams], rng, progress)
         finally:
             torch.set_num_threads(threads)
         standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change}
-        return self.restore({**standard, **{name: tensor.numpy() for name, tensor in module.state_dict().items()}})
+        return self.restore(
+            {**standard, **{name: tensor.cpu().numpy() for name, tensor in module.state_dict().items()}}
+        )
+
+    def predict(self, state: Any, rows: NDArray[np.float64]) -> tuple[Any, ModelOutput]:
+        with self.placed():
+            return self.advance(state, rows)
+
+    @abstractmethod
+    def advance(self, state: Any, rows: NDArray[np.float64]) -> tuple[Any, ModelOutput]:
+        """As ``Model.predict``: on from the state by rows (B, D)."""
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         senses = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
-        with torch.random.fork_rng(devices=[]):
+        with torch.random.fork_rng(devices=[]), self.placed():
             module = self.module(senses)
         state = {name: torch.from_numpy(np.array(learned[name], np.float32)) for name in module.state_dict()}
         try:
@@ -142,10 +171,10 @@ def padded(episodes: Sequence[NDArray[np.float32]]) -> tuple[Tensor, Tensor]:
     for n, episode in enumerate(episodes):
         rows[n, : len(episode)] = episode
         real[n, : len(episode)] = 1.0
-    return torch.from_numpy(rows), torch.from_numpy(real)
+    return torch.as_tensor(rows), torch.as_tensor(real)
 
 
 def steps_of(rows: NDArray[np.float32], size: int, updates: int, rng: np.random.Generator) -> Iterator[Tensor]:
     """``updates`` random batches of ``rows`` (N, …)."""
     for _, chosen in zip(range(updates), shuffled(len(rows), size, rng), strict=False):
-        yield torch.from_numpy(rows[chosen])
+        yield torch.as_tensor(rows[chosen])

@@ -17,7 +17,7 @@ from asm_gym.episode import Episode
 from asm_gym.policies.network import Cell, NetworkPolicy
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.training.cloning import steps_of
-from asm_gym.rollouts.training.run import Standard
+from asm_gym.rollouts.training.run import ObservationScale
 
 RECURRENT = "gru"
 """Its name among the algorithms."""
@@ -35,7 +35,7 @@ def clone_recurrent(episodes: Sequence[Episode], updates: int, seed: int, progre
         updates: batches of episodes that it learns from.
         seed: of the weights, the batches and the noise.
     """
-    standard = Standard.of(steps_of(episodes)[0])
+    standard = ObservationScale.of(steps_of(episodes)[0])
     seen = [torch.as_tensor((e.observations[:-1] - standard.mean) / standard.scale).float() for e in episodes]
     acted = [torch.as_tensor(e.actions) for e in episodes]
     with torch.random.fork_rng(devices=[]):

@@ -54,7 +54,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Standard:
+class ObservationScale:
     """What observations are standardised by.
 
     Args:
@@ -65,7 +65,7 @@ class Standard:
     scale: NDArray[np.float32]
 
     @classmethod
-    def of(cls, observations: NDArray[np.float32]) -> Standard:
+    def of(cls, observations: NDArray[np.float32]) -> ObservationScale:
         """Of (N, O) observations; a number that never changes is left as it is."""
         spread = observations.std(axis=0)
         return cls(observations.mean(axis=0), np.where(spread > 1e-3, spread, 1.0).astype(np.float32))
@@ -112,7 +112,7 @@ class TrainingRun:
         self.env = plan.make()
         _check(self.env, demonstrations)
         seen = steps_of(demonstrations)[0] if demonstrations else _wandered(self.env, plan.seed)
-        self.standard = Standard.of(seen)
+        self.standard = ObservationScale.of(seen)
         around = Monitor(self.standard.around(self.env))
         self.learner = make_learner(plan.algorithm, around, plan.seed, bool(demonstrations), plan.steps)
         self.state = TrainingState(0, -1.0, ())

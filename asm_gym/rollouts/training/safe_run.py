@@ -26,7 +26,7 @@ from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
 from asm_gym.rollouts.training.learners import export, make_novice
 from asm_gym.rollouts.training.outcome import TrainingOutcome, count
-from asm_gym.rollouts.training.run import Standard, success_rate
+from asm_gym.rollouts.training.run import ObservationScale, success_rate
 from asm_gym.rollouts.training.violations import TorqueWatch
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.cost import CostlyReward
@@ -61,7 +61,7 @@ class Setting:
 class ViolationCallback(BaseCallback):
     """Notes every step's violations, and judges the agent now and then without the wrapper."""
 
-    def __init__(self, setting: Setting, standard: Standard, judged: gym.Env[Any, Any], seed: int) -> None:
+    def __init__(self, setting: Setting, standard: ObservationScale, judged: gym.Env[Any, Any], seed: int) -> None:
         super().__init__()
         self._setting, self._standard, self._judged, self._seed = setting, standard, judged, seed
         self.forces: list[float] = []
@@ -104,7 +104,7 @@ def run(job: tuple[str, int], setting: Setting, memory: Path, demonstrations: Se
     torch.set_num_threads(1)
     episodes = _demonstrations(tuple(demonstrations))
     observations, actions = steps_of(episodes)
-    standard = Standard.of(observations)
+    standard = ObservationScale.of(observations)
     env: gym.Env[Any, Any] = NeuralASMSafety(
         TorqueWatch(gym.make(setting.env_id)), NeuralASM.load(memory), on_overrun="ignore", **CONDITIONS[condition]
     )

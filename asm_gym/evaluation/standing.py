@@ -1,0 +1,138 @@
+"""Where monitors stand: ahead, behind or within chance of the first; and whether what was promised was kept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from asm_gym.evaluation.comparison import BenchmarkResult
+from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, hourly_alarms
+from asm_gym.evaluation.resampling import Draws, interval
+from asm_gym.evaluation.statistics import Estimate, Floats, Rate, Share
+from asm_gym.evaluation.tables import Table, count
+
+AHEAD, BEHIND, CHANCE = "ahead", "behind", "within chance"
+
+
+def verdict(difference: Estimate) -> str:
+    """What a paired difference says of whoever is first; its 95 % interval decides."""
+    if np.isnan(difference.low):
+        return ""
+    return AHEAD if difference.low > 0 else BEHIND if difference.high < 0 else CHANCE
+
+
+def lead_table(result: BenchmarkResult) -> Table:
+    """How far the first monitor is ahead of each other, on the same scenes and calibration episodes."""
+    first, *others = result.on_visible
+    compared = [f"Found at {100 * result.rate:g} % [points]", *(f"at {r:g} an hour [points]" for r in first.hourly)]
+    rows = []
+    for other in others:
+        auroc = interval(first.auroc - other.auroc, first.draws.auroc - other.draws.auroc)
+        cells = [f"{auroc.value:+.3f} ({auroc.low:+.3f} to {auroc.high:+.3f}), {verdict(auroc)}"]
+        cells.append(_ahead(first.found, other.found, first.draws.found, other.draws.found, result.rate))
+        both = first.found_hourly, other.found_hourly, first.draws.hourly, other.draws.hourly
+        cells += [_ahead(*both, r) for r in first.hourly]
+        rows.append((other.name, *cells))
+    return Table(
+        f"How far {first.name} is ahead of each other monitor; 95 % intervals of the paired difference, which say "
+        f"whether it is {AHEAD}, {BEHIND} or {CHANCE}.",
+        ("Monitor", "AUROC", *compared),
+        rows,
+    )
+
+
+def _ahead(mine: Any, theirs: Any, drawn: Any, others: Any, rate: float) -> str:
+    """The difference of two shares of faults found at a rate, in points; empty where either is not known."""
+    if rate not in drawn.keys() & others.keys():
+        return ""
+    found = interval(mine[rate].value - theirs[rate].value, drawn[rate] - others[rate])
+    return f"{100 * found.value:+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f}), {verdict(found)}"
+
+
+def kept_table(result: BenchmarkResult) -> Table:
+    """False alarms in nominal test episodes, beside what each threshold promised."""
+    every = result.on_all
+    rates = sorted({r for m in every for r in m.thresholds})
+    hourly = sorted({r for m in every for r in m.hourly}, reverse=True)
+    rows = []
+    for m in every:
+        shares = [
+            kept_share(false_alarms([t.at(m.thresholds[r]) for t in m.nominal]), r) if r in m.thresholds else ""
+            for r in rates
+        ]
+        each = [
+            kept_rate(hourly_alarms([t.at(m.hourly[r]) for t in m.nominal]), r) if r in m.hourly else "" for r in hourly
+        ]
+        rows.append((m.name, *shares, *each))
+    hours = sum(len(t) * t.dt for t in every[0].nominal) / 3600
+    return Table(
+        f"False alarms in {len(every[0].nominal)} nominal test episodes of {hours:.2f} hours, by what was promised; 95 "
+        "% intervals (Wilson, Poisson) of these episodes alone. Broken: the interval lies above what was promised.",
+        ("Monitor", *(f"promised {100 * r:g} %" for r in rates), *(f"{r:g} an hour" for r in hourly)),
+        rows,
+    )
+
+
+def kept_share(share: Share, promised: float) -> str:
+    """Such as ``1.2 % (0.8 to 1.8)``, and whether the promise is broken."""
+    low, high = share.interval
+    broken = ", broken" if low > promised else ""
+    return f"{100 * share.value:.1f} % ({100 * low:.1f} to {100 * high:.1f}){broken}"
+
+
+def kept_rate(rate: Rate, promised: float) -> str:
+    """The same by the hour."""
+    return rate.text + (", broken" if rate.interval[0] > promised else "")
+
+
+def coverage_table(result: BenchmarkResult) -> Table:
+    """Nominal test episodes in alarm, task by task, for each monitor at the run's own rate."""
+    every = result.on_all
+    tasks = list(dict.fromkeys(t.task for t in every[0].nominal))
+    rows = []
+    for m in every:
+        shares = [false_alarms([t for t in m.nominal if t.task == task]) for task in tasks]
+        broken = (", broken" if s.interval[0] > result.rate else "" for s in shares)
+        rows.append((m.name, *(f"{count(s)}{b}" for s, b in zip(shares, broken, strict=True))))
+        if m.name in result.monitors and (known := result.monitors[m.name].calibration_tasks):
+            over = np.asarray(m.maxima) > m.thresholds[result.rate]
+            own = (Share.of([bool(o) for o, t in zip(over, known, strict=True) if t == task]) for task in tasks)
+            rows.append((f"{m.name}, in calibration", *map(count, own)))
+    return Table(
+        f"Nominal test episodes in alarm at the threshold for {100 * result.rate:g} % of all, task by task, and of "
+        "those that it was set on. Broken: the 95 % interval lies above what was promised; a threshold for all tasks "
+        "promises nothing of one.",
+        ("Monitor", *tasks),
+        rows,
+    )
+
+
+def card(metrics: DetectionMetrics, draws: Draws | None = None) -> dict[str, Any]:
+    """The figures of one monitor, for a file."""
+    drawn = draws or metrics.draws
+
+    def within(value: float, own: Floats) -> list[float]:
+        return [round(number, 4) for number in interval(value, own)]
+
+    return {
+        "monitor": metrics.name,
+        "faults": len(metrics.faulty),
+        "nominal": len(metrics.nominal),
+        "auroc": within(metrics.auroc, drawn.auroc),
+        "aucpdt": round(metrics.aucpdt, 4),
+        "found": {f"{r:g}": within(s.value, drawn.found[r]) for r, s in metrics.found.items() if r in drawn.found},
+        "found_at_an_hour": {f"{r:g}": within(s.value, drawn.hourly[r]) for r, s in metrics.found_hourly.items()},
+        "median_delay_ms": metrics.delays.median_ms if metrics.delays else None,
+        "false_alarms": {f"{r:g}": _share(metrics, q) for r, q in metrics.thresholds.items()},
+        "false_alarms_an_hour": {f"{r:g}": _rate(metrics, q) for r, q in metrics.hourly.items()},
+    }
+
+
+def _share(metrics: DetectionMetrics, threshold: float) -> Sequence[int]:
+    return list(false_alarms([t.at(threshold) for t in metrics.nominal]))
+
+
+def _rate(metrics: DetectionMetrics, threshold: float) -> Sequence[float]:
+    return list(hourly_alarms([t.at(threshold) for t in metrics.nominal]))

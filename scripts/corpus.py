@@ -1,0 +1,76 @@
+"""Records the corpus that every table of detection is judged on: healthy motion, and faults with their healthy twins.
+
+It can be killed at any time: what was recorded is not recorded again. The manifest says what is there after each task
+of each round, so that a corpus of which some rounds are missing can be used already.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.rollouts.corpus import PARTS, QUICK, ROUNDS, VERSION, Corpus, record_corpus
+from asm_gym.rollouts.parallel import ParallelConfig
+from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import claimed
+from asm_gym.scripts.command import run
+from asm_gym.scripts.options import check_options, option
+
+
+@dataclass(frozen=True)
+class Args:
+    """The recordings that monitors are judged on."""
+
+    part: tuple[str, ...] = option(tuple(PARTS), least=1, known=PARTS)
+    """What of it to record."""
+    rounds: int = option(ROUNDS, quick=1, least=1)
+    """How many rounds; each has as much of every task, and the first what is learned from."""
+    workers: str = option("2", check=ParallelConfig.named, metavar="N")
+    """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
+    out: Path = option(Path("runs/corpus"), metavar="FOLDER")
+    """Folder of the corpus."""
+    quick: bool = False
+    """To see that everything runs."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.rounds > ROUNDS:
+            raise ValueError(f"rounds must be at most {ROUNDS}, got {self.rounds}")
+
+
+def contents(corpus: Corpus) -> list[tuple[str, ...]]:
+    """Of each policy and task, how many episodes of each role there are, and how long the healthy ones last."""
+    rows = []
+    for policy, task in dict.fromkeys((e.policy, e.label.task) for e in corpus.entries):
+        own = [e for e in corpus.entries if (e.policy, e.label.task) == (policy, task)]
+        counts = [sum(e.label.role == role for e in own) for role in ("fit", "calibration", "nominal", "faulty")]
+        hours = sum(e.seconds for e in own if e.label.role != "faulty") / 3600
+        rows.append((f"{task}, {policy}", *map(str, counts), f"{hours:.2f}"))
+    return rows
+
+
+def make(args: Args, console: Console) -> None:
+    """Records what is missing, part by part, and says what there is."""
+    total = 1 if args.quick else ROUNDS
+    with claimed(args.out, "recordings.json", {"corpus": VERSION, "quick": args.quick}):
+        for part in args.part:
+            for number in range(min(args.rounds, total)):
+                with stage(f"{part}, round {number + 1}", console, {}) as progress:
+                    sources = (QUICK if args.quick else PARTS)[part]
+                    record_corpus(args.out, sources, number, total, ParallelConfig.named(args.workers), progress)
+    titles = "", "fit", "calibration", "nominal", "faulty", "healthy hours"
+    corpus = Corpus.open(args.out)
+    console.print(console_table(Table(f"Corpus {VERSION}: {len(corpus.entries)} episodes.", titles, contents(corpus))))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Records, and returns the exit code."""
+    return run("corpus", Args, make, argv, __doc__)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
