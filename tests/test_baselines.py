@@ -146,6 +146,7 @@ def test_unknown_names_and_hyperparameters_list_the_known():
     [
         ("window_pca", {"rows": 3, "kept": 0.9}),
         ("kalman", {"ridge": 0.5}),
+        ("memory_temporal", {"dynamics": "settling"}),
         ("gru", {"hidden_size": 8}),
         ("lstm_vae", {"hidden_size": 8, "latent_size": 3}),
     ],

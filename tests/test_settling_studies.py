@@ -1,4 +1,4 @@
-"""The studies of the papers' network: closed forms, the Riccati equation, and sequences that cannot be told apart."""
+"""The studies of the papers' network: closed forms, the Riccati equation, sequences that look alike, and an arm."""
 
 from __future__ import annotations
 
@@ -8,8 +8,18 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
+from asm_gym import NeuralASM
+from asm_gym.memory.inference import STRIDE, iterations_within
+from asm_gym.memory.settling import SettlingNetwork
+from asm_gym.memory.settling_learning import initial_settling_weights
+from asm_gym.memory.temporal import unassociated
+from asm_gym.monitors import load_monitor
 from asm_gym.scripts.reproduce import sequences, tracking
+from asm_gym.scripts.reproduce.closed_loop import CUE, EVENT, PUSH, Memorised, written
+from asm_gym.scripts.reproduce.handwriting import repertoire
+from asm_gym.scripts.reproduce.lagging import LaggingNetwork
 from asm_gym.scripts.reproduce.tracking import A, C, informed, kalman, recording, settled, squared, tracked
+from asm_gym.scripts.reproduce.two_links import COMMAND, DT, ENCODERS, HAND, SPEC, demonstrations, hand, joints
 
 
 @pytest.fixture(scope="module")
@@ -94,3 +104,99 @@ def test_patterns_like_a_template_are_like_each_other_and_confuse_correlation_al
     off = sequence.copy()
     off[3, :10] *= -1
     assert sequences.recalled(off, sequence) == (14 / 15, pytest.approx(4 * 10 / 1500))
+
+
+def test_units_that_cannot_jump_close_the_same_share_of_the_gap_in_each_step_and_end_where_the_others_do():
+    rng = np.random.default_rng(0)
+    jumping = SettlingNetwork(initial_settling_weights(6, 4, 2, rng), unassociated(), 3, 1.0, 1.0)
+    lagging = LaggingNetwork.of(jumping)
+    z, u = (rng.normal(size=(5, n)).astype(np.float32) for n in (6, 3))
+    x, seen = rng.normal(size=(5, 4)).astype(np.float32), np.ones((5, 4), np.float32)
+    # Alone F is ½ Π_z ‖z - μ‖², so that a step takes STRIDE Π_z / curvature of what is left.
+    step, left = lagging.run_on(z), (1.0 - float(STRIDE / jumping.curvature)) ** 3
+    np.testing.assert_allclose(step.z - step.mu, left * (z - step.mu), atol=1e-5)
+    np.testing.assert_allclose(step.mu, jumping.run_on(z).mu, atol=1e-6)
+    ours, theirs = (n.with_iterations(5000).follow(z, u, x, seen) for n in (lagging, jumping))
+    np.testing.assert_allclose(ours.z, theirs.z, atol=1e-3)
+    assert np.abs(lagging.follow(z, u, x, seen).z - z).max() < np.abs(jumping.follow(z, u, x, seen).z - z).max()
+
+
+@pytest.fixture(scope="module")
+def letters():
+    rng = np.random.default_rng(0)
+    two = repertoire(2, 2, rng)
+    return demonstrations(two, 12, rng), demonstrations(two, 4, rng)
+
+
+def test_a_budget_of_inference_is_so_many_steps_a_row_and_one_at_least(letters, tmp_path):
+    assert [iterations_within(b, 0.05) for b in (20, 39, 40, 100.0)] == [1, 1, 2, 5]
+    with pytest.raises(
+        ValueError, match=r"^a budget of 19 steps of inference a second is less than one for each of 20"
+    ):
+        iterations_within(19, 0.05)
+    with pytest.raises(ValueError, match=r"^budget must be .* above 0, got 0"):
+        iterations_within(0, 0.05)
+    asm = NeuralASM(SPEC, 8, 8, epochs=2, dynamics="settling").fit(letters[0]).calibrate(letters[0], 0.1)
+    few = asm.with_budget(60)
+    assert (few.iterations, few.model.network.iterations, few.threshold_) == (3, 3, None)
+    assert (asm.iterations, asm.model.network.iterations) == (20, 20)
+    few.save(tmp_path / "few.asm")
+    cue = letters[1][0].stream[:20]
+    np.testing.assert_array_equal(load_monitor(tmp_path / "few.asm").recall(cue, 9), few.recall(cue, 9))
+    assert np.abs(few.recall(cue, 9) - asm.recall(cue, 9)).max() > 1e-4
+    with pytest.raises(ValueError, match="less than one for each of 20 rows a second"):
+        asm.with_budget(10)
+    with pytest.raises(RuntimeError, match="has learned nothing yet"):
+        NeuralASM(SPEC, 8, 8).with_budget(60)
+
+
+def test_the_arm_is_where_its_joints_and_its_commands_say(letters):
+    for e in letters[1]:
+        rows = e.stream.astype(np.float64)
+        assert np.abs(hand(rows[:, ENCODERS]) - rows[:, HAND]).max() < 0.25  # the noise of both
+        moved = rows[0, ENCODERS] + DT * np.cumsum(rows[1:, COMMAND], axis=0)
+        assert np.abs(moved - rows[1:, ENCODERS]).max() < 0.01
+        np.testing.assert_allclose(hand(joints(rows[:, HAND])), rows[:, HAND], atol=1e-9)
+
+
+class Replayed:
+    """Commands what was commanded."""
+
+    def __init__(self, cues):
+        self.cues, self.t = cues, 0
+
+    def command(self):
+        return self.cues[self.t][:, COMMAND]
+
+    def read(self, rows):
+        self.t += 1
+        self.last = rows
+        return np.zeros(len(rows))
+
+
+def test_what_is_commanded_as_it_was_writes_the_letter_unless_something_happens(letters):
+    cues = np.stack([e.stream for e in letters[1]], axis=1).astype(np.float64)
+    paths = {}
+    for way in ("left alone", "pushed", "stuck"):
+        drives = Replayed(cues)
+        paths[way] = written(drives, cues, way, 0).path
+    off = np.linalg.norm(paths["left alone"] - cues[:, :, HAND], axis=2)
+    assert off.max() < 0.3
+    np.testing.assert_array_equal(paths["pushed"][:EVENT], paths["left alone"][:EVENT])
+    moved = np.abs(joints(paths["pushed"][EVENT + 2 :]) - joints(paths["left alone"][EVENT + 2 :]))
+    np.testing.assert_allclose(moved, PUSH, atol=1e-6)
+    np.testing.assert_allclose(drives.last[:, 0], joints(cues[EVENT - 1, :, HAND])[:, 0], atol=0.02)
+
+
+def test_a_memory_writes_what_it_was_shown_and_is_surprised_by_a_push(letters):
+    asm = NeuralASM(SPEC, 32, 32, epochs=400, free_running_probability=0.6).fit(letters[0]).calibrate(letters[0], 0.1)
+    cues = np.stack([e.stream for e in letters[1]], axis=1).astype(np.float64)
+    energy = asm.model.free_energy(letters[1])
+    alone, pushed = (written(Memorised(asm, 8), cues, w, 0, energy, asm.threshold) for w in ("left alone", "pushed"))
+    truth = cues[CUE:, :, HAND]
+    off = np.linalg.norm(alone.path[CUE:] - truth, axis=2).mean()
+    assert off < 0.5 * np.linalg.norm(truth - truth[0], axis=2).mean()
+    assert (pushed.alarm < EVENT + 10).all()
+    for what in ("surprise", "energy"):
+        calm, found = (getattr(c, what)[EVENT : EVENT + 5].max(axis=0) for c in (alone, pushed))
+        assert found.min() > calm.max()

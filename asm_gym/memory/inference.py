@@ -19,6 +19,7 @@ import numpy as np
 
 from asm_gym.memory.energy import Array, Scalar, activate, energy_gradient, kernel, outward
 from asm_gym.memory.traces import DECAYS, advance
+from asm_gym.validation import check_number
 
 STRIDE = np.float32(1.5)
 """Length of an inference step over the inverse of the curvature; from 2 on it would diverge."""
@@ -34,6 +35,19 @@ class Weights(NamedTuple):
     W_F: Array  # (S + A, H) from the state to senses and action
     W_D: Array  # (S + A, I + A + 1) from the traces, the action and a constant 1 to senses and action
     gains: Array  # (K,) g of the traces; not learned
+
+
+def iterations_within(budget: float, dt: float) -> int:
+    """Steps of inference for each row, which come every ``dt`` seconds, of a ``budget`` of steps a second.
+
+    Raises:
+        ValueError: it is less than one step for each row.
+    """
+    each = check_number("budget", budget, above=0.0) * dt
+    if each < 1.0 - 1e-9:
+        rows = f"{1 / dt:.4g} rows a second"
+        raise ValueError(f"a budget of {budget:g} steps of inference a second is less than one for each of {rows}")
+    return int(each + 1e-9)
 
 
 def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
@@ -75,7 +89,15 @@ def infer(mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array, curvature:
         curvature: Π_z + max Π_x ‖W_F‖², spectral norm.
         iterations: how many steps, at most.
     """
-    z = mu.copy()
+    return infer_from(mu, mu, x, W_F, pi_z, pi_x, curvature, iterations)
+
+
+@kernel
+def infer_from(
+    start: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array, curvature: Scalar, iterations: int
+) -> Array:
+    """The same from another state (B, H) on: units that cannot jump begin where the row before left them."""
+    z = start.copy()
     for _ in range(iterations):
         gradient, bend = energy_gradient(z, mu, x, W_F, pi_z, pi_x)
         farthest = np.float32(0)

@@ -66,7 +66,14 @@ class CompiledRow:
         spec = model.spec
         whole, where_whole = _side_by_side(np.int64, spec.sensory, spec.motor, s.slow, network.spans)
         where = np.stack([*where_singles, *where_doubles, *where_whole])
-        self._learned = (singles, doubles, whole, where, *network.inference, bool(d.context_quantile[:-1].any()))
+        self._learned: tuple[Any, ...] = (
+            singles,
+            doubles,
+            whole,
+            where,
+            *network.inference,
+            bool(d.context_quantile[:-1].any()),
+        )
 
     @classmethod
     def of(cls, model: MemoryModel, detection: Detection) -> CompiledRow | None:

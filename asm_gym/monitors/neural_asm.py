@@ -20,6 +20,7 @@ from asm_gym.detection.events import Excuses
 from asm_gym.episode import Episode
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of
 from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
+from asm_gym.memory.inference import iterations_within
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
 from asm_gym.memory.temporal import TemporalNetwork
@@ -334,6 +335,24 @@ class NeuralASM(CalibratedMonitor):
         other.about = {**self.about, "alarm_on": which}
         known = self.threshold_, self.maxima_, self.blocks_, self.promised_
         other.threshold_, other.maxima_, other.blocks_ = self.skill_.calibrated(which, *known)
+        return other
+
+    def with_budget(self, budget: float) -> Self:
+        """The same memory with as many steps of inference a row as ``budget`` steps a second allow.
+
+        It has no threshold: ``calibrate`` sets that of what it expects now. By traces a row that is seen takes no step.
+
+        Raises:
+            ValueError: a row would have none.
+            RuntimeError: the memory has not learned anything yet.
+        """
+        self._fitted()
+        other = self._copy()
+        most = iterations_within(budget, self.spec.dt * self.model.lag)  # one row in l is inferred
+        other.iterations = min(most, MOST_ITERATIONS)
+        other.model.schedule = self.model.schedule._replace(iterations=other.iterations)
+        other.model.network_ = self.model.network.with_iterations(other.iterations)
+        other._uncalibrate()
         return other
 
     def for_stream(self, spec: StreamSpec) -> Self:

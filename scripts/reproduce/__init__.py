@@ -20,6 +20,7 @@ class Study(NamedTuple):
 
 STUDIES = {
     "memorise_and_recall": Study("one network learns skills, recalls each from a cue"),
+    "abstract": Study("one network, six skills, no label: the abstract"),
     "contextual_inference": Study("the state says which skill is running, untold"),
     "express_skills": Study("one memory's own motor prediction drives the arm"),
     "tracking": Study("the settling network against the Kalman filter"),
@@ -30,7 +31,7 @@ STUDIES = {
     "failure": Study("does surprise tell that a policy will fail"),
     "harm": Study("harm avoided against success kept, under any policy"),
     "attack": Study("what who writes to the senses can hide"),
-    "hours": Study("alarms an hour of a shipped memory, as promised and as they come", needs_a_run=True),
+    "hours": Study("alarms an hour of a shipped memory, as promised?", needs_a_run=True),
     "learning_curve": Study("detection by the number of episodes learned from", needs_a_run=True),
     "one_energy": Study("surprise, completion, reaction by one energy", needs_a_run=True),
     "feedback": Study("what local learning of association costs", needs_a_run=True),

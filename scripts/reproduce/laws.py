@@ -4,6 +4,7 @@
     fitts         e = gain exp(-n/τ)                Fitts' law, n = a + b log2 1/e
     power         e = limit + gain n^-exponent
     linear        e = start + slope v                     v the speed
+    log           e = start + slope ln v                  errors as amplitude over time has them
 
 Sources: Fitts 1954 (J. Exp. Psychol. 47(6)); Wickelgren 1977 (Acta Psychologica 41(1)); Schmidt et al. 1979
 (Psychological Review 86(5)); Akaike 1974 for the comparison.
@@ -43,6 +44,7 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
     "fitts": (lambda n, gain, tau: gain * np.exp(-n / tau), ("gain", "τ")),
     "power": (lambda n, limit, gain, slope: limit + gain * n**-slope, ("limit", "gain", "exponent")),
     "linear": (lambda v, start, slope: start + slope * v, ("start", "slope")),
+    "log": (lambda v, start, slope: start + slope * np.log(v), ("start", "slope")),
 }
 
 
@@ -55,8 +57,9 @@ def fit(law: str, x: NDArray[np.float64], y: NDArray[np.float64]) -> Fit | None:
         "fitts": [first, 5.0],
         "power": [last, first - last, 1.0],
         "linear": [first, 0.0],
+        "log": [first, 0.0],
     }[law]
-    free, ends = [np.inf] * (len(names) - 1), (-np.inf, np.inf) if law == "linear" else (1e-2, 1e3)
+    free, ends = [np.inf] * (len(names) - 1), (-np.inf, np.inf) if law in ("linear", "log") else (1e-2, 1e3)
     bounds = [*(-x for x in free), ends[0]], [*free, ends[1]]
     try:
         values, covariance = curve_fit(function, x, y, p0=guess, bounds=bounds, maxfev=20_000)

@@ -10,9 +10,12 @@ letters, and both are asked, with 1 to 100 steps of inference a row,
     slips told   whether it slipped: surprise there against surprise in good writings, AUROC
 
 The steps of this package are nearly as long as they can be and settle in a few; neurons integrate slowly, so steps a
-twentieth as long are asked for too. Errors are fitted by laws of the time that was taken, steps times their length.
-Another memory learns letters at several speeds and is asked at each, with as much inference a row, and so a second,
-whatever the speed: its error is fitted by the linear law of movements.
+twentieth as long are asked for too. Nor can neurons jump. This package begins at the expected state, so the same
+network is also asked with inference that begins where the row before left it ("lagging"), as in the authors' script for
+the Kalman filter. Errors are fitted by laws of the time that was taken, steps times their length. Another memory
+learns letters at several speeds and is asked at each, with as much inference a second, whatever the speed: its error is
+fitted by the linear law of movements. The first is also asked with noisier senses, and to prepare a movement: by longer
+cues, or by more inference on each of their rows.
 
 Sources: Fitts 1954 (J. Exp. Psychol. 47(6)); Wickelgren 1977 (Acta Psychologica 41(1)) for the approach to a limit;
 Schmidt et al. 1979 (Psychological Review 86(5)) for error = a + b speed; Akaike 1974 for the comparison.
@@ -32,14 +35,16 @@ from numpy.typing import NDArray
 
 from asm_gym.evaluation.statistics import auroc
 from asm_gym.memory.dynamics import DYNAMICS
-from asm_gym.memory.inference import direct, expect, infer, sense
+from asm_gym.memory.inference import direct, expect, infer, iterations_within, sense
 from asm_gym.memory.network import Network
-from asm_gym.memory.recall import follow
+from asm_gym.memory.recall import follow, run_on, to_rows
+from asm_gym.memory.settling import SettlingNetwork
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import Memory, Rows, read
-from asm_gym.scripts.reproduce.handwriting import NOISE, STEPS, Letter, check_letters, copybook, repertoire, written
+from asm_gym.scripts.reproduce.handwriting import DT, NOISE, STEPS, Letter, check_letters, copybook, repertoire, written
 from asm_gym.scripts.reproduce.kit import Findings, Record
+from asm_gym.scripts.reproduce.lagging import LaggingNetwork
 from asm_gym.scripts.reproduce.recordings import wide_enough
 from asm_gym.scripts.reproduce.speed_accuracy_report import drawn, fits, tables
 from asm_gym.validation import check_number
@@ -57,11 +62,21 @@ HIDDEN_AXIS = 1
 SHORTER = (20, 1)
 """How many times shorter than this package's steps of inference are, the slow ones first."""
 
+CUES = (5, 10, 20, 30)
+PREPARED = (1, 3, 10, 30, 100)
+"""Long steps of inference on each row of a cue."""
+
+NOISES = (0.0, 0.02, 0.05, 0.1, 0.2)
+"""Standard deviations of what is added to the pen's sensed position [cm]."""
+
+LAGGING = "lagging"
+"""By settling, from the state of the row before on."""
+
 TESTS = 8
 """Writings of each letter that are asked for."""
 
 
-_COUNT = partial(check_number, "iterations and budgets", low=1, whole=True)
+_COUNT = partial(check_number, "iterations", low=1, whole=True)
 
 
 @dataclass(frozen=True)
@@ -72,8 +87,8 @@ class Config(kit.Config):
     """Steps of inference."""
     speeds: tuple[float, ...] = option((0.6, 0.8, 1.0, 1.25, 1.6, 2.0), quick=(0.8, 1.25, 2.0))
     """Speeds of writing, as multiples of the usual one."""
-    budgets: tuple[int, ...] = option((2, 100), check=_COUNT)
-    """Short steps of inference a row, at every speed."""
+    budgets: tuple[int, ...] = option((120, 6000), check=partial(iterations_within, dt=DT))
+    """Short steps of inference a second, at every speed; a row takes one at least."""
     skills: int = option(4, quick=2, check=check_letters)
     """Letters."""
     hidden: int = option(64, quick=32)
@@ -97,44 +112,87 @@ def one_seed(seed: int, config: Config) -> list[Record]:
     rng, records = np.random.default_rng(seed), []
     letters = repertoire(config.skills, 2, rng)
     for name in DYNAMICS:
-        own = by_iterations(seed, letters, config, rng, name) + by_speed(seed, letters, config, rng, name)
-        records += [{"dynamics": name, **r} for r in own]
+        records += by_iterations(seed, letters, config, rng, name) + by_speed(seed, letters, config, rng, name)
     return records
 
 
-def asked(memory: Memory, iterations: int, shorter: int) -> Memory:
+def asked(memory: Memory, iterations: int, shorter: int = 1) -> Memory:
     """The memory with so many steps of inference a row, which are ``shorter`` times shorter than they could be."""
     network = memory.network.with_iterations(iterations)
     network.curvature *= np.float32(shorter)  # a step is as long as its inverse
     return Memory(memory.reader, network)
 
 
+def each_way(memory: Memory, dynamics: str) -> dict[str, Memory]:
+    """The memory as it is, and one that settles as it is where its units cannot jump."""
+    found = {dynamics: memory}
+    if isinstance(memory.network, SettlingNetwork):
+        found[LAGGING] = Memory(memory.reader, LaggingNetwork.of(memory.network))
+    return found
+
+
 def by_iterations(
     seed: int, letters: Sequence[Letter], config: Config, rng: np.random.Generator, dynamics: str
 ) -> list[Record]:
-    """What one memory makes of letters, and how long it takes, by steps of inference."""
+    """What one memory makes of letters, and how long it takes, by steps of inference, cues and noise."""
     memory = Memory.learned(
         copybook(letters, config.writings, 2, rng), config.hidden, rng, config.steps, dynamics=dynamics
     )
     rows = np.stack([e.stream for e in copybook(letters, TESTS, 2, rng)], axis=1).astype(np.float64)
     slipped, onset = slips(rows, rng)
+    noise = rng.standard_normal((*rows.shape[:2], 2))
+    records = []
+    for name, one in each_way(memory, dynamics).items():
+        own = by_steps(one, rows, slipped, onset, config) + by_noise(one, rows, noise) + by_preparation(one, rows)
+        records += [{"seed": seed, "dynamics": name, **r} for r in own]
+    return records
+
+
+def by_steps(memory: Memory, rows: Rows, slipped: Rows, onset: NDArray[np.intp], config: Config) -> list[Record]:
+    """All that is asked, by steps of inference a row."""
     records = []
     for count, shorter in product(config.iterations, SHORTER):
         own = asked(memory, count, shorter)
         hand, online = own.express(rows, CUE)[CUE:, :, :2], own.express(rows, len(rows))[1:, :, :2]
-        recalled, next_row = (float(np.linalg.norm(h - rows[-len(h) :, :, :2], axis=2).mean()) for h in (hand, online))
         records.append(
             {
-                "seed": seed,
                 "iterations": count,
                 "shorter": shorter,
-                "recalled_cm": recalled,
-                "next_cm": next_row,
+                "recalled_cm": off(hand, rows),
+                "next_cm": off(online, rows),
                 "completed_cm": completed(own, rows),
                 "auroc": told_apart(own, rows, slipped, onset),
                 "us": 1e6 * _seconds_a_row(own, rows),
             }
         )
+    return records
+
+
+def off(hand: Rows, rows: Rows) -> float:
+    """Mean distance [cm] of the hand (T', B, 2) in the last rows."""
+    return float(np.linalg.norm(hand - rows[-len(hand) :, :, :2], axis=2).mean())
+
+
+def by_noise(memory: Memory, rows: Rows, noise: Rows) -> list[Record]:
+    """Where the pen is in the next row, and goes after a cue, while the senses are noisier than those learned from."""
+    records = []
+    for more, count in product(NOISES, (PREPARED[0], PREPARED[-1])):
+        own, seen = asked(memory, count), rows.copy()
+        seen[:, :, :2] += more * noise
+        next_row, recalled = own.express(seen, len(rows))[1:, :, :2], own.express(seen, CUE)[CUE:, :, :2]
+        records.append({"noise": more, "long": count, "noisy_cm": off(next_row, rows), "cued_cm": off(recalled, rows)})
+    return records
+
+
+def by_preparation(memory: Memory, rows: Rows) -> list[Record]:
+    """Where the pen goes after a cue, by the cue's length and the inference on its rows; then inference is plenty."""
+    records, plenty = [], asked(memory, PREPARED[-1]).network
+    for cue, count in product(CUES, PREPARED):
+        network = asked(memory, count).network
+        cued = follow(network, network.at_rest(rows.shape[1]), *read(memory.reader, rows[:cue]))
+        hand = to_rows(memory.reader, run_on(plenty, cued.traces, STEPS - max(CUES)))[:, :, :2]
+        ahead = rows[cue : cue + len(hand)]
+        records.append({"cue": cue, "prepared": count, "begun_cm": off(hand, ahead)})
     return records
 
 
@@ -219,11 +277,11 @@ def by_speed(
         tests = [written(letter, 2, rng, speed) for letter in letters for _ in range(TESTS)]
         rows = np.stack([e.stream for e in tests], axis=1).astype(np.float64)
         pace = float(np.linalg.norm(rows[:, :, 2:], axis=2).mean())
-        for budget in config.budgets:
-            own, third = asked(memory, budget, SHORTER[0]), len(rows) // 3
+        for (name, one), budget in product(each_way(memory, dynamics).items(), config.budgets):
+            own, third = asked(one, iterations_within(budget, DT), SHORTER[0]), len(rows) // 3
             hand, online = own.express(rows, third)[third:, :, :2], own.express(rows, len(rows))[1:, :, :2]
             path, ahead = (np.linalg.norm(h - rows[-len(h) :, :, :2], axis=2) for h in (hand, online))
-            where = {"seed": seed, "speed": speed, "cm_per_s": pace, "budget": budget}
+            where = {"seed": seed, "dynamics": name, "speed": speed, "cm_per_s": pace, "budget": budget}
             errors = {"end_cm": path[-1], "path_cm": path, "ahead_cm": ahead}
             records.append({**where, **{name: float(e.mean()) for name, e in errors.items()}})
     return records

@@ -42,8 +42,13 @@ def fits(records: Sequence[Record]) -> dict[Key, Fit]:
         for value in AT_SPEED:
             for budget in _distinct(own, "budget"):
                 moved = [r for r in own if r.get("budget") == budget]
-                if (one := fit("linear", *_within_seeds(moved, "cm_per_s", value))) is not None:
-                    found[name, value, str(budget), "linear"] = one
+                for law in ("linear", "log"):
+                    if (one := fit(law, *_within_seeds(moved, "cm_per_s", value))) is not None:
+                        found[name, value, f"{budget} a second", law] = one
+        for count in _distinct(own, "long"):
+            noisy = [r for r in own if r.get("long") == count]
+            if (one := fit("linear", *_within_seeds(noisy, "noise", "noisy_cm"))) is not None:
+                found[name, "noisy_cm", f"{count} steps", "linear"] = one
     return found
 
 
@@ -90,7 +95,7 @@ def tables(records: Sequence[Record], asked_for: str) -> list[Table]:
         ),
         Table(
             "By speed of writing; recalled after a cue of a third",
-            ("", "", "short steps a row", *(f"{s:g}×" for s in speeds)),
+            ("", "", "short steps a second", *(f"{s:g}×" for s in speeds)),
             [
                 (
                     str(name),
@@ -104,6 +109,40 @@ def tables(records: Sequence[Record], asked_for: str) -> list[Table]:
             ],
         ),
         Table(
+            "With noisier senses [cm of noise]",
+            ("", "", "long steps a row", *map(str, _distinct(records, "noise"))),
+            [
+                (
+                    str(name),
+                    label,
+                    str(count),
+                    *(
+                        shown(records, value, 3, dynamics=name, noise=n, long=count)
+                        for n in _distinct(records, "noise")
+                    ),
+                )
+                for name in names
+                for value, label in (("noisy_cm", "next row [cm]"), ("cued_cm", "recalled [cm]"))
+                for count in _distinct(records, "long")
+            ],
+        ),
+        Table(
+            "Prepared by a cue: where the pen goes in half a second [cm], by long steps on each of its rows",
+            ("", "rows of the cue", *map(str, _distinct(records, "prepared"))),
+            [
+                (
+                    str(name),
+                    str(cue),
+                    *(
+                        shown(records, "begun_cm", 3, dynamics=name, cue=cue, prepared=count)
+                        for count in _distinct(records, "prepared")
+                    ),
+                )
+                for name in names
+                for cue in _distinct(records, "cue")
+            ],
+        ),
+        Table(
             "Laws, with 95 % intervals; time in long steps",
             ("", "of", "law", "parameters", "AIC"),
             [(name, ", ".join(of), law, one.text, f"{one.aic:.1f}") for (name, *of, law), one in fits(records).items()],
@@ -112,25 +151,30 @@ def tables(records: Sequence[Record], asked_for: str) -> list[Table]:
 
 
 def drawn(records: Sequence[Record]) -> Figure:
-    """Each measure by time of inference with its laws, and the next row by speed."""
+    """Each measure by time of inference with its laws, and the next row by speed and by noise."""
     laws = fits(records)
-    with figure(height=5.0, width=9) as fig:
-        rows = fig.subplots(2, 3)
-        for axes, name in zip(rows, _distinct(records, "dynamics"), strict=True):
+    names = _distinct(records, "dynamics")
+    with figure(height=2.5 * len(names), width=11) as fig:
+        rows = fig.subplots(len(names), 4, squeeze=False)
+        for axes, name in zip(rows, names, strict=True):
             for ax, value in zip(axes, ("recalled_cm", "next_cm"), strict=False):
                 _over_time(ax, [r for r in records if r["dynamics"] == name], value, str(name), laws)
             for i, budget in enumerate(_distinct(records, "budget")):
                 own = [r for r in records if r["dynamics"] == name and r.get("budget") == budget]
                 speeds = _distinct(own, "speed")
                 pace = [over_seeds(own, "cm_per_s", speed=s).mean for s in speeds]
-                points(
-                    axes[2], pace, [over_seeds(own, "ahead_cm", speed=s) for s in speeds], i, f"{budget} short steps"
-                )
-                if (line := laws.get((str(name), "ahead_cm", str(budget), "linear"))) is not None:
+                points(axes[2], pace, [over_seeds(own, "ahead_cm", speed=s) for s in speeds], i, f"{budget} steps/s")
+                if (line := laws.get((str(name), "ahead_cm", f"{budget} a second", "linear"))) is not None:
                     ends = np.array([min(pace), max(pace)])
                     axes[2].plot(ends, LAWS["linear"][0](ends, *line.values), color=look(i)[0], linewidth=1)
             axes[2].set(xlabel="mean speed [cm/s]", ylabel="next row [cm]", ylim=0, title=str(name))
             axes[2].legend(fontsize=7)
+            for i, count in enumerate(_distinct(records, "long")):
+                noises = _distinct(records, "noise")
+                found = [over_seeds(records, "noisy_cm", dynamics=name, noise=n, long=count) for n in noises]
+                points(axes[3], noises, found, i, f"{count} long step{'s'[: count > 1]}")
+            axes[3].set(xlabel="added noise [cm]", ylabel="next row [cm]", ylim=0, title=str(name))
+            axes[3].legend(fontsize=7)
         rows[0][0].legend(fontsize=7)
     return fig
 

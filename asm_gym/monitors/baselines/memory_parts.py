@@ -1,6 +1,6 @@
 """The parts of the Neural ASM, each alone: what one finds without the other is what it is worth.
 
-memory_temporal      ε_t = (x_t - x̂_t)/s    x̂_t from traces, state and command; its state is the context
+memory_temporal      ε_t = (x_t - x̂_t)/s    x̂_t from traces or a settled state, and the command; context: the state
 memory_association   ε_t as in the memory    from the other senses, what came before and the command; no context
 
 ``association_linear`` is association without hidden units. All are judged by the detection of the memory.
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
+from asm_gym.memory.dynamics import TRACES
 from asm_gym.memory.state import MemoryState, past
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
@@ -29,11 +30,12 @@ FAINTEST = 1e-4
 
 
 class _Part(StreamModel):
-    """A whole memory, of which a part is heard."""
+    """A whole memory of one of ``memory.dynamics.DYNAMICS``, of which a part is heard."""
 
-    def __init__(self, spec: StreamSpec) -> None:
+    def __init__(self, spec: StreamSpec, dynamics: str = TRACES) -> None:
         super().__init__(spec)
-        self.memory = NeuralASM(spec).model
+        self.dynamics = dynamics
+        self.memory = NeuralASM(spec, dynamics=dynamics).model
         self.shortest = self.memory.shortest
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
