@@ -23,7 +23,7 @@ from asm_gym.protocols import KnowsItsArms
 from asm_gym.spec import StreamSpec
 
 LIMIT = 6.0
-"""Of |m|, in standard deviations of what the hand's channels say; healthy episodes come to 3 ([figures](attack))."""
+"""Of |m|, in standard deviations of what the hand's channels say."""
 
 OVER_S = 0.2
 """What the running mean is over, about [s]."""
