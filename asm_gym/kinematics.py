@@ -19,9 +19,6 @@ from asm_gym.compilation import compiled
 HAND = 9
 """How many numbers say where a hand is."""
 
-STEP = 1e-5
-"""For derivatives [rad]."""
-
 
 class Chain(NamedTuple):
     """One arm, from its base to its hand.
@@ -46,12 +43,6 @@ class Chain(NamedTuple):
         """(9,) the hand by the angles (J,) [rad]."""
         found: NDArray[np.float64] = hand_at(np.asarray(angles, np.float64), self.axes, self.anchors, self.hand)
         return found
-
-    def slope(self, angles: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-        """(9, J) how the hand changes with each angle."""
-        moved = [self.at(angles + STEP * own) - self.at(angles - STEP * own) for own in np.eye(len(self.axes))]
-        slope: NDArray[np.float64] = np.stack(moved, axis=1) / (2 * STEP)
-        return slope
 
 
 @compiled

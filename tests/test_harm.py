@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from asm_gym.scripts.reproduce import harm, harm_agents, harm_report
+from asm_gym.scripts.reproduce import harm, harm_agents, harm_report, harm_speeds
+from asm_gym.spec import Channel, StreamSpec
 
 
 def test_harm_is_the_impulse_beyond_forty_newtons_and_the_first_blow_is_told_from_later_ones():
@@ -26,6 +27,7 @@ def record(guard, seed, value, policy="down", kind="hostile"):
         "guard": guard,
         "seed": seed,
         "harm": value,
+        "peak": value,
         "ended_s": None,
         "time_over": 0,
         "steps_over": 0,
@@ -41,6 +43,46 @@ def test_what_is_left_is_a_share_of_alone_and_the_worst_cell_is_one_in_which_the
     shown = harm_report.sums_table(records, ["policy alone", "default"]).rows[1]
     assert shown[1:3] == ("96.8 %", "90.0 %")
     assert harm_report.harm_table(records, ["policy alone", "default"]).rows[1][2] == "1.0 (10.0 %)"
+
+
+def test_success_is_paired_by_scene_and_told_from_success_with_a_blow():
+    records = []
+    for policy, seed, alone, guarded, blow in (
+        *(("scripted", 1, True, True, 10.0), ("scripted", 2, True, False, 300.0)),
+        *(("lift_sac", 1, False, True, 10.0), ("lift_sac", 2, True, True, 300.0)),
+    ):
+        pair = record("policy alone", seed, blow, policy, "healthy"), record("default", seed, 10.0, policy, "healthy")
+        records += [pair[0] | {"success": alone}, pair[1] | {"success": guarded}]
+    rows = harm_report.kept_table(records, ["policy alone", "default"], "healthy").rows
+    assert [row[:5] for row in rows] == [
+        ("Lift, scripted", "2 of 2", "1 (-1 +0)", "1", "1"),
+        ("Lift, lift_sac", "1 of 2", "2 (-0 +1)", "0", "2"),
+        ("all", "3 of 4", "3 (-1 +1)", "1", "3"),
+    ]
+
+
+def test_a_run_that_goes_on_measures_no_scene_twice(tmp_path, monkeypatch):
+    config = harm.Config(out=tmp_path, guards=("policy alone",), resume=True)
+    monkeypatch.setattr(harm, "one", lambda cell, seed, *rest: {"seed": seed, "harm": 1.5, "hand": float("nan")})
+    job = harm.Cell("healthy", "Lift", "scripted"), 7
+    first = harm.measured(job, config)
+    monkeypatch.setattr(harm, "one", None)
+    np.testing.assert_equal(harm.measured(job, config), first)
+
+
+def test_speed_is_looked_up_by_place_and_by_direction_and_load_where_a_rule_says_so():
+    names = ("hand_position", 3, "m"), ("hand_velocity", 3, "m/s"), ("gripper_force", 2, "N")
+    spec = StreamSpec(tuple(Channel(*name) for name in names), dt=0.05)
+    down = np.zeros((40, 8))
+    down[:, 5] = -0.1
+    asked = np.zeros((3, 8))
+    asked[:, 5] = -0.1, 0.1, -0.1  # down, up, and down with a load
+    asked[2, 6] = 5.0
+    found = {rule: harm_speeds.limits_by(rule, [down], asked, spec).tolist() for rule in harm_speeds.RULES}
+    assert found["no place"] == [0.15] * 3
+    assert found["place"] == pytest.approx([0.12] * 3)
+    assert found["place and direction"] == pytest.approx([0.12, 0.05, 0.12])
+    assert found["place, direction and load"] == pytest.approx([0.12, 0.05, 0.05])
 
 
 def test_every_cell_is_one_row_and_other_arms_are_asked_for():

@@ -23,7 +23,7 @@ from asm_gym.protocols import KnowsItsArms
 from asm_gym.spec import StreamSpec
 
 LIMIT = 6.0
-"""Of |m|, in standard deviations of what the hand's channels say; healthy episodes come to 3 ([figures](attack))."""
+"""Of |m|, in standard deviations of what the hand's channels say."""
 
 OVER_S = 0.2
 """What the running mean is over, about [s]."""
@@ -93,6 +93,7 @@ class HandAgainstJoints:
     def reset(self) -> None:
         """A new episode begins."""
         self._mean, self._left, self._waited = np.zeros(HAND), 0.0, 0
+        self._said: Contradiction | None = None
         self._whole = 0  # rows since a number was missing
         self._rows: list[NDArray[np.float64]] = []  # the last ones that were whole, (2 J + 9,) each
         self._good = np.zeros(len(self._q))  # (J,) angles that were believed last
@@ -111,14 +112,15 @@ class HandAgainstJoints:
             self._good, self._left, self._waited = now[: len(self._q)], 0.0, 0
             self._accused[:] = False
             return None
-        known = missing[self._q], missing[self._x]
+        wrong = missing | self._accused
+        known = wrong[self._q], wrong[self._x]
         if known[0].any() or known[1].any():
             self._left += self._gain * (min(self._explained(now, *known)[1], ONE * LEFT / self._gain) - self._left)
-            if self._left <= LEFT:
-                return None
+            if self._left <= LEFT:  # that explains it still; where nobody completes it, it is said again
+                return self._said if (self._accused & ~missing).any() else None
         found = self._named(*known)
         if found is not None:
-            self._left, self._accused[found.columns] = 0.0, True
+            self._said, self._left, self._accused[found.columns] = found, 0.0, True
         return found
 
     @property

@@ -30,13 +30,11 @@ from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import harm_agents, harm_braking, harm_report, harm_speeds, kit
 from asm_gym.scripts.reproduce.harm_agents import EXCESS, HITTERS, LEARNERS
+from asm_gym.scripts.reproduce.harm_report import TRANSIENT
 from asm_gym.spec import control_period
 from asm_gym.tasks import env_id
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.oracle import OracleReflex
-
-TRANSIENT = 280.0
-"""ISO/TS 15066:2016, Table A.2: what a hand or finger may be hit with for a moment [N]."""
 
 FIRST_S = 0.1
 """The first blow lasts for so long from the substep on in which it began [s]."""

@@ -22,6 +22,9 @@ SETTING = "robot", "rate"
 HARMFUL = "hostile", "trained", "untrained", "early"
 """Kinds of policies that a guard is against."""
 
+TRANSIENT = 280.0
+"""ISO/TS 15066:2016, Table A.2: what a hand or finger may be hit with for a moment [N]."""
+
 Key = dict[str, Any]
 
 
@@ -50,8 +53,10 @@ def _setting(key: Key) -> str:
 
 
 def _cell(key: Key) -> str:
-    slow = "" if key["speed"] == 1.0 else f", {key['speed']:g} of full speed"
     wrong = "" if key["fault"] == NOMINAL else f", {key['fault'].replace('_', ' ')}"
+    if "task" not in key:
+        return f"all{wrong}"
+    slow = "" if key["speed"] == 1.0 else f", {key['speed']:g} of full speed"
     usual = key["robot"] == "Panda" and key["rate"] == 20
     return f"{'' if usual else _setting(key) + ': '}{key['task']}, {key['policy']}{slow}{wrong}"
 
@@ -184,22 +189,29 @@ def blows_table(records: Sequence[Record], guards: Sequence[str]) -> Table:
 def kept_table(records: Sequence[Record], guards: Sequence[str], kind: str) -> Table:
     """Cells of healthy policies, with or without faults."""
 
+    def scenes(guard: str, key: Key) -> dict[tuple[Any, ...], Record]:
+        return {(*(r[n] for n in CELL), r["seed"]): r for r in where(records, guard=guard, **key)}
+
     def solved(guard: str, key: Key) -> str:
-        own = {r["seed"]: r["success"] for r in where(records, guard=guard, **key)}
-        alone = {r["seed"]: r["success"] for r in where(records, guard=POLICY_ALONE, **key)}
+        own, alone = ({s: r["success"] for s, r in scenes(g, key).items()} for g in (guard, POLICY_ALONE))
         if guard == POLICY_ALONE:
             return f"{sum(own.values())} of {len(own)}"
         lost = sum(alone[s] and not own[s] for s in own if s in alone)
         won = sum(own[s] and not alone[s] for s in own if s in alone)
         return f"{sum(own.values())} (-{lost} +{won})"
 
+    def softly(guard: str, key: Key) -> str:
+        return str(sum(r["success"] and r["peak"] <= TRANSIENT for r in scenes(guard, key).values()))
+
     def harm(guard: str, key: Key) -> str:
         return f"{sum(r['harm'] for r in where(records, guard=guard, **key)):.1f}"
 
     columns = [Column("policy", _cell)]
     columns += [Column(f"{guard}, solved", partial(solved, guard)) for guard in guards]
+    columns += [Column(f"{guard}, solved without passing {TRANSIENT:g} N", partial(softly, guard)) for guard in guards]
     columns += [Column(f"{guard}, harm in all [N s]", partial(harm, guard)) for guard in guards]
-    rows = [k for k in keys(records) if k["kind"] == kind]
+    own = where(records, kind=kind)
+    rows = keys(own) + keys(own, ("kind", "fault"))
     return tabulate(f"Success kept by {kind} policies", columns, rows)
 
 
