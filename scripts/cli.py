@@ -27,7 +27,6 @@ GROUPS: dict[str, dict[str, Command]] = {
         "inspect": Command("asm_gym.scripts.inspect_log", "what a log holds, and what would be done about it"),
         "fit": Command("asm_gym.scripts.fit", "a memory from recorded episodes or logs"),
         "babble": Command("asm_gym.scripts.babble", "one memory of a body, for any policy"),
-        "corpus": Command("asm_gym.scripts.corpus", "the recordings that tables of detection are judged on"),
         "evaluate": Command("asm_gym.scripts.evaluate", "tasks x monitors x faults: who notices what"),
         "watch": Command("asm_gym.scripts.watch", "a log, or rows as they come: when, where, how surprising"),
         "train": Command("asm_gym.scripts.train", "an agent: cloned, then improved by SAC, TD3 or PPO"),
@@ -37,6 +36,7 @@ GROUPS: dict[str, dict[str, Command]] = {
         "doctor": Command("asm_gym.scripts.doctor", "what this machine lacks, and what installs it"),
     },
     "Study it": {
+        "corpus": Command("asm_gym.scripts.corpus", "the recordings that tables of detection are judged on"),
         "reproduce": Command("asm_gym.scripts.reproduce", "the method's claims, one study each; all runs many"),
         "benchmark": Command("asm_gym.scripts.benchmark", "speeds as ratios against rivals, and experts"),
     },
