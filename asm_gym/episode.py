@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from asm_gym.checkpoint import DAMAGE, read_checkpoint, write_checkpoint
 from asm_gym.data.channels import read_recorded
 from asm_gym.files import regular_file
-from asm_gym.inline import lines_over_time
+from asm_gym.notebook_display import lines_over_time
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32, typed
 

@@ -113,7 +113,7 @@ def register_task(
         raise ValueError(f"there is a task {name!r} already")
     check_number("horizon", horizon, low=1, whole=True)
     if isinstance(make, type) and any(c.__module__.startswith("robosuite.") for c in make.__mro__):
-        make, arguments = "asm_gym.envs.own_class:OwnRobosuite", {"make": make} | arguments
+        make, arguments = "asm_gym.envs.user_environment:OwnRobosuite", {"make": make} | arguments
     entry: Any = make
     spec = EnvSpec(f"asm_gym/{name}-v0", entry_point=entry, max_episode_steps=horizon, kwargs=arguments)
     add("task", OWN, name, spec)

@@ -12,36 +12,36 @@ from asm_gym.scripts.command import DONE, exit_code
 from asm_gym.validation import check_choice
 
 
-class Command(NamedTuple):
+class Subcommand(NamedTuple):
     """The module whose ``main(argv) -> int`` it is, and one line of what it does."""
 
     module: str
     summary: str
 
 
-GROUPS: dict[str, dict[str, Command]] = {
+GROUPS: dict[str, dict[str, Subcommand]] = {
     "Use it": {
-        "demo": Command("asm_gym.scripts.demo", "a robot that notices when something is wrong"),
-        "collect": Command("asm_gym.scripts.collect", "record episodes of a policy, as a Minari dataset"),
-        "import": Command("asm_gym.scripts.import_demonstrations", "read robosuite's or robomimic's HDF5 likewise"),
-        "inspect": Command("asm_gym.scripts.inspect_log", "what a log holds, and what would be done about it"),
-        "fit": Command("asm_gym.scripts.fit", "a memory from recorded episodes or logs"),
-        "babble": Command("asm_gym.scripts.babble", "one memory of a body, for any policy"),
-        "evaluate": Command("asm_gym.scripts.evaluate", "tasks x monitors x faults: who notices what"),
-        "watch": Command("asm_gym.scripts.watch", "a log, or rows as they come: when, where, how surprising"),
-        "train": Command("asm_gym.scripts.train", "an agent: cloned, then improved by SAC, TD3 or PPO"),
-        "push": Command("asm_gym.scripts.push", "a memory and its card, to the Hugging Face hub"),
-        "completion": Command("asm_gym.scripts.completion", "what makes your shell complete all of this"),
-        "warmup": Command("asm_gym.scripts.warmup", "compile ahead what the first guarded step waits for"),
-        "doctor": Command("asm_gym.scripts.doctor", "what this machine lacks, and what installs it"),
+        "demo": Subcommand("asm_gym.scripts.demo", "a robot that notices when something is wrong"),
+        "collect": Subcommand("asm_gym.scripts.collect", "record episodes of a policy, as a Minari dataset"),
+        "import": Subcommand("asm_gym.scripts.import_demonstrations", "read robosuite's or robomimic's HDF5 likewise"),
+        "inspect": Subcommand("asm_gym.scripts.inspect_log", "what a log holds, and what would be done about it"),
+        "fit": Subcommand("asm_gym.scripts.fit", "a memory from recorded episodes or logs"),
+        "babble": Subcommand("asm_gym.scripts.babble", "one memory of a body, for any policy"),
+        "evaluate": Subcommand("asm_gym.scripts.evaluate", "tasks x monitors x faults: who notices what"),
+        "watch": Subcommand("asm_gym.scripts.watch", "a log, or rows as they come: when, where, how surprising"),
+        "train": Subcommand("asm_gym.scripts.train", "an agent: cloned, then improved by SAC, TD3 or PPO"),
+        "push": Subcommand("asm_gym.scripts.push", "a memory and its card, to the Hugging Face hub"),
+        "completion": Subcommand("asm_gym.scripts.completion", "what makes your shell complete all of this"),
+        "warmup": Subcommand("asm_gym.scripts.warmup", "compile ahead what the first guarded step waits for"),
+        "doctor": Subcommand("asm_gym.scripts.doctor", "what this machine lacks, and what installs it"),
     },
     "Study it": {
-        "corpus": Command("asm_gym.scripts.corpus", "the recordings that tables of detection are judged on"),
-        "reproduce": Command("asm_gym.scripts.reproduce", "the method's claims, one study each; all runs many"),
-        "benchmark": Command("asm_gym.scripts.benchmark", "speeds as ratios against rivals, and experts"),
+        "corpus": Subcommand("asm_gym.scripts.corpus", "the recordings that tables of detection are judged on"),
+        "reproduce": Subcommand("asm_gym.scripts.reproduce", "the method's claims, one study each; all runs many"),
+        "benchmark": Subcommand("asm_gym.scripts.benchmark", "speeds as ratios against rivals, and experts"),
     },
     "Examples": {
-        "lagrangian": Command("asm_gym.scripts.examples.lagrangian", "PPO with a Lagrange multiplier on alarms"),
+        "lagrangian": Subcommand("asm_gym.scripts.examples.lagrangian", "PPO with a Lagrange multiplier on alarms"),
     },
 }
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}

@@ -27,7 +27,7 @@ from asm_gym.evaluation import figures
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
 from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, hourly_alarms, typical
 from asm_gym.evaluation.report import write_json, write_report
-from asm_gym.evaluation.scored import NOMINAL
+from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import Share, binomial_interval
 from asm_gym.evaluation.tables import (
     BRIEF_CONDITION_COLUMNS,

@@ -21,7 +21,7 @@ from asm_gym.data.commands import feedback
 from asm_gym.data.gaps import filled
 from asm_gym.data.live import is_live, lines_from
 from asm_gym.data.logs import LogLayout, read_logs
-from asm_gym.data.notes import noted
+from asm_gym.data.reader_notes import noted
 from asm_gym.data.selection import (
     SHORTEST_S,
     declared_by_all,
@@ -37,14 +37,14 @@ from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.episode import Episode
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
-from asm_gym.monitors.asked import Asked
+from asm_gym.monitors.promise import Asked
 from asm_gym.monitors.registry import check_monitor
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
-from asm_gym.scripts.kinds import Part, about_pieces, left_out
-from asm_gym.scripts.listening import listen, rtde_source
+from asm_gym.scripts.live_recording import listen, rtde_source
 from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.scripts.unlike_pieces import Part, about_pieces, left_out
 from asm_gym.spec import MOTOR
 from asm_gym.validation import check_number
 

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from asm_gym.data.inspection import ChannelFound, Inspection, in_time, inspected
 from asm_gym.data.logs import LogLayout, read_tables
-from asm_gym.data.notes import noted
+from asm_gym.data.reader_notes import noted
 from asm_gym.evaluation import figures
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 from asm_gym.scripts.options import check_options, fixed, option

@@ -22,15 +22,15 @@ from rich.console import Console
 
 from asm_gym.data.live import RETURNING, is_live, lines_from
 from asm_gym.data.logs import Log, LogLayout, read_logs
-from asm_gym.data.notes import noted
+from asm_gym.data.reader_notes import noted
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, traces_of
-from asm_gym.evaluation.scored import ScoredEpisode, moments_of
+from asm_gym.evaluation.scored_episode import ScoredEpisode, moments_of
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
-from asm_gym.scripts.following import follow
+from asm_gym.scripts.live_watching import follow
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.validation import check_number
 from asm_gym.view.rerun import LiveView

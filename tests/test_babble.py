@@ -12,7 +12,7 @@ import pytest
 from asm_gym.detection import Blocks
 from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.metrics import DetectionMetrics
-from asm_gym.evaluation.scored import ScoredEpisode
+from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.monitors import NeuralASM, Surprise
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.registry import SHIPPED

@@ -11,7 +11,7 @@ import torch
 from rich.console import Console
 
 from asm_gym.monitors import NeuralASM, make_monitor
-from asm_gym.monitors.model import model_outputs
+from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.scripts.benchmark import main
 from asm_gym.scripts.benchmark.experts import Attempt, _row, attempt
 from asm_gym.scripts.benchmark.fit import errors, repeated

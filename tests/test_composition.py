@@ -29,7 +29,7 @@ from asm_gym.monitors import (
     monitor_class,
     register_monitor,
 )
-from asm_gym.monitors.model import StreamModel
+from asm_gym.monitors.stream_model import StreamModel
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.streams import frozen, sine_episodes, sine_spec
 

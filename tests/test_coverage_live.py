@@ -12,7 +12,7 @@ from asm_gym.data.coverage import Coverage
 from asm_gym.data.live import SourceDied
 from asm_gym.data.selection import divided_in_time, pieces
 from asm_gym.episode import Episode
-from asm_gym.scripts import listening
+from asm_gym.scripts import live_recording as listening
 from asm_gym.scripts.cli import main
 
 

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from asm_gym.data.live import SourceDied, lines_from
-from asm_gym.scripts.following import follow
+from asm_gym.scripts.live_watching import follow
 from tests.needs import needs
 from tests.soak import dds
 

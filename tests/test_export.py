@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.export import STATE, initial_state, write_onnx
+from asm_gym.monitors.onnx_export import STATE, initial_state, write_onnx
 from tests.needs import needs
 from tests.streams import sine_episodes, sine_spec
 

@@ -7,7 +7,7 @@ import pytest
 
 from asm_gym.episode import Episode
 from asm_gym.monitors import CalibratedMonitor, load_monitor, make_monitor
-from asm_gym.monitors.fresh import KEPT, STRETCH, check_fresh, marks, sketch
+from asm_gym.monitors.overlap import KEPT, STRETCH, check_fresh, marks, sketch
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("sense", 3, group="a"), Channel("action", 2, group=MOTOR)), dt=0.05)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from asm_gym.evaluation.metrics import DetectionMetrics
-from asm_gym.evaluation.scored import ScoredEpisode
+from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.rollouts.pretraining.model_card import Marks
 from asm_gym.scripts.reproduce.hours import Setting, each, kept, records
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.kinds import kind_of, unlike
+from asm_gym.scripts.unlike_pieces import kind_of, unlike
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_a_long_log_is_learned_from_between_its_marked_rows(tmp_path, capsys):
 
 
 def test_a_threshold_that_is_refused_names_the_piece(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("asm_gym.monitors.sighted.MOST", 0.0)
+    monkeypatch.setattr("asm_gym.monitors.blindness.MOST", 0.0)
     write(tmp_path / "log.csv", 0, 60)
     rows = [row.split(",") for row in (tmp_path / "log.csv").read_text().splitlines()]
     for row in rows[2701:2750]:

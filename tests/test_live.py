@@ -177,7 +177,7 @@ def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
 
 
 def test_rows_are_watched_in_constant_memory(monitor, monkeypatch):
-    monkeypatch.setattr("asm_gym.scripts.following.LATENCIES", 100)
+    monkeypatch.setattr("asm_gym.scripts.live_watching.LATENCIES", 100)
     asm, episode = monitor
     line = json.dumps(episode(500).stream[20].tolist())
     peaks = []

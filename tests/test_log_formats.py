@@ -13,9 +13,9 @@ import pytest
 
 from asm_gym.data.lerobot import write_lerobot
 from asm_gym.data.logs import LogLayout, read_logs
+from asm_gym.data.row_times import regular
 from asm_gym.data.tabular import as_array, read_parquet
 from asm_gym.data.text import read_table
-from asm_gym.data.timing import regular
 from asm_gym.episode import Episode
 from asm_gym.readings import noise_of
 from asm_gym.scripts.cli import main

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from asm_gym.data.channels import read_recorded
-from asm_gym.data.clock import clock_among, is_clock
+from asm_gym.data.clock_column import clock_among, is_clock
 from asm_gym.data.lerobot import write_lerobot
 from asm_gym.data.logs import LogLayout, read_logs
-from asm_gym.data.notes import LogWarning
+from asm_gym.data.reader_notes import LogWarning
+from asm_gym.data.row_times import period
 from asm_gym.data.selection import normal_episodes
 from asm_gym.data.text import read_table
-from asm_gym.data.timing import period
 from asm_gym.data.units import ratio
 from asm_gym.episode import Episode
 

@@ -22,7 +22,7 @@ from asm_gym.evaluation.metrics import (
     time_matched_auroc,
     typical,
 )
-from asm_gym.evaluation.scored import InterventionOutcome, ScoredEpisode, TraceDetail, window_steps
+from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode, TraceDetail, window_steps
 from asm_gym.evaluation.statistics import Share, auroc, wilson_interval
 
 

@@ -28,9 +28,9 @@ from asm_gym.scripts.reproduce import (
 from asm_gym.scripts.reproduce.apprentices import DISTURBANCE, demonstrate, stream_of
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
+    ExpressionMemory,
     Hopfield,
     Library,
-    Memory,
     mean_demonstrations,
     recalled,
 )
@@ -82,7 +82,7 @@ def test_the_library_is_told_and_expresses_another_skill_when_told_another():
 
 def test_the_memory_recalls_each_letter_from_its_cue():
     train, tests = letters_of(2, each=8)
-    memory = Memory.learned(train, 32, np.random.default_rng(0), 4000)
+    memory = ExpressionMemory.learned(train, 32, np.random.default_rng(0), 4000)
     error, right = recalled(memory, tests, mean_demonstrations(train, 2), 20)
     streams = np.stack([e.stream for e in tests], axis=1)
     still = np.linalg.norm(streams[20:, :, :2] - streams[19, :, :2], axis=2).mean()

@@ -6,7 +6,7 @@ import pytest
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.resampling import Calibration, drawn_anew, interval
-from asm_gym.evaluation.scored import ScoredEpisode
+from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.standing import lead_table
 
 

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from asm_gym.envs.threads import ThreadVectorEnv
+from asm_gym.envs.threaded_vector import ThreadVectorEnv
 from asm_gym.episode import Episode
 from asm_gym.faults import Push
 from asm_gym.monitors import NeuralASM

@@ -12,8 +12,8 @@ from asm_gym import Channel, NeuralASMSafety, StreamRecorder, StreamSpec, collec
 from asm_gym.data.live import RowReader
 from asm_gym.detection import ModelOutput
 from asm_gym.monitors import CalibratedMonitor, Surprise, load_monitor
-from asm_gym.monitors.model import StreamModel
 from asm_gym.monitors.registry import MONITORS, register_monitor
+from asm_gym.monitors.stream_model import StreamModel
 from asm_gym.tasks import OWN
 from tests.streams import sine_episodes, sine_spec
 

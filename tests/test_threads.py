@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import asm_gym  # noqa: F401
-from asm_gym.envs.threads import ThreadVectorEnv
+from asm_gym.envs.threaded_vector import ThreadVectorEnv
 from asm_gym.graphics import rendering_backend
 
 

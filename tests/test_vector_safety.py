@@ -6,7 +6,7 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from asm_gym import collect
-from asm_gym.envs.threads import ThreadVectorEnv
+from asm_gym.envs.threaded_vector import ThreadVectorEnv
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies.reflexes import Hold, Retract
 from asm_gym.spec import MOTOR, Channel, StreamSpec

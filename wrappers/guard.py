@@ -26,9 +26,9 @@ from asm_gym.wrappers.factory import (
     names_causes,
 )
 from asm_gym.wrappers.observer import joined
-from asm_gym.wrappers.reports import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPRISE, RowReport
 from asm_gym.wrappers.responses import NO_RESPONSE, Responder, responses_from
 from asm_gym.wrappers.severity import AGAIN, LEANS_S, Severity, SeverityEstimator
+from asm_gym.wrappers.step_report import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPRISE, RowReport
 from asm_gym.wrappers.substeps import Beneath, SubstepGuard
 
 

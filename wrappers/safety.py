@@ -30,7 +30,7 @@ from asm_gym.wrappers.factory import (
 )
 from asm_gym.wrappers.guard import Guard, GuardOptions, nothing
 from asm_gym.wrappers.observer import Observer, joined
-from asm_gym.wrappers.reports import INFO, STALE, RowReport, ends, report
+from asm_gym.wrappers.step_report import INFO, STALE, RowReport, ends, report
 from asm_gym.wrappers.substeps import Beneath
 
 
@@ -53,7 +53,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     and stream hold what that sensor should say, completed from all others, until it has been well for a second. A
     number that is not finite is an alarm; under ``"graded"`` it is completed, and surprise goes on from what is left.
 
-    ``info["asm"]`` says what came of a step: see ``asm_gym.wrappers.reports.report``. For loggers the same stands
+    ``info["asm"]`` says what came of a step: see ``asm_gym.wrappers.step_report.report``. For loggers the same stands
     beside it as NumPy scalars: ``info["asm_surprise"]``, ``info["asm_alarm"]``, ``info["asm_intervened"]``, and
     ``info["cost"]``, which is 1.0 on every step with an alarm and 0.0 otherwise, as safe-RL libraries expect.
     ``info["overridden"]`` is True after a step that began with another than the policy in charge: a policy with a state

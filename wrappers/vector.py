@@ -24,7 +24,7 @@ from asm_gym.wrappers.factory import LOG, OnAlarm, body_memory, check_monitor, f
 from asm_gym.wrappers.guard import Guard, GuardOptions, nothing
 from asm_gym.wrappers.lazily import Lazily
 from asm_gym.wrappers.observer import Observer, joined
-from asm_gym.wrappers.reports import INFO, STALE, RowReport, ends, report
+from asm_gym.wrappers.step_report import INFO, STALE, RowReport, ends, report
 from asm_gym.wrappers.vector_utils import (
     Mask,
     Member,

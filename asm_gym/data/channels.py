@@ -3,8 +3,8 @@
 A column is a channel of its own. Columns that differ in a number only, ``joint[0], joint[1]`` or ``joint_0, joint_1``,
 are the elements of one channel, and so are the columns of a two-dimensional array. Each channel is a group: what it
 does is expected from what the others do. What is called ``action`` was commanded, whether somebody says so or not. A
-unit may stand behind a name, ``joint_0 [rad]``. Rows that are late or lost, by the clock (``asm_gym.data.clock``), are
-put right by ``asm_gym.data.timing``. Clocks, counters of rows and labels are no channels.
+unit may stand behind a name, ``joint_0 [rad]``. Rows that are late or lost, by the clock (``asm_gym.data.clock_column``),
+are put right by ``asm_gym.data.row_times``. Clocks, counters of rows and labels are no channels.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.clock import clock_among, is_clock
-from asm_gym.data.notes import note
+from asm_gym.data.clock_column import clock_among, is_clock
+from asm_gym.data.reader_notes import note
+from asm_gym.data.row_times import increasing, period, regular
 from asm_gym.data.tabular import as_array
 from asm_gym.data.text import read_table
-from asm_gym.data.timing import increasing, period, regular
 from asm_gym.data.units import ratio
 from asm_gym.readings import noise_of
 from asm_gym.spec import MOTOR, Channel, StreamSpec

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.channels import bare_name, counts_rows, is_label, unit_of
-from asm_gym.data.clock import clock_among, is_clock
+from asm_gym.data.clock_column import clock_among, is_clock
 from asm_gym.data.commands import is_command
-from asm_gym.data.timing import FAR, increasing, period
+from asm_gym.data.row_times import FAR, increasing, period
 from asm_gym.readings import noise_of, resolution
 
 FEW_VALUES = 8

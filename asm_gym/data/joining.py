@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.clock import clock_among, is_clock
-from asm_gym.data.timing import FAR
+from asm_gym.data.clock_column import clock_among, is_clock
+from asm_gym.data.row_times import FAR
 
 Columns = Mapping[str, NDArray[Any]]
 

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.channels import bare_name, label_of, unit_of
-from asm_gym.data.clock import Clock, clock_among
-from asm_gym.data.dds import dds_lines
-from asm_gym.data.pace import ClockWentBack, Pace
+from asm_gym.data.clock_column import Clock, clock_among
+from asm_gym.data.resampling import ClockWentBack, Pace
+from asm_gym.data.ros2_dds import dds_lines
 from asm_gym.data.rtde import rtde_lines
 from asm_gym.data.text import Dialect, header_of
 from asm_gym.data.units import ratio

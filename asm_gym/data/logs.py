@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from asm_gym.checkpoint import read_arrays
 from asm_gym.data.bags import read_bag
 from asm_gym.data.channels import is_label
-from asm_gym.data.clock import is_clock
+from asm_gym.data.clock_column import is_clock
 from asm_gym.data.commands import is_command
 from asm_gym.data.datasets import METADATA, read_dataset
 from asm_gym.data.joining import joined

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.clock import is_clock
-from asm_gym.data.notes import note
+from asm_gym.data.clock_column import is_clock
+from asm_gym.data.reader_notes import note
 from asm_gym.files import regular_file
 
 AT_ONCE = 4096

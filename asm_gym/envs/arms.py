@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.envs.views import JOINT_POSITION, JOINTS, OSC_POSE, Arms
+from asm_gym.envs.mujoco_views import JOINT_POSITION, JOINTS, OSC_POSE, Arms
 
 
 def compilable(robot: Any, arm: str) -> bool:

@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 
 from asm_gym.compilation import compiled
-from asm_gym.envs.views import JOINT_POSITION, Arms, Floats, Goals, Ints, NominalViews, Views
+from asm_gym.envs.mujoco_views import JOINT_POSITION, Arms, Floats, Goals, Ints, NominalViews, Views
 
 
 @compiled

@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.envs import kernels
-from asm_gym.envs.views import Views
+from asm_gym.envs import compiled_substeps as kernels
+from asm_gym.envs.mujoco_views import Views
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 Corruption = Callable[[NDArray[np.float64]], None]

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import must_compile
-from asm_gym.envs import kernels
+from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.arms import bodies, compilable, describe
 from asm_gym.envs.control import hold_at
 from asm_gym.envs.expectation import Expected
-from asm_gym.envs.nominal import NominalDynamics
+from asm_gym.envs.mujoco_views import ACTS, ARMED, FELT, JOINTS, LEFT, Goals, SubstepBand, Views
+from asm_gym.envs.nominal_robot import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
 from asm_gym.envs.speeds import HandSpeeds
-from asm_gym.envs.views import ACTS, ARMED, FELT, JOINTS, LEFT, Goals, SubstepBand, Views
 
 
 class Simulation:

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.envs.views import Arms
+from asm_gym.envs.mujoco_views import Arms
 
 SURELY = 1.0 - 1e-9
 """Share of a limit of speed below which rounding decides nothing."""

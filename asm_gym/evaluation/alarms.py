@@ -9,7 +9,7 @@ import numpy as np
 
 from asm_gym.data.gaps import blamed, bridged, reason
 from asm_gym.data.logs import Log
-from asm_gym.evaluation.scored import ScoredEpisode, TraceDetail, moments_of
+from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail, moments_of
 from asm_gym.spec import StreamSpec
 
 

@@ -14,7 +14,7 @@ from asm_gym.detection import Blocks
 from asm_gym.evaluation.defaults import RATES
 from asm_gym.evaluation.ideal import auroc_bound, power_bound
 from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Kind, KindMetrics, false_alarms, in_words
-from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
+from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.statistics import Floats, Share
 
 IDEAL = "ideal observer"

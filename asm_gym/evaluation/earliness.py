@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from asm_gym.evaluation.scored import ScoredEpisode, window_steps
+from asm_gym.evaluation.scored_episode import ScoredEpisode, window_steps
 
 
 def aucpdt(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float) -> float:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from asm_gym.detection import Blocks, alarms_in
 from asm_gym.evaluation.earliness import aucpdt
 from asm_gym.evaluation.resampling import Calibration, Draws, drawn_anew
-from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE, ScoredEpisode, window_steps
+from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE, ScoredEpisode, window_steps
 from asm_gym.evaluation.statistics import Floats, Rate, Share, auroc
 
 Kind = tuple[str, str]

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability
 from asm_gym.evaluation.figures.style import SAYS
-from asm_gym.evaluation.scored import ScoredEpisode, window_steps
+from asm_gym.evaluation.scored_episode import ScoredEpisode, window_steps
 from asm_gym.evaluation.standing import card, coverage_table, kept_table, lead_table
 from asm_gym.evaluation.tables import Table, harmless_table, kinds_table, markdown, monitors_table
 from asm_gym.extras import needed_for

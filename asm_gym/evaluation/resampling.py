@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection import Blocks, conformal_episodes, conformal_threshold, hourly_threshold
-from asm_gym.evaluation.scored import ScoredEpisode, window_steps
+from asm_gym.evaluation.scored_episode import ScoredEpisode, window_steps
 from asm_gym.evaluation.statistics import Estimate, Floats
 
 DRAWS = 400

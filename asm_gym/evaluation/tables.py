@@ -19,7 +19,7 @@ from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import ActingMetrics, Delays, DetectionMetrics, KindMetrics, in_words
 from asm_gym.evaluation.resampling import interval
-from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE
+from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.evaluation.statistics import Estimate, Share
 
 Subject = TypeVar("Subject")

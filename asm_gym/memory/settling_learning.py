@@ -54,7 +54,7 @@ def settling_change(before: Array, u: Array, h: Array, errors: tuple[Array, Arra
     )
 
 
-class Settled(NamedTuple):
+class SettledStep(NamedTuple):
     """What a control step of learning came to."""
 
     mu: Array  # (B, H)
@@ -78,7 +78,7 @@ class SettlingLearner:
         found: Array = outward(activate(outward(activate(before), w.W_H) + w.W_U[:, -1]), w.W_A)
         return found
 
-    def step(self, before: Array, u: Array, x: Array, rate: float, taken: Array | None = None) -> Settled:
+    def step(self, before: Array, u: Array, x: Array, rate: float, taken: Array | None = None) -> SettledStep:
         """One control step of a batch.
 
         Args:
@@ -103,7 +103,7 @@ class SettlingLearner:
             synapse.learn(getattr(change, name), rate)
         # W_F moves little in a step, so one iteration keeps the norm up to date.
         self._norm, self._direction = power_iteration(w.W_F, self._direction)
-        return Settled(mu, z, total)
+        return SettledStep(mu, z, total)
 
 
 class SettlingStreams:

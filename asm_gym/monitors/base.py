@@ -13,8 +13,8 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.events import EVENTS, KNOCK, STOP, Excused, event_of
 from asm_gym.episode import Episode
-from asm_gym.inline import lines_over_time
 from asm_gym.monitors.diagnosis import Diagnosis
+from asm_gym.notebook_display import lines_over_time
 from asm_gym.spec import StreamSpec
 
 Progress = Callable[[int, int], object]

@@ -32,7 +32,7 @@ from asm_gym.memory.specialise import specialise
 from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past
 from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.base import Progress, Told
-from asm_gym.monitors.model import StreamModel, model_outputs, running
+from asm_gym.monitors.stream_model import StreamModel, model_outputs, running
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 

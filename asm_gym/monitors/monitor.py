@@ -17,15 +17,15 @@ from asm_gym.detection import Detection, ModelOutput, Nominal
 from asm_gym.detection.conformal import HOUR
 from asm_gym.episode import Episode
 from asm_gym.familiar_speed import FamiliarSpeed
-from asm_gym.monitors.asked import Asked
 from asm_gym.monitors.base import Model, Progress, Specialises, State, Surprise, Told
-from asm_gym.monitors.calibrated import Calibrated
-from asm_gym.monitors.fresh import Marks, check_fresh, sketch
-from asm_gym.monitors.model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
-from asm_gym.monitors.nominal import check_nominal
-from asm_gym.monitors.packed import packed, unpacked
-from asm_gym.monitors.saved import SavedMonitor, calibration_arrays
-from asm_gym.monitors.sighted import require_sight
+from asm_gym.monitors.blindness import require_sight
+from asm_gym.monitors.monitor_file import SavedMonitor, calibration_arrays
+from asm_gym.monitors.overlap import Marks, check_fresh, sketch
+from asm_gym.monitors.promise import Asked
+from asm_gym.monitors.stream_model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
+from asm_gym.monitors.threshold import Calibrated
+from asm_gym.monitors.training_data import check_nominal
+from asm_gym.monitors.weight_packing import packed, unpacked
 from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
 
 

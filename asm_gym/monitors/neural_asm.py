@@ -24,19 +24,19 @@ from asm_gym.memory.inference import iterations_within
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
 from asm_gym.memory.temporal import TemporalNetwork
-from asm_gym.monitors.asked import Asked
 from asm_gym.monitors.base import Progress, Surprise, Told
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.fused import CompiledRow
 from asm_gym.monitors.hub import fetched
 from asm_gym.monitors.memory_model import MemoryModel
-from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState
-from asm_gym.monitors.nominal import check_nominal
-from asm_gym.monitors.packed import rounded, unpacked
-from asm_gym.monitors.saved import restored
+from asm_gym.monitors.monitor_file import restored
+from asm_gym.monitors.promise import Asked
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise, apart
+from asm_gym.monitors.stream_model import parameter_names
+from asm_gym.monitors.training_data import check_nominal
+from asm_gym.monitors.weight_packing import rounded, unpacked
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_flag, check_number, shown, typed

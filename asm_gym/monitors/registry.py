@@ -10,9 +10,9 @@ from asm_gym.checkpoint import kind_of, read_checkpoint
 from asm_gym.detection import Detection, EvidenceDetection
 from asm_gym.extras import needed_for
 from asm_gym.monitors.estimators import adapted
-from asm_gym.monitors.model import parameter_names
 from asm_gym.monitors.monitor import CalibratedMonitor
-from asm_gym.monitors.saved import restored
+from asm_gym.monitors.monitor_file import restored
+from asm_gym.monitors.stream_model import parameter_names
 from asm_gym.registries import add, registry, target
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, typed
@@ -196,8 +196,8 @@ def _model_class(own: Any, name: str) -> Any:
     missing = [n for n in ("kind", "fit", *(() if whole else ("start", "predict", "restore"))) if not hasattr(own, n)]
     if missing:
         raise ValueError(
-            f"{name} is no model: it has no {', '.join(missing)}; derive from asm_gym.monitors.model.StreamModel, or "
-            "give an estimator with fit and score_samples"
+            f"{name} is no model: it has no {', '.join(missing)}; derive from asm_gym.monitors.stream_model.StreamModel, "
+            "or give an estimator with fit and score_samples"
         )
     return own
 

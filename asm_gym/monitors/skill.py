@@ -27,8 +27,8 @@ from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.memory.state import newest, past
 from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
 from asm_gym.monitors.base import Progress, Surprise, Told
-from asm_gym.monitors.model import StreamModel
 from asm_gym.monitors.monitor import CalibratedMonitor
+from asm_gym.monitors.stream_model import StreamModel
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number

@@ -21,7 +21,7 @@ from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, Monito
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.ideal import earliest, noise_floor, separation
 from asm_gym.evaluation.metrics import typical
-from asm_gym.evaluation.scored import NOMINAL, InterventionOutcome, ScoredEpisode, TraceDetail, window_steps
+from asm_gym.evaluation.scored_episode import NOMINAL, InterventionOutcome, ScoredEpisode, TraceDetail, window_steps
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
 from asm_gym.monitors.registry import model_of
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import asm_gym  # noqa: F401  (registers the environments in every worker)
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.evaluation.scored import IDEAL, NOMINAL
+from asm_gym.evaluation.scored_episode import IDEAL, NOMINAL
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.anywhere import faults_anywhere, sigmas
 from asm_gym.faults.body import touches_body

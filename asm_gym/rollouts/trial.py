@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 
 from asm_gym.episode import EpisodeLabel
-from asm_gym.evaluation.scored import IDEAL, NOMINAL, POLICY_ALONE
+from asm_gym.evaluation.scored_episode import IDEAL, NOMINAL, POLICY_ALONE
 from asm_gym.faults import Fault
 from asm_gym.policies import Policy
 from asm_gym.rollouts.seeds import draw_onset

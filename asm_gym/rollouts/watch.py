@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from asm_gym.evaluation.scored import POLICY_ALONE, InterventionOutcome, ScoredEpisode, TraceDetail
+from asm_gym.evaluation.scored_episode import POLICY_ALONE, InterventionOutcome, ScoredEpisode, TraceDetail
 from asm_gym.monitors import Monitor, NeuralASM
 from asm_gym.rollouts.staging import play, staged
 from asm_gym.rollouts.trial import RolloutConfig, Trial

@@ -26,7 +26,7 @@ from asm_gym.scripts.benchmark.deadline import Deadline
 from asm_gym.scripts.benchmark.experts import Experts
 from asm_gym.scripts.benchmark.fit import FitCost
 from asm_gym.scripts.benchmark.fleet import Robots
-from asm_gym.scripts.benchmark.memory import Memory
+from asm_gym.scripts.benchmark.memory import MemoryCost
 from asm_gym.scripts.benchmark.safety import Safety
 from asm_gym.scripts.benchmark.turns import GROWTH, BusyError, resident, take_turns
 from asm_gym.scripts.benchmark.vector import vector_table
@@ -201,7 +201,7 @@ BENCHMARKS: dict[str, type[Any]] = {
     "leaks": Leaks,
     "experts": Experts,
     "coverage": CoverageCheck,
-    "memory": Memory,
+    "memory": MemoryCost,
     "fit": FitCost,
     "safety": Safety,
     "watch": Watch,

@@ -22,7 +22,7 @@ from asm_gym.evaluation.tables import Table, console_table
 from asm_gym.extras import require
 from asm_gym.memory.traces import DECAYS
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.export import STATE, initial_state, write_onnx
+from asm_gym.monitors.onnx_export import STATE, initial_state, write_onnx
 from asm_gym.scripts.benchmark.turns import again, take_turns
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
@@ -175,7 +175,7 @@ def _fitted(hidden: int, channels: int, skills: int = 1) -> tuple[NeuralASM, Epi
 
 
 @dataclass
-class Memory:
+class MemoryCost:
     """What one call of observe() costs, against the same equations written plainly in torch."""
 
     hidden: int = 256

@@ -15,7 +15,7 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from mujoco.rollout import Rollout
 from rich.console import Console
 
-from asm_gym.envs.threads import ThreadVectorEnv
+from asm_gym.envs.threaded_vector import ThreadVectorEnv
 from asm_gym.evaluation.tables import Table
 from asm_gym.scripts.benchmark.turns import check_quiet, take_turns
 

@@ -38,7 +38,7 @@ from asm_gym.scripts.reproduce.closed_loop import (
     Recurring,
     written,
 )
-from asm_gym.scripts.reproduce.expression import FREE, Backpropagated, Memory
+from asm_gym.scripts.reproduce.expression import FREE, Backpropagated, ExpressionMemory
 from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters, repertoire
 from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.scripts.reproduce.speed_accuracy import SHORTER, asked
@@ -130,7 +130,7 @@ def one(job: tuple[str, int], config: Config) -> tuple[list[Record], dict[str, C
         return made, {"left alone": course}
     how = {"association_size": 64, "epochs": config.epochs, "free_running_probability": FREE, **SETTINGS[name]}
     asm = NeuralASM(SPEC, dynamics=name, seed=seed, **how).fit(told.train).calibrate(told.calibration, RATE)
-    memory, energy = Memory(asm.senses_, asm.model.network), asm.model.free_energy(told.calibration[::4])
+    memory, energy = ExpressionMemory(asm.senses_, asm.model.network), asm.model.free_energy(told.calibration[::4])
     for measure, cue in (("next row", STEPS), ("recalled", CUE)):
         note(measure, **online(memory, told, cue))
     short = asked(memory, 1, SHORTER[0])

@@ -23,7 +23,7 @@ from asm_gym.memory.readout import certainty, learn_readout
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.contextual_report import SPLICE, TIMES, Example, drawn, tables
-from asm_gym.scripts.reproduce.expression import Memory, Rows
+from asm_gym.scripts.reproduce.expression import ExpressionMemory, Rows
 from asm_gym.scripts.reproduce.handwriting import (
     NAMES,
     STEPS,
@@ -83,7 +83,7 @@ def one_seed(seed: int, config: Config) -> tuple[list[Record], Example]:
     rng = np.random.default_rng(seed)
     letters = alphabet(config, rng)
     train, tests = copybook(letters, config.writings, 2, rng), copybook(letters, config.writings, 2, rng)
-    memory = Memory.learned(train, config.hidden, rng, config.steps)
+    memory = ExpressionMemory.learned(train, config.hidden, rng, config.steps)
     names = [letter.name for letter in letters]
     (rows, skill), (seen, truth) = (_stacked(e, names) for e in (train, tests))
     features = _features(memory, rows, seen)
@@ -108,7 +108,7 @@ def one_middle(seed: int, config: Config) -> list[Record]:
     letters = [Letter("a", (first, *letter.strokes[1:]))]
     letters.append(detoured(letters[0], "b", rng))
     train, tests = copybook(letters, 2 * config.writings, 2, rng), copybook(letters, 2 * config.writings, 2, rng)
-    memory = Memory.learned(train, config.hidden, rng, config.steps)
+    memory = ExpressionMemory.learned(train, config.hidden, rng, config.steps)
     (rows, skill), (seen, truth) = (_stacked(e, "ab") for e in (train, tests))
     records = []
     for source, (known, asked) in _features(memory, rows, seen).items():
@@ -121,7 +121,9 @@ def one_middle(seed: int, config: Config) -> list[Record]:
     return records
 
 
-def _features(memory: Memory, rows: Rows, seen: Rows) -> dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]:
+def _features(
+    memory: ExpressionMemory, rows: Rows, seen: Rows
+) -> dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """What a readout may see (T, B, C), of what was learned and of what is judged, for each source."""
     reader = memory.reader
     known, asked = (((x - reader.mean) / reader.spread).astype(np.float32) for x in (rows, seen))
@@ -182,7 +184,7 @@ def _clustered(
     return records
 
 
-def _begun_late(memory: Memory, readout: Any, seen: Rows, truth: NDArray[np.intp], seed: int) -> list[Record]:
+def _begun_late(memory: ExpressionMemory, readout: Any, seen: Rows, truth: NDArray[np.intp], seed: int) -> list[Record]:
     """Cues that begin in mid-letter: the memory is asked after so many steps."""
     records = []
     for length in (1, 2, 5, 10, 20):
@@ -196,7 +198,7 @@ def _begun_late(memory: Memory, readout: Any, seen: Rows, truth: NDArray[np.intp
     return records
 
 
-def _switched(memory: Memory, readout: Any, seen: Rows, truth: NDArray[np.intp], seed: int) -> list[Record]:
+def _switched(memory: ExpressionMemory, readout: Any, seen: Rows, truth: NDArray[np.intp], seed: int) -> list[Record]:
     """One letter up to ``SPLICE``, from there on another: the share that names the new one, since the switch."""
     other = np.roll(np.arange(len(truth)), len(truth) // (int(truth.max()) + 1))
     spliced = np.concatenate([seen[:SPLICE], seen[SPLICE:, other]])
@@ -207,7 +209,9 @@ def _switched(memory: Memory, readout: Any, seen: Rows, truth: NDArray[np.intp],
     ]
 
 
-def _example(memory: Memory, readout: Any, seen: Rows, truth: NDArray[np.intp], states: NDArray[np.float32]) -> Example:
+def _example(
+    memory: ExpressionMemory, readout: Any, seen: Rows, truth: NDArray[np.intp], states: NDArray[np.float32]
+) -> Example:
     centred = states - states.mean(axis=(0, 1))
     _, _, axes = np.linalg.svd(_flat(centred)[::3], full_matrices=False)
     plane = centred @ axes[:2].T  # (T, B, 2)

@@ -52,7 +52,7 @@ def trajectories(reader: StreamScaler, episodes: Sequence[Episode]) -> list[Traj
 
 
 @dataclass(frozen=True)
-class Memory:
+class ExpressionMemory:
     """The temporal predictive coding network alone: nothing is judged here, so there is no association."""
 
     reader: StreamScaler
@@ -68,7 +68,7 @@ class Memory:
         rate: float = 3e-3,
         gain: float = 1.0,
         dynamics: str = TRACES,
-    ) -> Memory:
+    ) -> ExpressionMemory:
         """From whole episodes, no labels.
 
         Args:

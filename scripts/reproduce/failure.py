@@ -22,7 +22,7 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode, EpisodeLabel, load_episode, save_episode
 from asm_gym.evaluation import defaults
 from asm_gym.evaluation.figures import figure, look
-from asm_gym.evaluation.scored import NOMINAL
+from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import RESAMPLES, Estimate, Share, auroc
 from asm_gym.evaluation.tables import Table, count
 from asm_gym.monitors import MONITORS

@@ -30,7 +30,7 @@ from asm_gym.memory.feedback import FEEDBACK
 from asm_gym.monitors import CalibratedMonitor, make_monitor
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
-from asm_gym.monitors.model import StreamModel
+from asm_gym.monitors.stream_model import StreamModel
 from asm_gym.rollouts.run_folder import recorded
 from asm_gym.rollouts.scoring import judged
 from asm_gym.scaling import StreamScaler, rows_apart

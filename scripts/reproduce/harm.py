@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.envs.backend import PHYSICS_FREQ
-from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE
+from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.files import written_whole
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
@@ -104,7 +104,7 @@ class Config(kit.Config):
     """Goes on where a run into the same folder, of the same code and options, was interrupted."""
 
 
-class Cell(NamedTuple):
+class HarmCell(NamedTuple):
     """One policy in one task, and what goes wrong in it."""
 
     kind: str  # "hostile", "trained", "untrained", "early", "healthy" or "faulty"
@@ -117,19 +117,19 @@ class Cell(NamedTuple):
     steps: int = 0  # of training
 
 
-def cells(config: Config) -> list[tuple[Cell, int]]:
+def cells(config: Config) -> list[tuple[HarmCell, int]]:
     """Every cell, and how many episodes it has."""
     tasks, n = config.tasks, config.training
-    hostile = [Cell("hostile", task, name) for task, name in product(tasks, HOSTILE)]
-    slower = [Cell("hostile", task, "down", speed=s) for task, s in product(tasks, (0.5, 0.25))]
-    trained = [Cell("trained", task, name, steps=n) for task, name in product(tasks, HITTERS)]
-    untrained = [Cell("untrained", task, name) for task, name in product(tasks, LEARNERS)]
+    hostile = [HarmCell("hostile", task, name) for task, name in product(tasks, HOSTILE)]
+    slower = [HarmCell("hostile", task, "down", speed=s) for task, s in product(tasks, (0.5, 0.25))]
+    trained = [HarmCell("trained", task, name, steps=n) for task, name in product(tasks, HITTERS)]
+    untrained = [HarmCell("untrained", task, name) for task, name in product(tasks, LEARNERS)]
     early = [
-        Cell("early", task, f"{name} after {steps}", steps=steps)
+        HarmCell("early", task, f"{name} after {steps}", steps=steps)
         for task, name, steps in product(tasks, LEARNERS, (n // 4, n))
     ]
     elsewhere = [cell._replace(robot=robot, rate=rate) for (robot, rate), cell in product(ELSEWHERE, hostile)]
-    healthy = [Cell("healthy", task, policy) for task, policy in HEALTHY.values() if task in config.healthy_in]
+    healthy = [HarmCell("healthy", task, policy) for task, policy in HEALTHY.values() if task in config.healthy_in]
     faulty = [
         cell._replace(kind="faulty", fault=fault)
         for cell, fault in product(healthy, FAULTS)
@@ -141,13 +141,13 @@ def cells(config: Config) -> list[tuple[Cell, int]]:
     return [(cell, n) for group, n in counted for cell in group if n]
 
 
-def file_of(cell: Cell, config: Config) -> Any:
+def file_of(cell: HarmCell, config: Config) -> Any:
     """Of an agent that was trained."""
     name = cell.policy.split(" after ")[0]
     return harm_agents.made(config.out / "harm_agents", cell.robot, cell.task, name, cell.steps, config.seed)
 
 
-def policy_of(cell: Cell, env: gym.Env[Any, Any], seed: int, config: Config) -> Policy:
+def policy_of(cell: HarmCell, env: gym.Env[Any, Any], seed: int, config: Config) -> Policy:
     """The policy of an episode."""
     if cell.kind == "hostile":
         return HOSTILE[cell.policy](env, seed, cell.speed)
@@ -163,7 +163,7 @@ def chosen(name: str, env: gym.Env[Any, Any], seed: int) -> Policy:
     return HOSTILE[name](env, seed, 1.0) if name in HOSTILE else policy_for(name, env, seed)
 
 
-def measured(job: tuple[Cell, int], config: Config) -> list[kit.Record]:
+def measured(job: tuple[HarmCell, int], config: Config) -> list[kit.Record]:
     """One scene under every guard; kept, for a run that goes on."""
     cell, seed = job
     kept = config.out / "harm_scenes" / f"{'-'.join(map(str, cell))}-{seed}.json".replace(" ", "_")
@@ -216,7 +216,7 @@ def guarded(env: gym.Env[Any, Any], guard: str, memory: NeuralASM, rate: int) ->
     return env if told is None else NeuralASMSafety(env, memory, on_overrun="ignore", monitor_freq=fast, **told)
 
 
-def one(cell: Cell, seed: int, guard: str, memory: NeuralASM, config: Config) -> kit.Record:
+def one(cell: HarmCell, seed: int, guard: str, memory: NeuralASM, config: Config) -> kit.Record:
     """One episode."""
     trial = Trial(env_id(cell.task), seed, cell.fault, "" if cell.fault in (NOMINAL, "passing_push") else "medium")
     rollouts = RolloutConfig(robot=cell.robot, stream_freq=None if cell.rate == 20 else cell.rate)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from asm_gym.evaluation.scored import NOMINAL, POLICY_ALONE
+from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.evaluation.statistics import wilson_interval
 from asm_gym.evaluation.tables import Column, Table, tabulate
 from asm_gym.scripts.reproduce.kit import Record

@@ -21,7 +21,7 @@ from asm_gym.detection import conformal_threshold
 from asm_gym.episode import Episode
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.metrics import detected, false_alarms, time_matched_auroc
-from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
+from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import DYNAMICS
 from asm_gym.memory.free_energy import Before, FreeEnergy

@@ -21,9 +21,9 @@ from asm_gym.scripts.reproduce import splines
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     Expresser,
+    ExpressionMemory,
     Hopfield,
     Library,
-    Memory,
     mean_demonstrations,
     recalled,
 )
@@ -124,7 +124,9 @@ def learned(
     """
     how: dict[str, Any] = dict(setting)
     if name in ("memory", "memory_wide"):
-        return Memory.learned(train, hidden * (WIDER if name == "memory_wide" else 1), rng, practice.steps, **how)
+        return ExpressionMemory.learned(
+            train, hidden * (WIDER if name == "memory_wide" else 1), rng, practice.steps, **how
+        )
     if name == "hopfield":
         return Hopfield.learned(train, **how)
     if name == "library":

@@ -41,7 +41,7 @@ from asm_gym.memory.recall import follow, run_on, to_rows
 from asm_gym.memory.settling import SettlingNetwork
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.expression import Memory, Rows, read
+from asm_gym.scripts.reproduce.expression import ExpressionMemory, Rows, read
 from asm_gym.scripts.reproduce.handwriting import DT, NOISE, STEPS, Letter, check_letters, copybook, repertoire, written
 from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.scripts.reproduce.lagging import LaggingNetwork
@@ -116,18 +116,18 @@ def one_seed(seed: int, config: Config) -> list[Record]:
     return records
 
 
-def asked(memory: Memory, iterations: int, shorter: int = 1) -> Memory:
+def asked(memory: ExpressionMemory, iterations: int, shorter: int = 1) -> ExpressionMemory:
     """The memory with so many steps of inference a row, which are ``shorter`` times shorter than they could be."""
     network = memory.network.with_iterations(iterations)
     network.curvature *= np.float32(shorter)  # a step is as long as its inverse
-    return Memory(memory.reader, network)
+    return ExpressionMemory(memory.reader, network)
 
 
-def each_way(memory: Memory, dynamics: str) -> dict[str, Memory]:
+def each_way(memory: ExpressionMemory, dynamics: str) -> dict[str, ExpressionMemory]:
     """The memory as it is, and one that settles as it is where its units cannot jump."""
     found = {dynamics: memory}
     if isinstance(memory.network, SettlingNetwork):
-        found[LAGGING] = Memory(memory.reader, LaggingNetwork.of(memory.network))
+        found[LAGGING] = ExpressionMemory(memory.reader, LaggingNetwork.of(memory.network))
     return found
 
 
@@ -135,7 +135,7 @@ def by_iterations(
     seed: int, letters: Sequence[Letter], config: Config, rng: np.random.Generator, dynamics: str
 ) -> list[Record]:
     """What one memory makes of letters, and how long it takes, by steps of inference, cues and noise."""
-    memory = Memory.learned(
+    memory = ExpressionMemory.learned(
         copybook(letters, config.writings, 2, rng), config.hidden, rng, config.steps, dynamics=dynamics
     )
     rows = np.stack([e.stream for e in copybook(letters, TESTS, 2, rng)], axis=1).astype(np.float64)
@@ -148,7 +148,9 @@ def by_iterations(
     return records
 
 
-def by_steps(memory: Memory, rows: Rows, slipped: Rows, onset: NDArray[np.intp], config: Config) -> list[Record]:
+def by_steps(
+    memory: ExpressionMemory, rows: Rows, slipped: Rows, onset: NDArray[np.intp], config: Config
+) -> list[Record]:
     """All that is asked, by steps of inference a row."""
     records = []
     for count, shorter in product(config.iterations, SHORTER):
@@ -173,7 +175,7 @@ def off(hand: Rows, rows: Rows) -> float:
     return float(np.linalg.norm(hand - rows[-len(hand) :, :, :2], axis=2).mean())
 
 
-def by_noise(memory: Memory, rows: Rows, noise: Rows) -> list[Record]:
+def by_noise(memory: ExpressionMemory, rows: Rows, noise: Rows) -> list[Record]:
     """Where the pen is in the next row, and goes after a cue, while the senses are noisier than those learned from."""
     records = []
     for more, count in product(NOISES, (PREPARED[0], PREPARED[-1])):
@@ -184,7 +186,7 @@ def by_noise(memory: Memory, rows: Rows, noise: Rows) -> list[Record]:
     return records
 
 
-def by_preparation(memory: Memory, rows: Rows) -> list[Record]:
+def by_preparation(memory: ExpressionMemory, rows: Rows) -> list[Record]:
     """Where the pen goes after a cue, by the cue's length and the inference on its rows; then inference is plenty."""
     records, plenty = [], asked(memory, PREPARED[-1]).network
     for cue, count in product(CUES, PREPARED):
@@ -196,7 +198,7 @@ def by_preparation(memory: Memory, rows: Rows) -> list[Record]:
     return records
 
 
-def completed(memory: Memory, rows: Rows) -> float:
+def completed(memory: ExpressionMemory, rows: Rows) -> float:
     """Mean error [cm] of a hidden axis in each row after the cue, inferred from the other and the past."""
     net, (senses, commands) = memory.network, read(memory.reader, rows)
     c, errors, S = net.at_rest(rows.shape[1]), [], senses.shape[2]
@@ -210,7 +212,9 @@ def completed(memory: Memory, rows: Rows) -> float:
     return float(np.mean(errors))
 
 
-def _filled_in(memory: Memory, c: NDArray[np.float32], taken: NDArray[np.float32], x: NDArray[np.float32]) -> Rows:
+def _filled_in(
+    memory: ExpressionMemory, c: NDArray[np.float32], taken: NDArray[np.float32], x: NDArray[np.float32]
+) -> Rows:
     """(B,) the hidden axis, standardised, where neither it nor the command along it was read."""
     net, S, motor = memory.network, x.shape[1], len(memory.reader.spec.motor)
     unseen = np.ones(S + motor, np.float32)
@@ -237,7 +241,7 @@ def slips(rows: Rows, rng: np.random.Generator) -> tuple[Rows, NDArray[np.intp]]
     return moved, onset
 
 
-def told_apart(memory: Memory, rows: Rows, slipped: Rows, onset: NDArray[np.intp]) -> float:
+def told_apart(memory: ExpressionMemory, rows: Rows, slipped: Rows, onset: NDArray[np.intp]) -> float:
     """AUROC of the greatest surprise within the window, each slip against all good writings in the same steps."""
     good, bad = (_errors(memory, x) for x in (rows, slipped))
     spread = good.std(axis=(0, 1))
@@ -246,14 +250,14 @@ def told_apart(memory: Memory, rows: Rows, slipped: Rows, onset: NDArray[np.intp
     return float(np.mean(own))
 
 
-def _errors(memory: Memory, rows: Rows) -> Rows:
+def _errors(memory: ExpressionMemory, rows: Rows) -> Rows:
     """(T, B, S) of the senses expected before they were read."""
     senses, commands = read(memory.reader, rows)
     expected = follow(memory.network, memory.network.at_rest(rows.shape[1]), senses, commands).senses
     return (senses - expected).astype(np.float64)
 
 
-def _seconds_a_row(memory: Memory, rows: Rows) -> float:
+def _seconds_a_row(memory: ExpressionMemory, rows: Rows) -> float:
     """Of what is needed to watch one stream."""
     net, (senses, commands) = memory.network, read(memory.reader, rows[:, :1])
     c, seen, taken = net.at_rest(1), np.ones_like(senses[0]), []
@@ -269,7 +273,7 @@ def by_speed(
 ) -> list[Record]:
     """A memory of letters at all speeds: where it has the hand in the next row, and after a third of a letter."""
     each = max(2, config.writings // 3)
-    memory = Memory.learned(
+    memory = ExpressionMemory.learned(
         copybook(letters, each, 2, rng, config.speeds), config.hidden, rng, config.steps, dynamics=dynamics
     )
     records = []

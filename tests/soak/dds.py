@@ -23,7 +23,7 @@ from rich.console import Console
 from asm_gym.data.live import lines_from
 from asm_gym.episode import Episode
 from asm_gym.monitors import make_monitor
-from asm_gym.scripts.following import follow
+from asm_gym.scripts.live_watching import follow
 
 JOINTS = 7
 NAMES = [f"panda_joint{j + 1}" for j in range(JOINTS)]

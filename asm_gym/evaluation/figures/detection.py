@@ -14,7 +14,7 @@ from asm_gym.evaluation.comparison import IDEAL
 from asm_gym.evaluation.figures.episodes import limits
 from asm_gym.evaluation.figures.style import BLACK, figure, look, require_some
 from asm_gym.evaluation.metrics import DetectionMetrics, Kind, KindMetrics, delays_ms, in_words, placements
-from asm_gym.evaluation.scored import NOMINAL, ScoredEpisode
+from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.statistics import wilson_interval
 
 MOST_BANDS = 4

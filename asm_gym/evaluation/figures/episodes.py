@@ -14,7 +14,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from asm_gym.episode import spans
 from asm_gym.evaluation.figures.style import BLACK, BLUE, ORANGE, VERMILLION, figure, require_some, says
-from asm_gym.evaluation.scored import ScoredEpisode, TraceDetail
+from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail
 
 
 def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:

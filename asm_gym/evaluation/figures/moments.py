@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from asm_gym.episode import spans
 from asm_gym.evaluation.figures.style import BLACK, BLUE, VERMILLION, figure, require_some
-from asm_gym.evaluation.scored import AlarmMoment
+from asm_gym.evaluation.scored_episode import AlarmMoment
 
 AROUND_S, AROUND_ROWS = 0.5, 10
 """How much is shown before and after [s], and at least how many rows."""

@@ -32,7 +32,7 @@ from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
-from asm_gym.monitors.model import StreamModel
+from asm_gym.monitors.stream_model import StreamModel
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, typed

@@ -17,7 +17,7 @@ from asm_gym.detection import ModelOutput
 from asm_gym.episode import Episode
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
-from asm_gym.monitors.model import StreamModel
+from asm_gym.monitors.stream_model import StreamModel
 
 SMOOTH = 2
 """Steps before and after whose rows count too."""

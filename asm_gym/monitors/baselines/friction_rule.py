@@ -20,7 +20,7 @@ from asm_gym.episode import Episode
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.association_values import WIDTHS, speeds
 from asm_gym.monitors.baselines.base import no_context
-from asm_gym.monitors.model import StreamModel
+from asm_gym.monitors.stream_model import StreamModel
 from asm_gym.scaling import rows_apart
 from asm_gym.spec import StreamSpec
 

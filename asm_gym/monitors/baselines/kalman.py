@@ -20,7 +20,7 @@ from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import Standard, no_context
-from asm_gym.monitors.model import StreamModel
+from asm_gym.monitors.stream_model import StreamModel
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 

@@ -21,8 +21,8 @@ from asm_gym.memory.dynamics import TRACES
 from asm_gym.memory.state import MemoryState, past
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
-from asm_gym.monitors.model import StreamModel, model_outputs
 from asm_gym.monitors.neural_asm import NeuralASM
+from asm_gym.monitors.stream_model import StreamModel, model_outputs
 from asm_gym.spec import StreamSpec
 
 FAINTEST = 1e-4

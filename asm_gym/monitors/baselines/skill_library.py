@@ -26,7 +26,7 @@ from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
-from asm_gym.monitors.model import StreamModel, skills_of
+from asm_gym.monitors.stream_model import StreamModel, skills_of
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 

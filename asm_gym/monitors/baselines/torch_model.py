@@ -19,7 +19,7 @@ from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.learning import shuffled
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.model import StreamModel
+from asm_gym.monitors.stream_model import StreamModel
 from asm_gym.scaling import ScaledRows, StreamScaler
 
 

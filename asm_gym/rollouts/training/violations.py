@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from asm_gym.envs.kernels import MOTOR
+from asm_gym.envs.compiled_substeps import MOTOR
 
 
 class TorqueWatch(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

@@ -20,7 +20,7 @@ from numba import types
 
 from asm_gym.compilation import compiled
 from asm_gym.envs.control import brake, control, hand_velocity, hold_at, set_goal
-from asm_gym.envs.views import (
+from asm_gym.envs.mujoco_views import (
     ACTS,
     ARMED,
     FELT,

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from asm_gym.data.channels import label_of
-from asm_gym.data.clock import clock_among
+from asm_gym.data.clock_column import clock_among
 from asm_gym.data.coverage import POSITION, Coverage
 from asm_gym.data.live import SourceDied
 from asm_gym.data.rtde import rtde_lines

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from asm_gym.detection import Blocks, Promise, hourly_promise
 from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.familiar_speed import FamiliarSpeed
-from asm_gym.monitors.asked import Asked
 from asm_gym.monitors.base import Surprise
+from asm_gym.monitors.promise import Asked
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import typed
 

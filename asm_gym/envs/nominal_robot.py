@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.envs import kernels
-from asm_gym.envs.views import NominalViews, Views
+from asm_gym.envs import compiled_substeps as kernels
+from asm_gym.envs.mujoco_views import NominalViews, Views
 
 _INERTIA = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
 """Whoever edits these in the model edits the world, not the robot's knowledge of it."""

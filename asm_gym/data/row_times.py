@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.notes import note
+from asm_gym.data.reader_notes import note
 
 Column = NDArray[np.generic]
 
