@@ -3,8 +3,8 @@
 A column is a channel of its own. Columns that differ in a number only, ``joint[0], joint[1]`` or ``joint_0, joint_1``,
 are the elements of one channel, and so are the columns of a two-dimensional array. Each channel is a group: what it
 does is expected from what the others do. What is called ``action`` was commanded, whether somebody says so or not. A
-unit may stand behind a name, ``joint_0 [rad]``. Rows that are late or lost, by the clock (``asm_gym.data.clock_column``),
-are put right by ``asm_gym.data.row_times``. Clocks, counters of rows and labels are no channels.
+unit may stand behind a name, ``joint_0 [rad]``. Rows that are late or lost by their clock are put right
+(``asm_gym.data.clock_column``, ``row_times``). Clocks, counters of rows and labels are no channels.
 """
 
 from __future__ import annotations

@@ -196,8 +196,8 @@ def _model_class(own: Any, name: str) -> Any:
     missing = [n for n in ("kind", "fit", *(() if whole else ("start", "predict", "restore"))) if not hasattr(own, n)]
     if missing:
         raise ValueError(
-            f"{name} is no model: it has no {', '.join(missing)}; derive from asm_gym.monitors.stream_model.StreamModel, "
-            "or give an estimator with fit and score_samples"
+            f"{name} is no model: it has no {', '.join(missing)}; derive from "
+            "asm_gym.monitors.stream_model.StreamModel, or give an estimator with fit and score_samples"
         )
     return own
 
