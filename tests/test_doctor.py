@@ -295,7 +295,7 @@ def test_a_command_gets_the_rest_of_the_arguments_and_its_exit_code_is_returned(
         return 7
 
     monkeypatch.setitem(sys.modules, "a_script", SimpleNamespace(main=script))
-    monkeypatch.setitem(cli.COMMANDS, "try", cli.Command("a_script", "tries"))
+    monkeypatch.setitem(cli.COMMANDS, "try", cli.Subcommand("a_script", "tries"))
     assert cli.main(["try", "--seed", "3"]) == 7
     assert got == [["--seed", "3"]]
 

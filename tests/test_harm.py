@@ -20,7 +20,7 @@ def test_harm_is_the_impulse_beyond_forty_newtons_and_the_first_blow_is_told_fro
 
 
 def record(guard, seed, value, policy="down", kind="hostile"):
-    cell = harm.Cell(kind, "Lift", policy)._asdict()
+    cell = harm.HarmCell(kind, "Lift", policy)._asdict()
     rest = {"success": True, "first": value, "later": 0.0, "strain": 1.0, "steps": 10, "held": 1, "hand": 0.1}
     return {
         **cell,
@@ -64,7 +64,7 @@ def test_success_is_paired_by_scene_and_told_from_success_with_a_blow():
 def test_a_run_that_goes_on_measures_no_scene_twice(tmp_path, monkeypatch):
     config = harm.Config(out=tmp_path, guards=("policy alone",), resume=True)
     monkeypatch.setattr(harm, "one", lambda cell, seed, *rest: {"seed": seed, "harm": 1.5, "hand": float("nan")})
-    job = harm.Cell("healthy", "Lift", "scripted"), 7
+    job = harm.HarmCell("healthy", "Lift", "scripted"), 7
     first = harm.measured(job, config)
     monkeypatch.setattr(harm, "one", None)
     np.testing.assert_equal(harm.measured(job, config), first)
@@ -94,7 +94,8 @@ def test_every_cell_is_one_row_and_other_arms_are_asked_for():
         "trained": 2,
         "untrained": 3,
         "early": 6,
-        "healthy": 9,
+        "healthy": 2,
+        "faulty": 10,
     }
     assert {cell.robot for cell, n in chosen if n == 2} == {"Panda", "Sawyer", "IIWA"}
     assert sorted({cell.steps for cell, _ in chosen if cell.kind == "early"}) == [100, 400]

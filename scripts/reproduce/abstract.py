@@ -60,13 +60,13 @@ class Config(kit.Config):
     skills: int = option(6, quick=2, check=partial(check_letters, least=2))
     """Letters."""
     writings: int = option(20, quick=6, least=2)
-    """Of each letter to learn from."""
+    """How often each letter is written to learn from."""
     tests: int = option(3, quick=1, least=1)
-    """Of each letter to be expressed."""
+    """How often each letter is to be expressed."""
     epochs: int = option(70, quick=10, least=1)
     """Passes over them."""
     updates: int = option(600, quick=20, least=1)
-    """Of the GRU."""
+    """How often the GRU learns from a batch."""
     calibration: int = fixed(16, quick=12, least=1)
     """Writings of each letter that set the threshold."""
 

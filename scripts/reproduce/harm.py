@@ -68,7 +68,9 @@ FAULTS = ("frozen_encoder", "encoder_bias", "encoder_dropout", "weak_joint", "pa
 
 HEALTHY_TASKS = tuple(dict.fromkeys(task for task, _ in HEALTHY.values()))
 
-AGAINST = "hostile", "untrained", "taught", "elsewhere"
+AGAINST = "hostile", "untrained", "taught", "elsewhere", "faulty"
+TASKS = "Lift", "Stack", "Door", "PickPlaceCan"
+"""Of hostile policies; healthy ones act in those that they are for."""
 
 ELSEWHERE = ("Sawyer", 20), ("IIWA", 20), ("Panda", 100)
 """Other arms, and another rate of the memory [Hz]."""
@@ -82,22 +84,19 @@ class Config(kit.Config):
     """How often it is done anew, with other seeds."""
     episodes: int = option(10, quick=1, least=0)
     """Episodes of each policy that a guard is against."""
-    against: tuple[str, ...] = option(("hostile", "untrained"), known=AGAINST, metavar="NAME")
-    """Which; elsewhere are hostile ones with the Sawyer, the IIWA, and at 100 Hz."""
+    against: tuple[str, ...] = option(("hostile", "untrained"), known=(*AGAINST, "speeds"), metavar="NAME")
+    """Which. Elsewhere are hostile ones with the Sawyer, the IIWA, and at 100 Hz. Faulty are healthy ones in Lift and
+    Stack under each kind of fault. Speeds are healthy ones by which limits by place, direction and load are compared."""
     healthy: int = option(40, quick=1, least=0)
     """Episodes of each healthy policy."""
-    healthy_in: tuple[str, ...] = option(HEALTHY_TASKS, known=HEALTHY_TASKS, metavar="TASK")
-    """Where these act."""
-    faulty: int = option(0, least=0)
-    """Episodes of each healthy policy of Lift and Stack under each kind of fault."""
-    speeds: int = option(0, least=0)
-    """Episodes of healthy policies by which speed limits by place, direction and load are compared."""
     guards: tuple[str, ...] = option(
         (POLICY_ALONE, "default", "hold", "terminate"), known=tuple(GUARDS), metavar="NAME"
     )
     """Ways to guard."""
-    tasks: tuple[str, ...] = option(("Lift", "Stack", "Door", "PickPlaceCan"), quick=("Lift",), metavar="TASK")
-    """Where these act."""
+    tasks: tuple[str, ...] = option(
+        (), quick=("Lift",), known=tuple(dict.fromkeys((*TASKS, *HEALTHY_TASKS))), metavar="TASK"
+    )
+    """Where all act; by default each kind of policy where it has a task."""
     training: int = fixed(2000, quick=500, least=4)
     """Steps for which those are trained that learn, to hit and to their task; a quarter of them too."""
     resume: bool = False
@@ -119,7 +118,7 @@ class HarmCell(NamedTuple):
 
 def cells(config: Config) -> list[tuple[HarmCell, int]]:
     """Every cell, and how many episodes it has."""
-    tasks, n = config.tasks, config.training
+    tasks, n = [t for t in TASKS if t in (config.tasks or TASKS)], config.training
     hostile = [HarmCell("hostile", task, name) for task, name in product(tasks, HOSTILE)]
     slower = [HarmCell("hostile", task, "down", speed=s) for task, s in product(tasks, (0.5, 0.25))]
     trained = [HarmCell("trained", task, name, steps=n) for task, name in product(tasks, HITTERS)]
@@ -129,15 +128,19 @@ def cells(config: Config) -> list[tuple[HarmCell, int]]:
         for task, name, steps in product(tasks, LEARNERS, (n // 4, n))
     ]
     elsewhere = [cell._replace(robot=robot, rate=rate) for (robot, rate), cell in product(ELSEWHERE, hostile)]
-    healthy = [HarmCell("healthy", task, policy) for task, policy in HEALTHY.values() if task in config.healthy_in]
+    healthy = [
+        HarmCell("healthy", task, policy)
+        for task, policy in HEALTHY.values()
+        if task in (config.tasks or HEALTHY_TASKS)
+    ]
     faulty = [
         cell._replace(kind="faulty", fault=fault)
         for cell, fault in product(healthy, FAULTS)
         if cell.task in ("Lift", "Stack")
     ]
-    groups = dict(zip(AGAINST, (hostile + slower, untrained, trained + early, elsewhere), strict=True))
-    counted = [(groups[name], config.episodes) for name in config.against]
-    counted += [(healthy, config.healthy), (faulty, config.faulty)]
+    groups = dict(zip(AGAINST, (hostile + slower, untrained, trained + early, elsewhere, faulty), strict=True))
+    counted = [(groups[name], config.episodes) for name in config.against if name in groups]
+    counted.append((healthy, config.healthy))
     return [(cell, n) for group, n in counted for cell in group if n]
 
 
@@ -292,9 +295,9 @@ def run(config: Config) -> kit.Findings:
     if "elsewhere" in config.against:
         held = kit.together(kit.each("braking", harm_braking.braking, harm_braking.ROBOTS, config))
         tables.append(harm_braking.braking_table(held))
-    if config.speeds:
-        by_task = [(t, tuple(p for own, p in HEALTHY.values() if own == t)) for t in config.tasks]
-        compare = partial(harm_speeds.speeds, episodes=config.speeds, make=chosen)
+    if "speeds" in config.against:
+        by_task = [(t, tuple(p for own, p in HEALTHY.values() if own == t)) for t in config.tasks or TASKS]
+        compare = partial(harm_speeds.speeds, episodes=config.episodes, make=chosen)
         tables.append(harm_speeds.speeds_table(kit.together(kit.each("speeds", compare, by_task, config))))
     tables += [harm_report.kept_table(records, guards, kind) for kind in ("healthy", "faulty")]
     return kit.Findings(records, [table for table in tables if table.rows], harm_report.frontier(records, guards))
