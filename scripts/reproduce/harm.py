@@ -86,7 +86,7 @@ class Config(kit.Config):
     """Episodes of each policy that a guard is against."""
     against: tuple[str, ...] = option(("hostile", "untrained"), known=(*AGAINST, "speeds"), metavar="NAME")
     """Which. Elsewhere are hostile ones with the Sawyer, the IIWA, and at 100 Hz. Faulty are healthy ones in Lift and
-    Stack under each kind of fault. Speeds are healthy ones by which limits by place, direction and load are compared."""
+    Stack under each kind of fault. With speeds, limits by place, direction and load are compared on healthy ones."""
     healthy: int = option(40, quick=1, least=0)
     """Episodes of each healthy policy."""
     guards: tuple[str, ...] = option(
