@@ -49,9 +49,8 @@ def test_it_writes_what_it_promises(run):
     assert all(r["ideal_separation"] > 100 and len(r["surprise"]) == r["steps"] for r in push)
     assert all(r["ideal_delay_s"] == pytest.approx(0.05) for r in push)
     report = (run / "report.html").read_text()
-    assert (
-        report.count("<img") == 4 + 1 + 4
-    )  # typical episodes of a push and a frozen encoder, what they sensed and what surprised
+    # Typical episodes of a push and a frozen encoder, what they sensed and what surprised.
+    assert report.count("<svg ") == 4 + 1 + 4
     assert "ideal observer" in report
     said = re.sub(r"base64,[\w+/=]+", "", report)  # of pictures, in which four letters stand by chance
     assert "http" not in said.replace("http://www.w3.org", "")

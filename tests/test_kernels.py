@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from asm_gym.envs import control, kernels
+from asm_gym.envs import compiled_substeps as kernels
+from asm_gym.envs import control
 from asm_gym.envs.backend import import_robosuite
 
 
