@@ -131,10 +131,12 @@ def main(names: list[str]) -> int:
     """Checks some or all, and returns 1 where one is wrong."""
     with TemporaryDirectory() as folder:
         wheel = build_wheel(Path(folder))
-        said = {name: pairs(wheel) if name == "pairs" else check(name, wheel) for name in names or (*CHECKS, "pairs")}
-    for name, wrong in said.items():
-        print(f"{name:<14} {wrong or 'ok'}")
-    return int(any(said.values()))
+        wrong = 0
+        for name in names or (*CHECKS, "pairs"):
+            found = pairs(wheel) if name == "pairs" else check(name, wheel)
+            print(f"{name:<14} {found or 'ok'}", flush=True)
+            wrong += bool(found)
+    return int(wrong > 0)
 
 
 if __name__ == "__main__":
