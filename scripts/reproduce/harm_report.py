@@ -232,5 +232,6 @@ def frontier(records: Sequence[Record], guards: Sequence[str]) -> Figure:
     axes.invert_xaxis()
     axes.set_xlabel("harm left of policies that a guard is against [% of alone]")
     axes.set_ylabel("healthy episodes solved [%]")
-    axes.legend(loc="lower left")
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="lower left")
     return figure
