@@ -21,7 +21,7 @@ from asm_gym.detection import check_per_hour
 from asm_gym.detection.hourly import check_hours
 from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.defaults import WINDOW_S
-from asm_gym.evaluation.tables import console_table, markdown
+from asm_gym.evaluation.tables import ConsoleTable, markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.shipped import USUAL
@@ -262,7 +262,7 @@ def babble(args: Args, console: Console) -> None:
             others = [rate for rate in RATES if rate != args.false_alarms_per_hour]
             table, said = card(marks, memory, args.window), at_rates(marks, memory, others)
             (args.out / "card.md").write_text(f"{markdown(table)}\n\n{said}\n", encoding="utf-8")
-            console.print(console_table(table))
+            console.print(ConsoleTable(table))
             console.print(said)
     console.print(f"Wrote {args.out / args.name}.asm: NeuralASMSafety(env, NeuralASM.load(...)) watches with it")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.rollouts.corpus import PARTS, QUICK, ROUNDS, VERSION, Corpus, record_corpus
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.progress import stage
@@ -64,7 +64,7 @@ def make(args: Args, console: Console) -> None:
                     record_corpus(args.out, sources, number, total, ParallelConfig.named(args.workers), progress)
     titles = "", "fit", "calibration", "nominal", "faulty", "healthy hours"
     corpus = Corpus.open(args.out)
-    console.print(console_table(Table(f"Corpus {VERSION}: {len(corpus.entries)} episodes.", titles, contents(corpus))))
+    console.print(ConsoleTable(Table(f"Corpus {VERSION}: {len(corpus.entries)} episodes.", titles, contents(corpus))))
 
 
 def main(argv: list[str] | None = None) -> int:

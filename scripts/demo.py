@@ -31,7 +31,7 @@ from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import Share, binomial_interval
 from asm_gym.evaluation.tables import (
     BRIEF_CONDITION_COLUMNS,
-    console_table,
+    ConsoleTable,
     detection_table,
     headline,
     outcome_table,
@@ -260,7 +260,7 @@ def demonstrate(args: Args, console: Console) -> None:
     rows = by_condition(traces, WINDOW_S)
     latency = observe_latency_us(memory)
     title = f"Noticed while the policy acts alone; solved and force: alone → {args.on_alarm}"
-    console.print("", console_table(tabulate(title, BRIEF_CONDITION_COLUMNS, rows), plain=True), "")
+    console.print("", ConsoleTable(tabulate(title, BRIEF_CONDITION_COLUMNS, rows), plain=True), "")
     low, high = binomial_interval(args.nominal_episodes, args.false_alarm_rate)
     expected = (
         f"At a false-alarm rate of {args.false_alarm_rate:g}, {low} to {high} of {args.nominal_episodes} nominal "

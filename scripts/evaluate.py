@@ -26,7 +26,7 @@ from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_S
 from asm_gym.evaluation.report import publish
 from asm_gym.evaluation.standing import coverage_table, kept_table
-from asm_gym.evaluation.tables import brief_monitors_table, console_table, harmless_table, kinds_table
+from asm_gym.evaluation.tables import ConsoleTable, brief_monitors_table, harmless_table, kinds_table
 from asm_gym.faults import anywhere
 from asm_gym.faults.interface import FaultyInterface
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of, possible
@@ -306,7 +306,7 @@ def evaluate_and_report(args: Args, console: Console) -> None:
     harmless = any(monitor.harmless for monitor in result.monitors.values())
     details = [harmless_table(result, args.monitors[:1])] if harmless else [kept_table(result), coverage_table(result)]
     for table in (brief_monitors_table(result), *(details if not args.elsewhere else [kinds_table(result)])):
-        console.print(console_table(table))
+        console.print(ConsoleTable(table))
     console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.parquet'}")
 
 

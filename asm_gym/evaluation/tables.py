@@ -6,12 +6,15 @@ A new column is one function and one entry in a list of columns.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markup import escape
-from rich.table import Table as ConsoleTable
+from rich.table import Table as RichTable
 
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import metrics
@@ -23,6 +26,9 @@ from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.evaluation.statistics import Estimate, Share
 
 Subject = TypeVar("Subject")
+WITH_UNIT = re.compile(r"(?<=\d) (?=[%A-Za-zµ°]{1,3}\b|%)")
+"""The space between a number and its unit, which no line ends at."""
+
 Compared = DetectionMetrics | KindMetrics
 """A monitor, or the ideal observer, who has fewer columns."""
 
@@ -54,19 +60,57 @@ def tabulate(caption: str, columns: Sequence[Column[Subject]], subjects: Iterabl
     return Table(caption, [column.heading for column in columns], rows)
 
 
-def console_table(table: Table, left: int = 1, plain: bool = False) -> ConsoleTable:
+@dataclass(frozen=True)
+class ConsoleTable:
     """For a terminal: the caption on top, the first ``left`` columns to the left, numbers to the right.
 
-    Args:
-        plain: without rules, and no column is wrapped.
+    Columns stand side by side where the terminal is wide enough for every word, else each cell has a line of its own.
+    ``plain`` is without rules.
     """
-    style: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)} if plain else {}
-    made = ConsoleTable(title=escape(table.caption), **style)
-    for i, heading in enumerate(table.headings):
-        made.add_column(escape(heading), justify="left" if i < left else "right", no_wrap=plain or i < left)
-    for row in table.rows:
-        made.add_row(*(escape(str(cell)) for cell in row))
-    return made
+
+    table: Table
+    left: int = 1
+    plain: bool = False
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Called by rich when it is printed."""
+        style: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)} if self.plain else {}
+        made = RichTable(title=escape(self.table.caption), **style)
+        columns = list(zip(self.table.headings, *self.table.rows, strict=True))
+        rules = 2 * len(columns) if self.plain else 3 * len(columns) + 1
+        widths = _widths([list(map(str, cells)) for cells in columns], self.left, options.max_width - rules)
+        if widths is None:
+            yield self._listed()
+            return
+        for i, (heading, width) in enumerate(zip(self.table.headings, widths, strict=True)):
+            made.add_column(escape(heading), justify="left" if i < self.left else "right", width=width)
+        for row in self.table.rows:
+            made.add_row(*(escape(str(cell)) for cell in row))
+        yield made
+
+    def _listed(self) -> str:
+        """A paragraph for each row: what names it, then a line for each cell that says something."""
+        paragraphs = [f"[italic]{escape(self.table.caption)}[/]"]
+        for row in self.table.rows:
+            name = ", ".join(str(cell) for cell in row[: self.left])
+            cells = zip(self.table.headings[self.left :], row[self.left :], strict=True)
+            said = [f"  {escape(heading)}: {escape(str(cell))}" for heading, cell in cells if str(cell)]
+            paragraphs.append("\n".join([f"[bold]{escape(name)}[/]", *said]))
+        return "\n".join(paragraphs)
+
+
+def _widths(columns: Sequence[Sequence[str]], left: int, room: int) -> list[int] | None:
+    """How wide each column is so that no word is cut and few lines are needed; None where there is no room."""
+    most = [max(map(cell_len, cells)) for cells in columns]
+    words = [[word for cell in cells for word in WITH_UNIT.sub("_", cell).split() or [""]] for cells in columns]
+    widths = [max(map(cell_len, these)) for these in words]
+    widths[:left] = most[:left]
+    if sum(widths) > room:
+        return None
+    for _ in range(min(room, sum(most)) - sum(widths)):
+        tightest = max(range(len(widths)), key=lambda i: most[i] / max(widths[i], 1))
+        widths[tightest] += 1
+    return widths
 
 
 def markdown(table: Table) -> str:

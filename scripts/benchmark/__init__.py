@@ -20,7 +20,7 @@ from rich.progress import track
 
 import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
-from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.scripts.benchmark.coverage import CoverageCheck
 from asm_gym.scripts.benchmark.deadline import Deadline
 from asm_gym.scripts.benchmark.experts import Experts
@@ -78,16 +78,16 @@ class Env:
                 for name in steps.seconds
             ],
         )
-        console.print(console_table(table))
+        console.print(ConsoleTable(table))
         resets, default = (
             take_turns(self._resets(), self.resets, console, self.even_if_busy),
             "robosuite, hard (its default)",
         )
         rows = [(name, f"{1e3 * resets.median(name):.1f}", resets.faster(name, default)) for name in resets.seconds]
-        console.print(console_table(Table(f"median of {self.resets} resets", ("", "ms", "against robosuite"), rows)))
+        console.print(ConsoleTable(Table(f"median of {self.resets} resets", ("", "ms", "against robosuite"), rows)))
         if self.members:
             vector = vector_table(self._made, self.members, max(1, self.steps // 4), console, self.even_if_busy)
-            console.print(console_table(vector))
+            console.print(ConsoleTable(vector))
         console.print(steps.where())
         return DONE
 

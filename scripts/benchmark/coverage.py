@@ -23,7 +23,7 @@ from scipy.stats import betabinom
 from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.episode import Episode, load_episode
 from asm_gym.evaluation.statistics import Share
-from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.rollouts.collect import collect_to
 from asm_gym.rollouts.progress import stage
@@ -140,7 +140,7 @@ class CoverageCheck:
         nominal, tested = (np.array([s.value.max() for s in monitor.score_episodes(e)]) for e in (calibration, fresh))
         rng = np.random.default_rng(self.seed)
         found = [covered(nominal, tested, rate, rng) for rate in self.rates]
-        console.print(console_table(_table(self, found, len(nominal), len(tested))))
+        console.print(ConsoleTable(_table(self, found, len(nominal), len(tested))))
         console.print(f"law: how many alarms {CONFIDENCE:.0%} of such runs have; redrawn: mean over {SPLITS} splits")
         return DONE if all(c.kept for c in found) else BAD_NEWS
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.benchmark.turns import machine
 from asm_gym.scripts.command import DONE
@@ -119,6 +119,6 @@ class Deadline:
             missed = f"{100 * np.mean(late > 1.0 / self.rate):.1f} %"
             rows.append((name, *(f"{1e3 * q:.2f}" for q in np.quantile(late, (0.5, 0.99, 0.999))), missed))
         title = f"{self.rows} rows at {self.rate:g} Hz, from due to judged"
-        console.print(console_table(Table(title, ("", "p50 ms", "p99 ms", "p99.9 ms", "later than a row"), rows)))
+        console.print(ConsoleTable(Table(title, ("", "p50 ms", "p99 ms", "p99.9 ms", "later than a row"), rows)))
         console.print(machine((time.process_time() - own) / (time.perf_counter() - wall)))
         return DONE

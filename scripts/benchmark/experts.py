@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from asm_gym.evaluation.statistics import Share
-from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.registry import EXPERTS
 from asm_gym.rollouts.parallel import parallel_map
@@ -83,7 +83,7 @@ class Experts:
                     attempts = parallel_map(partial(attempt, task=name, robot=robot), seeds, self.workers, progress)
                 rows.append((name, robot, *_row(attempts)))
         headings = ("task", "robot", "solved", "95 %", "held", "steps", "force")
-        console.print(console_table(Table(f"scripted experts, seeds of {self.seed}", headings, rows), left=2))
+        console.print(ConsoleTable(Table(f"scripted experts, seeds of {self.seed}", headings, rows), left=2))
         console.print("held: also at the last step; steps: mean until solved; force: median largest [N]")
         return 0
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from asm_gym.episode import Episode
-from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.memory.association import complete, hidden_units
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.baselines.gru import GRU
@@ -82,7 +82,7 @@ class FitCost:
             ("", "s", *(("against the GRU",) if self.rival else ()), "median error of a step [sd of the change]"),
             [(name, f"{t:.0f}", *against[name], f"{off:.3f}") for name, (t, off) in rows.items()],
         )
-        console.print(console_table(table))
+        console.print(ConsoleTable(table))
         if recorded < self.episodes:
             console.print(f"Of each task {recorded} episodes were recorded; the others repeat them with other noise.")
         console.print(

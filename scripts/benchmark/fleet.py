@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.benchmark.turns import machine
 from asm_gym.scripts.command import BAD_NEWS, DONE
@@ -184,7 +184,7 @@ class Robots:
             numbers = f"{100 * share:.1f} %", f"{p50:.1f}", f"{p99:.1f}", f"{most:.1f}", f"{busy:.2f}"
             rows.append((f"{streams} at {rate:g} Hz", *numbers))
         names = "robots", "rows judged", "p50 ms", "p99 ms", "p99.9 ms", "cores"
-        console.print(console_table(Table(f"{memory.spec.size} numbers a row, from sent to judged", names, rows)))
+        console.print(ConsoleTable(Table(f"{memory.spec.size} numbers a row, from sent to judged", names, rows)))
         console.print(machine((time.process_time() - own) / (time.perf_counter() - wall)))
         return DONE if kept else BAD_NEWS
 

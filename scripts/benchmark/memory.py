@@ -18,7 +18,7 @@ from asm_gym.detection.evidence import CONTEXT_GAIN, POWER
 from asm_gym.detection.repetition import evidence_steps
 from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.episode import Episode
-from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.extras import require
 from asm_gym.memory.traces import DECAYS
 from asm_gym.monitors import NeuralASM
@@ -214,7 +214,7 @@ class MemoryCost:
             (name, *(f"{1e6 * turns.quantile(name, q):.0f}" for q in (0.5, 0.99, 0.999)), turns.faster(name, plain))
             for name in turns.seconds
         ]
-        console.print(console_table(Table(title, ("", "µs", "p99", "p99.9", "against torch"), rows)))
+        console.print(ConsoleTable(Table(title, ("", "µs", "p99", "p99.9", "against torch"), rows)))
         console.print(turns.where())
         if self.sweep:
             self._sweep(console)
@@ -230,4 +230,4 @@ class MemoryCost:
             rivals = {str(size): watching(*make(size), 1) for size in sizes}
             turns = take_turns(rivals, max(1, self.steps // 4), console, self.even_if_busy)
             rows = [(name, f"{1e6 * turns.median(name):.0f}", turns.times(name, str(sizes[0]))) for name in rivals]
-            console.print(console_table(Table(f"one stream, by {what}", (what, "µs", f"against {sizes[0]}"), rows)))
+            console.print(ConsoleTable(Table(f"one stream, by {what}", (what, "µs", f"against {sizes[0]}"), rows)))

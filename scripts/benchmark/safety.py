@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 from rich.console import Console
 
-from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.contact_band import ContactBand
 from asm_gym.rollouts.collect import collect
@@ -59,7 +59,7 @@ class Safety:
             (name, *(f"{1e3 * turns.quantile(name, q):.2f}" for q in (0.5, 0.99)), turns.times(name, "step"))
             for name in rivals
         ]
-        console.print(console_table(Table(caption, ("", "ms", "p99", "against step"), rows)))
+        console.print(ConsoleTable(Table(caption, ("", "ms", "p99", "against step"), rows)))
         console.print(f"A band takes {turns.times(banded, guarded)} as long as the wrapper without.")
         if self.members:
             console.print(self._side_by_side(memory, console))

@@ -38,7 +38,7 @@ from threadpoolctl import threadpool_limits
 import asm_gym
 from asm_gym.evaluation.figures import save
 from asm_gym.evaluation.statistics import Spread
-from asm_gym.evaluation.tables import Table, console_table, markdown
+from asm_gym.evaluation.tables import ConsoleTable, Table, markdown
 from asm_gym.rollouts import progress
 from asm_gym.rollouts.parallel import Progress, parallel_map
 from asm_gym.scripts import command
@@ -143,7 +143,7 @@ def conduct(name: str, study: Callable[[Any], Findings], config: Any, console: C
         _NOW.reset(token)
     publish(name, found, config, sitting.seconds)
     for table in found.tables:
-        console.print(console_table(table))
+        console.print(ConsoleTable(table))
     kinds = ".png, .svg, .csv" if found.figure else ".csv"
     console.print(f"Wrote {config.out / name}{kinds}, .md and .json")
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from asm_gym.evaluation.tables import Table, console_table
+from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 from asm_gym.validation import check_choice, check_number
 from tests.soak import guard, kills, verdicts
@@ -82,7 +82,7 @@ def hostile(args: Args, console: Console) -> bool:
                     judged.append(one)
                     kept.write(json.dumps(one) + "\n")
     rows = verdicts.counted(judged)
-    console.print(console_table(Table("hostile cases by verdict", ("area", "cases", *verdicts.VERDICTS), rows)))
+    console.print(ConsoleTable(Table("hostile cases by verdict", ("area", "cases", *verdicts.VERDICTS), rows)))
     bad = [j for j in judged if j.verdict not in ("fine", "clear")]
     for j in list({(j.verdict, j.said[:40]): j for j in bad}.values())[:20]:  # each that was said, once
         console.print(ascii(f"{j.verdict}: {j.case}: {j.said}"[:200]), markup=False, highlight=False)
@@ -104,7 +104,7 @@ def killed(args: Args, console: Console) -> bool:
         if work.name != "save":
             found += [kills.out_of_disk(work, out / work.name), kills.two_at_once(work, out / work.name)]
     title = "killed, out of disk, two at once: exit codes (-9 killed, 2 refused in a line), and whether the end is one"
-    console.print(console_table(Table(title, ("what", "times", "exit codes", "same end"), [f.row for f in found])))
+    console.print(ConsoleTable(Table(title, ("what", "times", "exit codes", "same end"), [f.row for f in found])))
     return all(f.same for f in found)
 
 
@@ -119,10 +119,10 @@ def guarded(args: Args, console: Console) -> bool:
         found[name] = guard.guarded(made(), steps, args.seed, tell)
     names = "robot", "steps", "episodes", "in alarm", "sensor or policy failed", "without alarm", "bad actions done"
     counts = [(n, *map(str, f[:6]), f"{f.growth:+.1f} %") for n, f in found.items()]
-    console.print(console_table(Table("guarded steps", (*names, "memory grew"), counts)))
+    console.print(ConsoleTable(Table("guarded steps", (*names, "memory grew"), counts)))
     tenths = [(n, *(f"{size:.0f}" for size in f.sizes)) for n, f in found.items()]
     title = "resident memory of the process after each tenth of the steps [MB]"
-    console.print(console_table(Table(title, ("robot", *(f"{k}0 %" for k in range(1, 11))), tenths)))
+    console.print(ConsoleTable(Table(title, ("robot", *(f"{k}0 %" for k in range(1, 11))), tenths)))
     return all(not (f.missed or f.let_through) and f.growth < MOST_GROWTH for f in found.values())
 
 
