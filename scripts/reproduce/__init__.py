@@ -21,8 +21,6 @@ class Study(NamedTuple):
 STUDIES = {
     "memorise_and_recall": Study("one network learns skills, recalls each from a cue"),
     "abstract": Study("one network, six skills, no label: the abstract"),
-    "contextual_inference": Study("the state says which skill is running, untold"),
-    "express_skills": Study("one memory's own motor prediction drives the arm"),
     "tracking": Study("the settling network against the Kalman filter"),
     "sequences": Study("sequences of patterns, some of which come twice"),
     "local_learning": Study("local updates against backpropagation through time"),
