@@ -350,7 +350,7 @@ def test_a_force_range_that_was_never_calibrated_is_the_usual_one():
 
 def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_third_as_fast_for_a_second(lift):
     lift.reset(seed=0)
-    guard = SubstepGuard(lift, ContactLimits(), True, None, CueMonitor())
+    guard = SubstepGuard(lift, ContactLimits(), True, CueMonitor())
     guard.begin()
     guard.pressed()
     told = []
