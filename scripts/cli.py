@@ -40,9 +40,6 @@ GROUPS: dict[str, dict[str, Subcommand]] = {
         "reproduce": Subcommand("asm_gym.scripts.reproduce", "the method's claims, one study each; all runs many"),
         "benchmark": Subcommand("asm_gym.scripts.benchmark", "speeds as ratios against rivals, and experts"),
     },
-    "Examples": {
-        "lagrangian": Subcommand("asm_gym.scripts.examples.lagrangian", "PPO with a Lagrange multiplier on alarms"),
-    },
 }
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 

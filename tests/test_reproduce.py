@@ -203,13 +203,13 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_study(tmp_path, caps
     assert "file" in capsys.readouterr().err
 
 
-# safe_training and harm have tests of their own; the pages of harm and attack are checked by a quick run.
+# harm has tests of its own; the pages of harm and attack are checked by a quick run.
 COUNTED = ("failure",)
 """Studies that count episodes; the others print a mean over seeds."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("study", [s for s in INDEPENDENT if s not in ("safe_training", "harm", "attack")])
+@pytest.mark.parametrize("study", [s for s in INDEPENDENT if s not in ("harm", "attack")])
 def test_every_study_runs_from_end_to_end(study, tmp_path, capsys):
     assert cli(["reproduce", study, "--quick", "--workers", "1", "--seed", "3", "--out", str(tmp_path)]) == 0
     written = {p.name for p in tmp_path.iterdir()}

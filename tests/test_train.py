@@ -14,6 +14,7 @@ import pytest
 import torch
 from rich.console import Console
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv
 from torch.utils._pytree import tree_leaves
 
 from asm_gym.data.datasets import write_dataset
@@ -27,6 +28,8 @@ from asm_gym.rollouts.training.state import TrainingState, newest, resume, save
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.train import Args, train_and_report
 from asm_gym.spec import StreamSpec
+from asm_gym.wrappers import NeuralASMSafety
+from tests.fakes import CueMonitor, FakeEnv
 
 PENDULUM = ["train", "Pendulum-v1", "--demonstrations", "0", "--evaluation-episodes", "1", "--final-episodes", "1"]
 
@@ -109,6 +112,18 @@ def test_warming_the_critic_leaves_the_actor_as_it_is(env):
     assert not torch.equal(before["actor.mu.weight"], learner.policy.actor.mu.weight)
     rates = [optimiser.param_groups[0]["lr"] for optimiser in (learner.actor.optimizer, learner.critic.optimizer)]
     assert rates[0] == pytest.approx(RECIPES["sac"].actor_share * rates[1])
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_our_learners_keep_the_action_that_was_executed(kind):
+    def watched():
+        return NeuralASMSafety(FakeEnv(10), CueMonitor((3,)), on_alarm="hold", release_after=2)
+
+    learner = make_learner(kind, DummyVecEnv([watched]), 0, False, 10)
+    learner.learn(10)
+    kept = learner.replay_buffer.actions[:10, 0]
+    assert (kept[4:6, :2] == 0.0).all()  # the reflex rested in the two steps after the alarm
+    assert np.abs(kept[[0, 1, 2, 3, 6, 7], :2]).min() > 0.0
 
 
 def test_critics_have_layer_normalisation(env):

@@ -25,7 +25,6 @@ STUDIES = {
     "sequences": Study("sequences of patterns, some of which come twice"),
     "local_learning": Study("local updates against backpropagation through time"),
     "speed_accuracy": Study("more inference, or slower movements, for more accuracy"),
-    "safe_training": Study("an agent trained alone, and under the safety wrapper"),
     "failure": Study("does surprise tell that a policy will fail"),
     "harm": Study("harm avoided against success kept, under any policy"),
     "attack": Study("what who writes to the senses can hide"),
