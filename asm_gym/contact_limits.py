@@ -95,10 +95,6 @@ class ContactLimits:
         return math.isfinite(self.hand_speed)
 
 
-NO_LIMITS = ContactLimits(math.inf, math.inf, math.inf, stays=False)
-"""Which nothing passes."""
-
-
 def healthy_forces(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> tuple[float, ...]:
     """The most that healthy motion was seen to reach, (N,) of each number that an arm feels [N m], [N].
 

@@ -59,38 +59,12 @@ class SensesWithinSteps(Protocol):
 
 
 @runtime_checkable
-class FeelsWithinSteps(Protocol):
-    """It compares what its arms feel with what is expected, in every physics substep."""
-
-    felt_channels: tuple[Channel, ...]
-    substeps: int
-
-    @property
-    def felt(self) -> NDArray[np.float64]:
-        """(K, N) in each substep of the last control step."""
-        ...
-
-    @property
-    def left_band_s(self) -> float | None:
-        """When in the last step it was something else than expected, after the step began [s]; None where never."""
-        ...
-
-    def expect(self, low: NDArray[np.float64], high: NDArray[np.float64], stays: bool = True) -> None:
-        """Says what the arms are to feel in the next step (N,); they stay from the substep after they feel more."""
-        ...
-
-
-@runtime_checkable
 class LimitsContact(Protocol):
     """It compares what its arms feel with limits in every physics substep, and stays where one is passed."""
 
     felt_channels: tuple[Channel, ...]
     contact_limits: ContactLimits | None
     """Of this episode; ``reset`` forgets them."""
-
-    def slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(A,) what is commanded in the place of ``action``, by the speed that the limits allow a hand."""
-        ...
 
 
 @runtime_checkable

@@ -1,18 +1,16 @@
 """Trained agents as what they are: a network from observation to action, in arrays and JSON.
 
-    a = squash(W_n f(… f(W_1 x + b_1) …) + b_n),   x = (o - m) / s,   or its h = GRU((o - m) / s, h) for a recurrent one
+    a = squash(W_n f(… f(W_1 x + b_1) …) + b_n),   x = (o - m) / s
 
 ``squash`` is tanh, scaled from [-1, 1] to the action space (SAC, TD3, DDPG), or a clip to it (PPO, A2C). Nothing but
 numpy is needed to act, and loading one runs no code that the file brings.
-
-Source: Cho et al. 2014 (EMNLP) for the GRU, in the form and order of torch's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -33,43 +31,8 @@ SQUASHES = ("tanh", "clip")
 KIND = "agent"
 
 
-class Cell(NamedTuple):
-    """A GRU of H units, its gates one after the other: reset, update, new.
-
-    Attributes:
-        W_x: (3H, O).
-        W_h: (3H, H).
-        b_x, b_h: (3H,).
-    """
-
-    W_x: Array
-    W_h: Array
-    b_x: Array
-    b_h: Array
-
-    def __call__(self, x: Array, h: Array) -> Array:
-        """The next state (..., H), from standardised observations (..., O) and the state before (..., H)."""
-        (r, z, n), (r_h, z_h, n_h) = (
-            np.split(v, 3, axis=-1) for v in (x @ self.W_x.T + self.b_x, h @ self.W_h.T + self.b_h)
-        )
-        reset, update = (np.exp(-np.logaddexp(0.0, -v)) for v in (r + r_h, z + z_h))
-        return np.asarray((1.0 - update) * np.tanh(n + reset * n_h) + update * h, np.float32)
-
-    @classmethod
-    def of(cls, arrays: Sequence[NDArray[Any]]) -> Cell:
-        """From its four arrays. Raises ValueError where they do not fit one another, or are not finite."""
-        cell = cls(*(np.asarray(a, np.float32) for a in arrays))
-        H = cell.W_h.shape[-1]
-        shapes = tuple(a.shape for a in cell)
-        if cell.W_x.ndim != 2 or shapes[1:] != ((3 * H, H), (3 * H,), (3 * H,)) or len(cell.W_x) != 3 * H:
-            raise ValueError(f"a GRU needs (3H, O), (3H, H), (3H,) and (3H,), got {shapes}")
-        if not all(np.isfinite(a).all() for a in cell):
-            raise ValueError("a GRU must be finite")
-        return cell
-
-
 class NetworkPolicy:
-    """Acts by a network. A value: it keeps nothing between steps but its generator; a recurrent one hands its state on.
+    """Acts by a network. A value: it keeps nothing between steps but its generator.
 
     Args:
         layers: (out, in) weights and (out,) biases, first to last.
@@ -80,7 +43,6 @@ class NetworkPolicy:
             ``squash``. None for one that does not.
         trained_in: what the agent knows of its environment, by name: see ``describe``.
         seed: of the noise.
-        cell: what comes before the layers, in an agent that is recurrent.
 
     Raises:
         ValueError: layers that do not fit one another, or an unknown name.
@@ -97,7 +59,6 @@ class NetworkPolicy:
         log_std: tuple[Array, Array] | None = None,
         trained_in: dict[str, Any] | None = None,
         seed: int | None = None,
-        cell: Cell | None = None,
     ) -> None:
         check_choice("activation", activation, ACTIVATIONS)
         check_choice("squash", squash, SQUASHES)
@@ -106,8 +67,7 @@ class NetworkPolicy:
         self.layers = [(np.asarray(W, np.float32), np.asarray(b, np.float32)) for W, b in layers]
         if self.layers[0][0].ndim != 2:
             raise ValueError(f"layer 0 needs weights in two dimensions, got {self.layers[0][0].shape}")
-        self.cell = None if cell is None else Cell.of(cell)
-        size = self.observation_size if self.cell is None else self.cell.W_h.shape[1]
+        size = self.observation_size
         for n, (W, b) in enumerate(self.layers):
             if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
                 raise ValueError(f"layer {n} takes {size} numbers, got weights {W.shape} and biases {b.shape}")
@@ -130,7 +90,7 @@ class NetworkPolicy:
     @property
     def observation_size(self) -> int:
         """O."""
-        return int((self.layers[0][0] if self.cell is None else self.cell.W_x).shape[1])
+        return int(self.layers[0][0].shape[1])
 
     @property
     def action_size(self) -> int:
@@ -168,14 +128,9 @@ class NetworkPolicy:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[Array, Any]:
-        """The action (A,), or (n, A) for n observations; and the state, of a recurrent agent (H,) or (n, H)."""
+        """The action (A,), or (n, A) for n observations; and the state as it came."""
         f = ACTIVATIONS[self.activation]
         x = (np.asarray(observation, np.float32) - self.mean) / self.scale
-        if self.cell is not None:
-            h = np.zeros((*x.shape[:-1], self.cell.W_h.shape[1]), np.float32) if state is None else state
-            if episode_start is not None:
-                h = np.where(np.reshape(episode_start, (*x.shape[:-1], 1)), np.float32(0.0), h)
-            x = state = self.cell(x, h)
         for W, b in self.layers[:-1]:
             x = f(x @ W.T + b)
         W, b = self.layers[-1]
@@ -198,8 +153,6 @@ class NetworkPolicy:
         arrays = {"mean": self.mean, "scale": self.scale}
         for n, (W, b) in enumerate(self.layers):
             arrays |= {f"W{n}": W, f"b{n}": b}
-        if self.cell is not None:
-            arrays |= {f"cell_{name}": array for name, array in self.cell._asdict().items()}
         header = {"activation": self.activation, "squash": self.squash, "trained_in": self.trained_in, "about": about}
         write_checkpoint(path, KIND, header, arrays)
 
@@ -210,14 +163,11 @@ class NetworkPolicy:
         try:
             count = sum(name.startswith("W") for name in saved.arrays)
             layers = [(saved.arrays.pop(f"W{n}"), saved.arrays.pop(f"b{n}")) for n in range(count)]
-            cell = None
-            if any(name.startswith("cell_") for name in saved.arrays):
-                cell = Cell(*(saved.arrays.pop(f"cell_{name}") for name in Cell._fields))
             header, mean, scale = saved.header, saved.arrays.pop("mean"), saved.arrays.pop("scale")
             if saved.arrays:
                 raise ValueError(f"an agent has no {', '.join(saved.arrays)}")
             how = header["activation"], header["squash"]
-            return cls(layers, *how, mean=mean, scale=scale, trained_in=header["trained_in"], cell=cell)
+            return cls(layers, *how, mean=mean, scale=scale, trained_in=header["trained_in"])
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged: {error}") from error
 

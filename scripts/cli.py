@@ -23,7 +23,6 @@ GROUPS: dict[str, dict[str, Subcommand]] = {
     "Use it": {
         "demo": Subcommand("asm_gym.scripts.demo", "a robot that notices when something is wrong"),
         "collect": Subcommand("asm_gym.scripts.collect", "record episodes of a policy, as a Minari dataset"),
-        "import": Subcommand("asm_gym.scripts.import_demonstrations", "read robosuite's or robomimic's HDF5 likewise"),
         "inspect": Subcommand("asm_gym.scripts.inspect_log", "what a log holds, and what would be done about it"),
         "fit": Subcommand("asm_gym.scripts.fit", "a memory from recorded episodes or logs"),
         "babble": Subcommand("asm_gym.scripts.babble", "one memory of a body, for any policy"),
@@ -39,9 +38,6 @@ GROUPS: dict[str, dict[str, Subcommand]] = {
         "corpus": Subcommand("asm_gym.scripts.corpus", "the recordings that tables of detection are judged on"),
         "reproduce": Subcommand("asm_gym.scripts.reproduce", "the method's claims, one study each; all runs many"),
         "benchmark": Subcommand("asm_gym.scripts.benchmark", "speeds as ratios against rivals, and experts"),
-    },
-    "Examples": {
-        "lagrangian": Subcommand("asm_gym.scripts.examples.lagrangian", "PPO with a Lagrange multiplier on alarms"),
     },
 }
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}

@@ -21,7 +21,7 @@ from rich.console import Console
 
 from asm_gym.data.datasets import read_dataset
 from asm_gym.episode import Episode, load_episode
-from asm_gym.policies.network import NetworkPolicy, describe
+from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.collect import check as check_policy
 from asm_gym.rollouts.collect import collect_to
 from asm_gym.rollouts.parallel import ParallelConfig, Progress
@@ -29,7 +29,6 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.learners import ALGORITHMS
-from asm_gym.rollouts.training.recurrent import RECURRENT, clone_recurrent
 from asm_gym.rollouts.training.run import BEST, CLONE, Plan, TrainingRun, success_rate
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import run
@@ -51,8 +50,8 @@ class Args:
 
     task: str = option("Lift", positional=True, check=env_id, listed=TASKS, metavar="TASK")
     """Name of a task, or any Gymnasium id with Box spaces."""
-    algorithm: str = option("sac", known=(*ALGORITHMS, RECURRENT))
-    """How it learns; gru is a recurrent clone, and takes no steps of its own."""
+    algorithm: str = option("sac", known=ALGORITHMS)
+    """How it learns."""
     robot: str | None = option(None, known=ROBOTS)
     """The arm; the task's own by default."""
     steps: int = option(20_000, quick=300, least=0)
@@ -84,8 +83,6 @@ class Args:
         check_options(self)
         if not self.steps and not self.demonstrations and self.dataset is None:
             raise ValueError("there is nothing to learn from: neither steps nor demonstrations")
-        if self.algorithm == RECURRENT and self.steps:
-            raise ValueError(f"{RECURRENT} learns from demonstrations alone: steps must be 0, got {self.steps}")
 
     @property
     def parallel(self) -> ParallelConfig:
@@ -151,8 +148,7 @@ def _train(args: Args, console: Console) -> dict[str, Any]:
     start = time.perf_counter()
     with stage("recording demonstrations", console, seconds) as tick:
         episodes = demonstrate(args, tick)
-    learn = _cloned if args.algorithm == RECURRENT else _learned
-    agent, curve = learn(args, episodes, console, seconds)
+    agent, curve = _learned(args, episodes, console, seconds)
     with stage("judging", console, seconds), closing(args.plan.make()) as env:
         seeds = episode_seeds(args.seed, args.final_episodes, stage=3)
         success = success_rate(agent.fit_to(env, "the agent"), env, seeds)
@@ -179,16 +175,6 @@ def _learned(
         with stage("learning", console, seconds) as tick:
             training.learn(tick)
         return NetworkPolicy.load(args.out / (BEST if args.steps else CLONE)), training.state.curve
-
-
-def _cloned(
-    args: Args, episodes: Sequence[Episode], console: Console, seconds: dict[str, float]
-) -> tuple[NetworkPolicy, Curve]:
-    """A recurrent clone, which nothing evaluates on the way."""
-    with stage("cloning", console, seconds) as tick, closing(args.plan.make()) as env:
-        agent = clone_recurrent(episodes, args.cloning_updates, args.seed, tick)
-        agent.trained_in = describe(env)
-    return agent, ()
 
 
 def _command(args: Args) -> str:

@@ -135,17 +135,6 @@ def test_experts_refuse_what_they_do_not_know(arguments, message, capsys):
 
 
 @pytest.mark.slow  # two processes start
-def test_what_a_row_costs_to_watch_is_printed_and_it_keeps_up(capfd):
-    assert main(["watch", "--rows", "5000", "--channels", "10"]) == 0
-    shown = capfd.readouterr().out
-    assert "5000 rows, 0 alarms; a row took" in shown
-    assert "17 numbers:" in shown
-    sizes = shown.partition("by tenths:")[2].partition("growth")[0].split()
-    assert len(sizes) == 10
-    assert min(map(float, sizes)) > 10.0  # it is the command's memory that is looked at, and not a shell's
-    assert main(["watch", "--rows", "20"]) == 2
-
-
 def test_vector_environments_are_compared_on_a_quiet_machine_alone(monkeypatch):
     make = partial(gym.make, "asm_gym/Lift-v0", horizon=10**6, disable_env_checker=True)
     table = vector_table(make, (2,), 2, Console(), even_if_busy=True)

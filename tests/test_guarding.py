@@ -1,22 +1,13 @@
-"""What a guard promises at its edges: to copy, to be bound to its robot, to see its monitor change, and to hold."""
+"""What a guard promises at its edges: to copy, to be bound to its robot, and to see its monitor change."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
-from asm_gym import collect
-from asm_gym.contact_limits import ContactLimits, healthy_forces
-from asm_gym.familiar_speed import UNKNOWN, FamiliarSpeed
-from asm_gym.monitors import NeuralASM, make_monitor
-from asm_gym.monitors.registry import load_monitor
 from asm_gym.policies.reflexes import Hold, Retract
-from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
-from asm_gym.wrappers.factory import limits_of
-from asm_gym.wrappers.oracle import OracleReflex
-from asm_gym.wrappers.substeps import SubstepGuard
-from tests.fakes import SPEC, CueMonitor, FadingMonitor, FakeEnv
+from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
 from tests.test_completion import Judge
 from tests.test_responses import ACT as ARM_ACT
 from tests.test_responses import Acting, infos
@@ -265,144 +256,6 @@ def test_statistics_that_go_on_are_refused_around_many_environments_too():
     VectorNeuralASMSafety(many, FadingMonitor())
 
 
-# ---------------------------------------------------------------- limits, on the arm
-
-
-def down(env, steps, seed=0):
-    """The largest contact force of a hand that is driven down [N], and what was said."""
-    env.reset(seed=seed)
-    action = np.array([0, 0, -1, 0, 0, 0, -1], np.float32)
-    forces, said = [], []
-    for _ in range(steps):
-        *_, terminated, truncated, info = env.step(action)
-        forces.append(info["contact_force"])
-        said.append(info)
-        if terminated or truncated:
-            break
-    return max(forces), said
-
-
-def test_a_hand_that_rams_the_table_is_stopped_by_default(lift):
-    alone, _ = down(lift, 60)
-    guarded = NeuralASMSafety(lift, NeuralASM.pretrained("panda"), on_overrun="ignore")
-    force, said = down(guarded, 100)
-    assert alone > 500.0
-    assert force < 0.5 * alone
-    assert said[-1]["asm"]["gave_up"]
-    assert any(i["asm"]["reason"] == "contact" for i in said)
-    speeds = [i["asm"]["severity"]["speed"] for i in said]
-    assert max(speeds) < 0.19
-    assert np.isnan(lift.unwrapped.measured).sum() == 0
-
-
-def test_limits_are_forgotten_by_reset_and_change_nothing_of_gentle_motion(lift):
-    gentle = np.array([0.2, 0.1, 0.1, 0, 0, 0, -1], np.float32)
-
-    def rows(limits):
-        lift.reset(seed=3)
-        lift.unwrapped.contact_limits = limits
-        return np.stack([lift.step(gentle)[4]["stream"] for _ in range(10)])
-
-    np.testing.assert_array_equal(rows(ContactLimits()), rows(None))
-    lift.reset(seed=3)
-    assert lift.unwrapped.contact_limits is None
-
-
-def test_who_only_watches_is_told_of_limits_and_neither_slowed_nor_stopped(lift):
-    alone, _ = down(lift, 40)
-    watched, said = down(NeuralASMSafety(lift, NeuralASM.pretrained("panda"), "monitor", on_overrun="ignore"), 40)
-    assert watched == alone
-    assert any(i["asm"]["reason"] == "contact" and i["cost"] for i in said)
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"wrist_force": 0.0}, "wrist_force must be a number above 0, got 0.0"),
-        ({"hand_speed": float("nan")}, "hand_speed must be a number above 0, got nan"),
-        ({"healthy": (1.0, -2.0)}, "healthy must be a number of at least 0, got -2.0"),
-    ],
-)
-def test_limits_that_are_none_are_refused(given, message):
-    with pytest.raises(ValueError, match=message):
-        ContactLimits(**given)
-
-
-def test_limits_of_another_arm_are_refused_at_construction(lift):
-    with pytest.raises(ValueError, match="healthy must say 10 numbers"):
-        NeuralASMSafety(lift, NeuralASM.pretrained("panda"), contact_limits=ContactLimits(healthy=(1.0, 2.0)))
-    with pytest.raises(ValueError, match="contact_limits must be ContactLimits"):
-        NeuralASMSafety(lift, NeuralASM.pretrained("panda"), contact_limits="none")
-
-
-def test_what_healthy_motion_was_seen_to_reach_counts_where_it_is_more(lift):
-    felt = lift.unwrapped.felt_channels
-    most = ContactLimits(healthy=(50.0, *[1.0] * 9)).most(felt)
-    np.testing.assert_array_equal(most, [50, *[40] * 6, 80, 80, 80])
-
-
-def test_a_force_range_that_was_never_calibrated_is_the_usual_one():
-    assert limits_of("memory", CueMonitor()) == ContactLimits()
-    unknown = CueMonitor()
-    unknown.healthy_, unknown.familiar_ = (), None
-    assert limits_of("memory", unknown) == ContactLimits()
-
-
-def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_third_as_fast_for_a_second(lift):
-    lift.reset(seed=0)
-    guard = SubstepGuard(lift, ContactLimits(), True, None, CueMonitor())
-    guard.begin()
-    guard.pressed()
-    told = []
-    for _ in range(21):
-        told.append(lift.unwrapped.contact_limits)
-        guard.acted()
-    assert told[:20] == [ContactLimits(wrist_force=40.0, external_torque=20.0, hand_speed=0.15 / 3)] * 20
-    assert told[20] == ContactLimits()
-
-
-def test_the_ideal_reflex_stops_at_what_the_simulator_knows(lift):
-    alone, _ = down(lift, 40)
-    stopped, said = down(OracleReflex(lift, beyond=40.0), 40)
-    assert stopped < 0.95 * alone
-    assert any(info["overridden"] for info in said)
-    assert not lift.unwrapped.substep_hooks
-
-
-def test_side_by_side_robots_are_stopped_as_each_alone():
-    envs = VectorNeuralASMSafety(
-        SyncVectorEnv([lambda: gym.make("asm_gym/Lift-v0")] * 2), NeuralASM.pretrained("panda")
-    )
-    envs.reset(seed=[0, 1])
-    action = np.array([[0, 0, -1, 0, 0, 0, -1], [0, 0, 0.2, 0, 0, 0, -1]], np.float32)
-    forces, alarms = np.zeros(2), np.zeros(2, bool)
-    for _ in range(40):
-        *_, info = envs.step(action)
-        forces = np.maximum(forces, info["contact_force"])
-        alarms |= info["asm"]["reason"] == "contact"
-    assert forces[0] < 400.0
-    assert forces[1] < 20.0
-    assert alarms.tolist() == [True, False]
-    envs.close()
-
-
-def test_a_wrapper_inside_that_skips_frames_is_held_in_every_one(lift):
-    env = NeuralASMSafety(
-        gym.wrappers.MaxAndSkipObservation(lift, skip=4),
-        CueMonitor(range(3, 500), spec=lift.unwrapped.stream_spec),
-        on_alarm="hold",
-        contact_limits=None,
-    )
-    env.reset(seed=1)
-    action = np.array([1, 1, 1, 1, -1, 1, 1], np.float32)
-    for _ in range(5):
-        env.step(action)
-    start = lift.unwrapped.simulation.data.qpos[:7].copy()
-    for _ in range(12):
-        env.step(action)
-    assert np.abs(lift.unwrapped.simulation.data.qpos[:7] - start).max() < 0.05
-
-
 def test_steps_in_alarm_are_counted_for_wrappers_outside_that_skip_some():
     env = NeuralASMSafety(FakeEnv(), CueMonitor([1, 2, 6]), on_alarm="monitor")
     env.reset(seed=0)
@@ -410,65 +263,3 @@ def test_steps_in_alarm_are_counted_for_wrappers_outside_that_skip_some():
     assert [i["cost_sum"] for i in infos] == [0, 1, 2, 2, 2, 2, 3, 3]
     assert infos[-1]["asm"]["alarms"] == 3
     assert env.reset(seed=0)[1]["cost_sum"] == 0
-
-
-def test_the_healthy_range_is_learned_from_calibration_less_the_hardest_of_twenty_and_saved(tmp_path, lift):
-    spec = lift.unwrapped.stream_spec
-    streams = [np.zeros((5, spec.size), np.float32) for _ in range(40)]
-    torque, force = spec.slices["external_torque_peak"], spec.slices["wrist_force_peak"]
-    for n, stream in enumerate(streams):
-        stream[2, torque.start + 1] = -(45.0 + 0.1 * n)
-        stream[3, force.start] = 10.0
-    streams[7][3, force.start + 2] = 600.0  # a knock
-    healthy = healthy_forces(streams, spec)
-    assert healthy[1] == pytest.approx(45.0 + 0.1 * 37, abs=0.11)
-    assert healthy[7:] == (10.0, 0.0, 0.0)
-    for stream in streams:
-        stream[3, force.start + 2] = 600.0
-    assert healthy_forces(streams, spec)[9] == 200.0
-    assert healthy_forces(streams, StreamSpec((Channel("position", spec.size, "m"),), 0.05)) == ()
-
-
-def test_a_memory_knows_what_its_calibration_felt_like_and_a_guard_takes_it(tmp_path):
-    monitor = make_monitor("force_limit", gym.make("asm_gym/Lift-v0").unwrapped.stream_spec)
-    episodes = collect("asm_gym/Lift-v0", policy="hold", episodes=4, horizon=10)
-    monitor.fit(episodes[:2]).calibrate(episodes[2:], 0.5)
-    peaks = np.concatenate([e.stream[:, e.spec.slices["wrist_force_peak"]] for e in episodes[2:]])
-    np.testing.assert_allclose(monitor.healthy_[7:], np.abs(peaks).max(axis=0), rtol=1e-6)
-    monitor.save(tmp_path / "limit.asm")
-    assert load_monitor(tmp_path / "limit.asm").healthy_ == monitor.healthy_
-
-
-def sweep(speed):
-    """An episode in which the hand goes along x at ``speed``, from 0 to 0.3 m."""
-    steps = int(0.3 / (0.05 * speed)) + 1
-    stream = np.zeros((steps, HAND.size), np.float32)
-    stream[:, 0] = np.arange(steps) * 0.05 * speed
-    stream[:, 3] = speed
-    return stream
-
-
-HAND = StreamSpec((Channel("hand_position", 3, "m"), Channel("hand_velocity", 3, "m/s")), 0.05)
-
-
-def test_where_the_hand_has_been_it_may_go_as_fast_and_elsewhere_slowly():
-    known = FamiliarSpeed.learned([sweep(0.1), sweep(0.1)], HAND)
-    assert known.at(np.array([0.15, 0.0, 0.0])) == pytest.approx(1.2 * 0.1, rel=1e-5)
-    assert known.at(np.array([0.15, 0.1, 0.0])) == UNKNOWN
-    assert known.at(np.full(3, np.nan)) == UNKNOWN
-    again = FamiliarSpeed.restored(known.rows)
-    np.testing.assert_allclose(again.places, known.places, atol=1e-4)
-    assert FamiliarSpeed.restored([]) is None
-    assert FamiliarSpeed.learned([np.zeros((5, 5), np.float32)], SPEC) is None
-
-
-def test_by_place_needs_a_monitor_that_knows_places_and_slows_the_hand_where_it_never_was(lift):
-    limits = ContactLimits(by_place=True)
-    with pytest.raises(ValueError, match="by_place needs a monitor that knows"):
-        NeuralASMSafety(lift, CueMonitor(spec=lift.unwrapped.stream_spec), "hold", contact_limits=limits)
-    monitor = CueMonitor(spec=lift.unwrapped.stream_spec)
-    monitor.healthy_, monitor.familiar_ = (), FamiliarSpeed(np.array([[9.0, 9.0, 9.0]]), np.array([0.2]))
-    env = NeuralASMSafety(lift, monitor, "hold", contact_limits=limits)
-    env.reset(seed=0)
-    speeds = [env.step(np.array([0, 1, 0, 0, 0, 0, -1], np.float32))[4]["asm"]["severity"]["speed"] for _ in range(20)]
-    assert max(speeds[5:]) < 0.065

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,8 +14,6 @@ from asm_gym.scripts.reproduce.handwriting import (
     STEPS,
     Letter,
     Stroke,
-    branching,
-    detoured,
     repertoire,
     velocity,
     written,
@@ -52,23 +49,6 @@ def test_writing_twice_as_fast_goes_the_same_way_in_half_the_steps():
     assert len(fast) == len(slow) / 2
     np.testing.assert_allclose(fast.stream[:, :2], slow.stream[1::2, :2], atol=6 * NOISE)
     np.testing.assert_allclose(fast.stream[:, 2:], slow.stream[::2, 2:] + slow.stream[1::2, 2:], atol=0.05)  # [cm/s]
-
-
-def test_pairs_begin_alike_or_have_one_middle():
-    rng = np.random.default_rng(0)
-    letter = repertoire(1, 2, rng)[0]
-    letter = replace(letter, strokes=(STROKE, *letter.strokes[1:]))
-    time = np.arange(4000) / 4000
-    paths = [
-        np.cumsum(velocity(x, time), axis=0) / 4000
-        for x in (letter, branching(letter, "b", 2, rng), detoured(letter, "c", rng))
-    ]
-    begun, detour = (np.linalg.norm(p - paths[0], axis=1) for p in paths[1:])
-    assert begun[: int(0.3 * 4000)].max() < 0.05
-    assert begun[-1] > 1.0
-    assert detour[: int(0.3 * 4000)].max() > 0.3
-    assert detour[int(0.45 * 4000) : int(0.5 * 4000)].max() < 0.1
-    assert detour[-1] > 1.0
 
 
 def test_a_spline_begins_at_the_origin_and_goes_as_far_as_its_knots():

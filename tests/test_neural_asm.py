@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import re
-import zipfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.episode import Episode
 from asm_gym.monitors import Monitor, NeuralASM, make_monitor
 from asm_gym.spec import Channel, StreamSpec
+from tests.memories import SMALL, learned_bytes, sine_memory
 from tests.streams import frozen, sine_episodes, sine_spec
-
-SMALL = {"hidden_size": 48, "association_size": 240, "epochs": 25, "seed": 1}
 
 
 @pytest.fixture(scope="module")
 def asm() -> NeuralASM:
-    return NeuralASM(sine_spec(), **SMALL).fit(sine_episodes(50)).calibrate(sine_episodes(60, seed=1), 0.05)
-
-
-def learned_bytes(asm: NeuralASM) -> list[bytes]:
-    senses = asm.senses_
-    detector = [asm.learned_[name] for name in asm.detection.arrays]
-    network = *asm.network_.weights, *asm.network_.association
-    return [a.tobytes() for a in (*network, senses.mean, senses.spread, senses.change, *detector, asm.energy_)]
+    return sine_memory()
 
 
 def test_a_frozen_sense_is_detected_and_attributed_to_its_channel(asm):
@@ -77,13 +66,6 @@ def test_the_action_as_commanded_is_used_to_predict(asm):
     stream[20:, asm.spec.motor] *= -1  # the robot does something else than it was told
     reversed_action = asm.score(replace(episode, stream=stream))
     assert reversed_action.value[20:].mean() > 3 * asm.score(episode).value[20:].mean()
-
-
-def test_a_checkpoint_without_what_the_detector_needs_is_refused(asm, tmp_path):
-    asm.save(tmp_path / "m.asm")
-    rewritten(tmp_path / "m.asm", tmp_path / "older.asm", without("tail"))
-    with pytest.raises(ValueError, match="has no tail, so fit it anew"):
-        NeuralASM.load(tmp_path / "older.asm")
 
 
 def test_observing_changes_neither_weights_nor_state_nor_row(asm):
@@ -214,87 +196,6 @@ def test_progress_is_told_after_every_pass():
     assert total >= 3
 
 
-def test_save_and_load_keep_every_bit(asm, tmp_path):
-    asm.save(tmp_path / "memory.asm")
-    back = NeuralASM.load(tmp_path / "memory.asm")
-    assert learned_bytes(back) == learned_bytes(asm)
-    assert (back.spec, back.threshold, back.get_params()) == (asm.spec, asm.threshold, asm.get_params())
-    episode = sine_episodes(1, seed=13)[0]
-    assert back.score(episode).attribution.tobytes() == asm.score(episode).attribution.tobytes()
-    back.save(tmp_path / "again.asm")
-    with zipfile.ZipFile(tmp_path / "memory.asm") as a, zipfile.ZipFile(tmp_path / "again.asm") as b:
-        assert {n: a.read(n) for n in a.namelist()} == {n: b.read(n) for n in b.namelist()}
-
-
-def test_a_memory_without_a_threshold_can_be_saved(tmp_path):
-    numbers = {"hidden_size": np.int64(8), "epochs": np.int64(1), "gains": (np.float32(0.5),)}
-    NeuralASM(sine_spec(), **numbers).fit(sine_episodes(3)).save(tmp_path / "m.asm")
-    with pytest.raises(RuntimeError, match="calibrate"):
-        _ = NeuralASM.load(tmp_path / "m.asm").threshold
-
-
-def rewritten(source, target, change) -> None:
-    """Copies a checkpoint, with ``change(members)`` made to its {name: bytes}."""
-    with zipfile.ZipFile(source) as file:
-        members = {n: file.read(n) for n in file.namelist()}
-    change(members)
-    with zipfile.ZipFile(target, "w") as file:
-        for name, data in members.items():
-            file.writestr(name, data)
-
-
-def without(*names):
-    """A change for ``rewritten``: a checkpoint that never had these arrays."""
-
-    def change(members):
-        header = json.loads(members["header.json"])
-        for name in names:
-            del header["shapes"][name], header["arrays"][name], members[f"{name}.npy"]
-        members["header.json"] = json.dumps(header).encode()
-
-    return change
-
-
-def tampered(asm, path, arrays=None, **header):
-    """A checkpoint of ``asm`` in which something else is written."""
-    asm.save(path)
-    saved = read_checkpoint(path, asm.kind)
-    write_checkpoint(path, asm.kind, saved.header | header, saved.arrays | (arrays or {}))
-    return path
-
-
-@pytest.mark.parametrize(
-    ("arrays", "message"),
-    [
-        ({"whitening": lambda a: 0 * a}, "no error can add up to evidence: at most 0"),
-        ({"whitening": lambda a: 1e-9 * a}, "no error can add up to evidence"),
-        ({"ceiling": lambda a: np.full_like(a, np.inf)}, "ceiling should be finite"),
-        ({"ceiling": lambda a: np.full_like(a, 1e300)}, "no error can add up to evidence"),
-        ({"ceiling": lambda a: -a}, r"ceiling of evidence must be in \(0, inf\]"),
-        ({"tail": lambda a: 0 * a}, r"tail of evidence must be in \(0, 1\]"),
-        ({"context_quantile": lambda a: a + 1000.0}, "no error can add up to evidence"),
-        ({"W_C": lambda a: a * np.nan}, "W_C should be finite"),
-        ({"extra": lambda _: np.zeros(3)}, "declares no extra"),
-    ],
-)
-def test_weights_that_disarm_a_memory_are_refused(asm, tmp_path, arrays, message):
-    changed = {name: change(asm.learned_.get(name)) for name, change in arrays.items()}
-    with pytest.raises(ValueError, match=message):
-        NeuralASM.load(tampered(asm, tmp_path / "m.asm", changed))
-
-
-@pytest.mark.parametrize("threshold", [1e300, -1.0, True, "high", 10**400])
-def test_a_threshold_that_nothing_exceeds_is_refused(asm, tmp_path, threshold):
-    with pytest.raises(ValueError, match="threshold must be"):
-        NeuralASM.load(tampered(asm, tmp_path / "m.asm", threshold=threshold))
-
-
-def test_a_memory_that_would_never_answer_is_refused(asm, tmp_path):
-    slow = asm.get_params() | {"iterations": 10**9}
-    with pytest.raises(ValueError, match=r"iterations must be a whole number in \[1, 1000\], got 1000000000"):
-        NeuralASM.load(tampered(asm, tmp_path / "m.asm", hyperparameters=slow))
-
-
 def test_an_interrupted_fit_leaves_the_memory_as_it_was():
     asm = NeuralASM(sine_spec(), **SMALL).fit(sine_episodes(8)).calibrate(sine_episodes(19, seed=1), 0.05)
     episode, threshold = sine_episodes(1, seed=13)[0], asm.threshold
@@ -308,29 +209,6 @@ def test_an_interrupted_fit_leaves_the_memory_as_it_was():
         asm.fit(sine_episodes(8, seed=5), interrupt)
     assert asm.threshold == threshold
     assert (asm.score(episode).value.tobytes(), learned_bytes(asm)) == (before, weights)
-
-
-@pytest.mark.parametrize("member", ["W_C.npy", "whitening.npy", "mean.npy"])
-def test_a_checkpoint_with_a_missing_or_misshapen_array_is_refused(asm, tmp_path, member):
-    asm.save(tmp_path / "m.asm")
-    rewritten(tmp_path / "m.asm", tmp_path / "missing.asm", lambda m: m.pop(member))
-    with pytest.raises(ValueError, match="damaged"):
-        NeuralASM.load(tmp_path / "missing.asm")
-    rewritten(tmp_path / "m.asm", tmp_path / "shape.asm", lambda m: m.update({member: m["energy.npy"]}))
-    with pytest.raises(ValueError, match="damaged"):
-        NeuralASM.load(tmp_path / "shape.asm")
-
-
-def test_a_checkpoint_with_an_unknown_hyperparameter_is_refused(asm, tmp_path):
-    def change(members):
-        header = json.loads(members["header.json"])
-        header["hyperparameters"]["depth"] = 3
-        members["header.json"] = json.dumps(header).encode()
-
-    asm.save(tmp_path / "m.asm")
-    rewritten(tmp_path / "m.asm", tmp_path / "n.asm", change)
-    with pytest.raises(ValueError, match="depth"):
-        NeuralASM.load(tmp_path / "n.asm")
 
 
 def test_nothing_works_before_it_is_learned(tmp_path):
@@ -421,145 +299,3 @@ def test_a_monitor_is_made_by_name():
     assert monitor.hidden_size == 7
     with pytest.raises(ValueError, match=r"unknown monitor 'oracle'; known: .*neural_asm"):
         make_monitor("oracle", sine_spec())
-
-
-def test_the_running_skill_is_told_by_name_and_changes_nothing_else(asm, tmp_path):
-    def labelled(count, seed):
-        made = []
-        for n, e in enumerate(sine_episodes(count, seed=seed)):
-            stream = e.stream.copy()
-            stream[:, :4] += 2.0 * (n % 2)  # the second skill is elsewhere
-            made.append(replace(e, stream=stream, info={"skill": ("near", "far")[n % 2]}))
-        return made
-
-    memory = NeuralASM(sine_spec(), **SMALL).fit(labelled(30, 0))
-    before = memory.score(labelled(1, 1)[0]).value
-    memory.name_skills(labelled(30, 0))
-    np.testing.assert_array_equal(memory.score(labelled(1, 1)[0]).value, before)
-    memory.save(tmp_path / "m.asm")
-    memory = NeuralASM.load(tmp_path / "m.asm")
-    right = []
-    for e in labelled(20, 2):
-        state = memory.initial_state()
-        for row in e.stream[:20]:
-            state, surprise = memory.observe(state, row[None])
-        right.append(surprise.skill[0] == e.info["skill"])
-    assert np.mean(right) > 0.95
-    with pytest.raises(ValueError, match="does not say its skill"):
-        memory.name_skills(sine_episodes(2))
-    with pytest.raises(ValueError, match="two skills"):
-        memory.name_skills(labelled(2, 0)[:1])
-
-
-def changing(count: int, seed: int, back: bool = False) -> list[Episode]:
-    """Episodes of a skill near by, of one far away, and of both, whose second half, where it goes, is nowhere else.
-
-    Args:
-        back: the second skill of a change is reached from the other side.
-    """
-    made = []
-    for n, e in enumerate(sine_episodes(count, seed=seed)):
-        stream, half = e.stream.copy(), len(e) // 2
-        if n % 3 == 1:
-            stream[:, :4] += 2.0
-        if n % 3 == 2:
-            stream[half:, :4] += -2.0 if back else 2.0
-        told = [{"skill": "near"}, {"skill": "far"}, {"skills": ["near", "far"], "changed": half}][n % 3]
-        made.append(replace(e, stream=stream, info=told))
-    return made
-
-
-def test_names_that_were_learned_from_changes_follow_one_that_single_skills_do_not_show():
-    shown, asked = changing(30, 0, back=True), changing(30, 1, back=True)[2::3]
-    memory = NeuralASM(sine_spec(), **SMALL).fit(shown)
-
-    def right() -> float:
-        return float(np.mean([np.mean(memory.skills(e.stream)[len(e) // 2 + 20 :] == "far") for e in asked]))
-
-    memory.name_skills([e for e in shown if "skill" in e.info])
-    alone = right()
-    memory.name_skills(shown)
-    assert memory.skills_ == ("far", "near")
-    assert right() > 0.95 > alone + 0.3
-
-
-@pytest.mark.parametrize(
-    ("info", "message"),
-    [
-        ({"skills": ["a", "b"]}, "episode 1 names 2 skills, and says of 0 where they begin"),
-        ({"skills": ["a", "b"], "changed": [3, 9]}, "names 2 skills, and says of 2"),
-        ({"skills": ["a", "b", "a"], "changed": [9, 3]}, "cannot begin at 0, 9, 3"),
-        ({"skills": ["a", "b"], "changed": 10**6}, "rows, in which skills cannot begin at 0, 1000000"),
-        ({"skills": ["a", "b"], "changed": 0}, r"info\['changed'\] must be a whole number .*, got 0"),
-        ({"skills": ["a", "b"], "changed": 2.5}, r"info\['changed'\] must be a whole number .*, got 2.5"),
-        ({"skills": ["a", "b"], "changed": None}, r"info\['changed'\] must be a whole number .*, got None"),
-        ({"skills": "ab", "changed": 3}, "must name its skills in order"),
-        ({"skills": ["a", ""], "changed": 3}, "must name its skills in order"),
-    ],
-)
-def test_changes_that_cannot_be_are_refused(asm, info, message):
-    first, second = sine_episodes(2)
-    with pytest.raises(ValueError, match=message):
-        asm.name_skills([replace(first, info={"skill": "a"}), replace(second, info=info)])
-
-
-def worn(episode: Episode, share: float) -> Episode:
-    """Episodes of a body whose first sense gives only ``share`` of what it gave."""
-    stream = episode.stream.copy()
-    stream[:, 0] *= share
-    return replace(episode, stream=stream)
-
-
-def live(memory: NeuralASM, episode: Episode, learn: bool) -> tuple[np.ndarray, int]:
-    state, values, learned = memory.initial_state(), [], 0
-    for row in episode.stream:
-        before = state
-        state, surprise = memory.observe(before, row[None])
-        values.append(surprise.value[0])
-        if learn:
-            learned += int(memory.adapt(before, row[None], surprise)[0])
-    return np.array(values), learned
-
-
-def test_a_memory_that_learns_on_the_job_follows_a_body_that_wears(asm, tmp_path):
-    asm.save(tmp_path / "new.asm")
-    adapting = NeuralASM.load(tmp_path / "new.asm")
-    for n, episode in enumerate(sine_episodes(120, seed=20)):
-        live(adapting, worn(episode, 1.0 - 0.05 * n / 120), learn=True)
-    old = [worn(e, 0.95) for e in sine_episodes(20, seed=21)]
-    usual, followed = (np.median([s.value.max() for s in m.score_episodes(old)]) for m in (asm, adapting))
-    assert followed < 0.4 * usual  # 1.3 and 7.6, of which 1.2 is there without wear
-    adapting.save(tmp_path / "worn.asm")
-    again = NeuralASM.load(tmp_path / "worn.asm")
-    np.testing.assert_array_equal(again.score(old[0]).value, adapting.score(old[0]).value)
-
-
-def test_what_is_surprising_is_never_learned(asm, tmp_path):
-    asm.save(tmp_path / "a.asm")
-    adapting = NeuralASM.load(tmp_path / "a.asm")
-    state = adapting.initial_state()
-    kept = learned_bytes(adapting)
-    for t in range(10):
-        row = np.full((1, asm.spec.size), 50.0 * (-1) ** t)
-        before = state
-        state, surprise = adapting.observe(before, row)
-        assert not adapting.adapt(before, row, surprise).any()
-    assert learned_bytes(adapting) == kept
-    row[0, 0] = np.nan
-    _, surprise = adapting.observe(state, row)
-    assert not adapting.adapt(state, row, surprise).any()
-
-
-def test_learning_on_the_job_refuses_what_makes_no_sense(asm):
-    state = asm.initial_state()
-    row = sine_episodes(1)[0].stream[:1]
-    _, surprise = asm.observe(state, row)
-    with pytest.raises(ValueError, match=r"rate must be a number in \(0, 1\], got 0"):
-        asm.adapt(state, row, surprise, rate=0.0)
-    with pytest.raises(ValueError, match=r"below must be a number in \(0, 1\], got 2"):
-        asm.adapt(state, row, surprise, below=2.0)
-    fresh = NeuralASM(sine_spec(), **SMALL | {"epochs": 1}).fit(sine_episodes(4))
-    state = fresh.initial_state()
-    _, surprise = fresh.observe(state, row)
-    with pytest.raises(RuntimeError, match="no threshold"):
-        fresh.adapt(state, row, surprise)

@@ -26,7 +26,6 @@ from asm_gym.memory.settling_learning import (
 )
 from asm_gym.memory.temporal import unassociated
 from asm_gym.monitors import NeuralASM, load_monitor
-from asm_gym.monitors.contact_band import ContactBand
 from asm_gym.policies import NeuralASMPolicy
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
@@ -334,5 +333,3 @@ def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):
     traces.save(tmp_path / "traces.asm")
     with pytest.raises(ValueError, match=r"^this is a memory of dynamics='traces', .* cannot be loaded as 'settling'$"):
         NeuralASM(sine_spec(), 8, 8, dynamics="settling").restore(read_checkpoint(tmp_path / "traces.asm", traces.kind))
-    with pytest.raises(ValueError, match="a band needs a fitted memory of traces, got one of dynamics='settling'"):
-        ContactBand(asm)

@@ -1,9 +1,10 @@
-"""A band on what the arms feel, looked at in every physics substep."""
+"""Limits on what the arms feel, looked at in every physics substep."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from asm_gym.contact_limits import ContactLimits
 from asm_gym.faults import Push
 from asm_gym.wrappers import FaultInjection
 
@@ -26,6 +27,11 @@ def begin(env, steps=5):
     return env.unwrapped
 
 
+def limits(most, stays=True):
+    """Of each number by itself [N m], [N]; of speed none."""
+    return ContactLimits(1e-9, 1e-9, np.inf, healthy=tuple(most), stays=stays)
+
+
 def test_what_is_felt_is_what_the_stream_says_the_mean_of(free):
     robot = begin(free)
     felt, row = robot.felt, robot.measured
@@ -37,32 +43,34 @@ def test_what_is_felt_is_what_the_stream_says_the_mean_of(free):
     np.testing.assert_allclose(felt.mean(axis=0), means, atol=6 * noise.max())
 
 
-def test_a_band_that_is_not_left_changes_nothing(free):
+def test_limits_that_are_not_passed_change_nothing(free):
     robot = begin(free)
     free.step(ACTION)
     alone = robot.simulation.data.qpos.copy()
     robot = begin(free)
-    robot.expect(np.full(10, -WIDE), np.full(10, WIDE))
-    free.step(ACTION)
-    assert robot.left_band_s is None
+    robot.contact_limits = limits(np.full(10, WIDE))
+    *_, info = free.step(ACTION)
+    assert np.isnan(info["contact_left_s"])
+    assert info["contact_load"] == pytest.approx(np.abs(robot.felt).max() / WIDE)
     np.testing.assert_array_equal(robot.simulation.data.qpos, alone)
 
 
 @pytest.mark.parametrize("number", range(10))
-def test_leaving_it_in_any_number_is_known_in_that_substep_and_counts_for_one_step(free, number):
+def test_passing_any_of_them_is_known_in_that_substep_and_counts_for_one_step(free, number):
     robot = begin(free)
     free.step(ACTION)
-    felt = robot.felt[:, number].copy()
+    felt = np.abs(robot.felt[:, number])
     robot = begin(free)
-    low, high = np.full(10, -WIDE), np.full(10, WIDE)
-    middle = np.median(felt)
-    beyond = felt > middle
-    high[number] = middle
-    robot.expect(low, high, stays=False)
-    free.step(ACTION)
-    assert robot.left_band_s == (pytest.approx(0.002 * (1 + np.argmax(beyond))) if beyond.any() else None)
-    free.step(ACTION)
-    assert robot.left_band_s is None
+    most = np.full(10, WIDE)
+    most[number] = np.median(felt)
+    beyond = felt > most[number]
+    robot.contact_limits = limits(most, stays=False)
+    *_, info = free.step(ACTION)
+    assert beyond.any()
+    assert info["contact_left_s"] == pytest.approx(0.002 * (1 + np.argmax(beyond)))
+    robot.contact_limits = limits(np.full(10, WIDE), stays=False)
+    *_, info = free.step(ACTION)
+    assert np.isnan(info["contact_left_s"])
 
 
 @pytest.mark.parametrize("controller", ["OSC_POSE", "JOINT_POSITION", "JOINT_TORQUE"])
@@ -76,9 +84,10 @@ def test_the_arm_stays_from_the_next_substep_on_whatever_its_controller(controll
         for _ in range(5):
             env.step(action)
         joints = robot.simulation.data.qpos[:7].copy()
-        robot.expect(np.zeros(10), np.zeros(10), stays)
+        robot.contact_limits = limits(np.zeros(10), stays)
         *_, info = env.step(action)
-        assert robot.left_band_s == 0.002
+        assert info["contact_left_s"] == 0.002
+        robot.contact_limits = None
         said = info["stream"][env.unwrapped.stream_spec.motor]
         for _ in range(3):
             robot.holding = holds
@@ -97,20 +106,10 @@ def test_the_arm_stays_from_the_next_substep_on_whatever_its_controller(controll
 
 def test_a_push_of_20_newtons_is_felt_within_two_substeps(free):
     robot = begin(free)
-    usual = robot.felt
-    low, high = usual.min(axis=0) - 2.0, usual.max(axis=0) + 2.0
+    usual = np.abs(robot.felt).max(axis=0) + 2.0
     pushed = FaultInjection(free, [Push(body="robot0_link5", newtons=20.0, onset=6, duration=4)])
     robot = begin(pushed, 6)
-    robot.expect(low, high)
-    pushed.step(ACTION)
-    assert robot.left_band_s <= 0.004
+    robot.contact_limits = limits(usual)
+    *_, info = pushed.step(ACTION)
+    assert info["contact_left_s"] <= 0.004
     pushed.undo_faults()
-
-
-@pytest.mark.parametrize(
-    ("low", "high"),
-    [(np.zeros(9), np.ones(9)), (np.ones(10), np.zeros(10)), (np.full(10, np.nan), np.ones(10))],
-)
-def test_a_band_that_is_none_is_refused(free, low, high):
-    with pytest.raises(ValueError, match="a band needs"):
-        begin(free, 0).expect(low, high)

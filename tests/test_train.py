@@ -14,6 +14,7 @@ import pytest
 import torch
 from rich.console import Console
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv
 from torch.utils._pytree import tree_leaves
 
 from asm_gym.data.datasets import write_dataset
@@ -21,12 +22,13 @@ from asm_gym.episode import Episode
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
 from asm_gym.rollouts.training.learners import ALGORITHMS, RECIPES, export, make_learner, warm_critic
-from asm_gym.rollouts.training.recurrent import clone_recurrent
 from asm_gym.rollouts.training.run import ObservationScale, Plan, TrainingRun
 from asm_gym.rollouts.training.state import TrainingState, newest, resume, save
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.train import Args, train_and_report
 from asm_gym.spec import StreamSpec
+from asm_gym.wrappers import NeuralASMSafety
+from tests.fakes import CueMonitor, FakeEnv
 
 PENDULUM = ["train", "Pendulum-v1", "--demonstrations", "0", "--evaluation-episodes", "1", "--final-episodes", "1"]
 
@@ -111,6 +113,18 @@ def test_warming_the_critic_leaves_the_actor_as_it_is(env):
     assert rates[0] == pytest.approx(RECIPES["sac"].actor_share * rates[1])
 
 
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_our_learners_keep_the_action_that_was_executed(kind):
+    def watched():
+        return NeuralASMSafety(FakeEnv(10), CueMonitor((3,)), on_alarm="hold", release_after=2)
+
+    learner = make_learner(kind, DummyVecEnv([watched]), 0, False, 10)
+    learner.learn(10)
+    kept = learner.replay_buffer.actions[:10, 0]
+    assert (kept[4:6, :2] == 0.0).all()  # the reflex rested in the two steps after the alarm
+    assert np.abs(kept[[0, 1, 2, 3, 6, 7], :2]).min() > 0.0
+
+
 def test_critics_have_layer_normalisation(env):
     for algorithm in ("sac", "td3"):
         critic = small(algorithm, env).policy.critic
@@ -163,39 +177,6 @@ def test_a_checkpoint_gives_back_the_learner(algorithm, env, tmp_path):
     (folder / "state.json").write_text("{")
     with pytest.raises(ValueError, match="no checkpoint to go on from"):
         resume(folder, other)
-
-
-def following_expert(count=8, steps=30, seed=0):
-    """Episodes in which the action is what was observed first: no expert of single observations can know it."""
-    rng, episodes = np.random.default_rng(seed), linear_expert(count, steps)
-    for n, episode in enumerate(episodes):
-        observations = np.zeros_like(episode.observations)
-        observations[0] = rng.choice([-0.5, 0.5])
-        episodes[n] = replace(
-            episode, observations=observations, actions=np.full_like(episode.actions, observations[0, 0])
-        )
-    return episodes
-
-
-def test_a_recurrent_clone_remembers_what_its_expert_saw():
-    agent = clone_recurrent(following_expert(), 300, 0, lambda done, total: None)
-    for episode in following_expert(seed=1):
-        state, acted = None, []
-        for observation in episode.observations[:-1]:
-            action, state = agent.predict(observation, state)
-            acted.append(action)
-        np.testing.assert_allclose(acted, episode.actions, atol=0.1)
-
-
-def test_a_recurrent_clone_is_trained_by_the_command_and_takes_no_steps(tmp_path, capsys):
-    how = ["train", "Lift", "--quick", "--algorithm", "gru", "--out", str(tmp_path / "run")]
-    assert main(how) == 2
-    assert "steps must be 0, got 300" in " ".join(capsys.readouterr().err.split())
-    assert main([*how, "--steps", "0"]) == 0
-    agent = NetworkPolicy.load(tmp_path / "run" / "agent.npz")
-    assert agent.cell is not None
-    assert agent.trained_in["env"] == "asm_gym/Lift-v0"
-    assert json.loads((tmp_path / "run" / "result.json").read_text())["curve"] == []
 
 
 @pytest.mark.usefixtures("small_disk")

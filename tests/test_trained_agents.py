@@ -19,7 +19,7 @@ from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from asm_gym import collect
 from asm_gym.checkpoint import write_checkpoint
 from asm_gym.policies import POLICIES, make_policy, rollout
-from asm_gym.policies.network import Cell, NetworkPolicy
+from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.registry import SHIPPED, agents
 from asm_gym.policies.sb3 import read_archive
 from asm_gym.rollouts.seeds import episode_seeds
@@ -246,46 +246,6 @@ def test_an_agent_is_the_same_after_saving(tmp_path):
     x = (observations - agent.mean) / agent.scale
     by_hand = np.tanh(np.tanh(x @ W.T + b) @ V.T + c)
     np.testing.assert_allclose(agent.predict(observations)[0], by_hand, atol=1e-5)
-
-
-def recurrent(cell, readout):
-    """The agent of a torch GRU and its readout."""
-    with torch.no_grad():
-        arrays = [p.numpy() for p in (*cell.parameters(), *readout.parameters())]
-    mean, scale = np.array([0.5, -1.0], np.float32), np.array([2.0, 0.5], np.float32)
-    return NetworkPolicy([tuple(arrays[4:])], "tanh", "clip", mean=mean, scale=scale, cell=Cell(*arrays[:4]))
-
-
-def test_a_recurrent_agent_acts_as_torchs_gru_does_and_forgets_where_an_episode_starts(tmp_path):
-    torch.manual_seed(0)
-    cell, readout = torch.nn.GRU(2, 5), torch.nn.Linear(5, 3)
-    recurrent(cell, readout).save(tmp_path / "agent.npz")
-    agent = NetworkPolicy.load(tmp_path / "agent.npz")
-    seen = np.random.default_rng(0).normal(size=(30, 4, 2)).astype(np.float32)  # (T, n, O)
-    with torch.no_grad():
-        expected = readout(
-            cell((torch.as_tensor(seen) - torch.tensor([0.5, -1.0])) / torch.tensor([2.0, 0.5]))[0]
-        ).numpy()
-    state = one = None
-    for o, a in zip(seen, expected, strict=True):
-        acted, state = agent.predict(o, state)
-        alone, one = agent.predict(o[0], one)
-        np.testing.assert_allclose(acted, np.clip(a, -1, 1), atol=1e-6)
-        np.testing.assert_allclose(alone, acted[0], atol=1e-6)
-    again, _ = agent.predict(seen[0], state, episode_start=np.array([True, False, True, True]))
-    np.testing.assert_allclose(again[[0, 2, 3]], np.clip(expected[0, [0, 2, 3]], -1, 1), atol=1e-6)
-    assert np.abs(again[1] - np.clip(expected[0, 1], -1, 1)).max() > 1e-3
-
-
-def test_a_cell_that_does_not_hang_together_is_refused():
-    torch.manual_seed(0)
-    good = recurrent(torch.nn.GRU(2, 5), torch.nn.Linear(5, 3))
-    with pytest.raises(ValueError, match="a GRU needs"):
-        NetworkPolicy(good.layers, "tanh", "clip", cell=good.cell._replace(b_h=good.cell.b_h[:-1]))
-    with pytest.raises(ValueError, match="a GRU must be finite"):
-        NetworkPolicy(good.layers, "tanh", "clip", cell=good.cell._replace(b_h=good.cell.b_h * np.nan))
-    with pytest.raises(ValueError, match="layer 0 takes 5 numbers"):
-        NetworkPolicy([(np.ones((3, 4)), np.ones(3))], "tanh", "clip", cell=good.cell)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection.events import FAULT, KNOCK
 from asm_gym.monitors import Monitor, Surprise
-from asm_gym.monitors.contact_band import ContactBand
 from asm_gym.validation import check_flag, shown
 from asm_gym.wrappers.arbiter import NOTHING, Arbiter, Sensed
 from asm_gym.wrappers.factory import (
@@ -48,7 +47,6 @@ class GuardOptions:
     truncate: bool = False
     responses: Mapping[str, str] | None = None
     contact_limits: ContactLimits | str | None = "memory"
-    band: ContactBand | None = None
 
     def __post_init__(self) -> None:
         check_flag("truncate", self.truncate)
@@ -97,7 +95,7 @@ class Guard:
             reflex, env, options.release_after, options.release_below, options.max_override, options.try_after
         )
         fallback = None if box is None else make_fallback(env)
-        self.substeps = SubstepGuard(env, limits_of(options.contact_limits, monitor), acts, options.band, monitor)
+        self.substeps = SubstepGuard(env, limits_of(options.contact_limits, monitor), acts, monitor)
         self.arbiter = Arbiter(reflex, threshold, rule.in_rows(rows_per_step), fallback, box)
         self._severity = SeverityEstimator(monitor.spec)
         self.largest: float | None = None

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import LearnsOnTheJob, Monitor, Surprise
-from asm_gym.monitors.contact_band import ContactBand
 from asm_gym.protocols import HoldsItself
 from asm_gym.spec import control_period
 from asm_gym.stream_source import StreamSource
@@ -99,9 +98,6 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             nobody knows what presses, and ``"graded"`` holds at every alarm but a sensor's.
         info: ``"full"``, or ``"flat"`` for the scalars that stand beside ``info["asm"]`` and not that itself. It costs
             little in steps in which nobody reads it, for most of it is put together then.
-        band: a calibrated band on what the arm feels, made with ``monitor``, compared within the limits in every
-            physics substep of the policy's steps. What it promises comes beside what ``monitor`` does. Elsewhere than
-            in this package it is compared once a step, and a warning says so.
 
     Raises:
         ValueError: an unknown ``on_alarm``, cause or response, a response that lets a pressing arm go on, a reflex
@@ -138,7 +134,6 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         adaptive_threshold: AdaptiveThreshold | None = None,
         responses: Mapping[str, str] | None = None,
         contact_limits: ContactLimits | Literal["memory"] | None = "memory",
-        band: ContactBand | None = None,
         info: Literal["full", "flat"] = "full",
     ) -> None:
         given: dict[str, Any] = {
@@ -150,7 +145,6 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             "truncate": truncate,
             "responses": responses,
             "contact_limits": contact_limits,
-            "band": band,
         }
         RecordConstructorArgs.__init__(
             self,
@@ -258,7 +252,6 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._command(action)
         overridden = self._guard.arbiter.overriding or self._refused
         self._rows: list[RowReport] = []
-        self._guard.substeps.send(self._observer.state, self._executed, overridden)
         parts = zip(fitted_parts(self._monitor), self._parts, strict=True)
         self._stale = "" if all(a is b for a, b in parts) else STALE
         observation, reward, terminated, truncated, info = self._run()

@@ -1,4 +1,4 @@
-"""What is watched beneath a control step: the contact limits of an episode, and a learned band for the coming step."""
+"""What is watched beneath a control step: the contact limits of an episode."""
 
 from __future__ import annotations
 
@@ -11,12 +11,9 @@ from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.familiar_speed import PLACE
-from asm_gym.monitors import Monitor, NeuralASM
-from asm_gym.monitors.contact_band import UNJUDGED, Band, ContactBand
-from asm_gym.monitors.monitor import MonitorState
-from asm_gym.protocols import FeelsWithinSteps, LimitsContact
+from asm_gym.monitors import Monitor
+from asm_gym.protocols import LimitsContact
 from asm_gym.spec import control_period
-from asm_gym.validation import shown
 from asm_gym.wrappers.factory import familiar_to
 from asm_gym.wrappers.severity import ContactForce
 
@@ -35,7 +32,7 @@ class Beneath(NamedTuple):
 
     Attributes:
         load: the largest share of a contact limit that was felt; not a number where nobody feels within steps.
-        left_s: when, after the step began, a limit was passed or a band left [s]; not a number where none was.
+        left_s: when, after the step began, a limit was passed [s]; not a number where none was.
         force: contact force on the arm that this comes to, the mean of the step [N]; not a number where nobody feels.
     """
 
@@ -59,13 +56,10 @@ class SubstepGuard:
         env: wrapped or not.
         limits: None for none.
         acts: the arm stays from the substep after a limit was passed, and its hand is slowed down.
-        band: calibrated; what the arm should feel in the coming step, sent down before each. None for none. Where
-            the environment does not feel within steps, it is compared with the row that ends a step, and a warning says
-            so.
-        monitor: what watches; the memory of the band, or one with its weights.
+        monitor: what watches.
 
     Raises:
-        ValueError: the band is of another memory, or ``env`` has other arms; limits of another arm.
+        ValueError: limits of another arm.
     """
 
     def __init__(
@@ -73,7 +67,6 @@ class SubstepGuard:
         env: gym.Env[Any, Any],
         limits: ContactLimits | None,
         acts: bool,
-        band: ContactBand | None,
         monitor: Monitor,
     ) -> None:
         inner = env.unwrapped
@@ -84,30 +77,13 @@ class SubstepGuard:
         self._place: NDArray[np.floating[Any]] = np.full(3, np.nan)  # of the hand, when it was sensed last
         if limits is not None and self._limited is not None:
             limits.most(self._limited.felt_channels)
-        self._band, self._acts = band, acts
-        self._arm = inner if isinstance(inner, FeelsWithinSteps) else None
-        if band is not None:
-            self._check(band, monitor, inner)
         self._felt = None if self._limited is None else ContactForce.felt_by(self._limited.felt_channels)
         self._careful_steps = max(1, round(CAREFUL_S / control_period(env)))
         self._careful = 0  # steps of the policy for which its hand is slower still
-        self._sent: Band | None = None
-        self._unjudged = 0  # steps of the policy for which there is no band
-
-    def _check(self, band: ContactBand, monitor: Monitor, inner: Any) -> None:
-        if not isinstance(band, ContactBand):
-            raise TypeError(f"band must be a ContactBand, got {shown(band)}")
-        if not isinstance(monitor, NeuralASM) or monitor.network_ is not band.memory.network_:
-            raise ValueError("the band is of another memory than the one that watches: make it with that")
-        _ = band.promise  # raises before anything runs where it was never calibrated
-        if self._arm is None:
-            gym.logger.warn(f"{inner} does not feel within control steps: the band is compared once a step, at its end")
-        elif (names := tuple(c.name for c in self._arm.felt_channels)) != band.names:
-            raise ValueError(f"the band is for {', '.join(band.names)}, and this arm feels {', '.join(names)}")
 
     def begin(self) -> None:
         """A new episode has begun in the environment."""
-        self._sent, self._unjudged, self._careful = None, 0, 0
+        self._careful = 0
         self._place = np.full(3, np.nan)
         self._choose_speed()
 
@@ -135,35 +111,9 @@ class SubstepGuard:
                 limits = limits.stricter(forces, speed)
         self._limited.contact_limits = limits
 
-    def send(self, state: MonitorState, action: NDArray[np.floating[Any]], overridden: bool) -> None:
-        """Says what is expected of a step that is about to be made.
-
-        Args:
-            state: of the monitor, after the last row.
-            action: (A,) that is about to be commanded.
-            overridden: something else than the policy acts, from which the memory expects nothing that a nominal
-                episode shows.
-        """
-        self._sent = None
-        if self._band is None:
-            return
-        if overridden or self._unjudged:
-            self._unjudged = UNJUDGED if overridden else self._unjudged - 1
-            return
-        if self._limited is not None:
-            action = self._limited.slowed(np.asarray(action, np.float32))
-        self._sent = self._band.expect(state.model, action)
-        if self._arm is not None and self._sent is not None:
-            self._arm.expect(*self._sent, self._acts)
-
     def came(self, row: NDArray[np.floating[Any]], info: dict[str, Any]) -> Beneath:
         """What came of the step that ended with ``row`` (D,), of which the environment said ``info``."""
         self._place = np.asarray(row[self._at], np.float64)
         load, left = float(info.get("contact_load", np.nan)), float(info.get("contact_left_s", np.nan))
         force = np.nan if self._felt is None or "contact_felt" not in info else self._felt(info["contact_felt"])
-        if self._sent is not None and self._band is not None:
-            if self._arm is None:
-                left = self._band.spec.dt if (self._sent.times(self._band.felt_in(row)) > 1.0).any() else left
-            elif self._arm.left_band_s is not None:
-                left = self._arm.left_band_s
         return Beneath(load, left, force)

@@ -59,8 +59,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         env: of ``gym.make_vec``; where ``info`` has no ``"stream"``, observation and action are the stream.
         monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that they move.
         on_alarm: as in ``NeuralASMSafety``; a policy of yours is shared, and must keep what it knows in its state.
-        release_after, release_below, max_override, try_after, truncate, responses, contact_limits, info: as there. Nor
-            is a band sent down: for ``band``, wrap each member and put those side by side in ``ThreadVectorEnv``.
+        release_after, release_below, max_override, try_after, truncate, responses, contact_limits, info: as there.
         adaptive_threshold: as there; all environments share one running threshold, and an episode keeps what it began
             with.
 

@@ -33,7 +33,7 @@ from asm_gym.envs.mujoco_views import (
     Goals,
     Ints,
     NominalViews,
-    SubstepBand,
+    SubstepLimits,
     Views,
 )
 
@@ -115,19 +115,19 @@ def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Flo
 
 
 @compiled
-def feel(arms: Arms, band: SubstepBand, k: int, samples: Floats) -> None:
-    """Compares what the arms felt in substep ``k`` with what they were to feel; what is not a number is outside."""
-    state = band.state
+def feel(arms: Arms, limits: SubstepLimits, k: int, samples: Floats) -> None:
+    """Compares what the arms felt in substep ``k`` with the limits; what is not a number passes them."""
+    state = limits.state
     if state[ARMED]:
         for a in range(len(arms.joints)):
             for i in range(FELT):
                 if i < JOINTS and i >= arms.joints[a]:
                     continue
                 value = samples[a, k, i if i < JOINTS else i - JOINTS + WRENCH.start]
-                load = abs(value) / band.most[a, i]
-                if not load <= band.load[0]:
-                    band.load[0] = load if load == load else np.inf
-                if state[LEFT] < 0 and not (band.low[a, i] <= value <= band.high[a, i]):
+                load = abs(value) / limits.most[a, i]
+                if not load <= limits.load[0]:
+                    limits.load[0] = load if load == load else np.inf
+                if state[LEFT] < 0 and not load <= 1.0:
                     state[LEFT] = state[PASSED]
     state[PASSED] += 1
 
@@ -144,9 +144,9 @@ def brake_held(views: Views, nominal: NominalViews, arms: Arms, goals: Goals) ->
 
 
 @compiled
-def must_stay(band: SubstepBand) -> bool:
+def must_stay(limits: SubstepLimits) -> bool:
     """Whether the arms are to be told now to stay, which they are once."""
-    state = band.state
+    state = limits.state
     now = state[ACTS] and state[LEFT] >= 0 and not state[STAYED]
     if now:
         state[STAYED] = 1
@@ -159,7 +159,7 @@ def run(
     nominal: NominalViews,
     arms: Arms,
     goals: Goals,
-    band: SubstepBand,
+    limits: SubstepLimits,
     deltas: Floats,
     turns: Floats,
     fresh: bool,
@@ -170,7 +170,7 @@ def run(
     """Runs ``count`` physics substeps, controllers and sensors included.
 
     Args:
-        band: from the substep after it is left, the arms stay where they are, if that is asked for.
+        limits: from the substep after one is passed, the arms stay where they are, if that is asked for.
         deltas: (A, JOINTS) the action in metres and radians.
         turns: (A, 3, 3) the rotation it asks for, under operational space control.
         fresh: the set-points are to be moved by these in the first of these substeps.
@@ -181,7 +181,7 @@ def run(
         _step1(views.model, views.data)
         if nominal.model != 0:
             _believe(views, nominal)
-        stay = must_stay(band)
+        stay = must_stay(limits)
         for a in range(len(arms.joints)):
             if stay:
                 hold_at(views, arms, goals, a)
@@ -190,7 +190,7 @@ def run(
             control(views, nominal, arms, goals, a)
         _step2(views.model, views.data)
         sample(views, nominal, arms, k, samples)
-        feel(arms, band, k, samples)
+        feel(arms, limits, k, samples)
 
 
 @compiled

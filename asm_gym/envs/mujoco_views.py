@@ -119,16 +119,14 @@ class Goals(NamedTuple):
     held: Ints  # (A,) whether it is: 0, ``control.BRAKING`` or ``control.YIELDING``
 
 
-class SubstepBand(NamedTuple):
-    """What the arms are expected to feel in every substep of a control step; changed in place."""
+class SubstepLimits(NamedTuple):
+    """The most that arms may feel in every substep of a control step; changed in place."""
 
-    low: Floats  # (A, FELT) [N m], [N]
-    high: Floats  # (A, FELT)
-    most: Floats  # (A, FELT) contact limits, which ``load`` is counted in; infinite where there are none
+    most: Floats  # (A, FELT) [N m], [N]
     load: Floats  # (1,) the largest share of them that was felt since the control step began
     state: Ints  # (5,) see below
 
 
 ARMED, ACTS, PASSED, LEFT, STAYED = range(5)
-"""Of ``SubstepBand.state``: whether it is looked at; whether the arms stay once it is left; substeps since the control
-step began; in which of them it was first left, -1 for none; whether they were told to stay."""
+"""Of ``SubstepLimits.state``: whether they are looked at; whether the arms stay once one is passed; substeps since the
+control step began; in which of them one was first passed, -1 for none; whether they were told to stay."""

@@ -17,7 +17,6 @@ from asm_gym.envs.actions import Actions
 from asm_gym.envs.cameras import RENDER_MODES, Pictures
 from asm_gym.envs.chains import chains_of
 from asm_gym.envs.edits import SimulatorEdits
-from asm_gym.envs.expectation import Expectation
 from asm_gym.envs.layout import Layout
 from asm_gym.envs.rewards import Rewards, RewardTerms
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Corruption, SensorErrors
@@ -141,7 +140,6 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """What the arms may feel and how fast they may go in this episode; ``reset`` forgets it. ``info`` then holds
         ``contact_load``, the largest share of a limit that was felt within the step, ``contact_left_s``, when in it a
         limit was passed [s], not a number where none was, and ``contact_felt``, the step's mean of what was felt."""
-        self._expectation = Expectation()
         self.substeps = backend.PHYSICS_FREQ // control_freq
         self._groups = tuple(stream)
         self._flat = observation == "flat"
@@ -269,7 +267,6 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._warnings = self._bad_count()
         self._steps, self.holding = 0, False
         self.contact_limits = None
-        self._expectation.forget()
         self._action = np.zeros(self._actions.size, np.float32)
         self._row = self.measure()
         self._ended = False
@@ -297,12 +294,12 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
         env = self.robosuite_env
         env.timestep += 1
-        expected = self._expectation.taken(self.felt_channels, self.contact_limits)
-        self.simulation.begin(expected)
+        limits = self.contact_limits
+        self.simulation.begin(limits, self.felt_channels)
         self._command(action)
         self._rows: list[NDArray[np.float32]] = []
         self._advance()
-        if expected is not None and expected.stays and self.simulation.left_band is not None:
+        if limits is not None and limits.stays and self.simulation.passed_limit is not None:
             # What was done last is what the stream says was commanded.
             self._action = self._actions.resting(self.simulation, self._action)
         env.cur_time += env.control_timestep
@@ -360,28 +357,10 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             return action
         return self._actions.slowed(self.simulation, action, limits.hand_speed)
 
-    def expect(self, low: NDArray[np.float64], high: NDArray[np.float64], stays: bool = True) -> None:
-        """Says what the arms are to feel in every physics substep of the next control step, and of that alone.
-
-        Args:
-            low, high: (N,) as ``felt`` lays it out.
-            stays: the arms stay, in the rest of the step, from the substep after one in which they felt anything else.
-
-        Raises:
-            ValueError: a wrong shape, or a band that is empty or not a number.
-        """
-        self._expectation.expect(self.felt_channels, low, high, stays)
-
     @property
     def felt(self) -> NDArray[np.float64]:
         """(K, N) what the arms felt in each physics substep since the row began, noiseless; see ``felt_channels``."""
         return self.simulation.felt
-
-    @property
-    def left_band_s(self) -> float | None:
-        """When in the last step the arms felt what was not expected, after its beginning [s]; None where never."""
-        left = self.simulation.left_band
-        return None if left is None else (left + 1) / backend.PHYSICS_FREQ
 
     def action_for(self, turns: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """The action that moves the arms' joints by ``turns`` from where they are, as nearly as one step can.
@@ -434,9 +413,9 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         names = "contact_force", "external_force", "external_impulse"
         forces = dict(zip(names, (np.nan,) * 3 if unstable else felt, strict=True))
         if self.contact_limits is not None:
-            left = self.left_band_s
+            passed = sim.passed_limit
             info["contact_load"] = np.inf if unstable else sim.load
-            info["contact_left_s"] = np.nan if left is None else left
+            info["contact_left_s"] = np.nan if passed is None else (passed + 1) / backend.PHYSICS_FREQ
             info["contact_felt"] = sim.mean_felt
         return info | {"success": success, **forces, "unstable": unstable}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import must_compile
+from asm_gym.contact_limits import ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.arms import bodies, compilable, describe
 from asm_gym.envs.control import hold_at
-from asm_gym.envs.expectation import Expected
-from asm_gym.envs.mujoco_views import ACTS, ARMED, FELT, JOINTS, LEFT, Goals, SubstepBand, Views
+from asm_gym.envs.mujoco_views import ACTS, ARMED, FELT, JOINTS, LEFT, Goals, SubstepLimits, Views
 from asm_gym.envs.nominal_robot import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
 from asm_gym.envs.speeds import HandSpeeds
+from asm_gym.spec import Channel
 
 
 class Simulation:
@@ -46,9 +47,7 @@ class Simulation:
         """What the robot believes of itself."""
         self._samples = np.zeros((len(self.parts), substeps, kernels.SAMPLE))
         n = len(self.parts)
-        self._band = SubstepBand(
-            *(np.zeros((n, FELT)), np.zeros((n, FELT)), np.full((n, FELT), np.inf)), np.zeros(1), np.zeros(5, np.int64)
-        )
+        self._limits = SubstepLimits(np.full((n, FELT), np.inf), np.zeros(1), np.zeros(5, np.int64))
         self.proprioception = Proprioception(self.parts, self._views, self.data)
         self.contact_force = self.external_force = self.mean_external_force = 0.0
         """The largest net contact force on an arm within the control step [N]: the norm of the summed contact forces on
@@ -79,9 +78,9 @@ class Simulation:
             for name in ("_ref_joint_pos_indexes", "_ref_joint_vel_indexes")
         )
         n = len(self.parts)
-        self._band.state[:] = 0, 0, 0, -1, 0
-        self._expected: Expected | None = None
-        # Where the numbers of ``felt`` stand in a band: arm, and place.
+        self._limits.state[:] = 0, 0, 0, -1, 0
+        self._known: ContactLimits | None = None
+        # Where the numbers of ``felt`` stand in limits: arm, and place.
         self._felt_places = np.nonzero([[i >= JOINTS or i < n for i in range(FELT)] for n in self._arms.joints])
         self._felt_columns = np.where(
             self._felt_places[1] < JOINTS, self._felt_places[1], self._felt_places[1] - JOINTS + kernels.WRENCH.start
@@ -99,17 +98,15 @@ class Simulation:
 
     # ------------------------------------------------------------------ control steps
 
-    def begin(self, expected: Expected | None = None) -> None:
-        """Begins a control step, in which the arms are to feel what is ``expected``."""
+    def begin(self, limits: ContactLimits | None = None, felt: Sequence[Channel] = ()) -> None:
+        """Begins a control step, in which the arms may feel no more than ``limits`` have of what is ``felt``."""
         self._done = self._row_began = 0
-        self._band.state[:] = 0, 0, 0, -1, 0
-        self._band.load[0] = 0.0
-        if expected is not None:
-            if expected is not self._expected:  # as in every other step
-                for bound, values in zip(self._band[:3], expected, strict=False):
-                    bound[self._felt_places] = values
-                self._expected = expected
-            self._band.state[ARMED], self._band.state[ACTS] = 1, expected.stays
+        self._limits.state[:] = 0, 0, 0, -1, 0
+        self._limits.load[0] = 0.0
+        if limits is not None:
+            if limits is not self._known:
+                self._limits.most[self._felt_places], self._known = limits.most(felt), limits
+            self._limits.state[ARMED], self._limits.state[ACTS] = 1, limits.stays
         self._felt = (0.0, 0.0, 0.0)
 
     def command(self, action: NDArray[np.float64], hold: bool = False) -> None:
@@ -151,8 +148,8 @@ class Simulation:
                 kernels.brake_held(self._views, self.nominal.now(), self._arms, self._goals)
                 self.env.sim.step2()
                 kernels.sample(self._views, self.nominal.now(), self._arms, k - self._row_began, self._samples)
-                kernels.feel(self._arms, self._band, k - self._row_began, self._samples)
-                if kernels.must_stay(self._band):
+                kernels.feel(self._arms, self._limits, k - self._row_began, self._samples)
+                if kernels.must_stay(self._limits):
                     for a in range(len(self.parts)):
                         hold_at(self._views, self._arms, self._goals, a)
                 self._fresh = False
@@ -166,19 +163,19 @@ class Simulation:
 
     def _run(self, count: int) -> None:
         steps = (self._fresh, self._done - self._row_began, count, self._samples)
-        goals = self._goals, self._band, self._deltas, self._turns
+        goals = self._goals, self._limits, self._deltas, self._turns
         kernels.run(self._views, self.nominal.now(), self._arms, *goals, *steps)
 
     @property
-    def left_band(self) -> int | None:
-        """The first substep of the control step in which the arms felt what was not expected; None for none."""
-        left = int(self._band.state[LEFT])
+    def passed_limit(self) -> int | None:
+        """The first substep of the control step in which the arms felt more than a limit; None for none."""
+        left = int(self._limits.state[LEFT])
         return None if left < 0 else left
 
     @property
     def load(self) -> float:
         """The largest share of a contact limit that was felt in the control step; infinite for what is no number."""
-        return float(self._band.load[0])
+        return float(self._limits.load[0])
 
     @property
     def felt(self) -> NDArray[np.float64]:

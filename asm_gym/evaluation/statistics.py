@@ -168,20 +168,6 @@ def bootstrap(
     return Estimate(float(statistic(pairs)), float(low), float(high))
 
 
-def gain(pairs: Floats) -> Floats:
-    """Mean difference, reflex less policy alone."""
-    difference: Floats = pairs[..., 1].mean(axis=-1) - pairs[..., 0].mean(axis=-1)
-    return difference
-
-
-def reduction(pairs: Floats) -> Floats:
-    """1 - the mean with the reflex over the mean with the policy alone; NaN where that is 0."""
-    alone = pairs[..., 0].mean(axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share: Floats = np.where(alone > 0, 1.0 - pairs[..., 1].mean(axis=-1) / alone, math.nan)
-    return share
-
-
 def _scores(name: str, values: ArrayLike) -> NDArray[np.float64]:
     """(n,) numbers, infinite ones too."""
     try:

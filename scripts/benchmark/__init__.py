@@ -1,4 +1,4 @@
-"""Speeds as ratios against a rival in the same run, how often experts succeed, and whether alarms keep their rate.
+"""Speeds as ratios against a rival in the same run, and how often experts succeed.
 
 Machines differ and are noisy: rivals take turns, step by step, and the medians of their turns are compared.
 """
@@ -16,21 +16,18 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 
 import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
 from asm_gym.evaluation.tables import ConsoleTable, Table
-from asm_gym.scripts.benchmark.coverage import CoverageCheck
 from asm_gym.scripts.benchmark.deadline import Deadline
 from asm_gym.scripts.benchmark.experts import Experts
 from asm_gym.scripts.benchmark.fit import FitCost
 from asm_gym.scripts.benchmark.fleet import Robots
 from asm_gym.scripts.benchmark.memory import MemoryCost
 from asm_gym.scripts.benchmark.safety import Safety
-from asm_gym.scripts.benchmark.turns import GROWTH, BusyError, resident, take_turns
+from asm_gym.scripts.benchmark.turns import BusyError, take_turns
 from asm_gym.scripts.benchmark.vector import vector_table
-from asm_gym.scripts.benchmark.watch import Watch
 from asm_gym.scripts.command import BAD_NEWS, DONE, exit_code, run
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_choice, check_number
@@ -165,46 +162,12 @@ class Env:
         }
 
 
-@dataclass
-class Leaks:
-    """Whether the process grows over an environment's steps and resets."""
-
-    task: str = "Lift"
-    """Name of the task."""
-    steps: int = 100_000
-    """Control steps in all."""
-    resets: int = 500
-    """Resets, spread evenly over the steps; every tenth is seeded, which draws some tasks' shapes anew."""
-
-    def run(self, console: Console) -> int:
-        """Prints the resident memory after each tenth; 1 where the last is more than 5 % above the second."""
-        env: Any = gym.make(f"asm_gym/{self.task}-v0", horizon=10**9)
-        rng, length = np.random.default_rng(0), self.steps // self.resets
-        sizes: list[float] = []
-        for i in track(range(self.resets), "stepping", console=console, transient=True):
-            env.reset(seed=i if i % 10 == 0 else None)
-            for _ in range(length):
-                env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
-            if (i + 1) % max(1, self.resets // 10) == 0:
-                sizes.append(resident())
-        console.print(
-            f"{self.task}: {length * self.resets} steps, {self.resets} resets; resident memory [MB] by tenths"
-        )
-        console.print("  " + " ".join(f"{size:.0f}" for size in sizes))
-        growth = sizes[-1] / sizes[min(1, len(sizes) - 1)] - 1
-        console.print(f"  growth since the second: {100 * growth:+.1f} %")
-        return BAD_NEWS if growth > GROWTH else DONE
-
-
 BENCHMARKS: dict[str, type[Any]] = {
     "env": Env,
-    "leaks": Leaks,
     "experts": Experts,
-    "coverage": CoverageCheck,
     "memory": MemoryCost,
     "fit": FitCost,
     "safety": Safety,
-    "watch": Watch,
     "fleet": Robots,
     "deadline": Deadline,
 }
@@ -230,7 +193,7 @@ def measure(args: Any, console: Console) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs one benchmark, and returns the exit code; 1 where memory leaks."""
+    """Runs one benchmark, and returns the exit code."""
     name, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if name in ("-h", "--help"):
         print(usage())

@@ -14,9 +14,7 @@ from rich.console import Console
 
 from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.contact_band import ContactBand
 from asm_gym.rollouts.collect import collect
-from asm_gym.rollouts.substeps import felt_episodes
 from asm_gym.scripts.benchmark.turns import take_turns
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 
@@ -42,10 +40,9 @@ class Safety:
         """Prints the table."""
         plain = self._make(None)
         memory = self._memory(None)
-        guarded, banded = "step under the wrapper", "step under the wrapper and a band"
+        guarded = "step under the wrapper"
         envs = {"step": plain, guarded: NeuralASMSafety(self._make(None), memory)}
         envs[f"{guarded}, info flat"] = NeuralASMSafety(self._make(None), memory, info="flat")
-        envs[banded] = NeuralASMSafety(self._make(None), memory, band=self._band(memory))
         rate = self.monitor_freq
         watched = NeuralASMSafety(self._make(rate), self._memory(rate), monitor_freq=rate)
         envs |= {f"step, stream at {rate} Hz": self._make(rate), f"step under the wrapper at {rate} Hz": watched}
@@ -60,7 +57,6 @@ class Safety:
             for name in rivals
         ]
         console.print(ConsoleTable(Table(caption, ("", "ms", "p99", "against step"), rows)))
-        console.print(f"A band takes {turns.times(banded, guarded)} as long as the wrapper without.")
         if self.members:
             console.print(self._side_by_side(memory, console))
         console.print(turns.where())
@@ -92,10 +88,3 @@ class Safety:
         episodes = collect(env_id, episodes=4, workers=1, horizon=40, stream_freq=rate)
         asm = NeuralASM(episodes[0].spec, hidden_size=self.hidden, epochs=1).fit(episodes)
         return asm.with_threshold(1e300)  # beyond any surprise of these rows: nothing is to be held
-
-    def _band(self, memory: NeuralASM) -> ContactBand:
-        """One that has learned little and is as wide as can be: the cost is the same."""
-        felt = felt_episodes(self._make(None), range(6), steps=20)
-        band = ContactBand(memory).fit(felt[:4]).calibrate(felt[4:], 0.5)
-        band.scale_ = 1e30
-        return band

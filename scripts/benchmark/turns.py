@@ -25,9 +25,6 @@ OWN = 0.9
 OTHERS = 0.5
 """Load of other processes for each core [runnable processes], over the last minute, above which the machine is busy."""
 
-GROWTH = 0.05
-"""Share by which a process may grow after a fifth of what it does."""
-
 
 class BusyError(RuntimeError):
     """The machine had too much else to do for any figure to mean something."""
@@ -119,12 +116,6 @@ def check_quiet(share: float, load: float, cores: int) -> None:
             f"this machine is too busy to tell: the benchmark had {100 * share:.0f} % of a core, and over the last "
             f"minute {max(0.0, load - 1):.1f} other processes ran on {cores} cores. Wait, or add --even-if-busy"
         )
-
-
-def resident(process: int | str = "self") -> float:
-    """Resident memory of a process [MB], by its number; of this one by default."""
-    pages = int(Path(f"/proc/{process}/statm").read_text(encoding="utf-8").split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def _processor() -> str:

@@ -21,13 +21,10 @@ class Study(NamedTuple):
 STUDIES = {
     "memorise_and_recall": Study("one network learns skills, recalls each from a cue"),
     "abstract": Study("one network, six skills, no label: the abstract"),
-    "contextual_inference": Study("the state says which skill is running, untold"),
-    "express_skills": Study("one memory's own motor prediction drives the arm"),
     "tracking": Study("the settling network against the Kalman filter"),
     "sequences": Study("sequences of patterns, some of which come twice"),
     "local_learning": Study("local updates against backpropagation through time"),
     "speed_accuracy": Study("more inference, or slower movements, for more accuracy"),
-    "safe_training": Study("an agent trained alone, and under the safety wrapper"),
     "failure": Study("does surprise tell that a policy will fail"),
     "harm": Study("harm avoided against success kept, under any policy"),
     "attack": Study("what who writes to the senses can hide"),

@@ -88,10 +88,6 @@ class ExpressionMemory:
         learn(weights, taught, schedule, rng, lambda: None)
         return cls(reader, Network(weights, unassociated(), how.iterations, how.prior_precision, 1.0))
 
-    def hidden(self, streams: Rows) -> NDArray[np.float32]:
-        """The inferred states (T, B, H) of streams (T, B, D)."""
-        return follow(self.network, self.network.at_rest(streams.shape[1]), *read(self.reader, streams)).hidden
-
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = read(self.reader, streams[:cue])
         cued = follow(self.network, self.network.at_rest(streams.shape[1]), senses, commands)

@@ -22,7 +22,6 @@ from scipy.special import erf
 
 from asm_gym.episode import Episode
 from asm_gym.spec import MOTOR, Channel, StreamSpec
-from asm_gym.validation import check_choice
 
 NAMES = string.ascii_lowercase + string.ascii_uppercase[:6]
 """Of the letters; they look like none of the alphabet."""
@@ -85,35 +84,6 @@ def check_letters(*counts: int, least: int = 1) -> None:
     for count in counts:
         if not least <= count <= len(NAMES):
             raise ValueError(f"a repertoire has {least} to {len(NAMES)} skills, got {count}")
-
-
-def branching(letter: Letter, name: str, shared: int, rng: np.random.Generator) -> Letter:
-    """A letter that begins with the first ``shared`` strokes of another, and ends in strokes of its own."""
-    dims = 2 if all(s.rise == 0.0 for s in letter.strokes) else 3
-    # The opposite way, so that it is seen when they part.
-    own = [_stroke(n, dims, rng) for n in range(shared, len(letter.strokes))]
-    own = [replace(s, direction=o.direction + math.pi) for s, o in zip(own, letter.strokes[shared:], strict=True)]
-    return Letter(name, letter.strokes[:shared] + tuple(own))
-
-
-def detoured(letter: Letter, name: str, rng: np.random.Generator) -> Letter:
-    """A letter that begins as the mirror image of another about its first chord, goes on as that one, and ends apart.
-
-    A stroke ends where its mirror image does: ∫ Λ exp(i(θ + Δθ Φ)) dt = ∫_0^1 exp(i(θ + Δθ u)) du, along θ + Δθ/2.
-    """
-    first, *middle, last = letter.strokes
-    mirrored = replace(first, direction=first.direction + first.turn, turn=-first.turn)
-    dims = 2 if last.rise == 0.0 else 3
-    own = replace(_stroke(len(middle) + 1, dims, rng), direction=last.direction + math.pi)
-    return Letter(name, (mirrored, *middle, own))
-
-
-def chosen(letters: Sequence[Letter], names: Sequence[str]) -> list[Letter]:
-    """The letters of those names. Raises ValueError where the repertoire lacks one."""
-    known = {letter.name: letter for letter in letters}
-    for name in names:
-        check_choice("skill", name, known)
-    return [known[name] for name in names]
 
 
 def velocity(letter: Letter, time: NDArray[np.float64]) -> NDArray[np.float64]:

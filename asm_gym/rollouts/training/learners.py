@@ -26,8 +26,6 @@ from asm_gym.validation import check_choice
 
 ALGORITHMS = ("sac", "td3", "ppo")
 HIDDEN = (256, 256)
-NOVICE_LOG_STD = -1.2
-"""Of an untrained actor before tanh: with the usual 0, noise drowns what demonstrations teach."""
 
 
 @dataclass(frozen=True)
@@ -152,23 +150,6 @@ def make_learner(algorithm: str, env: gym.Env[Any, Any], seed: int, cloned: bool
     else:
         learner = _TD3(_TD3Policy, env, policy_kwargs=kwargs, action_noise=_noise(env), **settings)
     learner.actor_share = recipe.actor_share if cloned else 1.0
-    return learner
-
-
-def make_novice(env: gym.Env[Any, Any], seed: int) -> SAC:
-    """SAC with an untrained actor, for demonstrations in its replay buffer and an ``Anchor`` on them.
-
-    After 500 random steps it learns every other step: demonstrations make up for fewer updates.
-    """
-    entropy = -2.0 * float(np.prod(env.action_space.shape or ()))
-    settings = {**_OFF_POLICY, "learning_starts": 500, "train_freq": 2, "gradient_steps": 1}
-    settings |= {"ent_coef": "auto_0.05", "target_entropy": entropy}
-    learner = _SAC(_SACPolicy, env, policy_kwargs={"net_arch": list(HIDDEN)}, seed=seed, device="cpu", **settings)
-    learner.actor_share = 0.3
-    with torch.no_grad():
-        head: Any = learner.actor.log_std
-        head.weight.zero_()
-        head.bias.fill_(NOVICE_LOG_STD)
     return learner
 
 

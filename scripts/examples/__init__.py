@@ -1,1 +1,0 @@
-"""Examples: short programs that use the package as a user would."""

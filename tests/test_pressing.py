@@ -1,0 +1,222 @@
+"""What presses decides, whatever the cause is taken for: nobody goes on against what blocks the arm."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from asm_gym.memory.completion import Completion
+from asm_gym.monitors.diagnosis import Diagnosis
+from asm_gym.policies.reflexes import Graded
+from asm_gym.scaling import StreamScaler
+from asm_gym.spec import MOTOR, Channel, StreamSpec
+from asm_gym.wrappers import NeuralASMSafety
+from asm_gym.wrappers.arbiter import Arbiter, Sensed
+from asm_gym.wrappers.factory import make_fallback
+from asm_gym.wrappers.responses import DEFAULT, Responder
+from asm_gym.wrappers.severity import Severity
+from asm_gym.wrappers.transitions import ReleaseRule
+from tests.fakes import FakeEnv
+from tests.needs import needs
+from tests.test_completion import SPEC, Judge, Named
+from tests.test_responses import ACT, Acting, infos
+
+SOLID = StreamSpec(
+    (
+        Channel("joint_position", 2, "rad", 0.001, "joint"),
+        Channel("external_torque", 2, "N m", 0.1, "torque"),
+        Channel("action", 2, group=MOTOR),
+    ),
+    dt=0.05,
+)
+
+
+class Solid(gym.Env):
+    """Two joints that swing, until from step 60 on something presses the second, or not, and blocks it, or both."""
+
+    metadata = {"render_fps": 20}  # noqa: RUF012
+    stream_spec = SOLID
+    observation_layout = {"joint_position": 2}  # noqa: RUF012
+    observation_space = gym.spaces.Box(-50, 50, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self, torque=20.0, turns=0.0, others=0.0):
+        self.torque, self.turns, self.others = torque, turns, others
+
+    def row(self, action):
+        swing = np.sin(0.2 * self.t + np.arange(2))
+        blocked = self.t >= 60
+        swing *= [self.others if blocked else 1.0, self.turns if blocked else 1.0]
+        external = 0.1 * self.np_random.standard_normal(2) + np.array([0.0, self.torque * blocked])
+        return np.concatenate([swing + 0.001 * self.np_random.standard_normal(2), external, action]).astype(np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(2, np.float32), {"stream": self.row(np.zeros(2))}
+
+    def step(self, action):
+        self.t += 1
+        row = self.row(action)
+        return row[:2], 0.0, False, False, {"stream": row, "contact_load": 0.1}
+
+
+def healthy(seed):
+    env = Solid(0.0, 1.0, 1.0)
+    rows = [env.reset(seed=seed)[1]["stream"]]
+    return np.stack(rows + [env.step(np.zeros(2))[4]["stream"] for _ in range(150)])
+
+
+@pytest.mark.parametrize(
+    ("family", "fault", "case"),
+    [
+        ("object", (20.0, 0.0, 0.0), "lasting contact"),
+        ("object", (20.0, 0.0, 1.0), "object"),
+        ("object", (20.0, 1.0, 0.0), "object"),
+        ("object", (0.0, 0.0, 0.0), "object"),
+        ("joint", (20.0, 0.0, 1.0), "lasting actuator"),
+        ("joint", (20.0, 1.0, 0.0), "actuator"),
+    ],
+)
+def test_nobody_goes_on_against_what_blocks_the_arm(family, fault, case, monkeypatch):
+    monitor = Judge(range(60, 130, 5), family)
+    streams = [healthy(seed) for seed in range(8)]
+    monitor.spec = SOLID
+    monitor.diagnosis_ = Diagnosis(Completion.fit(StreamScaler.fit(SOLID, streams), streams), Named(family))
+    joint = next(h for h in monitor.diagnosis_.hypotheses if h.part == "joint[1]")
+    monkeypatch.setattr(Diagnosis, "named", lambda *_: joint)
+    env = NeuralASMSafety(Solid(*fault), monitor, "graded", release_after=2)
+    env.reset(seed=99)
+    said = []
+    while len(said) < 125 and not (said and said[-1]["gave_up"]):
+        said.append(env.step(ACT)[4]["asm"])
+    first = next((t for t, s in enumerate(said) if s["case"] == case), None)
+    assert {s["case"] for s in said[60:80]} == {"", "actuator" if family == "joint" else family}  # not at once
+    assert first is not None
+    assert (first >= 60 + 25) == case.startswith("lasting")
+    assert any(s["intervened"] for s in said) or not case.startswith("lasting")
+    assert said[-1]["gave_up"] == (case == "lasting actuator")
+
+
+@pytest.mark.parametrize("family", ["joint", "object", "contact", "sensor", "command"])
+def test_what_presses_decides_whatever_the_cause_is_taken_for(family):
+    class Pressing(Acting):
+        @property
+        def felt(self):
+            return 1.2 if self.t == 10 else 0.1
+
+    env = NeuralASMSafety(Pressing(), Judge({9}, family), release_after=2)
+    said = infos(env, 12)
+    assert (said[9]["case"], said[9]["response"], said[9]["reason"]) == ("pressing", "hold", "contact")
+    assert said[9]["cause"]["family"] == {"joint": "actuator", "command": "action"}.get(family, family)
+    assert said[9]["severity"]["presses"]
+    assert [s["intervened"] for s in said[8:12]] == [False, False, True, True]
+
+
+def test_what_presses_is_an_alarm_though_nobody_is_surprised():
+    class Pressing(Acting):
+        @property
+        def felt(self):
+            return 1.2 if self.t == 10 else 0.1
+
+    for on_alarm in ("graded", "hold", "monitor", "terminate"):
+        env = NeuralASMSafety(Pressing(), Judge(()), on_alarm)
+        env.reset(seed=0)
+        outs = [env.step(ACT) for _ in range(10)]
+        said = outs[-1][4]
+        assert (said["asm"]["alarm"], said["asm"]["reason"], said["cost"]) == (True, "contact", 1.0)
+        assert said["asm"]["surprise"] < said["asm"]["threshold"]
+        assert outs[-1][2] == (on_alarm == "terminate")
+        assert said["asm"]["state"] == ("reflex" if on_alarm in ("graded", "hold") else "policy")
+
+
+def test_who_presses_for_the_third_time_is_ended_and_who_presses_for_long_is_too():
+    class Often(Acting):
+        @property
+        def felt(self):
+            return 1.2 if self.actions and np.array_equal(self.actions[-1], ACT) else 0.1
+
+    env = NeuralASMSafety(Often(), Judge(()), release_after=2)
+    env.reset(seed=0)
+    ends = []
+    while not ends or not ends[-1]:
+        ends.append(env.step(ACT)[2])
+    assert len(ends) == 1 + 2 * (2 + 1)  # pressed, held for two, and so again; the third ends it
+
+
+@pytest.mark.parametrize(
+    ("felt", "probability", "goes_on"), [(0.1, 0.9, True), (None, 0.9, False), (0.1, 0.45, False), (1.1, 0.9, False)]
+)
+def test_the_policy_goes_on_only_where_somebody_would_feel_and_the_cause_is_sure(felt, probability, goes_on):
+    monitor = Judge({10}, "object")
+    named = monitor.diagnosis_.readout
+    named.p = probability * (named.p == named.p.max()) + (1 - probability) * (named.p != named.p.max()) / (
+        len(named.p) - 1
+    )
+    inner = Acting()
+    inner.felt = felt
+    said = infos(NeuralASMSafety(inner, monitor, "graded"), 13)
+    assert (said[10]["transition"] == "go on") == goes_on
+    assert said[11]["intervened"] != goes_on
+
+
+@pytest.mark.parametrize(("force", "goes_on"), [(39.0, True), (41.0, False)])
+def test_the_policy_goes_on_in_alarm_only_while_it_presses_no_harder_than_free_motion(force, goes_on):
+    monitor = Judge({10}, "object")
+    responder = Responder(Acting(), monitor, DEFAULT, repairs=True)
+    for _ in range(3):
+        responder.read(np.zeros(SPEC.size, np.float32))
+    said = responder.respond(True, False, np.full(SPEC.size, 1.0 / SPEC.size), Severity(load=0.5, force=force))
+    assert said.name == ("go on" if goes_on else "hold")
+
+
+def test_the_policy_goes_on_for_a_bounded_time_and_is_held_then():
+    env = NeuralASMSafety(Acting(), Judge(range(2, 150), "object"), "graded")
+    env.reset(seed=0)
+    said = []
+    while len(said) < 119 and not (said and said[-1]["gave_up"]):
+        said.append(env.step(ACT)[4]["asm"])
+    assert [s["transition"] for s in said[2:102]] == ["go on"] * 100  # five seconds
+    assert said[102]["transition"] == "override"
+
+
+@pytest.mark.parametrize("response", ["go on", "complete"])
+@pytest.mark.parametrize("cause", ["pressing", "lasting pressing"])
+def test_a_table_that_lets_a_pressing_arm_go_on_is_refused(cause, response):
+    with pytest.raises(ValueError, match=f"'{response}' would let an arm go on that presses: {cause} takes hold"):
+        NeuralASMSafety(Acting(), Judge(()), responses={cause: response})
+
+
+def held_by_a_contact():
+    env = FakeEnv()
+    arbiter = Arbiter(Graded(env), 1.0, ReleaseRule(10, try_after=10), make_fallback(env), env.action_space)
+    row, act = np.zeros(5), np.ones(3, np.float32)
+    assert arbiter.decide(Sensed(2.0, row, act, response="hold")).transition == "override"
+    return lambda surprise, **kw: arbiter.decide(Sensed(surprise, row, act, **kw)).transition
+
+
+def test_control_goes_back_once_nothing_presses_though_surprise_is_not_quiet_and_later_each_time_it_was_too_early():
+    decide = held_by_a_contact()
+    assert [decide(0.9, touched=False) for _ in range(5)] == [*[""] * 4, "release"]
+    assert decide(2.0, response="hold") == "override"
+    assert [decide(0.9, touched=False) for _ in range(10)] == [*[""] * 9, "release"]
+
+
+def test_control_does_not_go_back_while_something_presses_though_surprise_is_quiet():
+    decide = held_by_a_contact()
+    assert {decide(0.0, touched=True) for _ in range(30)} == {""}
+    assert "release" in [decide(0.0, touched=None) for _ in range(1)]
+
+
+def test_the_force_of_a_push_is_found_where_it_pushes():
+    mujoco = needs("mujoco")
+    env = gym.make("asm_gym/Lift-v0", horizon=20)
+    env.reset(seed=0)
+    inner = env.unwrapped
+    model, data = inner.simulation.model, inner.simulation.data
+    body, force = model.body("robot0_link5").id, np.array([3.0, -8.0, 5.0])
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
+    link, found = inner.force_behind(jacobian[:, inner.simulation._dofs].T @ force)
+    assert link == "robot0_link5"
+    np.testing.assert_allclose(found, force, atol=0.5)
+    env.close()
