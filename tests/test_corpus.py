@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from dataclasses import replace
 
@@ -15,6 +16,8 @@ from asm_gym.rollouts.parallel import THIS_PROCESS
 from asm_gym.rollouts.run_folder import unread
 from asm_gym.scripts.corpus import contents
 from asm_gym.scripts.evaluate import main as evaluate
+from asm_gym.scripts.reproduce import main as reproduce
+from asm_gym.scripts.reproduce import parts as parts_study
 from tests.streams import sine_episodes
 
 SOURCES = (Source("Lift", fit=2, calibration=1, nominal=4), Source("Stack", "stack_sac", nominal=2))
@@ -88,7 +91,9 @@ def test_one_bit_is_enough_to_be_refused(recorded):
         corpus.episodes()[3]
 
 
-def test_monitors_are_judged_by_it_and_have_cards(tmp_path, monkeypatch):
+@pytest.fixture
+def pushed(tmp_path, monkeypatch):
+    """A corpus of sines, in some of which a push is plain to see."""
     entries = wanted(Source("Lift", fit=6, calibration=24, nominal=8), 0, 1)
     seeds = [e.label.seed for e in entries if e.label.role == "nominal"][:4]
     entries += [Entry("scripted", EpisodeLabel("Lift", "faulty", "push", "strong", s, 20)) for s in seeds]
@@ -103,7 +108,23 @@ def test_monitors_are_judged_by_it_and_have_cards(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "record", record)
     monkeypatch.setattr(module, "wanted", lambda *_: entries)
     record_corpus(tmp_path / "corpus", SOURCES[:1], 0, 1, THIS_PROCESS, lambda done, total: None)
-    asked = ["--corpus", str(tmp_path / "corpus"), "--monitors", "kalman+evidence", "window_pca", "--workers", "1"]
+    return tmp_path / "corpus"
+
+
+def test_parts_of_the_memory_are_judged_by_it(pushed, tmp_path):
+    asked = ["--corpus", str(pushed), "--ways", "learned traces", "local traces", "linear", "--seeds", "2", "--quick"]
+    assert reproduce(["parts", *asked, "--workers", "1", "--out", str(tmp_path / "out")]) == 0
+    rows = list(csv.DictReader((tmp_path / "out/parts.csv").open()))
+    alone = ["temporal network alone", "association alone", "all, one precision everywhere"]
+    parts = ["all", *alone, "association alone, one precision everywhere", "all, local", "no hidden units"]
+    assert [(r["part"], r["seed"]) for r in rows] == [(part, seed) for seed in "01" for part in parts]
+    assert all(float(r["auroc"]) > 0.9 for r in rows)  # a push of three metres is plain to every part
+    with pytest.raises(ValueError, match="learned traces, transported traces"):
+        parts_study.Config(corpus=pushed, ways=("none",))
+
+
+def test_monitors_are_judged_by_it_and_have_cards(pushed, tmp_path):
+    asked = ["--corpus", str(pushed), "--monitors", "kalman+evidence", "window_pca", "--workers", "1"]
     assert evaluate([*asked, "--false-alarm-rate", "0.05", "--out", str(tmp_path / "out")]) == 0
     card = json.loads((tmp_path / "out/cards/kalman+evidence.json").read_text())
     assert (card["faults"], card["nominal"], card["auroc"][0], card["aucpdt"]) == (4, 8, 1.0, 0.0)
@@ -111,7 +132,7 @@ def test_monitors_are_judged_by_it_and_have_cards(tmp_path, monkeypatch):
     text = (tmp_path / "out/results.md").read_text()
     assert "within chance" in text
     assert "| kalman+evidence, in calibration | 0 of 24 |" in text
-    assert not (tmp_path / "corpus/scripted/monitors").exists()
+    assert not (pushed / "scripted/monitors").exists()
 
 
 @pytest.mark.parametrize(

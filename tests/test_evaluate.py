@@ -237,24 +237,6 @@ def test_a_learning_curve_learns_from_few_of_the_many(run, tmp_path):
     assert [e.labelled.seed for e in first] != [e.labelled.seed for e in second]
 
 
-def test_association_is_taught_in_every_way_that_is_asked_for_and_judged_alike(run, tmp_path):
-    from asm_gym.scripts.reproduce import feedback
-
-    asked = ["--run", str(run), "--ways", "transported", "random", "linear", "--kinds", "test", "--seeds", "2"]
-    assert (
-        cli(["reproduce", "feedback", *asked, "--false-alarm-rate", "0.05", "--workers", "1", "--out", str(tmp_path)])
-        == 0
-    )
-    rows = list(csv.DictReader((tmp_path / "feedback.csv").open()))
-    ways = ["transported", "random", "linear"]
-    assert [(r["way"], r["seed"]) for r in rows] == [(way, seed) for seed in "01" for way in ways]
-    assert all(0 <= float(r[key]) <= 1 for r in rows for key in ("auroc", "found"))
-    facts = json.loads((tmp_path / "feedback.json").read_text())
-    assert set(facts["kinds"]) == {"frozen_encoder", "gripper_opens"}  # a push is there to develop on
-    with pytest.raises(ValueError, match="transported, learned"):
-        feedback.Config(run=run, ways=("none",))
-
-
 def _labelled():
     """Two episodes of one task, and three of another."""
     spec = StreamSpec((Channel("a", 1),), 0.05)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asm_gym.memory.association import association_change, complete, hidden_units, learn_association
+from asm_gym.checkpoint import read_checkpoint
+from asm_gym.memory.association import association_change, complete, hidden_units, learn_association, synapses
 from asm_gym.memory.feedback import FEEDBACK, Learned, Random, Settled
+from asm_gym.memory.linear import learn_by_delta, learn_linear
 from asm_gym.monitors import NeuralASM
 from tests.problems import some_association
 from tests.streams import sine_episodes
@@ -44,6 +46,19 @@ def test_hidden_units_learn_what_no_line_can_and_best_by_errors_that_know_the_we
     assert left < (0.62 if way == "random" else 0.45)
 
 
+def test_the_delta_rule_comes_to_the_closed_form():
+    rng = np.random.default_rng(2)
+    a = np.hstack([rng.normal(size=(4000, 6)) @ rng.normal(size=(6, 6)), np.ones((4000, 1))]).astype(np.float32)
+    groups, changes = np.array([0, 0, 1]), slice(0, 3)
+    exists = synapses(groups, changes, 7, 1).D
+    exact, local = learn_linear(a, groups, changes), learn_by_delta(a, changes, exists, rng)
+    left = [np.std(a[:, changes] - a @ D.T, axis=0) for D in (local, exact)]
+    assert (left[0] < 1.02 * left[1]).all()
+    assert not local[exists == 0].any()
+    by = FEEDBACK["local"]().linear(a, groups, changes, exists, np.random.default_rng(5))
+    np.testing.assert_array_equal(by, learn_by_delta(a, changes, exists, np.random.default_rng(5)))
+
+
 def test_what_is_given_nothing_else_is_taught_by_the_transposed_weights():
     for one, other in zip(left_by(None)[0], left_by(FEEDBACK["transported"]())[0], strict=True):
         np.testing.assert_array_equal(one, other)
@@ -51,13 +66,17 @@ def test_what_is_given_nothing_else_is_taught_by_the_transposed_weights():
 
 def test_a_memory_remembers_how_it_was_taught(tmp_path):
     episodes = sine_episodes(16)
-    taught = NeuralASM(episodes[0].spec, hidden_size=8, association_size=16, epochs=1, feedback="learned").fit(episodes)
-    plain = NeuralASM(episodes[0].spec, hidden_size=8, association_size=16, epochs=1).fit(episodes)
+    taught = NeuralASM(episodes[0].spec, hidden_size=8, association_size=16, epochs=1).fit(episodes)
+    how = {"hidden_size": 8, "association_size": 16, "epochs": 1, "feedback": "transported"}
+    plain = NeuralASM(episodes[0].spec, **how).fit(episodes)
     assert not np.array_equal(taught.learned_["V"], plain.learned_["V"])
     taught.save(tmp_path / "taught.asm")
     again = NeuralASM.load(tmp_path / "taught.asm")
     assert again.feedback == again.model.feedback == "learned"
     np.testing.assert_array_equal(again.score(episodes[0]).value, taught.score(episodes[0]).value)
+    before = read_checkpoint(tmp_path / "taught.asm", NeuralASM.kind)
+    del before.header["hyperparameters"]["feedback"]  # as of one saved before there was a choice
+    assert NeuralASM(episodes[0].spec, hidden_size=8, association_size=16).restore(before).feedback == "transported"
     with pytest.raises(ValueError, match="transported, learned"):
         NeuralASM(episodes[0].spec, feedback="none")
 

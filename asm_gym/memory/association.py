@@ -115,7 +115,13 @@ def existing(association: Association) -> Change:
 
 
 class Feedback:
-    """How the hidden units learn what they did wrong: here by the transposed weights."""
+    """How the hidden units learn what they did wrong: here by the transposed weights; and the linear part."""
+
+    def linear(
+        self, a: Array, groups: NDArray[np.intp], changes: slice, exists: Array, rng: np.random.Generator
+    ) -> Array:
+        """D (X, I) from many rows (N, I): in closed form; ``exists`` is 1 where it has a synapse."""
+        return learn_linear(a, groups, changes)
 
     def begin(self, exists: Array, rng: np.random.Generator) -> None:
         """Before the first batch; ``exists`` is 1 where U (X, M) has a synapse."""
@@ -230,10 +236,10 @@ def learn_association(
         feedback: how errors come back to the hidden units; by the transposed weights where None.
         lengths: how many rows each episode has; where none are told, thirds are of rows that follow each other.
     """
-    few = len(a) < ROWS_PER_INPUT * a.shape[1]
-    D = learn_from_past(a, changes) if few else learn_linear(a, groups, changes)
-    remainder = np.maximum(np.sqrt(np.mean((delta - a @ D.T) ** 2, axis=0)), SMALLEST_SPREAD)  # (X,)
+    few, feedback = len(a) < ROWS_PER_INPUT * a.shape[1], feedback or Feedback()
     exists = synapses(groups, changes, a.shape[1], size)
+    D = learn_from_past(a, changes) if few else feedback.linear(a, groups, changes, exists.D, rng)
+    remainder = np.maximum(np.sqrt(np.mean((delta - a @ D.T) ** 2, axis=0)), SMALLEST_SPREAD)  # (X,)
     if few:
         for _ in range(ALL_TICKS):
             tick()
@@ -241,7 +247,7 @@ def learn_association(
     left = (delta - a @ D.T) / remainder
 
     def learned(rows: NDArray[np.bool_] | slice) -> tuple[Array, Array]:
-        return _learn_hidden(a[rows], left[rows], exists, rng, tick, updates, passes, feedback or Feedback())
+        return _learn_hidden(a[rows], left[rows], exists, rng, tick, updates, passes, feedback)
 
     def expect(learned_from: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Array:
         V, U = learned(learned_from)

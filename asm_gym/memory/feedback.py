@@ -4,6 +4,7 @@
     transported     ε_h = f'(h_t) ⊙ Uᵀ ε_t                                               the gradient
     random          ε_h = f'(h_t) ⊙ Bᵀ ε_t                     B is drawn once and stays
     learned         ε_h = f'(h_t) ⊙ Bᵀ ε_t                     ΔB = ΔU, and both decay: so B comes to U
+    local           as learned, and ΔD ∝ (Δ_t - D a_t) a_tᵀ    the delta rule, where D has a closed form else
     settled         ε_h = Π_h (h* - V a_t)                     h* = argmin ½ Π_h ‖h - V a_t‖² + Σ σ ρ((r_t - U f(h))/σ)
 
 ΔB is the product of what its own two ends hold, as ΔU is, so that with learned feedback every change of V, U and B is
@@ -18,10 +19,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from asm_gym.memory.association import Change, Feedback
 from asm_gym.memory.energy import Array, activate, outward
 from asm_gym.memory.learning import Synapse, coincidence, power_iteration
+from asm_gym.memory.linear import learn_by_delta
 
 FAINTNESS = 0.1
 """Gain of the weights that errors come back by, before anything is learned; U begins at 0."""
@@ -62,6 +65,15 @@ class Learned(Random):
             W *= np.float32(1.0 - DECAY * rate)
 
 
+class Local(Learned):
+    """All of association by local rules: the linear part by the delta rule, in place of the inverse."""
+
+    def linear(
+        self, a: Array, groups: NDArray[np.intp], changes: slice, exists: Array, rng: np.random.Generator
+    ) -> Array:
+        return learn_by_delta(a, changes, exists, rng)
+
+
 class Settled(Feedback):
     """The units settle where the energy is least, and learn to be there at once.
 
@@ -97,10 +109,11 @@ class Settled(Feedback):
         return Change(coincidence(pushed, a), coincidence(pulled, f), np.zeros_like(D)), error
 
 
-TRANSPORTED = "transported"
+TRANSPORTED, LEARNED = "transported", "learned"
 FEEDBACK: dict[str, Callable[[], Feedback]] = {
     TRANSPORTED: Feedback,
-    "learned": Learned,
+    LEARNED: Learned,
+    "local": Local,
     "random": Random,
     "settled": lambda: Settled(Feedback()),
     "settled_learned": lambda: Settled(Learned()),

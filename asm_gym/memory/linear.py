@@ -5,7 +5,7 @@
 
 One inverse serves every group: D_g is the ridge regression of group g on everything else. λ is chosen for each sense by
 the error that it leaves in rows that C has not seen, and D then follows from all rows. From few rows it is given, and
-D reads the past and the command alone.
+D reads the past and the command alone. ``learn_by_delta`` comes to D by local steps, as far as their number allows.
 
 Sources: Besag 1975 (parts given the rest) and Lauritzen 1996 for conditionals of a Gaussian; Hoerl and Kennard 1970 for
 ridge regression.
@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array
+from asm_gym.memory.energy import Array, outward
+from asm_gym.memory.learning import Synapse, coincidence, cosine_decay, shuffled
 
 Floats = NDArray[np.float64]
 
@@ -33,6 +34,9 @@ MOST_INPUTS = 8192
 
 FEW_PENALTY = 1e-4
 """λ where rows are too few to choose it by: the last of them may all be of one skill, and then ask for far too much."""
+
+DELTA_RATE, DELTA_BATCH, DELTA_PASSES = 3e-3, 256, 200
+"""Of the delta rule: the largest change of a synapse in a step, rows of a step, passes over all rows."""
 
 HELD_OUT = 5
 """One in so many rows, the last ones, shows what was learned from the others is worth."""
@@ -108,3 +112,19 @@ def learn_from_past(a: Array, changes: slice) -> NDArray[np.float32]:
 def tried_on(a: Array) -> Array:
     """The last rows, which what was learned from the others is tried on; all, where there are fewer than five."""
     return a[len(a) - len(a) // HELD_OUT :] if len(a) >= HELD_OUT else a
+
+
+def learn_by_delta(a: Array, changes: slice, exists: Array, rng: np.random.Generator) -> NDArray[np.float32]:
+    """D (X, I) from N rows (N, I) in random order, each synapse by what its own two ends do (Widrow and Hoff 1960).
+
+    Args:
+        changes: where what is to be predicted stands among the inputs.
+        exists: (X, I) 1 where there is a synapse.
+    """
+    D = np.zeros(exists.shape, np.float32)
+    synapse, updates = Synapse(D), DELTA_PASSES * len(a) // DELTA_BATCH
+    for n, rows in zip(range(updates), shuffled(len(a), DELTA_BATCH, rng), strict=False):
+        seen = a[rows]
+        error = np.ascontiguousarray(seen[:, changes]) - outward(seen, D)
+        synapse.learn(coincidence(error, seen) * exists, cosine_decay(DELTA_RATE, n / updates))
+    return D

@@ -17,7 +17,7 @@ from asm_gym.episode import Episode
 from asm_gym.memory.association import Association, association_shapes, existing, hidden_units
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of
-from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
+from asm_gym.memory.feedback import FEEDBACK, LEARNED
 from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs
@@ -63,7 +63,7 @@ class MemoryModel(StreamModel):
         hidden_size: int,
         association_size: int,
         schedule: Schedule,
-        feedback: str = TRANSPORTED,
+        feedback: str = LEARNED,
         dynamics: str = TRACES,
     ) -> None:
         super().__init__(spec)

@@ -19,7 +19,7 @@ from asm_gym.detection.detector import BOUND, GAINS
 from asm_gym.detection.events import Excuses
 from asm_gym.episode import Episode
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of
-from asm_gym.memory.feedback import FEEDBACK, TRANSPORTED
+from asm_gym.memory.feedback import FEEDBACK, LEARNED, TRANSPORTED
 from asm_gym.memory.inference import iterations_within
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
@@ -117,7 +117,7 @@ class NeuralASM(CalibratedMonitor):
         shrinkage: float = 1e-3,
         habituates: bool = True,
         seed: int = 0,
-        feedback: str = TRANSPORTED,
+        feedback: str = LEARNED,
         dynamics: str = TRACES,
         excuses: bool = False,
     ) -> None:
@@ -273,6 +273,8 @@ class NeuralASM(CalibratedMonitor):
         own, skill = apart(saved._replace(arrays=unpacked(saved.arrays)))
         if "dynamics" not in saved.header["hyperparameters"]:  # saved before there was a choice
             self.dynamics = self.model.dynamics = dynamics_of(saved.header["shapes"])
+        if "feedback" not in saved.header["hyperparameters"]:
+            self.feedback = self.model.feedback = TRANSPORTED
         super().restore(own)
         self.skill_ = SkillSurprise.found(self.spec, skill, self.seed) if skill else None
         if self.alarm_on != "body" and self.skill_ is None:

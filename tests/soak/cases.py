@@ -62,7 +62,7 @@ TOKENS = ("", "0", "-1", "1e9", "nan", "inf", "None", "True", "..", "/dev/null",
 LINES = (
     *("collect Lift --episodes 3 --seed 0 --out o", "evaluate --tasks Lift --false-alarm-rate 0.05 --window 1 --out o"),
     *("train Lift --seed 0 --out o", "fit good.csv --out m.asm --seed 0", "watch good.csv --monitor good.asm"),
-    *("demo --quick --seed 0", "doctor", "reproduce laws", "reproduce harm --tasks Lift", "reproduce feedback"),
+    *("demo --quick --seed 0", "doctor", "reproduce laws", "reproduce harm --tasks Lift", "reproduce parts"),
     *("benchmark env --steps 5", "benchmark experts --tasks Lift --episodes 1", "reproduce harm --seed 1"),
 )
 
