@@ -110,7 +110,7 @@ def test_monitors_are_judged_by_it_and_have_cards(tmp_path, monkeypatch):
     assert card["found"]["0.05"] == [1.0, 1.0, 1.0]
     text = (tmp_path / "out/results.md").read_text()
     assert "within chance" in text
-    assert "| kalman+evidence, in calibration | 0 of 24 |" in text
+    assert "|  | in calibration | 0 of 24 |" in text
     assert not (tmp_path / "corpus/scripted/monitors").exists()
 
 
