@@ -15,6 +15,7 @@ from rich.console import Console
 from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
 from asm_gym.data.live import Row, RowReader, SourceDied
 from asm_gym.data.resampling import ClockWentBack
+from asm_gym.detection.events import KNOCK, NO_EVENT, STOP
 from asm_gym.scripts.command import BAD_NEWS, DONE
 from asm_gym.spec import StreamSpec
 
@@ -80,6 +81,7 @@ class _Watch:
         self.state = self.monitor.initial_state(1)
         self.bridge = Bridge(self.seconds, self.spec.dt, self.spec.size)
         self.above = self.late = False
+        self.event = NO_EVENT
 
     def alarm(self, what: str) -> None:
         """One more, said with when it was."""
@@ -142,7 +144,10 @@ class _Watch:
             late = f"{self.latencies[-1]:.2f} ms after the row came"
             because = "" if why == SURPRISING else f"  ({why})"
             self.alarm(f"{channel}{value / threshold:.2f} thresholds  {late}{because}")
-        self.above = value > threshold
+        event = NO_EVENT if value == 0.0 else surprise.event(threshold)
+        if event in (KNOCK, STOP) and event != self.event:
+            self.say(f"{self.rows * self.spec.dt:.3f} s  {event}: no alarm")
+        self.above, self.event = value > threshold, event
 
     def _lost(self, lost: int) -> None:
         """Rows that did not come: the memory runs on over as many as may be missing."""

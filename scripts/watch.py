@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import math
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +24,7 @@ from rich.console import Console
 from asm_gym.data.live import RETURNING, is_live, lines_from
 from asm_gym.data.logs import Log, LogLayout, read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, traces_of
+from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, traces_of
 from asm_gym.evaluation.scored_episode import ScoredEpisode, moments_of
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
@@ -87,16 +88,18 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     """Scores a recording, writes what came of it, and prints the alarms."""
     alarms: list[Alarm] = []
     worst: list[ScoredEpisode] = []
-    episodes = 0
+    episodes, excused = 0, Counter[str]()
     layout = LogLayout(monitor.spec, args.rate, columns=args.columns, join=args.join)
     with stage("watching", console, {}) as progress, noted() as notes:
         for group in in_groups(read_logs(args.source, layout), AT_ONCE):
             traces = traces_of(group, monitor, args.bridge)
             alarms += [alarm for trace in traces for alarm in alarms_of(trace)]
+            excused.update(event for trace in traces for event in Counter(excused_in(trace)).elements())
             worst = sorted([*worst, *traces], key=lambda trace: -float(trace.surprise.max()))[: args.figures]
             episodes += len(group)
             progress(episodes, episodes)
     said = f"{len(alarms)} alarm{'s' * (len(alarms) != 1)} in {len({a.log for a in alarms})} of {episodes} episodes"
+    said += "".join(f", {count} {event}{'s' * (count != 1)}" for event, count in excused.items())
     write_alarms(args.out / "alarms.csv", alarms)
     lacks = publish(args, said, alarms, worst)
     if args.rerun is not None:

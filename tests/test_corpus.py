@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from asm_gym.episode import EpisodeLabel, save_episode
+from asm_gym.monitors import MONITORS
 from asm_gym.rollouts import corpus as module
 from asm_gym.rollouts.corpus import MANIFEST, PARTS, ROUNDS, VERSION, Corpus, Entry, Source, record_corpus, wanted
 from asm_gym.rollouts.parallel import THIS_PROCESS
@@ -19,6 +22,7 @@ from asm_gym.scripts.evaluate import main as evaluate
 from asm_gym.scripts.reproduce import main as reproduce
 from asm_gym.scripts.reproduce import parts as parts_study
 from tests.streams import sine_episodes
+from tests.test_composition import Persistence
 
 SOURCES = (Source("Lift", fit=2, calibration=1, nominal=4), Source("Stack", "stack_sac", nominal=2))
 
@@ -56,8 +60,9 @@ def test_it_has_what_was_asked_for():
     assert sum(count * horizons.get(s.task, 15.0) for s, count in each) / 3600 >= 20
 
 
-def test_what_is_there_is_not_recorded_again(recorded):
+def test_what_is_there_is_not_recorded_again(recorded, monkeypatch):
     folder, made = recorded
+    monkeypatch.setattr("time.localtime", lambda *_: (2031, 5, 17, 12, 0, 0, 0, 1, 0))  # another day, the same bytes
     assert len(made) == len(set(made)) == 9
     lost = folder / Corpus.open(folder).entries[0].path
     lost.unlink()
@@ -123,16 +128,42 @@ def test_parts_of_the_memory_are_judged_by_it(pushed, tmp_path):
         parts_study.Config(corpus=pushed, ways=("none",))
 
 
-def test_monitors_are_judged_by_it_and_have_cards(pushed, tmp_path):
-    asked = ["--corpus", str(pushed), "--monitors", "kalman+evidence", "window_pca", "--workers", "1"]
-    assert evaluate([*asked, "--false-alarm-rate", "0.05", "--out", str(tmp_path / "out")]) == 0
+@pytest.fixture
+def asked(pushed, tmp_path):
+    """How it is judged, without the monitors."""
+    common = ["--workers", "1", "--false-alarm-rate", "0.05", "--out", str(tmp_path / "out")]
+    return ["--corpus", str(pushed), *common]
+
+
+class Peeking(Persistence):
+    """Learns from what it should be judged on."""
+
+    kind = "peeking"
+
+    def fit(self, readings, rng, progress):
+        for path in Path(os.environ["PEEKED_AT"]).rglob("*.npz"):
+            np.load(path).close()
+        return super().fit(readings, rng, progress)
+
+
+def test_a_monitor_that_reads_the_recordings_by_itself_is_refused_in_a_line(asked, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PEEKED_AT", str(tmp_path / "corpus"))
+    monkeypatch.setattr("asm_gym.monitors.registry.MONITORS", dict(MONITORS))
+    assert evaluate([*asked, "--monitors", "tests.test_corpus:Peeking"]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "a monitor opened" in said
+    assert "it may learn from what fit and calibrate are given alone" in said
+
+
+def test_monitors_are_judged_by_it_and_have_cards(asked, tmp_path):
+    assert evaluate([*asked, "--monitors", "kalman+evidence", "window_pca"]) == 0
     card = json.loads((tmp_path / "out/cards/kalman+evidence.json").read_text())
     assert (card["faults"], card["nominal"], card["auroc"][0], card["aucpdt"]) == (4, 8, 1.0, 0.0)
     assert card["found"]["0.05"] == [1.0, 1.0, 1.0]
     text = (tmp_path / "out/results.md").read_text()
     assert "within chance" in text
-    assert "| kalman+evidence, in calibration | 0 of 24 |" in text
-    assert not (pushed / "scripted/monitors").exists()
+    assert "|  | in calibration | 0 of 24 |" in text
+    assert not (tmp_path / "corpus/scripted/monitors").exists()
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import socket
@@ -16,6 +17,9 @@ import pytest
 from rich.console import Console
 
 from asm_gym.data.live import RowReader, SourceDied, is_live, lines_from
+from asm_gym.detection.events import EVENTS, KNOCK
+from asm_gym.evaluation.alarms import excused_in
+from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.watch import follow
@@ -174,6 +178,25 @@ def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
     assert code == 1
     assert "0.260 s  2 rows lost: an alarm" in said
     assert said.splitlines()[-1].startswith("30 rows, ")
+
+
+def test_a_knock_that_excuses_surprise_is_said_once_and_is_no_alarm(monitor, monkeypatch):
+    asm, episode = monitor
+    observe, count = asm.observe, itertools.count()
+
+    def knocked(state, rows):
+        state, surprise = observe(state, rows)
+        felt = 5 <= next(count) - 1 < 9  # the first call compiles
+        kind = np.array([EVENTS.index(KNOCK) * felt], np.int8)
+        return state, surprise._replace(raw=surprise.value + 2 * asm.threshold * felt, excuse=kind)
+
+    monkeypatch.setattr(asm, "observe", knocked)
+    code, said = watched(csv_lines(rows=episode(501).stream[:30]), asm)
+    assert code == 0
+    assert said.count("knock") == 1
+    assert "0.120 s  knock: no alarm" in said
+    trace = ScoredEpisode("log", 0, 0.1, 1.0, np.zeros(6), excused={KNOCK: np.array([0, 2, 2, 0, 2, 0.5])})
+    assert excused_in(trace) == {KNOCK: 2}
 
 
 def test_rows_are_watched_in_constant_memory(monitor, monkeypatch):

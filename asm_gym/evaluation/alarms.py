@@ -9,6 +9,7 @@ import numpy as np
 
 from asm_gym.data.gaps import blamed, bridged, reason
 from asm_gym.data.logs import Log
+from asm_gym.episode import spans
 from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail, moments_of
 from asm_gym.spec import StreamSpec
 
@@ -64,5 +65,11 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
         shares = np.where(over[:, None], 0.0, surprise.attribution)
         value = np.where(over, 0.0, surprise.value)
         detail = TraceDetail(shares, spec.labels, fault, episode.stream)
-        traces.append(ScoredEpisode(name, 0, spec.dt, monitor.threshold, value, detail=detail))
+        excused = {event: np.where(over, 0.0, raw) for event, raw in surprise.excused_by_event.items()}
+        traces.append(ScoredEpisode(name, 0, spec.dt, monitor.threshold, value, excused=excused, detail=detail))
     return traces
+
+
+def excused_in(trace: ScoredEpisode) -> dict[str, int]:
+    """How often a knock, and a stop, was all that kept surprise from being an alarm."""
+    return {e: len(spans((raw > trace.threshold) & ~trace.alarm)) for e, raw in trace.excused.items()}

@@ -7,11 +7,16 @@ from typing import Any
 
 import numpy as np
 
+from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.evaluation.comparison import BenchmarkResult
-from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, hourly_alarms
+from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
+from asm_gym.evaluation.metrics import DetectionMetrics, detected, false_alarms, hourly_alarms
 from asm_gym.evaluation.resampling import Draws, interval
-from asm_gym.evaluation.statistics import Estimate, Floats, Rate, Share
-from asm_gym.evaluation.tables import Table, count
+from asm_gym.evaluation.statistics import Estimate, Floats, Rate, Share, chance_of_alarms
+from asm_gym.evaluation.tables import Table, count, percent
+
+UNLIKELY = 0.025
+"""Of a promise that is kept, the chance to be called broken."""
 
 AHEAD, BEHIND, CHANCE = "ahead", "behind", "within chance"
 
@@ -59,7 +64,9 @@ def kept_table(result: BenchmarkResult) -> Table:
     rows = []
     for m in every:
         shares = [
-            kept_share(false_alarms([t.at(m.thresholds[r]) for t in m.nominal]), r) if r in m.thresholds else ""
+            kept_share(false_alarms([t.at(m.thresholds[r]) for t in m.nominal]), m.maxima, m.thresholds[r])
+            if r in m.thresholds
+            else ""
             for r in rates
         ]
         each = [
@@ -69,17 +76,25 @@ def kept_table(result: BenchmarkResult) -> Table:
     hours = sum(len(t) * t.dt for t in every[0].nominal) / 3600
     return Table(
         f"False alarms in {len(every[0].nominal)} nominal test episodes of {hours:.2f} hours, by what was promised; 95 "
-        "% intervals (Wilson, Poisson) of these episodes alone. Broken: the interval lies above what was promised.",
+        "% intervals (Wilson, Poisson) of these episodes alone. Broken: one calibration in 40 comes to so many by "
+        "chance (beta-binomial); by the hour, the interval lies above what was promised.",
         ("Monitor", *(f"promised {100 * r:g} %" for r in rates), *(f"{r:g} an hour" for r in hourly)),
         rows,
     )
 
 
-def kept_share(share: Share, promised: float) -> str:
-    """Such as ``1.2 % (0.8 to 1.8)``, and whether the promise is broken."""
+def kept_share(share: Share, maxima: Floats, threshold: float) -> str:
+    """Such as ``1.2 % (0.8 to 1.8)``, and whether it broke what a threshold promised that these maxima have set."""
     low, high = share.interval
-    broken = ", broken" if low > promised else ""
+    broken = ", broken" if _unlikely(share, Share.of(list(maxima > threshold))) else ""
     return f"{100 * share.value:.1f} % ({100 * low:.1f} to {100 * high:.1f}){broken}"
+
+
+def _unlikely(tested: Share, calibrated: Share, looks: int = 1) -> bool:
+    """Whether so many alarms come of the same law as those in calibration in less than one of 40 looks."""
+    if not tested.n or not calibrated.k < calibrated.n:
+        return False
+    return chance_of_alarms(*tested, *calibrated) < UNLIKELY / looks
 
 
 def kept_rate(rate: Rate, promised: float) -> str:
@@ -88,25 +103,37 @@ def kept_rate(rate: Rate, promised: float) -> str:
 
 
 def coverage_table(result: BenchmarkResult) -> Table:
-    """Nominal test episodes in alarm, task by task, for each monitor at the run's own rate."""
-    every = result.on_all
-    tasks = list(dict.fromkeys(t.task for t in every[0].nominal))
+    """Nominal test episodes in alarm, task by task, for each monitor: promised to all of them, and to each."""
+    tasks = list(dict.fromkeys(t.task for t in result.on_all[0].nominal))
     rows = []
-    for m in every:
-        shares = [false_alarms([t for t in m.nominal if t.task == task]) for task in tasks]
-        broken = (", broken" if s.interval[0] > result.rate else "" for s in shares)
-        rows.append((m.name, *(f"{count(s)}{b}" for s, b in zip(shares, broken, strict=True))))
-        if m.name in result.monitors and (known := result.monitors[m.name].calibration_tasks):
-            over = np.asarray(m.maxima) > m.thresholds[result.rate]
-            own = (Share.of([bool(o) for o, t in zip(over, known, strict=True) if t == task]) for task in tasks)
-            rows.append((f"{m.name}, in calibration", *map(count, own)))
+    for m in result.on_visible:
+        threshold = m.thresholds[result.rate]
+        tested = _by_task(m, tasks, threshold)
+        known = result.monitors[m.name].calibration_tasks
+        own = [m.maxima[[k for k, t in enumerate(known) if t == task]] for task in tasks]
+        set_on = [Share.of(list(maxima > threshold)) for maxima in own]
+        more = [
+            ", more than in calibration" * _unlikely(*pair, len(tasks)) for pair in zip(tested, set_on, strict=True)
+        ]
+        rows.append((m.name, f"{100 * result.rate:g} % of all", *map(str.__add__, map(count, tested), more)))
+        if known:
+            rows.append(("", "in calibration", *map(count, set_on)))
+        if min(map(len, own)) >= conformal_episodes(FALSE_ALARM_RATE):
+            each = max(conformal_threshold(maxima, FALSE_ALARM_RATE) for maxima in own)
+            found = percent(detected([t.at(each) for t in m.faulty], m.window_s))
+            promise = f"{100 * FALSE_ALARM_RATE:g} % of each, finds {found}"
+            rows.append(("", promise, *map(count, _by_task(m, tasks, each))))
     return Table(
-        f"Nominal test episodes in alarm at the threshold for {100 * result.rate:g} % of all, task by task, and of "
-        "those that it was set on. Broken: the 95 % interval lies above what was promised; a threshold for all tasks "
-        "promises nothing of one.",
-        ("Monitor", *tasks),
+        "Nominal test episodes in alarm, task by task, by what the threshold promises. One for all of them promises "
+        "nothing of one; the greatest that a task needs promises it of each. More than in calibration: of the same law "
+        "one table of 40 has such a cell.",
+        ("Monitor", "promised", *tasks),
         rows,
     )
+
+
+def _by_task(metrics: DetectionMetrics, tasks: Sequence[str], threshold: float) -> list[Share]:
+    return [false_alarms([t.at(threshold) for t in metrics.nominal if t.task == task]) for task in tasks]
 
 
 def card(metrics: DetectionMetrics, draws: Draws | None = None) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammainccinv, gammaincinv
+from scipy.special import betaln, gammainccinv, gammaincinv
 
 from asm_gym.validation import check_number, shown
 
@@ -139,6 +139,17 @@ def poisson_interval(k: int, confidence: float = 0.95) -> tuple[float, float]:
     check_number("k", k, low=0, high=1e9, whole=True)
     tail = (1 - _check_confidence(confidence)) / 2
     return (float(gammaincinv(k, tail)) if k else 0.0), float(gammainccinv(k + 1, tail))
+
+
+def chance_of_alarms(k: int, n: int, beyond: int, calibrated: int) -> float:
+    """P of at least ``k`` alarms in ``n`` fresh episodes, if ``beyond`` of those ``calibrated`` on exceed a threshold.
+
+    Which share of fresh ones exceeds one of the maxima that it was set on is itself drawn, from Beta(beyond + 1,
+    calibrated - beyond): the count is beta-binomial. Takes continuous and exchangeable maxima, and nothing else.
+    """
+    check_number("beyond", beyond, low=0, high=calibrated - 1, whole=True)
+    a, b, j = beyond + 1, calibrated - beyond, np.arange(k, n + 1)
+    return float(np.exp(betaln(j + a, n - j + b) - betaln(a, b) - betaln(j + 1, n - j + 1) - math.log(n + 1)).sum())
 
 
 def auroc(scores_pos: ArrayLike, scores_neg: ArrayLike) -> float:

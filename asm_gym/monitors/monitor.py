@@ -174,6 +174,7 @@ class CalibratedMonitor(Calibrated):
         false_alarm_rate: float | None = None,
         *,
         false_alarms_per_hour: float | None = None,
+        each: Sequence[str] = (),
     ) -> Self:
         """Sets the threshold from nominal episodes that ``fit`` has not seen, for one of two promises.
 
@@ -185,6 +186,8 @@ class CalibratedMonitor(Calibrated):
             false_alarm_rate: P(any alarm in a nominal episode), at most; ``promise`` says how surely.
             false_alarms_per_hour: alarms in an hour of nominal episodes, at most, on average. One that persists, or
                 comes back within a minute of the same episode, is one alarm.
+            each: of each episode the task, or whose policy it is. Then the promise holds in each of them, by the
+                greatest threshold that one needs; without it, over all of them together, and of one nothing is said.
 
         Raises:
             ValueError: too few episodes or hours for this rate (the message says which they can promise), or bad ones;
@@ -194,10 +197,12 @@ class CalibratedMonitor(Calibrated):
         self._fitted()
         asked = Asked.of(false_alarm_rate, false_alarms_per_hour)  # refuses a bad rate before the work begins
         check_nominal(episodes, self.spec, self.model.shortest)
+        if each and len(each) != len(episodes):
+            raise ValueError(f"each must name one group an episode, got {len(each)} for {len(episodes)} episodes")
         if asked.per == HOUR:
             asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
             check_fresh(episodes, self._learned_from)
-        self._set_threshold(self.score_episodes(episodes), asked)
+        self._set_threshold(self.score_episodes(episodes), asked, each)
         streams = [episode.stream for episode in episodes]
         self.healthy_ = healthy_forces(streams, self.spec)
         self.familiar_ = FamiliarSpeed.learned(streams, self.spec)

@@ -286,8 +286,8 @@ class NeuralASM(CalibratedMonitor):
         self.skill_ = None  # it was weighed against the memory as it was
         super()._learn(episodes, progress, warm_start)
 
-    def _set_threshold(self, scores: Sequence[Surprise], asked: Asked) -> None:
-        super()._set_threshold(scores, asked)
+    def _set_threshold(self, scores: Sequence[Surprise], asked: Asked, each: Sequence[str]) -> None:
+        super()._set_threshold(scores, asked, each)
         if self.skill_ is not None:
             self.skill_ = self.skill_.heard(scores, self.spec.dt)
 

@@ -188,13 +188,7 @@ class Episodes(Sequence[Episode]):
     def __getitem__(self, index: int | slice) -> Episode | Episodes:
         if isinstance(index, slice):
             return Episodes(self.folder, self.entries[index])
-        entry = self.entries[index]
-        path = self.folder / entry.path
-        if digest(path) != entry.sha256:
-            raise ValueError(
-                f"{path} is damaged: its bytes are not those that the manifest knows; delete and record it"
-            )
-        return load_episode(path)
+        return load_episode(self._whole(self.entries[index]))
 
     def __iter__(self) -> Iterator[Episode]:
         return (self[k] for k in range(len(self)))

@@ -14,7 +14,7 @@ from asm_gym.faults import FrozenEncoder, Push
 from asm_gym.policies import make_policy, rollout
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety
 
-ONSET = 30
+ONSET, HORIZON = 30, 50
 CASES = {
     "healthy": [],
     "push of 10 N": [Push(body="robot0_right_hand", newtons=10.0, onset=ONSET, duration=10)],
@@ -23,17 +23,15 @@ CASES = {
 
 
 def main(robot: str) -> None:
-    for task in ("Lift", "Stack"):
-        for case, faults in CASES.items():
-            base = gym.make(f"asm_gym/{task}-v0", robot=robot, horizon=80)
-            env = NeuralASMSafety(FaultInjection(base, faults), on_alarm="monitor", on_overrun="ignore")
-            infos: list[Any] = []
-            rollout(env, make_policy("scripted", env, seed=2), 2, infos.append)
-            share = [info["asm"]["surprise"] / env.threshold for info in infos]
-            print(
-                f"{task}, {case}: {max(share[:ONSET]):.2f} of the threshold, {max(share[ONSET:]):.2f} from the onset on"
-            )
-            env.close()
+    for case, faults in CASES.items():
+        base = gym.make("asm_gym/Lift-v0", robot=robot, horizon=HORIZON)
+        env = NeuralASMSafety(FaultInjection(base, faults), on_alarm="monitor", on_overrun="ignore")
+        infos: list[Any] = []
+        rollout(env, make_policy("scripted", env, seed=2), 2, infos.append)
+        share = [info["asm"]["surprise"] / env.threshold for info in infos]
+        print(f"Lift, {case}: {max(share[:ONSET]):.2f} of the threshold, {max(share[ONSET:]):.2f} from the onset on")
+        env.close()
+
 
 
 if __name__ == "__main__":
