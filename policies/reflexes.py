@@ -29,6 +29,9 @@ __all__ = [
 USUAL_GAIN = 0.1
 """Weight of the newest step in the external torque that is taken to be usual."""
 
+FELT_AT_ONCE = 100
+"""Rows that are kept before they are reckoned with."""
+
 DELTAS = ("OSC_POSE", "JOINT_POSITION")
 """Controllers whose actions are changes, of pose or of joint angles."""
 
@@ -131,17 +134,27 @@ class Comply(Hold):
     def reset(self) -> None:
         self._usual = np.zeros(len(self._columns))
         self._torque = np.zeros(len(self._columns))
+        self._felt: list[tuple[NDArray[np.floating[Any]], bool]] = []  # (J,) each, and whether it acted
 
     def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
-        if not acting:
-            # What is carried weighs on the joints as well; only what has come since is yielded to.
-            self._usual += USUAL_GAIN * (self._torque - self._usual)
-        torque = np.asarray(row[self._columns], np.float64)
-        self._torque = torque if np.isfinite(torque).all() else np.nan_to_num(torque)
+        self._felt.append((row[self._columns], acting))
+        if len(self._felt) > FELT_AT_ONCE:
+            self._reckon()
+
+    def _reckon(self) -> None:
+        """Makes up for rows that were only kept: nobody asks while the policy acts."""
+        for felt, acting in self._felt:
+            if not acting:
+                # What is carried weighs on the joints as well; only what has come since is yielded to.
+                self._usual += USUAL_GAIN * (self._torque - self._usual)
+            torque = np.asarray(felt, np.float64)
+            self._torque = torque if np.isfinite(torque).all() else np.nan_to_num(torque)
+        self._felt.clear()
 
     @property
     def load(self) -> NDArray[np.float64]:
         """(J,) external torque beyond the usual and the tolerated [N m]."""
+        self._reckon()
         more = self._torque - self._usual
         beyond: NDArray[np.float64] = np.sign(more) * np.maximum(np.abs(more) - self.tolerated, 0.0)
         return beyond

@@ -11,6 +11,7 @@ from asm_gym.detection import (
     Detector,
     ModelOutput,
     accumulate,
+    accumulated,
     bounded,
     conformal_episodes,
     conformal_threshold,
@@ -84,6 +85,20 @@ def test_evidence_is_the_hand_computed_moving_average():
     np.testing.assert_allclose(strength(two, half), [[[1.75**2 / 0.3125, 0.25 / 0.3125]]])
     assert first.steps[0] == 0
     assert not first.vector.any()
+
+
+@pytest.mark.parametrize("steps", [1, 2, 40])
+def test_the_evidence_of_a_whole_episode_is_that_of_its_steps_to_the_bit(steps):
+    rng, gains = np.random.default_rng(steps), np.array([0.5, 0.1, 1.0])
+    whitened, contexts = rng.normal(size=(steps, 4)), rng.normal(size=(steps, 3))
+    evidence, vectors, lately = no_evidence(1, 3, 4, context=3), [], []
+    for e, c in zip(whitened, contexts, strict=True):
+        evidence = accumulate(evidence, e[None], c[None], gains)
+        vectors.append(evidence.vector[0])
+        lately.append(evidence.context[0])
+    whole = accumulated(whitened, contexts, gains)
+    np.testing.assert_array_equal(whole[0], vectors)
+    np.testing.assert_array_equal(whole[1], lately)
 
 
 def test_a_lasting_shift_adds_up_while_noise_averages_out():

@@ -1,4 +1,4 @@
-"""Weights of 8 bits and halves of symmetric matrices: what is lost by rounding, and nothing by packing."""
+"""Weights of 8 bits, roots of covariances, halves of symmetric matrices: what rounding loses, and packing does not."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,10 @@ def weights(seed=0):
     rng = np.random.default_rng(seed)
     W = (rng.normal(size=(40, 30)) * np.exp(3 * rng.normal(size=(40, 1)))).astype(np.float32)
     W[3], W[4, 5:], W[6, 7] = 0, 0, 1e-12
-    half = rng.normal(size=(9, 9))
-    return {"V": W, "moments": half + half.T, "D": W.copy(), "mean": np.arange(3.0)}
+    half, rows = rng.normal(size=(9, 9)), rng.normal(size=(50, 20)) @ np.diag(10.0 ** rng.uniform(-3, 0, 20))
+    rows[:, 3] = 0.7 * rows[:, 2]  # nothing else is ever seen of it
+    arrays = {"V": W, "moments": rows.T @ rows / 50, "whitening": half + half.T, "D": W.copy(), "mean": np.arange(3.0)}
+    return arrays | {"ceiling": rng.normal(size=(3, 87))}
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -24,19 +26,41 @@ def test_rounding_moves_a_weight_by_half_a_step_at_most_and_packing_by_nothing(s
     assert (np.abs(after["V"] - before["V"]) <= np.where(after["V"] == before["V"], 0, step)).all()
     assert np.mean(np.abs(after["V"] - before["V"]) <= step / 2) > 0.98  # but the faintest, which must stay
     np.testing.assert_array_equal(after["V"] == 0, before["V"] == 0)
-    np.testing.assert_array_equal(after["D"], before["D"])
+    np.testing.assert_allclose(after["D"], before["D"], rtol=2.0**-16)
+    np.testing.assert_allclose(after["whitening"], before["whitening"], rtol=2.0**-15)
+    np.testing.assert_array_equal(after["ceiling"], before["ceiling"])
     kept = packed(after)
-    assert set(kept) == {"V.bits", "V.scale", "moments.half", "D", "mean"}
+    parts = "V.bits", "V.scale", "moments.root", "moments.scale", "whitening.half", "D.planesf4", "mean"
+    assert set(kept) == {*parts, "ceiling.planesf8"}
     back = unpacked(kept)
     assert set(back) == set(after)
     for name, array in after.items():
         np.testing.assert_array_equal(back[name], array)
         assert back[name].dtype == array.dtype
-    np.testing.assert_array_equal(rounded(after)["V"], after["V"])
+    for name, array in rounded(after).items():
+        np.testing.assert_array_equal(array, after[name])
+
+
+def test_what_follows_from_a_rounded_covariance_is_what_followed_from_it():
+    C = weights()["moments"]
+    about = np.sqrt(np.diag(C)[5])
+    for known in ([0, 1, 4], list(range(5)), [*range(5), *range(6, 20)]):
+        was, now = (
+            np.linalg.solve(A[np.ix_(known, known)] + 1e-4 * np.eye(len(known)), A[known, 5])
+            for A in (C, rounded({"moments": C})["moments"])
+        )
+        left = np.sqrt(np.diag(C)[known]) * (now - was)  # what each adds otherwise, at its usual size
+        assert np.abs(left).max() < 0.01 * about
+
+
+def test_an_array_that_lies_by_columns_comes_back_so():
+    D = np.asfortranarray(weights()["D"])
+    back = unpacked(packed({"D": D}))["D"]
+    assert back.strides == D.strides
 
 
 def test_weights_that_would_be_lost_are_not_packed():
-    assert "V" in packed(weights())
+    assert "V.planesf4" in packed(weights())
 
 
 def test_parts_that_do_not_fit_are_refused():
@@ -44,6 +68,11 @@ def test_parts_that_do_not_fit_are_refused():
         unpacked({"V.bits": np.zeros((2, 2), np.int8)})
     with pytest.raises(ValueError, match="4 numbers are no half of a symmetric moments"):
         unpacked({"moments.half": np.zeros(4)})
+    with pytest.raises(ValueError, match="the root of moments should be of 16 bits with one scale, got float64"):
+        unpacked({"moments.root": np.zeros(3)})
+    for planes in (np.zeros((3, 2), np.uint8), np.zeros((4, 2)), np.zeros((), np.uint8)):
+        with pytest.raises(ValueError, match="D should lie apart by the bytes of its numbers, got"):
+            unpacked({"D.planesf4": planes})
 
 
 def test_a_rounded_memory_is_the_same_when_it_is_read_and_smaller(tmp_path):

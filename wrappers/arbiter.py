@@ -193,7 +193,8 @@ class Arbiter:
         if self.overriding:
             return self._reaction(observation)
         if np.isfinite(action).all():
-            return Command(np.clip(action, self._space.low, self._space.high))
+            # What np.clip does, in a third of the time.
+            return Command(np.minimum(np.maximum(action, self._space.low), self._space.high))
         self._refused = True
         said = f"policy: the action must be finite, got {shown(action.tolist())}"
         self.warn(said, "another is done instead")

@@ -57,7 +57,8 @@ class Observer:
 
     def begin_in(self, begun: Mask) -> None:
         """New episodes in the streams of ``begun`` (n,)."""
-        self._state = self._initial if begun.all() else choose(begun, self._initial, self._state)
+        if begun.any():
+            self._state = self._initial if begun.all() else choose(begun, self._initial, self._state)
 
     def observe(self, rows: NDArray[np.float32], failures: tuple[str, ...]) -> Observation:
         """Judges the next rows (n, D), some of which may be no more than NaN by the failures that are known already."""
@@ -73,8 +74,8 @@ class Observer:
             none = Surprise(np.zeros(self._batch), np.zeros((self._batch, self._monitor.spec.size)))
             failures = tuple(joined(f, f"monitor: {error!r}") for f in failures)
             return Observation(_infinite(none, failures), None, failures, latency)
-        lost = ~(surprise.value > -np.inf)  # NaN too
-        if lost.any():
+        if not surprise.value.min() > -np.inf:  # NaN too
+            lost = ~(surprise.value > -np.inf)
             failures = tuple(
                 joined(f, f"monitor: its surprise is {v}") if no else f
                 for f, v, no in zip(failures, surprise.value, lost, strict=True)

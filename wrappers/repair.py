@@ -122,16 +122,20 @@ class Repair:
         taken from what was completed."""
         return self.missing | (self._returned > 0)
 
-    def read(self, row: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-        """(D,) the next row, as it should be."""
+    def read(self, row: NDArray[np.floating[Any]], whole: bool = False) -> NDArray[np.float32]:
+        """(D,) the next row, as it should be.
+
+        Args:
+            whole: all of its numbers are known to be finite.
+        """
         self._earlier, self._raw = self._raw, np.array(row, np.float64)
         self.settling = max(0, self.settling - 1)
         if self._returning:
             self._returned, self._returning = np.maximum(self._returned - 1, 0), self._returning - 1
-        finite = np.isfinite(self._raw)
-        if finite.all() and not self._calm:  # as nearly always
+        if not self._calm and (whole or np.isfinite(self._raw).all()):  # as nearly always
             self._good = self._before = self._raw
             return row.astype(np.float32)
+        finite = np.isfinite(self._raw)
         self._since = {name: self._since.get(name, 0) + 1 for name in self._calm}
         lost = ~finite & ~self.missing
         lost[self._spec.motor] = False

@@ -221,7 +221,7 @@ class Responder:
         if self.repair is not None and self._map is not None:
             known = self.completed
             try:
-                row = self.repair.read(row)
+                row = self.repair.read(row, whole=self._lost is NONE)
                 if self.repair.names and (lost := ", ".join(name for name in self.completed if name not in known)):
                     _log.info("complete: %s says nothing any more", lost)
             except Exception as error:

@@ -17,6 +17,7 @@ from asm_gym.detection import AdaptiveThreshold
 from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.reflexes import Graded, Hold, Reflex, nearest_to_rest
 from asm_gym.protocols import HoldsItself, LimitsContact
+from asm_gym.spec import StreamSpec
 from asm_gym.stream_source import StreamSource
 from asm_gym.validation import as_float32, check_choice
 from asm_gym.wrappers.arbiter import Command
@@ -119,10 +120,12 @@ class VectorNeuralASMSafety(VectorWrapper):
                 f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
             )
         self._watch_with(body_memory(first, StreamSource(first).spec) if monitor is None else monitor)
-        self._limits = any(isinstance(member, LimitsContact) for member in self._members)
+        # Asked once: whether an object has what a protocol asks for takes longer than a row of the memory.
+        self._limited = [member for member in self._members if isinstance(member, LimitsContact)]
+        self._holders = [member for member in self._members if isinstance(member, HoldsItself)]
         self._told: list[ContactLimits | None] = []
-        self._holding = np.zeros(env.num_envs, bool)
-        if any(isinstance(member, HoldsItself) for member in self._members):
+        self._holding = [False] * env.num_envs
+        if self._holders:
             # Who is held is held in all steps that wrappers in between make of one.
             set_attribute(env, "keeps_holding", [True] * env.num_envs)
         self._confirmed = np.zeros(env.num_envs, bool)
@@ -243,12 +246,12 @@ class VectorNeuralASMSafety(VectorWrapper):
         each = zip(self._guards, chosen, observed, begun, strict=True)
         commands = [rest if fresh else guard.arbiter.command(action, seen) for guard, action, seen, fresh in each]
         self._limit()
-        wanted = np.array([isinstance(m, HoldsItself) and m.holding for m in self._members])
-        if (wanted | self._holding).any():
-            set_attribute(self.env, "holding", wanted.tolist())
-        self._holding = wanted
-        for member in self._members:
-            if isinstance(member, HoldsItself):
+        if self._holders:  # one has what all have
+            wanted = [member.holding for member in self._holders]
+            if any(wanted) or any(self._holding):
+                set_attribute(self.env, "holding", wanted)
+            self._holding = wanted
+            for member in self._holders:
                 member.holding = False
         return np.stack([command.action for command in commands]), commands
 
@@ -296,6 +299,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         last: Mask,
     ) -> list[RowReport]:
         """One ``observe`` for all, and who acts next in each; nothing counts where an episode has only ``begun``."""
+        everywhere = np.ones(self.num_envs, bool)
         known = [
             "" if b else joined(c.failure if c.refused else "", f)
             for c, f, b in zip(commands, failures, begun, strict=True)
@@ -306,12 +310,14 @@ class VectorNeuralASMSafety(VectorWrapper):
             rows[i], known[i] = self._guards[i].read(rows[i], known[i])
         surprise, expected, failed, latency = self._observer.observe(rows, tuple(known))
         reports: list[RowReport] = []
+        felt = [(name, infos[name], infos.get(f"_{name}", everywhere)) for name in FELT if name in infos]
         for i, guard in enumerate(self._guards):
             own = surprise.of(i)
             if begun[i]:
                 reports.append(nothing(own.silenced(np.ones(1, bool))))
                 continue
-            beneath = guard.substeps.came(rows[i], said_by(infos, i, bool(last[i]), FELT))
+            told = said_by(infos, i, True, FELT) if last[i] else {name: v[i] for name, v, there in felt if there[i]}
+            beneath = guard.substeps.came(rows[i], told)
             said = None if expected is None else expected[i]
             heard = guard.heard(own, bool(failed[i]))
             report = guard.judge(heard, rows[i], executed[i], failed[i], beneath, said, latency)
@@ -363,8 +369,8 @@ class VectorNeuralASMSafety(VectorWrapper):
 
     def _limit(self) -> None:
         """Tells the environments their limits, where those have changed."""
-        limits = [m.contact_limits if isinstance(m, LimitsContact) else None for m in self._members]
-        if self._limits and any(a is not b for a, b in zip_longest(limits, self._told)):
+        limits = [member.contact_limits for member in self._limited]
+        if any(a is not b for a, b in zip_longest(limits, self._told)):
             set_attribute(self.env, "contact_limits", limits)
             self._told = limits
 
@@ -393,20 +399,27 @@ class VectorNeuralASMSafety(VectorWrapper):
         self, infos: dict[str, Any], reports: list[RowReport], executed: NDArray[np.float32], present: Mask
     ) -> None:
         """Adds ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
-        spec, responders = self.monitor.spec, [guard.responder for guard in self._guards]
-        self._alarms += [r.decision.alarm for r in reports]
-        each = [report([r], spec, g.arbiter.threshold, None, "") for r, g in zip(reports, self._guards, strict=True)]
-        for one, s, n in zip(each, responders, self._alarms, strict=True):
-            one.update(completed=s.completed, unread=s.unread, lost=s.lost, alarms=int(n))
+        alarm = np.array([r.decision.alarm for r in reports])
+        self._alarms += alarm
+        now = {
+            "surprise": np.array([float(r.surprise.value[0]) for r in reports]),
+            "alarm": alarm,
+            "intervened": np.array([r.decision.intervened for r in reports]),
+        }
         same = {"executed_action": executed.copy()}
         if self._running is not None:
             both = {"ceiling": self._running.ceiling, "level": self._running.level}
             same |= {name: np.full(self.num_envs, value) for name, value in both.items()}
-        now = {name: np.array([one[name] for one in each]) for name in ("surprise", "alarm", "intervened")}
         said: dict[str, Any] = {f"asm_{name}": value for name, value in now.items()}
-        said |= {"cost": now["alarm"].astype(np.float64), "cost_sum": self._alarms.astype(np.float64)}
+        said |= {"cost": alarm.astype(np.float64), "cost_sum": self._alarms.astype(np.float64)}
         if self._full:
-            said["asm"] = Lazily(now, lambda: {n: stacked([one[n] for one in each]) for n in each[0]} | same)
+            beside = [
+                {"completed": s.completed, "unread": s.unread, "lost": s.lost, "alarms": int(n)}
+                for s, n in zip((guard.responder for guard in self._guards), self._alarms, strict=True)
+            ]
+            thresholds = [guard.arbiter.threshold for guard in self._guards]
+            each = self.monitor.spec, reports, thresholds, beside
+            said["asm"] = Lazily(now, lambda: _side_by_side(*each) | same)
         infos.update(said | {f"_{key}": present for key in said})
 
     def _nothing(self) -> list[RowReport]:
@@ -416,3 +429,11 @@ class VectorNeuralASMSafety(VectorWrapper):
     def _no_actions(self) -> NDArray[np.float32]:
         shape = self.env.single_action_space.shape or ()
         return np.full((self.num_envs, *shape), np.nan, np.float32)
+
+
+def _side_by_side(
+    spec: StreamSpec, reports: list[RowReport], thresholds: list[float], beside: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """What is said of each environment, in arrays."""
+    each = [report([r], spec, t, None, "") | b for r, t, b in zip(reports, thresholds, beside, strict=True)]
+    return {name: stacked([one[name] for one in each]) for name in each[0]}

@@ -6,7 +6,7 @@ from asm_gym.detection.adaptive import AdaptiveThreshold, RunningThreshold
 from asm_gym.detection.base import Detection, ModelOutput, Nominal
 from asm_gym.detection.conformal import Promise, conformal_episodes, conformal_threshold
 from asm_gym.detection.detector import Detector, EvidenceDetection, EvidenceState
-from asm_gym.detection.evidence import Evidence, accumulate, no_evidence, pool, strength
+from asm_gym.detection.evidence import Evidence, accumulate, accumulated, no_evidence, pool, strength
 from asm_gym.detection.hourly import Blocks, alarms_in, check_per_hour, hourly_promise, hourly_threshold
 from asm_gym.detection.tails import worst_case
 from asm_gym.detection.whitening import bounded, whitening
@@ -24,6 +24,7 @@ __all__ = [
     "Promise",
     "RunningThreshold",
     "accumulate",
+    "accumulated",
     "alarms_in",
     "bounded",
     "check_per_hour",

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Array, Arrays, ModelOutput, Nominal, Place
-from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, accumulate, no_evidence, pool, strength
+from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, accumulated, no_evidence, pool, strength
 from asm_gym.detection.habituation import STEPS_PER_NUMBER, usual_levels
 from asm_gym.detection.repetition import (
     MOST_BEYOND,
@@ -207,14 +207,9 @@ class Detector:
 
     def _strengths(self, run: ModelOutput) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """v (T, G, X) and the running mean of the contexts (T, C) of a whole episode."""
-        evidence = no_evidence(1, len(self.gains), len(self.whitening), run.contexts.shape[1])
         whitened = bounded(run.errors, self.bound) @ self.whitening
-        vectors, lately = [], []
-        for e, c in zip(whitened, run.contexts, strict=True):
-            evidence = accumulate(evidence, e[None], c[None], self.gains)
-            vectors.append(evidence.vector[0])
-            lately.append(evidence.context[0])
-        whole = Evidence(np.array(vectors), np.array(lately), np.arange(1, len(vectors) + 1))
+        vectors, lately = accumulated(whitened, np.asarray(run.contexts, np.float64), self.gains)
+        whole = Evidence(vectors, lately, np.arange(1, len(vectors) + 1))
         return strength(whole, self.gains), whole.context
 
 

@@ -4,8 +4,8 @@
                v_i = w_i² (2 - a) / (a (1 - (1 - a)^{2t}))              nominal mean 1 for white errors, for every t
     pooled     s_t = (Σ_i r_i^p)^(1/p)                                  r_i: v_i against its worst, see ``tails``
 
-p lets the most surprising one count, and several add up. These are the equations as they are fitted with, and the
-oracle of the compiled step in ``detector``.
+p lets the most surprising one count, and several add up. ``accumulated`` is what they are fitted with, and the others
+are the oracle of that and of the compiled step in ``detector``.
 
 Source: Lowry et al. 1992 (multivariate EWMA chart, its exact variance at start-up).
 """
@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.compilation import compiled
 from asm_gym.detection.base import Array
 
 POWER = 8
@@ -45,6 +46,28 @@ def accumulate(evidence: Evidence, whitened: Array, context: Array, gains: Array
     """w_t from w_{t-1} and the whitened errors e_t (B, X); a gain a in (0, 1] of 1 forgets all but this step."""
     vector = evidence.vector + gains[:, None] * (whitened[:, None, :] - evidence.vector)
     return Evidence(vector, evidence.context + CONTEXT_GAIN * (context - evidence.context), evidence.steps + 1)
+
+
+@compiled
+def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``accumulate`` over a whole episode: w_t (T, G, X), and the running mean of the contexts (T, C).
+
+    Args:
+        whitened: (T, X) e_t.
+        contexts: (T, C).
+        gains: (G,).
+    """
+    T, X = whitened.shape
+    vectors, lately = np.zeros((T, len(gains), X)), np.zeros(contexts.shape)
+    for t in range(T):
+        before = max(t - 1, 0)  # of the first row, where all is 0 still
+        for g in range(len(gains)):
+            for i in range(X):
+                w = vectors[before, g, i]
+                vectors[t, g, i] = w + gains[g] * (whitened[t, i] - w)
+        for c in range(contexts.shape[1]):
+            lately[t, c] = lately[before, c] + CONTEXT_GAIN * (contexts[t, c] - lately[before, c])
+    return vectors, lately
 
 
 def strength(evidence: Evidence, gains: Array) -> NDArray[np.float64]:

@@ -149,13 +149,16 @@ class NeuralASM(CalibratedMonitor):
         self.skill_: SkillSurprise | None = None
 
     def rounded(self) -> Self:
-        """The same memory with weights of 8 bits, which takes a quarter of the space when it is saved.
+        """The same memory in fewer bits, weights in 8, which takes a quarter of the space when it is saved.
 
         It has no threshold: ``calibrate`` sets that of the rounded weights.
         """
         self._fitted()
         other = self._copy()
         other.model.restore(rounded(self.model.learned_), self.skills_)
+        for detection in other.detections.values():
+            if detection.learned_:
+                detection.restore(rounded(detection.learned_))
         other._uncalibrate()
         return other
 
