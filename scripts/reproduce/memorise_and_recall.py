@@ -89,30 +89,16 @@ def tables(records: Sequence[Record], config: Config) -> list[Table]:
         return [(CALLED[m], *(cell(right, **{**where, key: v, "model": m}) for v in values)) for m in config.models]
 
     sizes, widths, cues = (("", *map(str, v)) for v in (config.repertoires, config.widths, config.cues))
-    own = {"domain": "letters", "dims": 2, "hidden": config.hidden}
     units = f"{config.hidden} units, cue of {longest}; mean ± SD over seeds, and share of right skills"
     online = rows("skills", config.repertoires, right=False, cue=STEPS)
     made = [
         Table(f"Offline error [cm] by letters, {units}", sizes, rows("skills", config.repertoires)),
         Table("Online error [cm] by letters", sizes, online),
     ]
-    heads = ("", *(f"{n} letters, 1 row in {every}" for n in config.repertoires for every in EVERY))
-    gaps = [
-        (
-            CALLED[m],
-            *(
-                shown(records, "glimpsed_cm", model=m, skills=n, every=e, **own)
-                for n in config.repertoires
-                for e in EVERY
-            ),
-        )
-        for m in config.models
-    ]
-    made.append(
-        Table(
-            "Error [cm] of rows that are not sensed, where commands are known", heads, [g for g in gaps if any(g[1:])]
-        )
-    )
+    asked: dict[str, Record] = {CALLED[m]: {"model": m} for m in config.models if m not in ("hopfield", "library")}
+    gaps = {f"{n} letters, 1 in {e}": {"skills": n, "every": e} for n in config.repertoires for e in EVERY}
+    own: Record = {"domain": "letters", "dims": 2, "hidden": config.hidden}
+    made.append(kit.grid("Error [cm] where one row in so many is sensed", records, "glimpsed_cm", asked, gaps, **own))
     made += [
         Table(f"Offline error [cm] by cue, {n} letters", cues, rows("cue", config.cues, skills=n))
         for n in config.repertoires
