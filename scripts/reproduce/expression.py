@@ -96,6 +96,12 @@ class ExpressionMemory:
             return rows
         return np.concatenate([rows, to_rows(self.reader, run_on(self.network, cued.traces, len(streams) - cue))])
 
+    def glimpse(self, streams: Rows, seen: NDArray[np.bool_]) -> Rows:
+        """What was expected of each row of B streams (T, B, D) of which only those ``seen`` (T,) are sensed."""
+        senses, commands = read(self.reader, streams)
+        senses[~seen] = np.nan
+        return to_rows(self.reader, follow(self.network, self.network.at_rest(streams.shape[1]), senses, commands))
+
 
 @dataclass(frozen=True)
 class Backpropagated:
@@ -124,6 +130,12 @@ class Backpropagated:
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = recurrent.expected(self.network, *read(self.reader, streams), cue)
         return to_rows(self.reader, Recalled(senses, commands, commands, commands[-1]))
+
+    def glimpse(self, streams: Rows, seen: NDArray[np.bool_]) -> Rows:
+        """As ``ExpressionMemory.glimpse``."""
+        senses, commands = read(self.reader, streams)
+        made, told = recurrent.glimpsed(self.network, senses, commands, seen), commands[:, :, :-1]
+        return to_rows(self.reader, Recalled(made, told, told, told[-1]))
 
 
 @dataclass(frozen=True)
@@ -232,3 +244,21 @@ def recalled(model: Expresser, tests: Sequence[Episode], means: NDArray[np.float
     apart = np.linalg.norm(hand[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None], axis=3).mean(axis=0)
     right = [names[k] == e.info["skill"] for k, e in zip(apart.argmin(axis=1), tests, strict=True)]
     return float(error), float(np.mean(right))
+
+
+GLIMPSED = 10
+"""Rows that are sensed before senses come and go."""
+
+
+def between_glimpses(
+    model: ExpressionMemory | Backpropagated, tests: Sequence[Episode], dims: int, every: int
+) -> float:
+    """Mean distance [cm] of what is expected of rows that are not sensed, where one in ``every`` is.
+
+    Commands are known throughout.
+    """
+    streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)  # (T, B, D)
+    row = np.arange(len(streams))
+    seen = (row < GLIMPSED) | (row % every == 0)
+    apart = model.glimpse(streams, seen)[:, :, :dims] - streams[:, :, :dims]
+    return float(np.linalg.norm(apart[~seen], axis=2).mean())

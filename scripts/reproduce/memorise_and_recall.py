@@ -20,7 +20,7 @@ from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.curves import curve
 from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters
 from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds, shown
-from asm_gym.scripts.reproduce.recall_rivals import CALLED, MODELS, Condition, Practice, recall
+from asm_gym.scripts.reproduce.recall_rivals import CALLED, EVERY, MODELS, Condition, Practice, recall
 from asm_gym.scripts.reproduce.recordings import wide_enough
 
 
@@ -36,6 +36,8 @@ class Config(kit.Config):
     """Hidden units, for a repertoire of eight."""
     cues: tuple[int, ...] = option((1, 2, 5, 10, 20, 30), least=1)
     """Steps that are read before recall begins."""
+    models: tuple[str, ...] = option(MODELS, least=1, known=MODELS)
+    """What learns, recalls, and is compared."""
     steps: int = option(16000, quick=1500, least=1)
     """Steps in which the synapses of the memory change."""
     updates: int = option(1200, quick=40, least=1)
@@ -84,7 +86,7 @@ def tables(records: Sequence[Record], config: Config) -> list[Table]:
         return f"{error} ({over_seeds(records, 'right', **basis | where).mean:.2f})" if right and error else error
 
     def rows(key: str, values: Sequence[int], right: bool = True, **where: Any) -> list[tuple[str, ...]]:
-        return [(CALLED[m], *(cell(right, **{**where, key: v, "model": m}) for v in values)) for m in MODELS]
+        return [(CALLED[m], *(cell(right, **{**where, key: v, "model": m}) for v in values)) for m in config.models]
 
     sizes, widths, cues = (("", *map(str, v)) for v in (config.repertoires, config.widths, config.cues))
     units = f"{config.hidden} units, cue of {longest}; mean ± SD over seeds, and share of right skills"
@@ -93,14 +95,18 @@ def tables(records: Sequence[Record], config: Config) -> list[Table]:
         Table(f"Offline error [cm] by letters, {units}", sizes, rows("skills", config.repertoires)),
         Table("Online error [cm] by letters", sizes, online),
     ]
+    asked: dict[str, Record] = {CALLED[m]: {"model": m} for m in config.models if m not in ("hopfield", "library")}
+    gaps = {f"{n} letters, 1 in {e}": {"skills": n, "every": e} for n in config.repertoires for e in EVERY}
+    own: Record = {"domain": "letters", "dims": 2, "hidden": config.hidden}
+    made.append(kit.grid("Error [cm] where one row in so many is sensed", records, "glimpsed_cm", asked, gaps, **own))
     made += [
         Table(f"Offline error [cm] by cue, {n} letters", cues, rows("cue", config.cues, skills=n))
         for n in config.repertoires
         if n >= middle
     ]
     if config.splines:
-        own = rows("cue", config.cues, domain="splines", skills=config.splines)
-        made.append(Table(f"Offline error [cm] by cue, {config.splines} splines", cues, own))
+        drawn_ones = rows("cue", config.cues, domain="splines", skills=config.splines)
+        made.append(Table(f"Offline error [cm] by cue, {config.splines} splines", cues, drawn_ones))
     if config.width_seeds:
         seeds = "one seed" if config.width_seeds == 1 else f"{config.width_seeds} seeds"
         where = f"{middle} letters, {seeds} for widths other than {config.hidden}"
@@ -131,7 +137,7 @@ def drawn(records: Sequence[Record], config: Config) -> Figure:
     with figure(height=6.0, width=9.0) as fig:
         axes = fig.subplots(2, 3)
         for ax, (key, label, values, value) in zip(axes.flat, panels, strict=False):
-            for i, model in enumerate(MODELS):
+            for i, model in enumerate(config.models):
                 found = [over_seeds(records, value, **{**base, key: v, "model": model}) for v in values]
                 curve(ax, values, found, i, CALLED[model] if ax is axes[0, 0] else None)
             ax.set(xlabel=label, ylabel="offline error [cm]" if value == "error_cm" else "right skill [share]", ylim=0)
@@ -146,7 +152,7 @@ def drawn(records: Sequence[Record], config: Config) -> Figure:
 
 
 def _online(ax: Any, records: Sequence[Record], config: Config, base: Record) -> None:
-    for i, model in enumerate(MODELS):
+    for i, model in enumerate(config.models):
         found = [
             over_seeds(records, "error_cm", **base | {"cue": STEPS, "skills": n, "model": model})
             for n in config.repertoires
@@ -161,6 +167,6 @@ def run(config: Config) -> Findings:
     """Runs every condition and sums up."""
     # The longest first, so that no process is left with one of them at the end.
     practice = Practice(config.writings, config.steps, config.updates)
-    work = partial(recall, practice=practice, cues=config.cues)
+    work = partial(recall, practice=practice, cues=config.cues, models=config.models)
     records = kit.together(kit.each("learning", work, conditions(config), config))
     return Findings(records, tables(records, config), drawn(records, config))

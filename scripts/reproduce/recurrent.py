@@ -1,4 +1,4 @@
-"""The recurrent rivals of recall: a GRU and a plain RNN, trained by backpropagation through time.
+"""The recurrent rivals of recall: a GRU, an LSTM and a plain RNN, trained by backpropagation through time.
 
 Truncated to one step, an error changes what that step alone did, as local as the memory's own rules are.
 
@@ -7,7 +7,8 @@ Truncated to one step, an error changes what that step alone did, as local as th
 They read what the memory reads, and are asked the same: the action before it is commanded, the senses before they are
 read. Noise on what they read while learning makes them recover from their own errors when they run on.
 
-Sources: Cho et al. 2014 (EMNLP); Elman 1990 (Cognitive Science 14(2)); Jaeger 2001 (GMD Report 148) for the noise.
+Sources: Cho et al. 2014 (EMNLP); Hochreiter and Schmidhuber 1997 (Neural Computation 9(8)); Elman 1990 (Cognitive
+Science 14(2)); Jaeger 2001 (GMD Report 148) for the noise.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ from asm_gym.memory.learning import Trajectory, batches
 from asm_gym.monitors.baselines.torch_model import adam, descend
 from asm_gym.validation import check_choice
 
-CELLS: dict[str, Any] = {"gru": nn.GRU, "rnn": nn.RNN}
+CELLS: dict[str, Any] = {"gru": nn.GRU, "lstm": nn.LSTM, "rnn": nn.RNN}
 
 
 class Recurrent(nn.Module):
     """A cell and its two readouts.
 
     Args:
-        cell: ``gru`` or ``rnn``.
+        cell: one of ``CELLS``.
         hidden: units.
         sensory, motor: numbers sensed and commanded.
     """
@@ -134,3 +135,16 @@ def expected(
         on = network.run_on(torch.cat([x[cue - 1], a[cue - 1]], dim=-1), state, len(x) - cue)
         sensed, acted = torch.cat([sensed, on[0]]), torch.cat([acted, on[1]])
     return sensed.numpy(), acted.numpy()
+
+
+def glimpsed(
+    network: Recurrent, senses: NDArray[np.float32], commands: NDArray[np.float32], seen: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """x̂ (T, B, S) where only the rows that are ``seen`` (T,) are read, and what was expected stands for the others."""
+    x, a = torch.from_numpy(senses), torch.from_numpy(commands[:, :, :-1])
+    row, state, made = torch.zeros(x.shape[1], x.shape[2] + a.shape[2]), None, []
+    for t in range(len(x)):
+        h, state = network.cell(row[None], state)
+        made.append(network.sense(torch.cat([h[0], a[t]], dim=-1)))
+        row = torch.cat([x[t] if seen[t] else made[-1], a[t]], dim=-1)
+    return torch.stack(made).numpy()
