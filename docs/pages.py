@@ -197,9 +197,7 @@ def to_print(live: list[Page], again: bool) -> list[Page]:
 def print_all(again: bool) -> int:
     """Prints what is due, a page at a time; one that fails is left as it was, and named at the end."""
     due, failed = to_print(pages(), again), []
-    cost = sum(page.meta.get("seconds", 0) for page in due)
-    unknown = sum("seconds" not in page.meta for page in due)
-    print(f"{len(due)} of {len(pages())} pages to print; {cost / 3600:.1f} h, and {unknown} that were not timed yet")
+    print(f"{len(due)} of {len(pages())} pages to print: {_total(due)}")
     for page in due:
         print(f"{page.name}: {_cost(page)} the last time; {state(page)}", flush=True)
         try:
@@ -240,11 +238,17 @@ def _cost(page: Page) -> str:
     return "not timed" if seconds is None else f"{seconds / 60:.1f} min"
 
 
+def _total(some: list[Page]) -> str:
+    known = [page.meta["seconds"] for page in some if "seconds" in page.meta]
+    return f"{sum(known) / 3600:.1f} h, and {len(some) - len(known)} that were not timed yet"
+
+
 def main(argv: list[str]) -> int:
     match argv:
         case []:
             for page in pages():
                 print(f"{page.name}: {page.meta['commit']}, {page.meta['date']}, {state(page)}; {_cost(page)}")
+            print(f"all {len(pages())}: {_total(pages())}")
         case ["print", *names] if names:
             for name in names:
                 run(Page.read(ROOT / name)).write()
