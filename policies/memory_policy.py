@@ -7,7 +7,6 @@ Nothing selects a skill: the row says what lies about, and the memory's state wh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
 
 import gymnasium as gym
@@ -18,27 +17,11 @@ from numpy.typing import NDArray
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import State
 from asm_gym.policies.grip import CommandReadout, Grip
-from asm_gym.spec import MOTOR, StreamSpec, control_period
+from asm_gym.spec import StreamSpec, control_period
 from asm_gym.validation import typed
 
 OBJECT = "object"
 """The group of what lies about; the objects of other tasks are out of play, and read 0."""
-
-
-def common_spec(specs: Sequence[StreamSpec], groups: Sequence[str]) -> StreamSpec:
-    """One layout for the streams of several tasks of one robot: every channel of these groups once, the action last.
-
-    Raises:
-        ValueError: no spec, or two that differ in more than their objects.
-    """
-    if not specs:
-        raise ValueError("at least one stream is needed to lay out what they have in common, got none")
-    chosen = {c.name: c for s in specs for c in s.channels if c.group in groups and c.group != MOTOR}
-    motor = tuple(c for c in specs[0].channels if c.group == MOTOR)
-    joined = StreamSpec((*chosen.values(), *motor), specs[0].dt, specs[0].source)
-    for spec in specs:
-        StreamReader.between(joined, spec)
-    return joined
 
 
 class StreamReader:

@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
@@ -42,6 +41,7 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
+from asm_gym.rollouts.run_folder import versions
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.staging import play, staged
 from asm_gym.rollouts.trial import RolloutConfig, Trial
@@ -162,14 +162,8 @@ PUSHED_AT = 40
 def fit(args: Args, folder: Path, timed: Callable[[str], Any]) -> tuple[NeuralASM, Share]:
     """A memory of the task as the expert does it, calibrated and saved; and how often the expert succeeded."""
     with timed("collecting nominal episodes") as progress:
-        episodes = collect(
-            args.env_id,
-            "scripted",
-            args.fit_episodes + args.calibrating,
-            args.seed,
-            args.workers,
-            progress=progress,
-        )
+        count = args.fit_episodes + args.calibrating
+        episodes = collect(args.env_id, "scripted", count, args.seed, args.workers, progress=progress)
     memory = NeuralASM(episodes[0].spec, epochs=args.epochs, seed=args.seed)
     with timed("learning") as progress:
         memory.fit(episodes[: args.fit_episodes], progress=progress)
@@ -229,10 +223,9 @@ def figures_of(
     args: Args, rows: Sequence[DetectionMetrics], expert: Share, latency: dict[str, float], seconds: dict[str, float]
 ) -> dict[str, Any]:
     """Every figure, with what it takes to make it again."""
-    packages = ("asm-gym", "mujoco", "robosuite", "gymnasium", "numpy", "numba")
     return {
         "arguments": {**asdict(args), "out": str(args.out)},
-        "versions": {"python": platform.python_version(), **{p: metadata.version(p) for p in packages}},
+        "versions": {"python": platform.python_version(), **versions("numba")},
         "window_s": WINDOW_S,
         "results": [as_json(m) for m in rows],
         "expert_success": expert._asdict(),

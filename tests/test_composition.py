@@ -272,11 +272,6 @@ def test_a_library_expects_a_skill_to_reach_the_goal_it_is_told(tmp_path):
 
     untold = make_monitor("skill_library", shown[0].spec).fit([reach(g, rng, told=False) for g in goals[:20]])
     assert surprise(untold) == surprise(untold, goal=lambda e: [])
-    of_skill = {k: a[:, 0] if k in ("goal", "weights", "mean") else a for k, a in untold.learned_.items()}
-    before = {k: a for k, a in of_skill.items() if k not in ("speed", "goal_size", "usual", "varies")}
-    model = untold.model.restore(before, untold.skills_)  # as it was saved before it was told the goal
-    assert model.learned_["mean"].shape == (1, 1, 60, 4)
-    assert model.start(1, [fresh[0].info]).goal.tolist() == [[1.0]]
 
 
 def test_optional_abilities_are_protocols():

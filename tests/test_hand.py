@@ -24,14 +24,6 @@ def test_a_planar_arm_is_where_trigonometry_says():
         np.testing.assert_allclose(chain.at(np.array([a, b])), [*place, 0, *turned], atol=1e-12)
 
 
-@pytest.fixture(scope="module")
-def lift():
-    env = gym.make("asm_gym/Lift-v0")
-    env.reset(seed=0)
-    yield env
-    env.close()
-
-
 def test_the_chain_of_an_arm_is_the_simulators(lift):
     arm = lift.unwrapped
     robot, model = arm.robosuite_env.robots[0], arm.simulation.model

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from asm_gym.scripts.reproduce import harm, harm_agents, harm_report, harm_speeds
+from asm_gym.scripts.reproduce import harm, harm_agents, harm_felt, harm_report, harm_speeds
 from asm_gym.spec import Channel, StreamSpec
 
 
@@ -11,11 +11,11 @@ def test_harm_is_the_impulse_beyond_forty_newtons_and_the_first_blow_is_told_fro
     force = np.zeros(100)
     force[30:32] = 140.0, 90.0  # 100 + 50 N over 2 ms each
     force[90] = 340.0  # 0.12 s later
-    found = harm.harm_of(force, 25)
+    found = harm_felt.harm_of(force, 25)
     assert found["harm"] == pytest.approx((100 + 50 + 300) / 500)
     assert (found["first"], found["later"], found["peak"], found["first_step"]) == (140.0, 340.0, 340.0, 1)
     assert (found["time_over"], found["steps_over"]) == (pytest.approx(1 / 25), 1)
-    calm = harm.harm_of(np.full(50, 39.0), 25)
+    calm = harm_felt.harm_of(np.full(50, 39.0), 25)
     assert (calm["harm"], calm["first"], calm["later"]) == (0.0, 0.0, 39.0)
 
 

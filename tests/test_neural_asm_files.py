@@ -73,6 +73,10 @@ def test_a_checkpoint_without_what_the_detector_needs_is_refused(asm, tmp_path):
     rewritten(tmp_path / "m.asm", tmp_path / "older.asm", without("tail"))
     with pytest.raises(ValueError, match="has no tail, so fit it anew"):
         NeuralASM.load(tmp_path / "older.asm")
+    rewritten(tmp_path / "m.asm", tmp_path / "oldest.asm", without("remainder", "span_S"))
+    older = "of an older version, which had no span_S, remainder: make it anew, by asm-gym fit or asm-gym babble"
+    with pytest.raises(ValueError, match=older):
+        NeuralASM.load(tmp_path / "oldest.asm")
 
 
 @pytest.mark.parametrize(

@@ -232,9 +232,7 @@ def _spec(folder: Path, known: dict[str, Any], env_id: str | None, dt: float | N
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{folder} names its channels in a way that cannot be read: {error}") from error
     if env_id in {task.id for task in TASKS.values()}:
-        raise ValueError(
-            f"{folder} was recorded in {env_id} and holds no streams: record it with `asm-gym collect`"
-        )
+        raise ValueError(f"{folder} was recorded in {env_id} and holds no streams: record it with `asm-gym collect`")
     dataset = known["dataset"]
     return StreamSpec.from_spaces(dataset.observation_space, dataset.action_space, dt or _period(env_id))
 

@@ -25,67 +25,7 @@ from asm_gym.evaluation.tables import Table, harmless_table, kinds_table, markdo
 from asm_gym.extras import needed_for
 from asm_gym.files import written_whole
 
-_PAGE = Template("""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<title>$title</title>
-<style>
-:root { color-scheme: light dark; --paper: #fdfdfc; --ink: #1d2126; --soft: #5c6570; --rule: #dcdfe3; --even: #f4f5f6; }
-@media (prefers-color-scheme: dark) {
-  :root { --paper: #15181c; --ink: #e8eaed; --soft: #a0a8b2; --rule: #343a42; --even: #1c2026; }
-}
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 100rem; padding: 3rem 1.5rem; background: var(--paper); color: var(--ink);
-       font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-h1 { font-size: 1.9rem; line-height: 1.2; font-weight: 650; margin: 0 0 1rem; }
-h2 { font-size: 1.2rem; font-weight: 600; margin: 3rem 0 1rem; break-after: avoid; }
-p { max-width: 44rem; margin: 0 0 0.8rem; }
-figure { margin: 0 0 2.5rem; break-inside: avoid; }
-figcaption { color: var(--soft); font-size: 0.9rem; max-width: 44rem; margin-top: 0.5rem; }
-img, figure svg { display: block; max-width: 100%; height: auto; background: #fff; border-radius: 6px; padding: 0.6rem;
-      border: 1px solid var(--rule); }
-video { display: block; width: 100%; max-width: 42rem; border-radius: 6px; }
-.figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(42rem, 100%), 1fr)); gap: 0 2.5rem;
-           align-items: start; }
-.scroll { overflow-x: auto; margin-bottom: 2.5rem; break-inside: avoid; max-width: max-content; }
-.scroll::-webkit-scrollbar { height: 0.7rem; }
-.scroll::-webkit-scrollbar-track { background: var(--even); border-radius: 0.35rem; }
-.scroll::-webkit-scrollbar-thumb { background: var(--soft); border-radius: 0.35rem; }
-.scroll tbody th { position: sticky; left: 0; background: var(--paper); }
-table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
-caption { caption-side: top; text-align: left; color: var(--soft); padding-bottom: 0.6rem;
-          max-width: min(44rem, 90vw); }
-th, td { padding: 0.45rem 0.8rem; text-align: right; vertical-align: top; }
-td { white-space: nowrap; }
-th:first-child, .text { text-align: left; }
-td.text { white-space: normal; min-width: 9rem; }
-thead th { border-bottom: 2px solid var(--rule); font-weight: 600; vertical-align: bottom; }
-tbody th { font-weight: 600; white-space: nowrap; }
-tbody tr { border-bottom: 1px solid var(--rule); }
-tbody tr:nth-child(even), tbody tr:nth-child(even) th { background: var(--even); }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 0.25rem 1.5rem; font-size: 0.9rem; }
-dt { color: var(--soft); }
-dd { margin: 0; overflow-wrap: anywhere; font-family: ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
-@media print {
-  :root { --paper: #fff; --ink: #000; --soft: #444; --rule: #bbb; --even: #f4f4f4; }
-  body { padding: 0; max-width: none; font-size: 10pt; }
-  .film { display: none; }
-  .scroll { overflow: visible; }
-}
-@page { margin: 18mm; }
-</style>
-</head>
-<body>
-<main>
-<h1>$title</h1>
-$body
-</main>
-</body>
-</html>
-""")
+_PAGE = Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
 
 
 def write_report(

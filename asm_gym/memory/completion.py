@@ -100,7 +100,7 @@ class Completion:
 
     @classmethod
     def found(cls, learned: Mapping[str, NDArray[Any]], senses: StreamScaler) -> Self | None:
-        """What ``named`` wrote; None where a memory was saved before there was completion.
+        """What ``named`` wrote; None where there was none.
 
         Raises:
             ValueError: something does not fit together.

@@ -25,7 +25,6 @@ from asm_gym.memory.marginalise import MOST_INPUTS, Kept, fewer_changes, fewer_s
 from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
 from asm_gym.memory.network import Network, train
 from asm_gym.memory.online import followed
-from asm_gym.memory.precision import unbounded
 from asm_gym.memory.readout import add_up, learn_readout
 from asm_gym.memory.recall import continued
 from asm_gym.memory.specialise import specialise
@@ -52,7 +51,7 @@ class MemoryModel(StreamModel):
         senses_: how it reads a row.
         network_: the weights; None before ``fit``.
         motor_: the motor association; None before ``learn_to_act``.
-        completion_: what completes missing senses; None in memories that were saved before there was any.
+        completion_: what completes missing senses; None where they are too many, and once some were lost.
     """
 
     kind = "neural_asm"
@@ -137,10 +136,6 @@ class MemoryModel(StreamModel):
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         senses = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
         X, A = len(self.spec.sensory), len(self.spec.motor)
-        if "remainder" not in learned:  # saved before it was known apart what is linear
-            learned = {**learned, "remainder": np.ones(X, np.float32)}
-        if "span_S" not in learned:  # saved before what it had shown bounded it
-            learned = {**learned, "span_S": unbounded(X)}
         units = len(learned["V"])
         if (found := dynamics_of(learned)) != self.dynamics:
             raise ValueError(f"this is a memory of dynamics={found!r}, which cannot be loaded as {self.dynamics!r}")
@@ -148,9 +143,10 @@ class MemoryModel(StreamModel):
         temporal = dynamics.shapes(self.hidden_size, senses.size, A)
         shapes = temporal | association_shapes(senses.inputs, units, X)
         if skills:
-            both = units + self.hidden_size
-            told = units if learned["W_K"].shape[-1] == units else both  # named before the state was asked
-            shapes |= {"W_K": (len(skills), told), "b_K": (len(skills),)}
+            shapes |= {"W_K": (len(skills), units + self.hidden_size), "b_K": (len(skills),)}
+        if missing := [name for name in shapes if name not in learned]:
+            older = f"a memory of an older version, which had no {', '.join(missing)}"
+            raise ValueError(f"this is {older}: make it anew, by asm-gym fit or asm-gym babble")
         for name, shape in shapes.items():
             if learned[name].shape != shape:
                 raise ValueError(f"{name} should be of shape {shape}, found {learned[name].shape}")

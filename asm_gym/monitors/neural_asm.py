@@ -18,8 +18,8 @@ from asm_gym.detection import Detector, EvidenceDetection
 from asm_gym.detection.detector import BOUND, GAINS
 from asm_gym.detection.events import Excuses
 from asm_gym.episode import Episode
-from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of
-from asm_gym.memory.feedback import FEEDBACK, LEARNED, TRANSPORTED
+from asm_gym.memory.dynamics import DYNAMICS, TRACES
+from asm_gym.memory.feedback import FEEDBACK, LEARNED
 from asm_gym.memory.inference import iterations_within
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
@@ -174,7 +174,7 @@ class NeuralASM(CalibratedMonitor):
 
     @property
     def diagnosis_(self) -> Diagnosis | None:
-        """What names the cause of a surprise, and completes senses; None in memories saved before there was any."""
+        """What names the cause of a surprise, and completes senses; None where nothing completes senses."""
         completion = self.model.completion_
         if completion is None:
             return None
@@ -274,10 +274,6 @@ class NeuralASM(CalibratedMonitor):
 
     def restore(self, saved: Checkpoint) -> Self:
         own, skill = apart(saved._replace(arrays=unpacked(saved.arrays)))
-        if "dynamics" not in saved.header["hyperparameters"]:  # saved before there was a choice
-            self.dynamics = self.model.dynamics = dynamics_of(saved.header["shapes"])
-        if "feedback" not in saved.header["hyperparameters"]:
-            self.feedback = self.model.feedback = TRANSPORTED
         super().restore(own)
         self.skill_ = SkillSurprise.found(self.spec, skill, self.seed) if skill else None
         if self.alarm_on != "body" and self.skill_ is None:

@@ -35,10 +35,10 @@ CRASH = 2.0
 """How many times what the robot usually presses at most in nominal episodes of a task is a crash."""
 
 
-def versions() -> dict[str, str]:
-    """Of what decides over an episode."""
+def versions(*more: str) -> dict[str, str]:
+    """Of what decides over an episode, and of ``more`` packages."""
     others = {}
-    for package in ("robosuite", "mujoco", "gymnasium", "numpy"):
+    for package in ("robosuite", "mujoco", "gymnasium", "numpy", *more):
         with suppress(metadata.PackageNotFoundError):  # a light install may be without robosuite
             others[package] = metadata.version(package)
     return {"asm_gym": asm_gym.__version__, **others}

@@ -182,7 +182,7 @@ def run(config: Config) -> Findings:
     memory = NeuralASM.pretrained("panda") if config.memory is None else NeuralASM.load(config.memory)
     own = memory.diagnosis_
     if own is None:
-        raise ValueError(f"{config.memory} was saved before there was completion: fit it anew")
+        raise ValueError(f"{config.memory} knows no completion: fit it anew")
     with kit.stage("weighing"):
         known = examples(memory, own, [load_episode(path) for path in paths])
     faulty = known.kinds != "harmless"

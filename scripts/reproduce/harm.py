@@ -7,8 +7,6 @@ sensor of the guard reads. Pairs share their seed: the same scene, policy, and f
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -16,10 +14,8 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
-from asm_gym.envs.backend import PHYSICS_FREQ
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.files import written_whole
 from asm_gym.monitors import NeuralASM
@@ -30,14 +26,11 @@ from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import harm_agents, harm_braking, harm_report, harm_speeds, kit
 from asm_gym.scripts.reproduce.harm_agents import EXCESS, HITTERS, LEARNERS
-from asm_gym.scripts.reproduce.harm_report import TRANSIENT
+from asm_gym.scripts.reproduce.harm_felt import Felt, hand_speed, harm_of
 from asm_gym.spec import control_period
 from asm_gym.tasks import env_id
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.oracle import OracleReflex
-
-FIRST_S = 0.1
-"""The first blow lasts for so long from the substep on in which it began [s]."""
 
 IDEAL = "ideal reflex"
 
@@ -180,36 +173,6 @@ def measured(job: tuple[HarmCell, int], config: Config) -> list[kit.Record]:
     return records
 
 
-class Felt:
-    """Contact force [N] and the largest external torque [N m] in every physics substep."""
-
-    def __init__(self, arm: Any) -> None:
-        self._arm = arm
-        self._joints = np.concatenate([np.full(c.size, c.name.endswith("external_torque")) for c in arm.felt_channels])
-        self._forces: list[NDArray[np.float64]] = []
-        self.torque = 0.0
-
-    def read(self, substep: int = -1) -> None:
-        """What was felt since the row began; of one substep alone where its number is given."""
-        since = slice(-1, None) if substep >= 0 else slice(None)
-        self._forces.append(self._arm.simulation.contact_forces[since])
-        self.torque = max(self.torque, float(np.abs(self._arm.felt[since, self._joints]).max()))
-
-    @property
-    def force(self) -> NDArray[np.float64]:
-        """(T,)"""
-        return np.concatenate(self._forces)
-
-    @contextmanager
-    def reading(self, hooks: list[Any]) -> Iterator[None]:
-        """Reads whenever one of ``hooks`` is called, while the block runs."""
-        hooks.append(self.read)
-        try:
-            yield
-        finally:
-            hooks.remove(self.read)
-
-
 def guarded(env: gym.Env[Any, Any], guard: str, memory: NeuralASM, rate: int) -> gym.Env[Any, Any]:
     """An environment under one of ``GUARDS``."""
     told = GUARDS[guard]
@@ -251,28 +214,6 @@ def one(cell: HarmCell, seed: int, guard: str, memory: NeuralASM, config: Config
         "held": sum(bool(info.get("overridden")) for info in infos),
         "ended_s": len(infos) * control_period(arm) if ended else None,
     }
-
-
-def harm_of(force: NDArray[np.float64], substeps: int) -> kit.Record:
-    """What contact ``force`` (T,) [N] in every physics substep comes to, ``substeps`` of which are a step."""
-    hits = np.flatnonzero(force > EXCESS)
-    first = slice(hits[0], hits[0] + round(FIRST_S * PHYSICS_FREQ)) if hits.size else slice(0)
-    return {
-        "harm": float(np.maximum(force - EXCESS, 0.0).sum() / PHYSICS_FREQ),
-        "peak": float(force.max(initial=0.0)),
-        "first": float(force[first].max(initial=0.0)),
-        "first_step": int(hits[0]) // substeps if hits.size else 0,
-        "later": float(force[first.stop :].max(initial=0.0)),
-        # In control steps, so that shares of them can be added up over episodes.
-        "time_over": float((force > TRANSIENT).sum() / substeps),
-        "steps_over": int((force.reshape(-1, substeps) > TRANSIENT).any(axis=1).sum()),
-    }
-
-
-def hand_speed(arm: Any, infos: Sequence[dict[str, Any]], step: int) -> float:
-    """Of the hand when ``step`` began [m/s]; not a number in the first."""
-    velocity = infos[step - 1]["stream"][arm.stream_spec.slices["hand_velocity"]]
-    return float(np.linalg.norm(velocity)) if step else np.nan
 
 
 def run(config: Config) -> kit.Findings:

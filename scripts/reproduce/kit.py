@@ -25,7 +25,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field
-from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
@@ -35,12 +34,12 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
-import asm_gym
 from asm_gym.evaluation.figures import save
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import ConsoleTable, Table, markdown
 from asm_gym.rollouts import progress
 from asm_gym.rollouts.parallel import Progress, parallel_map
+from asm_gym.rollouts.run_folder import versions
 from asm_gym.scripts import command
 from asm_gym.scripts.options import check_options, option
 
@@ -49,8 +48,6 @@ Result = TypeVar("Result")
 
 Record = dict[str, Any]
 """One measurement: what was varied, the seed, and what came out."""
-
-PACKAGES = ("numpy", "scipy", "torch", "mujoco", "robosuite", "matplotlib")
 
 
 @dataclass(frozen=True)
@@ -165,7 +162,7 @@ def publish(name: str, found: Findings, config: Any, seconds: Mapping[str, float
     details = {
         "arguments": json.loads(json.dumps(asdict(config), default=str)),
         "seed": config.seed,
-        "versions": {"asm_gym": asm_gym.__version__, **{p: metadata.version(p) for p in PACKAGES}},
+        "versions": versions("scipy", "torch", "matplotlib"),
         "python": platform.python_version(),
         "machine": platform.machine(),
         "seconds": dict(seconds),

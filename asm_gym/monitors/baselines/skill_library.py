@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
-from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.baselines.base import no_context
@@ -82,14 +81,6 @@ class SkillLibrary(StreamModel):
             own = [n for n, name in enumerate(names) if name == skill]
             library.append(self._learn([xs[n] for n in own], [goals[n] for n in own], widest, floor))
         return self.restore({k: np.stack([one[k] for one in library]) for k in library[0]}, tuple(skills))
-
-    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        if "goal_size" not in learned:  # saved before it was told the goal
-            of_goal = {name: learned[name][:, None] for name in ("goal", "weights", "mean")}
-            of_goal["speed"] = np.zeros_like(of_goal["goal"])
-            nothing = np.zeros((len(learned["steps"]), 0))
-            learned = {**learned, **of_goal, "goal_size": np.zeros(len(nothing)), "usual": nothing, "varies": nothing}
-        return super().restore(learned, skills)
 
     def start(self, batch: int, told: Sequence[Told] = ()) -> _Running:
         """Of a skill that is not in the library, or not told, the first is taken to run, and of a goal the usual."""

@@ -83,8 +83,6 @@ def newest(out: Path) -> Path | None:
 def resume(folder: Path, learner: BaseAlgorithm, anchor: torch.optim.Optimizer | None = None) -> TrainingState:
     """Puts a learner of the same settings where the checkpoint was made; only tensors and arrays are read.
 
-    A checkpoint of before leaves the anchor, and the count of updates, as they are.
-
     Raises:
         ValueError: the checkpoint is damaged, or of other settings.
     """
@@ -101,9 +99,9 @@ def resume(folder: Path, learner: BaseAlgorithm, anchor: torch.optim.Optimizer |
                 for name in _BUFFER:
                     getattr(buffer, name)[: len(arrays[name])] = arrays[name]
                 buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
-        if anchor is not None and (folder / ANCHOR).is_file():
+        if anchor is not None:
             anchor.load_state_dict(torch.load(folder / ANCHOR, map_location="cpu", weights_only=True))
-        learner.num_timesteps, counted._n_updates = state["steps"], state.get("updates", counted._n_updates)
+        learner.num_timesteps, counted._n_updates = state["steps"], state["updates"]
         curve = tuple((int(s), float(x)) for s, x in state["curve"])
         return TrainingState(state["steps"], state["best"], curve)
     except (OSError, KeyError, ValueError, RuntimeError) as error:
