@@ -151,7 +151,8 @@ def _root_of(name: str, C: NDArray[Any]) -> tuple[NDArray[np.int16], NDArray[np.
 
 def _short(array: NDArray[Any]) -> NDArray[Any]:
     fraction, exponent = np.frexp(array)
-    return np.ldexp(np.rint(np.ldexp(fraction, SHORT)), exponent - SHORT)
+    rounded: NDArray[Any] = np.ldexp(np.rint(np.ldexp(fraction, SHORT)), exponent - SHORT)
+    return rounded
 
 
 def _apart(name: str, array: NDArray[Any]) -> tuple[str, NDArray[Any]]:
