@@ -24,18 +24,12 @@ from rich.console import Console
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
+from asm_gym.evaluation.detection_tables import BRIEF_CONDITION_COLUMNS, detection_table, headline, outcome_table
 from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, hourly_alarms, typical
 from asm_gym.evaluation.report import write_json, write_report
 from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import Share, binomial_interval
-from asm_gym.evaluation.tables import (
-    BRIEF_CONDITION_COLUMNS,
-    ConsoleTable,
-    detection_table,
-    headline,
-    outcome_table,
-    tabulate,
-)
+from asm_gym.evaluation.tables import ConsoleTable, tabulate
 from asm_gym.faults import Collision, Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.collect import collect

@@ -24,9 +24,10 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.episode import EpisodeLabel
 from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_S
+from asm_gym.evaluation.detection_tables import brief_monitors_table, harmless_table, kinds_table
 from asm_gym.evaluation.report import publish
 from asm_gym.evaluation.standing import coverage_table, kept_table
-from asm_gym.evaluation.tables import ConsoleTable, brief_monitors_table, harmless_table, kinds_table
+from asm_gym.evaluation.tables import ConsoleTable
 from asm_gym.faults import anywhere
 from asm_gym.faults.interface import FaultyInterface
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of, possible

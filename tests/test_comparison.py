@@ -8,8 +8,8 @@ import pytest
 
 from asm_gym.evaluation import comparison, metrics
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
+from asm_gym.evaluation.detection_tables import harmless_table, kinds_table, monitors_table
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.evaluation.tables import harmless_table, kinds_table, monitors_table
 
 
 def a_trace(peak, kind="nominal", severity="", onset=None):

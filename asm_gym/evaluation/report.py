@@ -18,10 +18,11 @@ from matplotlib.figure import Figure
 
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability
+from asm_gym.evaluation.detection_tables import harmless_table, kinds_table, monitors_table
 from asm_gym.evaluation.figures.style import SAYS
 from asm_gym.evaluation.scored_episode import ScoredEpisode, window_steps
 from asm_gym.evaluation.standing import card, coverage_table, kept_table, lead_table
-from asm_gym.evaluation.tables import Table, harmless_table, kinds_table, markdown, monitors_table
+from asm_gym.evaluation.tables import Table, markdown
 from asm_gym.extras import needed_for
 from asm_gym.files import written_whole
 

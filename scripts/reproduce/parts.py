@@ -19,10 +19,11 @@ from asm_gym.detection import EvidenceDetection, conformal_episodes
 from asm_gym.episode import Episode
 from asm_gym.evaluation import defaults
 from asm_gym.evaluation.comparison import BenchmarkResult, MonitorResult
+from asm_gym.evaluation.detection_tables import monitors_table
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.resampling import interval
 from asm_gym.evaluation.standing import lead_table
-from asm_gym.evaluation.tables import Table, monitors_table
+from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import TRACES
 from asm_gym.memory.feedback import FEEDBACK, LEARNED
 from asm_gym.memory.precision import unbounded

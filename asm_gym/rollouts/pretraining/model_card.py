@@ -12,10 +12,11 @@ import numpy as np
 from asm_gym.detection.events import KNOCK, STOP
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.comparison import visible_kinds
+from asm_gym.evaluation.detection_tables import milliseconds
 from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, hourly_alarms, hourly_events
 from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.statistics import Rate, Share
-from asm_gym.evaluation.tables import Column, Table, count, milliseconds, percent, tabulate
+from asm_gym.evaluation.tables import Column, Table, count, percent, tabulate
 from asm_gym.monitors import CalibratedMonitor
 from asm_gym.rollouts.run_folder import CRASH
 from asm_gym.rollouts.scoring import detectability_of, traces_of
