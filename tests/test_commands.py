@@ -21,7 +21,7 @@ from asm_gym.scripts.options import rows as options_of
 
 ROOT = Path(__file__).resolve().parents[1]
 STUDIES = [f"reproduce {study}" for study in ("all", *reproduce.STUDIES)]
-MEASURES = [f"benchmark {what}" for what in ("env", "leaks", "experts", "coverage", "memory", "fit", "safety", "watch")]
+MEASURES = [f"benchmark {what}" for what in ("env", "experts", "memory", "fit", "safety", "fleet", "deadline")]
 EVERY_COMMAND = [*cli.COMMANDS, *STUDIES, *MEASURES]
 
 
@@ -87,7 +87,7 @@ def test_help_says_what_will_do_and_what_is_shortened(capsys):
     assert cli.main(["train", "--help"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "--algorithm NAME How it learns" in said
-    assert "One of sac, td3, ppo, gru. Default: sac." in said
+    assert "One of sac, td3, ppo. Default: sac." in said
     assert "Unless asked otherwise: steps 300, demonstrations 4" in said
     assert cli.main(["demo", "--help"]) == 0
     assert "--on-alarm {graded,hold,terminate}" in capsys.readouterr().out
