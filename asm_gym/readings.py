@@ -35,13 +35,19 @@ def resolution(values: NDArray[Any]) -> float:
     changes = changes[changes > 2 * float(rounding)]
     if len(changes) < FEWEST:
         return 0.0
-    step = float(np.median(changes[changes < 1.5 * changes.min()]))
+    step = _median(changes[changes < 1.5 * changes.min()])
     ratios = changes / step
-    if np.median(ratios) > COARSE:
+    if _median(ratios) > COARSE:
         return 0.0
     tolerance = NEARLY + 2 * float(rounding) / step + 1e-3 * ratios
     near = np.abs(ratios - np.rint(ratios)) <= np.minimum(tolerance, 0.25)
-    return float(f"{step:.4g}") if near.mean() >= MOSTLY else 0.0
+    return float(f"{step:.4g}") if np.count_nonzero(near) / len(near) >= MOSTLY else 0.0
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    """That of finite numbers; ``np.median`` takes ten times as long for so few."""
+    ordered, half = np.sort(values), len(values) // 2
+    return float(ordered[half] if len(values) % 2 else (ordered[half - 1] + ordered[half]) / 2.0)
 
 
 def noise_of(values: NDArray[Any]) -> float:
@@ -54,4 +60,4 @@ def noise_of(values: NDArray[Any]) -> float:
     if len(known) < 8:
         return 0.0
     third = np.abs(np.diff(known, 3))
-    return float(f"{np.median(third) / 0.6745 / np.sqrt(20):.3g}")
+    return float(f"{_median(third) / 0.6745 / np.sqrt(20):.3g}")

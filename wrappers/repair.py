@@ -162,10 +162,10 @@ class Repair:
 
     def _doubt(self, columns: NDArray[np.bool_]) -> set[str]:
         """Believes the sensors of ``columns`` (D,) no more; which those are."""
-        names = {name for name, own in self._completion.sensors if columns[own].any()}
-        self._calm |= dict.fromkeys(names, 0)
+        names = [name for name, own in self._completion.sensors if columns[own].any()]
+        self._calm |= dict.fromkeys(names, 0)  # in an order that no hash decides, for reports are to the last bit
         self._choose()
-        return names
+        return set(names)
 
     def _choose(self) -> None:
         """Takes up which sensors are missing."""

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from asm_gym.memory.energy import Array, activate, kernel
 from asm_gym.memory.inference import Weights, direct, direct_synapses, expect, infer, sense
 
-UPDATES, RECALL_UPDATES = 15_000, 50_000
+UPDATES, RECALL_UPDATES = 10_000, 50_000
 """Steps of a batch that are learned from at most, without and with learning to run on alone, which takes longer: with
 very many episodes fewer passes over them are enough."""
 
