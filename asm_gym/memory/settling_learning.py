@@ -1,14 +1,16 @@
 """Learning of the network that settles: every synapse changes by what its own two ends do, and by nothing else.
 
     F_t = ½ Π_z ‖z_t - μ_t‖² + ½ Π_x ‖x_t - W_F f(z_t) - b_F‖² + ½ ‖a_t - W_A f(h_t)‖²      see ``settling``
-    ΔW_H ∝ Π_z ε_z f(z_{t-1})ᵀ    ΔW_U ∝ Π_z ε_z [a_t, 1]ᵀ    ΔW_F ∝ Π_x ε_x f(z_t)ᵀ    ΔW_A ∝ ε_a f(h_t)ᵀ
+    ΔW_H ∝ (Π_z ε_z + ε_h) f(z_{t-1})ᵀ    ΔW_U ∝ Π_z ε_z [a_t, 1]ᵀ + ε_h [0, 1]ᵀ    ε_h = f'(h_t) ⊙ W_Aᵀ ε_a
+    ΔW_F ∝ Π_x ε_x f(z_t)ᵀ    ΔW_A ∝ ε_a f(h_t)ᵀ
 
-Each is -∂F_t/∂W at the settled state; the error ε_a of the motor prediction stays with W_A and teaches no state.
-Nothing goes back through time: a step teaches what the step before handed it, and nothing further back. After a random
-cue a stream may run on alone, as in ``scheduled_sampling``: what is handed on is then μ_t, and the action its own.
+Each is -∂F_t/∂W at the settled state. Nothing goes back through time: a step teaches what the step before handed it,
+and nothing further back. So W_H begins near the identity, by which a unit carries on what it was, and the step before
+hands on what was long before it. After a random cue a stream may run on alone, as in ``scheduled_sampling``: what is
+handed on is then μ_t, and the action its own.
 
-Source: Millidge et al. 2024 (PLOS Comput Biol); Kingma and Ba 2015 for the step size; Bengio et al. 2015 (NeurIPS) for
-learning from own predictions.
+Sources: Millidge et al. 2024 (PLOS Comput Biol); Kingma and Ba 2015 for the step size; Bengio et al. 2015 (NeurIPS) for
+learning from own predictions; Le et al. 2015 (arXiv 1504.00941) for beginning at the identity.
 """
 
 from __future__ import annotations
@@ -25,17 +27,23 @@ from asm_gym.memory.scheduled_sampling import LONGEST_CUE, Moment, practise
 from asm_gym.memory.settling import SettlingNetwork, SettlingWeights, settling_shapes
 from asm_gym.memory.temporal import Trained, unassociated
 
+SUSTAINED, FAINT = (0.9, 1.0), 0.1
+"""What units begin with of their own last state, the least and the most; and the gain from all the others."""
+
 
 def initial_settling_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> SettlingWeights:
-    """Random weights of about unit gain; no biases."""
+    """Random weights of about unit gain, but from state to state, where each unit sustains itself; no biases."""
     weights = {n: np.zeros(shape, np.float32) for n, shape in settling_shapes(hidden, sensory, motor).items()}
     for name in ("W_H", "W_U", "W_F", "W_A"):
         W = weights[name]
         W[:] = rng.standard_normal(W.shape) / np.sqrt(W.shape[1])
+    weights["W_H"][:] = FAINT * weights["W_H"] + np.diag(np.linspace(*SUSTAINED, hidden, dtype=np.float32))
     return SettlingWeights(**weights)
 
 
-def settling_change(before: Array, u: Array, h: Array, errors: tuple[Array, Array, Array], z: Array) -> SettlingWeights:
+def settling_change(
+    before: Array, u: Array, h: Array, errors: tuple[Array, Array, Array], z: Array, W_A: Array
+) -> SettlingWeights:
     """What one control step asks of each array: the sum of local products, averaged over the batch.
 
     Args:
@@ -43,14 +51,19 @@ def settling_change(before: Array, u: Array, h: Array, errors: tuple[Array, Arra
         u: (B, A + 1) what was taken for the action, and a constant 1.
         h: (B, H) what the motor prediction was read from.
         errors: Π_z ε_z (B, H), Π_x ε_x (B, S) at ``z``, and ε_a (B, A).
+        W_A: (A, H), by whose transpose ε_a comes back to h.
     """
     state, senses, action = errors
+    f = activate(h)
+    motor = (np.float32(1) - f * f) * (action @ W_A)  # (B, H) ε_h
+    W_U = coincidence(state, u)
+    W_U[:, -1] += motor.mean(axis=0)
     return SettlingWeights(
-        W_H=coincidence(state, activate(before)),
-        W_U=coincidence(state, u),
+        W_H=coincidence(state + motor, activate(before)),
+        W_U=W_U,
         W_F=coincidence(senses, activate(z)),
         b_F=senses.mean(axis=0),
-        W_A=coincidence(action, activate(h)),
+        W_A=coincidence(action, f),
     )
 
 
@@ -98,7 +111,7 @@ class SettlingLearner:
         state, senses = z - mu, left - outward(activate(z), w.W_F)
         action = np.ascontiguousarray(u[:, :-1]) - outward(activate(h), w.W_A)
         total = 0.5 * float(pi_z * np.sum(state**2) + pi_x * np.sum(senses**2) + np.sum(action**2))
-        change = settling_change(before, taken, h, (pi_z * state, pi_x * senses, action), z)
+        change = settling_change(before, taken, h, (pi_z * state, pi_x * senses, action), z, w.W_A)
         for name, synapse in self.synapses.items():
             synapse.learn(getattr(change, name), rate)
         # W_F moves little in a step, so one iteration keeps the norm up to date.
