@@ -218,6 +218,7 @@ def learn_association(
     passes: int = PASSES,
     feedback: Feedback | None = None,
     lengths: Sequence[int] = (),
+    apart: int | None = None,
 ) -> Association:
     """What is linear in closed form; what remains by the hidden units, in random order; how sure it is last.
 
@@ -229,8 +230,9 @@ def learn_association(
         updates, passes: over batches and over the rows that are learned from, at most.
         feedback: how errors come back to the hidden units; by the transposed weights where None.
         lengths: how many rows each episode has; where none are told, thirds are of rows that follow each other.
+        apart: how many rows there would be if none overlapped, as changes over several rows do; N where None.
     """
-    few = len(a) < ROWS_PER_INPUT * a.shape[1]
+    few = (apart or len(a)) < ROWS_PER_INPUT * a.shape[1]
     D = learn_from_past(a, changes) if few else learn_linear(a, groups, changes)
     remainder = np.maximum(np.sqrt(np.mean((delta - a @ D.T) ** 2, axis=0)), SMALLEST_SPREAD)  # (X,)
     exists = synapses(groups, changes, a.shape[1], size)
