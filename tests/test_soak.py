@@ -119,5 +119,5 @@ def test_a_guard_lets_nothing_through_in_a_few_steps(made):
 
 
 def test_an_arm_at_rest_raises_no_alarm_and_a_push_on_it_does():
-    monitor = rest.learned(60, 0.05)
-    assert rest.watched(monitor, 60.0, 1_000_000) == (0, True)
+    monitor = rest.learned(40, 0.05)
+    assert rest.watched(monitor, 30.0, 1_000_000) == (0, True)
