@@ -127,6 +127,8 @@ def learned(
     settings: dict[str, Any] = {"seed": args.seed}
     if args.epochs is not None and "epochs" in monitor_class(args.monitor).hyperparameters:
         settings["epochs"] = args.epochs
+    if fitting[0].spec.source == "table" and "values" in monitor_class(args.monitor).hyperparameters:
+        settings["values"] = True  # an arm's log holds pushes that last, and torques
     monitor: Any = make_monitor(args.monitor, fitting[0].spec, **settings)
     monitor.fit(fitting, progress)
     try:

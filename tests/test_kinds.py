@@ -96,3 +96,14 @@ def test_a_threshold_that_is_refused_names_the_piece(tmp_path, capsys, monkeypat
     said = " ".join(capsys.readouterr().err.split())
     assert "could pass" in said
     assert "log.csv from 54 s" in said
+
+
+def test_two_logs_of_different_columns_are_refused_in_one_line(tmp_path, capsys):
+    for name, column in (("a", "torque"), ("b", "current")):
+        rows = [f"{n / 50},{n % 7},{n % 3}" for n in range(100)]
+        (tmp_path / f"{name}.csv").write_text("\n".join([f"time,q,{column}", *rows]))
+    assert main(["fit", str(tmp_path), "--out", str(tmp_path / "m.asm"), "--split", "0.5"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "b.csv" in said
+    assert "channels that are not there: torque" in " ".join(said.split())
+    assert not (tmp_path / "m.asm").exists()

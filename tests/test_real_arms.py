@@ -15,12 +15,16 @@ from asm_gym.data.selection import pieces
 from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.scores import Largest
 from asm_gym.episode import Episode
-from asm_gym.monitors import CalibratedMonitor, load_monitor, make_monitor
-from asm_gym.monitors.baselines.association_values import ValueAssociation, speeds
+from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_monitor
+from asm_gym.monitors.baselines.arm_inputs import forces, motion, speeds
+from asm_gym.monitors.baselines.association_values import ValueAssociation
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.monitors.onnx_export import write_onnx
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.reproduce.pushed import FAULTS, NEWTONS, SLIP, TABLES, _about_x, _about_z, jacobian
 from asm_gym.scripts.reproduce.real_arms import Config, Job, on_an_arm
+from asm_gym.scripts.reproduce.same_inputs import Informed
+from asm_gym.spec import Channel, StreamSpec
 
 REAL = Path(os.environ.get("ASM_GYM_REAL", "/nowhere"))
 real = pytest.mark.skipif(not REAL.is_dir(), reason="ASM_GYM_REAL names no folder of recordings of real arms")
@@ -128,18 +132,88 @@ def test_values_are_told_from_the_others_with_friction_and_sines_and_not_without
 def test_a_held_push_is_found_by_values_and_explained_away_by_changes():
     whole = Episode.from_table(arm())
     cut = pieces(whole, 1.0)
-    pushed = []
-    for piece in cut[45:]:
-        stream = piece.stream.copy()
-        stream[50:, 4] += np.minimum(1.0, np.arange(50) / 20) * 1.0
-        pushed.append(Episode.from_stream(stream, piece.spec))
+    faulty = [pushed(piece, 1.0) for piece in cut[45:]]
     found = {}
     for name in ("association_values+evidence", "association_linear+evidence"):
         monitor = make_monitor(name, whole.spec).fit(cut[:30]).calibrate(cut[30:45], 0.07)
-        scores = monitor.score_episodes(pushed)
+        scores = monitor.score_episodes(faulty)
         found[name] = np.mean([(s.value[90:] > monitor.threshold).any() for s in scores])
     assert found["association_values+evidence"] > 0.9
     assert found["association_linear+evidence"] < found["association_values+evidence"]
+
+
+def pushed(piece: Episode, size: float) -> Episode:
+    """From its middle on the first torque is so much more [N m], in a fifth of a second."""
+    stream, half = piece.stream.copy(), len(piece) // 2
+    stream[half:, 4] += size * np.minimum(1.0, np.arange(len(piece) - half) / 20)
+    return Episode.from_stream(stream, piece.spec)
+
+
+def test_torques_are_judged_however_well_they_are_told_and_where_an_arm_may_go_is_not():
+    columns = arm(3000)
+    columns["effort"][:, 1] = 0.05 * np.random.default_rng(1).normal(size=3000)  # nothing tells it
+    cut = pieces(Episode.from_table(columns), 1.0)
+    model = ValueAssociation(cut[0].spec, changes=False).fit(cut, np.random.default_rng(0), lambda done, total: None)
+    assert forces(cut[0].spec).tolist() == model.error_columns.tolist() == [4, 5]
+    assert motion(cut[0].spec).tolist() == [0, 1, 2, 3]
+    assert model.learned_["R2_values"][5] < 0.5
+
+
+def test_an_error_far_from_what_was_learned_counts_for_less():
+    whole = Episode.from_table(arm(3000))
+    cut = pieces(whole, 1.0)
+    model = ValueAssociation(whole.spec, changes=False).fit(cut, np.random.default_rng(0), lambda done, total: None)
+    state = model.start(1)
+    for row in whole.stream[:20].astype(np.float64):
+        state, _ = model.predict(state, row[None])
+    inside = np.ones((1, model.learned_["D"].shape[1]))
+    inside[:, :-1] = 0.0  # the middle of all that was shown
+    assert model._farther(inside).max() == 1.0
+    z = np.hstack([np.full((1, inside.shape[1] - 1), 30.0), np.ones((1, 1))])
+    far = model.learned_["far"][0]
+    assert model._farther(z)[0, 0] == pytest.approx(np.sqrt(z[0] @ far @ z[0]))
+    assert model._farther(2 * z)[0, 0] == pytest.approx(2 * model._farther(z)[0, 0])
+
+
+def test_a_memory_judges_values_beside_changes_and_keeps_both(tmp_path):
+    cut = pieces(Episode.from_table(arm()), 1.0)
+    faulty = [pushed(piece, 1.0) for piece in cut[45:]]
+    found = {}
+    for values in (False, True):
+        asm = NeuralASM(cut[0].spec, hidden_size=16, association_size=32, epochs=2, values=values)
+        asm.fit(cut[:30]).calibrate(cut[30:45], 0.07)
+        found[values] = np.mean([(s.value[90:] > asm.threshold).any() for s in asm.score_episodes(faulty)])
+        asm.save(tmp_path / "x.asm")
+        again = load_monitor(tmp_path / "x.asm")
+        np.testing.assert_array_equal(again.score(faulty[0]).value, asm.score(faulty[0]).value)
+    assert found[True] > 0.9 > found[False]
+    score = asm.score(faulty[0])
+    np.testing.assert_allclose(score.attribution.sum(axis=1), score.value)
+    assert np.argmax(score.attribution[-1]) == 4
+    body = asm.values_.score(faulty[0]).value
+    assert (score.value >= body).all()
+    with pytest.raises(ValueError, match="values=False"):
+        write_onnx(asm, tmp_path / "x.onnx")
+
+
+def test_a_memory_of_what_nothing_tells_judges_changes_alone():
+    rng = np.random.default_rng(0)
+    spec = StreamSpec((Channel("a", 1), Channel("b", 1)), dt=0.05)
+    episodes = [Episode.from_stream(rng.normal(size=(60, 2)), spec) for _ in range(10)]
+    assert NeuralASM(spec, hidden_size=8, association_size=8, epochs=1, values=True).fit(episodes).values_ is None
+
+
+def test_rivals_are_told_friction_and_weight_of_the_row_before():
+    cut = pieces(Episode.from_table(arm(2000)), 1.0)
+    informed = Informed(cut[0].spec, lambda spec: make_monitor("kalman+evidence", spec)).fit(cut[:15])
+    told = informed._informed(cut[0])
+    inputs = told.stream[:, told.spec.slices["of_arms"]]
+    q, dq = (cut[0].stream[:, cut[0].spec.slices[name]].astype(float) for name in ("position", "velocity"))
+    spread = np.concatenate([p.stream[:, 2:4] for p in cut[:15]]).astype(float).std(axis=0)
+    np.testing.assert_allclose(inputs[1:, :2], np.tanh(dq[:-1] / (0.01 * spread)), atol=1e-5)
+    np.testing.assert_allclose(inputs[1:, 6:8], np.sin(q[:-1]), atol=1e-5)
+    score = informed.score_episodes([cut[16]])[0]
+    assert len(score.value) == len(cut[16])
 
 
 def test_it_is_saved_and_says_the_same_again(tmp_path):
@@ -259,3 +333,18 @@ def test_recordings_of_arms_are_streams_of_position_speed_and_effort(name):
     sizes = {s.stop - s.start for s in episode.spec.slices.values()}
     assert len(sizes) == 1
     assert np.isfinite(episode.stream).all()
+
+
+def test_a_body_model_is_one_more_column():
+    columns = arm(3000)
+    q = columns["position"]
+    columns["effort"] += 4 * np.sin(q[:, :1] + q[:, 1:]) * np.array([1.0, np.cos(3 * q[:, 0]).mean()])
+    exact = columns["effort"] - 2 * np.tanh(columns["velocity"] / 0.02)
+    found = []
+    for known in (columns, {**columns, "computed_torque": exact}):
+        cut = pieces(Episode.from_table(known), 1.0)
+        model = ValueAssociation(cut[0].spec, changes=False, body=False)
+        model.fit(cut, np.random.default_rng(0), lambda done, total: None)
+        found.append(model.learned_["R2_values"][4:6].min())
+        assert forces(cut[0].spec).tolist() == [4, 5]
+    assert found[1] > found[0] + 0.1

@@ -45,7 +45,7 @@ def test_where_no_noise_is_declared_a_sense_is_watched_unless_it_stood_still_bef
     streams = [np.random.default_rng(seed).normal(size=(100, 3)) for seed in range(2)]
     streams[1][50, 1] = streams[1][49, 1]
     found = count_repetitions(streams, np.zeros(3, np.bool_))
-    assert (found[:2, [0, 2]] > 4.0).all()
+    assert (found[:2, [0, 2]] > 2.0).all()
     assert (found[:2, 1] == 0.0).all()
 
 
@@ -117,11 +117,11 @@ def asm() -> NeuralASM:
     return NeuralASM(noisy, hidden_size=16, association_size=40, epochs=2).fit(fit).calibrate(others, 0.05)
 
 
-def test_a_frozen_sense_alarms_within_three_rows_however_poor_the_prediction(asm):
+def test_a_frozen_sense_alarms_within_four_rows_however_poor_the_prediction(asm):
     for n, episode in enumerate(sine_episodes(12, seed=2, spec=asm.spec, noise=0.5)):
         surprise = asm.score(frozen(episode, n, onset=20))
         np.testing.assert_allclose(surprise.attribution.sum(axis=1), surprise.value)
-        assert surprise.value[23] > asm.threshold
+        assert surprise.value[24] > asm.threshold  # of so few episodes
         assert surprise.attribution[23].argmax() == n
 
 
@@ -163,3 +163,12 @@ def test_an_arm_that_rests_repeats_its_digits_and_is_healthy():
     stuck = rest.copy()
     stuck[:, 1] = 0.3  # what has noise does not rest
     assert run(stuck[:20], counted)[-1].unlikely[0, 1] > REPETITION_OFFSET
+
+
+def test_the_fewer_episodes_never_rested_the_longer_a_rest_is_believed():
+    def rows_until(episodes: int) -> int:
+        streams = [np.random.default_rng(seed).normal(size=(100, 1)) for seed in range(episodes)]
+        states = run(np.full((40, 1), 0.5), count_repetitions(streams, np.array([True])))
+        return int(np.argmax([s.unlikely[0, 0] > REPETITION_OFFSET for s in states]))
+
+    assert [rows_until(n) for n in (4, 12, 90)] == [5, 4, 2]  # 12 = 4.15 * log(0.9 * 20), 3.0 * log(54), 2 * log(405)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.soak import guard, kills, verdicts
+from tests.soak import guard, kills, rest, verdicts
 from tests.soak.targets import Good, public
 
 
@@ -116,3 +116,8 @@ def test_a_guard_lets_nothing_through_in_a_few_steps(made):
     assert found.failures > 0
     assert (found.missed, found.let_through) == (0, 0)
     assert len(found.sizes) == 10
+
+
+def test_an_arm_at_rest_raises_no_alarm_and_a_push_on_it_does():
+    monitor = rest.learned(40, 0.05)
+    assert rest.watched(monitor, 30.0, 1_000_000) == (0, True)

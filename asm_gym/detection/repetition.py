@@ -41,6 +41,9 @@ UNMOVED = 0.5
 RESTS = 0.5
 """A sense that repeats itself again as often as that, once it has begun to, stands still now and then."""
 
+RESTLESS = 5.0
+"""A repetition is no rarer than one in so many times the number of nominal episodes: of ninety, two are enough."""
+
 MOST_READ = 20_000
 """Rows from which noise and resolution are told."""
 
@@ -94,6 +97,8 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
         chances += [(~before).sum(axis=0), before.sum(axis=0)]
         happened += [(now & ~before).sum(axis=0), (now & before).sum(axis=0)]
     first = (happened[0] + 0.5) / (chances[0] + 1.0)
+    # Rest comes by the episode: where n of them never rested, the next may.
+    first = np.maximum(first, 1.0 / (RESTLESS * len(streams)))
     # As rare after a repetition as after none, until seen to be otherwise.
     p = np.array([first, (happened[1] + first) / (chances[1] + 1.0)])
     watched = (noisy & ~stands_still(streams) & (p[1] < RESTS)) if noisy.any() else happened.sum(axis=0) == 0

@@ -224,6 +224,7 @@ def learn_association(
     passes: int = PASSES,
     feedback: Feedback | None = None,
     lengths: Sequence[int] = (),
+    apart: int | None = None,
 ) -> Association:
     """What is linear in closed form; what remains by the hidden units, in random order; how sure it is last.
 
@@ -235,8 +236,9 @@ def learn_association(
         updates, passes: over batches and over the rows that are learned from, at most.
         feedback: how errors come back to the hidden units; by the transposed weights where None.
         lengths: how many rows each episode has; where none are told, thirds are of rows that follow each other.
+        apart: how many rows there would be if none overlapped, as changes over several rows do; N where None.
     """
-    few, feedback = len(a) < ROWS_PER_INPUT * a.shape[1], feedback or Feedback()
+    few, feedback = (apart or len(a)) < ROWS_PER_INPUT * a.shape[1], feedback or Feedback()
     exists = synapses(groups, changes, a.shape[1], size)
     D = learn_from_past(a, changes) if few else feedback.linear(a, groups, changes, exists.D, rng)
     remainder = np.maximum(np.sqrt(np.mean((delta - a @ D.T) ** 2, axis=0)), SMALLEST_SPREAD)  # (X,)

@@ -138,5 +138,6 @@ def train(
     network, energy = learn_temporal(trajectories, hidden, schedule, rng, tick)
     inputs, lengths = np.concatenate([t.inputs for t in trajectories]), [len(t.inputs) for t in trajectories]
     deltas, layout = np.ascontiguousarray(inputs[:, changes]), (groups, changes, units)
-    association = learn_association(inputs, deltas, *layout, rng, tick, feedback=feedback, lengths=lengths)
+    apart = sum(len(t.senses) for t in trajectories)  # changes over several rows overlap
+    association = learn_association(inputs, deltas, *layout, rng, tick, feedback=feedback, lengths=lengths, apart=apart)
     return Trained(network.with_association(association), energy)

@@ -36,6 +36,7 @@ class MonitorState(NamedTuple):
     detection: State
     skill: State = ()  # of what listens for skills, where there is one
     knock: State = ()  # of what excuses surprise, where it does
+    values: State = ()  # of what judges values beside changes, where there is one
 
 
 class CalibratedMonitor(Calibrated):

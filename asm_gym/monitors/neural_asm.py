@@ -33,9 +33,11 @@ from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState
 from asm_gym.monitors.monitor_file import restored
 from asm_gym.monitors.promise import Asked
 from asm_gym.monitors.shipped import pretrained_file
-from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise, apart
+from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise, apart, taken_up
 from asm_gym.monitors.stream_model import parameter_names
 from asm_gym.monitors.training_data import check_nominal
+from asm_gym.monitors.values import PREFIX as VALUES
+from asm_gym.monitors.values import greater, learned_values, values_monitor
 from asm_gym.monitors.weight_packing import rounded, unpacked
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
@@ -73,6 +75,8 @@ class NeuralASM(CalibratedMonitor):
             that is to watch any policy leaves it out.
         excuses: knocks, joints at their stops and fingers that move are told apart from faults (``detection.events``):
             for a memory that is to watch any policy, of which some strike things.
+        values: torques, and other values that the rest of a row tells, are judged beside changes (``monitors.values``):
+            for a push that is held, in logs of real arms.
         seed: of the initial weights and of the order of the episodes.
         feedback: how errors come back to the hidden units of association, one of ``memory.feedback.FEEDBACK``.
         dynamics: how the temporal network carries on what was: ``"traces"`` of what was sensed and done, or
@@ -83,6 +87,7 @@ class NeuralASM(CalibratedMonitor):
         maxima_: largest surprise in each episode that ``calibrate`` was given; None before.
         blocks_: the same by the hour; None before, and in memories that were saved before it was kept.
         skill_: what listens for skills; None before ``learn_skills``.
+        values_: what judges values; None before ``fit``, where nobody asked for it, and where nothing tells any.
 
     Example:
         >>> import numpy as np
@@ -120,7 +125,9 @@ class NeuralASM(CalibratedMonitor):
         feedback: str = LEARNED,
         dynamics: str = TRACES,
         excuses: bool = False,
+        values: bool = False,
     ) -> None:
+        self.values = check_flag("values", values)
         self._excuses = Excuses(spec) if check_flag("excuses", excuses) else None
         self.excuses = excuses
         check_choice("dynamics", dynamics, DYNAMICS)
@@ -147,6 +154,7 @@ class NeuralASM(CalibratedMonitor):
         self._row: CompiledRow | None = None
         self._row_of: tuple[Any, ...] | None = None
         self.skill_: SkillSurprise | None = None
+        self.values_: CalibratedMonitor | None = None
 
     def rounded(self) -> Self:
         """The same memory in fewer bits, weights in 8, which takes a quarter of the space when it is saved.
@@ -203,7 +211,7 @@ class NeuralASM(CalibratedMonitor):
         schedule = {name: getattr(self, name) for name in Schedule._fields}
         sizes = {"hidden_size": self.hidden_size, "association_size": self.association_size}
         detections = {n: getattr(d, n) for d in self.detections.values() for n in parameter_names(type(d))}
-        how = {n: getattr(self, n) for n in ("seed", "feedback", "dynamics", "excuses")}
+        how = {n: getattr(self, n) for n in ("seed", "feedback", "dynamics", "excuses", "values")}
         return schedule | sizes | detections | how
 
     @classmethod
@@ -237,8 +245,11 @@ class NeuralASM(CalibratedMonitor):
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
         self._fitted()
         rows, row = self._rows(state, stream), self._compiled()
-        before, knock = state.skill, state.knock
+        before, knock, held = state.skill, state.knock, state.values
         state, surprise = super().observe(state, rows) if row is None else row(state, rows)
+        if self.values_ is not None:
+            held, of_values = self.values_.observe(held, rows)
+            state, surprise = state._replace(values=held), greater(surprise, of_values)
         if self._excuses is not None:
             knock, excused = self._excuses.step(knock, rows)
             state, surprise = state._replace(knock=knock), surprise.excused(excused)
@@ -261,21 +272,29 @@ class NeuralASM(CalibratedMonitor):
         state = super().initial_state(batch, told)
         if self._excuses is not None:
             state = state._replace(knock=self._excuses.start(batch))
+        if self.values_ is not None:
+            state = state._replace(values=self.values_.initial_state(batch))
         return state if self.skill_ is None else state._replace(skill=self.skill_.monitor.initial_state(batch))
 
     def reset_evidence(self, state: MonitorState) -> MonitorState:
         state = super().reset_evidence(state)
+        if self.values_ is not None:
+            state = state._replace(values=self.values_.reset_evidence(state.values))
         return state if self.skill_ is None else state._replace(skill=self.skill_.monitor.reset_evidence(state.skill))
 
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
         found = super().learned_
+        if self.values_ is not None:
+            found |= {VALUES + name: array for name, array in self.values_.learned_.items()}
         return found if self.skill_ is None else found | self.skill_.arrays
 
     def restore(self, saved: Checkpoint) -> Self:
         own, skill = apart(saved._replace(arrays=unpacked(saved.arrays)))
+        own, values = apart(own, VALUES)
         super().restore(own)
         self.skill_ = SkillSurprise.found(self.spec, skill, self.seed) if skill else None
+        self.values_ = taken_up(values_monitor(self.spec, self.seed), values) if values else None
         if self.alarm_on != "body" and self.skill_ is None:
             raise ValueError(f"the checkpoint alarms on {shown(self.alarm_on)} surprise, and holds no skills")
         check_choice("alarm_on", self.alarm_on, ALARMS_ON)
@@ -284,6 +303,7 @@ class NeuralASM(CalibratedMonitor):
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
         self.skill_ = None  # it was weighed against the memory as it was
         super()._learn(episodes, progress, warm_start)
+        self.values_ = learned_values(episodes, self.seed) if self.values else None
 
     def _set_threshold(self, scores: Sequence[Surprise], asked: Asked, each: Sequence[str]) -> None:
         super()._set_threshold(scores, asked, each)

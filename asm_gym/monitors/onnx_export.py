@@ -44,7 +44,7 @@ def write_onnx(asm: NeuralASM, path: str | Path) -> Path:
     """Writes the graph of a fitted memory; its labels, period and threshold stand in the metadata.
 
     Raises:
-        ValueError: the memory is none of traces judged by evidence.
+        ValueError: the memory is none of traces judged by evidence, or judges values too.
         ImportError: onnx is not installed.
     """
     onnx = require("onnx", what="write_onnx")
@@ -53,6 +53,8 @@ def write_onnx(asm: NeuralASM, path: str | Path) -> Path:
         raise ValueError(
             f"an ONNX graph is of dynamics='traces' under evidence, got {asm.dynamics!r}, {detection.name!r}"
         )
+    if asm.values_ is not None:
+        raise ValueError("an ONNX graph judges changes alone, and this memory values too: fit one with values=False")
     made = _Graph(onnx)
     _step(made, model, detection)
     first = {"row": np.zeros((1, asm.spec.size)), **initial_state(asm)}

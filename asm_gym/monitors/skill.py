@@ -224,14 +224,8 @@ class SkillSurprise:
         """As arrays by their names without the prefix say. Raises ValueError or KeyError where they do not fit."""
         weight = check_number("the weight of skill surprise", float(arrays["weight"]), above=0.0)
         learned = {n: a for n, a in arrays.items() if n not in ("maxima", "blocks", "weight")}
-        shapes = {name: array.shape for name, array in learned.items()}
-        header = {"shapes": shapes, "skills": (), "threshold": None, "detection": EvidenceDetection.name, "about": {}}
-        return cls(
-            _monitor(spec, seed).restore(Checkpoint(header, learned)),
-            weight,
-            arrays.get("maxima"),
-            arrays.get("blocks"),
-        )
+        heard = arrays.get("maxima"), arrays.get("blocks")
+        return cls(taken_up(_monitor(spec, seed), learned), weight, *heard)
 
 
 def same_rank(threshold: float, of: NDArray[np.float64], among: NDArray[np.float64]) -> float:
@@ -240,12 +234,19 @@ def same_rank(threshold: float, of: NDArray[np.float64], among: NDArray[np.float
     return float(np.sort(among)[below - 1]) if below else 0.0
 
 
-def apart(saved: Checkpoint) -> tuple[Checkpoint, Arrays]:
-    """A memory's checkpoint without what listens for skills beside it, and the arrays of that."""
-    skill = {n.removeprefix(PREFIX): a for n, a in saved.arrays.items() if n.startswith(PREFIX)}
-    shapes = {n: s for n, s in saved.header["shapes"].items() if not n.startswith(PREFIX)}
-    arrays = {n: a for n, a in saved.arrays.items() if not n.startswith(PREFIX)}
-    return Checkpoint({**saved.header, "shapes": shapes}, arrays), skill
+def apart(saved: Checkpoint, prefix: str = PREFIX) -> tuple[Checkpoint, Arrays]:
+    """A memory's checkpoint without what is judged beside it, and the arrays of that."""
+    beside = {n.removeprefix(prefix): a for n, a in saved.arrays.items() if n.startswith(prefix)}
+    shapes = {n: s for n, s in saved.header["shapes"].items() if not n.startswith(prefix)}
+    arrays = {n: a for n, a in saved.arrays.items() if not n.startswith(prefix)}
+    return Checkpoint({**saved.header, "shapes": shapes}, arrays), beside
+
+
+def taken_up(monitor: CalibratedMonitor, learned: Arrays) -> CalibratedMonitor:
+    """A monitor that a memory keeps beside it, with what it had learned; it has no threshold of its own."""
+    shapes = {name: array.shape for name, array in learned.items()}
+    header = {"shapes": shapes, "skills": (), "threshold": None, "detection": EvidenceDetection.name, "about": {}}
+    return monitor.restore(Checkpoint(header, dict(learned)))
 
 
 def _monitor(spec: StreamSpec, seed: int) -> CalibratedMonitor:

@@ -39,8 +39,17 @@ from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.scripts.reproduce.pushed import FAULTS
+from asm_gym.scripts.reproduce.same_inputs import Informed
+from asm_gym.spec import StreamSpec
 
 RULE = "friction_rule"
+SETTINGS: dict[str, dict[str, Any]] = {
+    "neural_asm": {"values": True},
+    "association_values+evidence": {"shrinkage": 1.0},
+}
+"""The first as ``asm-gym fit`` has it of a log, the other without whitening, as the first has it beside."""
+INFORMED = ("kalman+evidence", "association_linear+evidence")
+"""Rivals that are told what arms are made of."""
 EXPERIMENTS = (*ARMS, "cobot", "executions")
 AROUND_S = 5.0
 """An alarm so long before or after an event of the cobot belongs to it."""
@@ -183,10 +192,15 @@ def parted(count: int, job: Job, config: Config) -> tuple[list[int], list[int], 
 def fitted(job: Job, episodes: Sequence[Episode]) -> Any:
     """The monitor, fitted; its threshold is set here, for so few pieces that none could be promised."""
     spec = episodes[0].spec
+    made: Any
     if job.monitor == RULE:
         made = CalibratedMonitor(FrictionRule(spec), Largest(spec), seed=job.seed)
     else:
-        made = make_monitor(job.monitor, spec, seed=job.seed)
+
+        def make(spec: StreamSpec) -> Any:
+            return make_monitor(job.monitor, spec, seed=job.seed, **SETTINGS.get(job.monitor, {}))
+
+        made = Informed(spec, make) if job.monitor in INFORMED else make(spec)
     return made.fit(list(episodes))
 
 

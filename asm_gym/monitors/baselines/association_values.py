@@ -1,36 +1,35 @@
 r"""Ridge regression on values: each group of senses from what the others say and do now, its own past left out.
 
-    x̂_g,t = D_g [x_{¬g,t}, Δ_{¬g,t}, φ_{¬g,t}, u_t, 1]       judged where a cross-fitted R² exceeds 1/2
+    x̂_g,t = D_g [x_{¬g,t}, Δ_{¬g,t}, φ_{¬g,t}, u_t, 1]       judged: torques, and what a cross-fitted R² of 1/2 tells
     Δ̂_g,t = E_g [x_{t-l}, Δ_{¬g,t}, φ_{¬g,t}, u_t, 1]        judged where it exceeds 0.99
-    φ      = tanh(v/w s),  w ∈ {0.01, 0.1, 1}                  of each speed v of spread s
-             sin, cos of angles q, of q_2 + q_3, …, and products of two of them
-    ε      = (x - x̂)/s_x                                      s_x: the cross-fitted spread
+    φ      friction and weight, see ``arm_inputs``
+    ε      = (x - x̂) / s_x √max(1, h/h̃)                      s_x: the cross-fitted spread
+    h      = zᵀ (ZᵀZ/N + λ)⁻¹ z,  h̃ its cross-fitted median    z: what x is expected from
 
 What is judged given its own last value explains a push that is held after one step; a value that is expected from the
-others does not. Motor current is torque plus what the sign of the speed says, and weight is a sum of products of sines
-of angles along the chain: a linear model can say neither, and with φ both.
-Changes are judged beside values only where they are nearly certain, as those of encoders are given speeds. Penalties,
-spreads and R² come from five folds over episodes, or over blocks of a long one.
+others does not. A torque is judged however well it is told: what is left of it is known, and a push is seldom less.
+Positions and speeds, beside torques, are left to their changes, for where an arm may go nothing tells. Few rows tell
+little of places that they do not hold: there h is large, and an error counts for less.
+Changes are judged only where they are nearly certain, as those of encoders are given speeds. Penalties, spreads, R²
+and h̃ come from five folds over episodes, or over blocks of a long one.
 
-Sources: Hoerl and Kennard 1970; Stribeck friction smoothed by tanh: Makkar et al. 2005 (IEEE/ASME AIM).
+Sources: Hoerl and Kennard 1970; for h, the leverage: Hoaglin and Welsch 1978 (The American Statistician 32).
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.coverage import POSITION, SPEED
-from asm_gym.data.units import ratio
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs
 from asm_gym.monitors.base import Progress, Told
+from asm_gym.monitors.baselines.arm_inputs import Derived, forces, motion
 from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
 from asm_gym.monitors.stream_model import StreamModel
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
@@ -38,15 +37,6 @@ from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, typed
 
 Floats = NDArray[np.float64]
-
-WIDTHS = (0.01, 0.1, 1.0)
-"""w, shares of a speed's spread."""
-
-MOST_ANGLES = 12
-"""More are no arm's: their products would be too many."""
-
-CHAIN = 3
-"""Angles from the second on that are added up: shoulder, elbow and wrist often turn about parallel axes."""
 
 FOLDS = 5
 PENALTIES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1)
@@ -57,6 +47,12 @@ TOLD, CERTAIN = 0.5, 0.99
 
 FAINTEST = 1e-4
 """Least spread of what is left of a standardised number."""
+
+STIFFNESS = 1e-2
+"""λ."""
+
+MOST_FAR = 1024
+"""Of more inputs it is not asked how far they are from what was learned: the matrices would be too large."""
 
 
 class _Fitted(NamedTuple):
@@ -105,15 +101,19 @@ class ValueAssociation(StreamModel):
         inputs = np.hstack([values, steps, before, (derived - middle) / width, commands])
         check_inputs(inputs.shape[1])
         fold = _folds([len(p[0]) for p in parts])
-        given = _crossfitted(inputs, values, fold, senses.groups, self._own(values=True))
+        own = self._own(values=True)
+        given = _crossfitted(inputs, values, fold, senses.groups, own)
         progress(1, 2)
-        moved = _crossfitted(inputs, steps, fold, senses.groups, self._own(values=False))
+        told, certain, moved = self._judged(given.told), np.zeros(0, np.intp), given
+        if self.changes or not len(told):
+            moved = _crossfitted(inputs, steps, fold, senses.groups, self._own(values=False))
+            certain = np.flatnonzero(moved.told > CERTAIN)
         progress(2, 2)
-        told = np.flatnonzero(given.told > TOLD)
-        certain = np.flatnonzero(moved.told > CERTAIN) if self.changes else np.zeros(0, np.intp)
         if not len(told) + len(certain):
             certain = np.arange(len(self.spec.sensory))  # nothing can be told: the changes are all there is
         left = np.concatenate([given.left[told], moved.left[certain]])
+        judging = np.unique(senses.groups[told]) if inputs.shape[1] <= MOST_FAR else ()
+        far = [_far(inputs, fold, own[g]) for g in judging]
         return self.restore(
             {
                 **{"mean": senses.mean, "spread": senses.spread, "change": senses.change},
@@ -122,9 +122,9 @@ class ValueAssociation(StreamModel):
                     "judged_values": told * 1.0,
                     "judged_changes": certain * 1.0,
                     "R2_values": given.told,
-                    "R2_changes": moved.told,
                 },
                 **{"D": given.weights[told], "E": moved.weights[certain], "remainder": np.maximum(left, FAINTEST)},
+                "far": np.array(far).reshape(len(far), *inputs.shape[1:] * 2),
             }
         )
 
@@ -143,7 +143,7 @@ class ValueAssociation(StreamModel):
         derived = (derived - found["derived_mean"]) / found["derived_spread"]
         inputs = np.hstack([values, steps, before, derived, commands])
         values, steps = values[:, self._told], steps[:, self._certain]
-        errors = np.hstack([values - inputs @ found["D"].T, steps - inputs @ found["E"].T])
+        errors = np.hstack([(values - inputs @ found["D"].T) / self._farther(inputs), steps - inputs @ found["E"].T])
         return state, ModelOutput(known * errors / found["remainder"], no_context(rows))
 
     def _read(self, read: ScaledRows) -> tuple[Floats, Floats, Floats, Floats, Floats]:
@@ -156,6 +156,24 @@ class ValueAssociation(StreamModel):
         derived = self._derived(physical, steps, senses.spread[sensory])
         return values, steps, before, derived, np.asarray(read.commands, np.float64)
 
+    def _judged(self, told: Floats) -> NDArray[np.intp]:
+        """Which values are, by their cross-fitted R² (X,)."""
+        place = {int(column): k for k, column in enumerate(self.spec.sensory)}
+        judged = told > TOLD
+        loads = [place[int(i)] for i in forces(self.spec)]
+        if loads:
+            judged[[place[int(i)] for i in motion(self.spec)]] = False
+            judged[loads] = True
+        return np.flatnonzero(judged)
+
+    def _farther(self, inputs: Floats) -> Floats:
+        """(N, V) what the spread of each judged value is multiplied by, for inputs (N, I)."""
+        found = np.ones((len(inputs), len(self._told)))
+        groups = self.senses_.groups[self._told]
+        for group, far in zip(np.unique(groups), self.learned_.get("far", ()), strict=False):
+            found[:, groups == group] = np.sqrt(np.maximum(1.0, ((inputs @ far) * inputs).sum(axis=1)))[:, None]
+        return found
+
     def _own(self, values: bool) -> list[NDArray[np.intp]]:
         """Of each group, the inputs that say what it says itself, which it is not expected from."""
         X, groups = len(self.spec.sensory), self.senses_.groups
@@ -167,82 +185,6 @@ class ValueAssociation(StreamModel):
             withheld.append(2 * X + np.arange(X) if values else np.arange(X))
             found.append(np.unique(np.concatenate(withheld)).astype(np.intp))
         return found
-
-
-class Derived(NamedTuple):
-    """What is made of speeds and angles.
-
-    Attributes:
-        speeds: (S,) senses that are speeds, or whose changes are.
-        from_steps: they are those of positions.
-        angles: (J,) senses that are angles, along the chain.
-        radians: (J,) in one of their units.
-        pairs: (2, P) of sines and cosines of single angles, that are multiplied.
-        sources: (M, X) which senses each is made of.
-    """
-
-    speeds: NDArray[np.intp]
-    from_steps: bool
-    angles: NDArray[np.intp]
-    radians: Floats
-    pairs: NDArray[np.intp]
-    sources: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, spec: StreamSpec, friction: bool, body: bool) -> Self:
-        """What a stream has by the names of its channels."""
-        place = {int(column): k for k, column in enumerate(spec.sensory)}
-        moving, from_steps = speeds(spec) if friction else (np.zeros(0, np.intp), False)
-        columns = _named(spec, POSITION) if body else np.zeros(0, np.intp)
-        columns = columns if len(columns) <= MOST_ANGLES else columns[:0]
-        units = {
-            i: c.unit for c, s in zip(spec.channels, spec.slices.values(), strict=True) for i in range(s.start, s.stop)
-        }
-        radians = np.array([ratio(units[int(i)], "rad") or 1.0 for i in columns])
-        S, J = len(moving), len(columns)
-        pairs = np.array(np.triu_indices(2 * J), np.intp) if J else np.zeros((2, 0), np.intp)
-        own = np.eye(J, dtype=np.bool_)
-        ends = range(2, min(J, CHAIN + 1))
-        sums = np.array([[1 <= k <= n for k in range(J)] for n in ends], np.bool_).reshape(len(ends), J)
-        single = np.vstack([own, own])
-        of_angles = np.vstack([single, sums, sums, single[pairs[0]] | single[pairs[1]]])
-        sources = np.zeros((S * len(WIDTHS) + len(of_angles), len(spec.sensory)), np.bool_)
-        at = [place[int(i)] for i in moving]
-        for w in range(len(WIDTHS)):
-            sources[w * S + np.arange(S), at] = True
-        angles = np.array([place[int(i)] for i in columns], np.intp)
-        sources[S * len(WIDTHS) :, angles] = of_angles
-        return cls(np.array(at, np.intp), from_steps, angles, radians, pairs, sources)
-
-    def __call__(self, values: Floats, steps: Floats, spread: Floats) -> Floats:
-        """(N, M) of values (N, X) in their units, standardised changes (N, X), and the values' spread (X,)."""
-        speed = steps[:, self.speeds] if self.from_steps else values[:, self.speeds] / spread[self.speeds]
-        parts = [np.tanh(speed / width) for width in WIDTHS]
-        if len(self.angles):
-            q = values[:, self.angles] * self.radians
-            single = np.hstack([np.sin(q), np.cos(q)])
-            sums = np.cumsum(q[:, 1 : CHAIN + 1], axis=1)[:, 1:]
-            products = single[:, self.pairs[0]] * single[:, self.pairs[1]]
-            parts += [single, np.sin(sums), np.cos(sums), products]
-        return np.hstack(parts)
-
-
-def _named(spec: StreamSpec, pattern: re.Pattern[str]) -> NDArray[np.intp]:
-    """Columns of senses whose channel is called so."""
-    named = zip(spec.channels, spec.slices.values(), strict=True)
-    found = [np.arange(s.start, s.stop) for c, s in named if pattern.fullmatch(c.name.lower())]
-    every = np.concatenate([*found, np.zeros(0, np.intp)])
-    own: NDArray[np.intp] = np.intersect1d(every, spec.sensory).astype(np.intp)
-    return own
-
-
-def speeds(spec: StreamSpec) -> tuple[NDArray[np.intp], bool]:
-    """Columns of the stream that are speeds; or of positions, and that their changes are."""
-    for pattern, from_steps in ((SPEED, False), (POSITION, True)):
-        found = _named(spec, pattern)
-        if len(found):
-            return found, from_steps
-    return np.zeros(0, np.intp), False
 
 
 def _folds(lengths: Sequence[int]) -> NDArray[np.intp]:
@@ -287,3 +229,22 @@ def _crossfitted(
             for k in np.flatnonzero(best == n):
                 weights[mine[k], used] = solved[:, k]
     return _Fitted(weights, left, told)
+
+
+def _far(inputs: Floats, fold: NDArray[np.intp], withheld: NDArray[np.intp]) -> Floats:
+    """(I, I) of which zᵀ far z is h/h̃ for inputs z."""
+    size = inputs.shape[1]
+    found = np.zeros((size, size))
+    used = np.setdiff1d(np.arange(size), withheld)
+    h = np.zeros(len(inputs))
+    for f in np.unique(fold):
+        tested = inputs[fold == f][:, used]
+        h[fold == f] = ((tested @ _inverse(inputs[fold != f][:, used])) * tested).sum(axis=1)
+    found[np.ix_(used, used)] = _inverse(inputs[:, used]) / np.median(h)
+    return found
+
+
+def _inverse(inputs: Floats) -> Floats:
+    """(ZᵀZ/N + λ)⁻¹ of inputs Z (N, I)."""
+    found: Floats = np.linalg.inv(inputs.T @ inputs / max(len(inputs), 1) + STIFFNESS * np.eye(inputs.shape[1]))
+    return found

@@ -8,7 +8,6 @@ and a limit on each channel, which is what most cells have.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import NamedTuple, Self
 
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from asm_gym.detection import ModelOutput
 from asm_gym.episode import Episode
 from asm_gym.monitors.base import Progress, Told
-from asm_gym.monitors.baselines.association_values import WIDTHS, speeds
+from asm_gym.monitors.baselines.arm_inputs import WIDTHS, forces, speeds
 from asm_gym.monitors.baselines.base import no_context
 from asm_gym.monitors.stream_model import StreamModel
 from asm_gym.scaling import rows_apart
@@ -26,9 +25,6 @@ from asm_gym.spec import StreamSpec
 
 OVER = 0.1
 """Seconds that a residual is averaged over."""
-
-_TORQUE = re.compile(r"(.*[^a-z])?(efforts?|torques?|currents?|curr|tau|iq)([^a-z].*)?")
-_TOLD = re.compile(r"(.*[^a-z])?(target|desired|computed)([^a-z].*)?")
 
 
 class _Past(NamedTuple):
@@ -48,12 +44,7 @@ class FrictionRule(StreamModel):
 
     def __init__(self, spec: StreamSpec) -> None:
         super().__init__(spec)
-        found = [
-            np.arange(s.start, s.stop)
-            for c, s in zip(spec.channels, spec.slices.values(), strict=True)
-            if _TORQUE.fullmatch(c.name.lower()) and not _TOLD.fullmatch(c.name.lower())
-        ]
-        self._torques: NDArray[np.intp] = np.concatenate([*found, np.zeros(0, np.intp)]).astype(np.intp)
+        self._torques = forces(spec)
         self._speeds, self.derived = speeds(spec)
         joints = min(len(self._torques), len(self._speeds))
         if not joints:
