@@ -53,6 +53,19 @@ def test_what_follows_from_a_rounded_covariance_is_what_followed_from_it():
         assert np.abs(left).max() < 0.01 * about
 
 
+def test_a_covariance_of_what_never_changes_stays_as_it_is():
+    kept = packed(rounded({"moments": np.zeros((3, 3), np.float32)}))
+    np.testing.assert_array_equal(unpacked(kept)["moments"], np.zeros((3, 3)))
+
+
+def test_a_covariance_far_from_one_is_kept_as_well():
+    C = weights()["moments"]
+    for size in (1e-12, 1e9):
+        after = rounded({"moments": size * C})["moments"]
+        np.testing.assert_allclose(after, size * C, atol=2e-4 * size * np.abs(C).max())
+        assert "moments.root" in packed({"moments": after})
+
+
 def test_an_array_that_lies_by_columns_comes_back_so():
     D = np.asfortranarray(weights()["D"])
     back = unpacked(packed({"D": D}))["D"]

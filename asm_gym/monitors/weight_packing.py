@@ -49,7 +49,7 @@ def rounded(arrays: Mapping[str, NDArray[Any]]) -> Found:
     for name, array in arrays.items():
         if _is_weight(name, array):
             found[name] = _of(*_split(array))
-        elif name in COVARIANCES and _root_of(name, array) is None:
+        elif name in COVARIANCES and np.trace(array) > 0 and _root_of(name, array) is None:
             found[name] = _square(*_root(array + FAINT * np.trace(array) / len(array) * np.eye(len(array))))
         elif name in SHORTENED:
             found[name] = _short((array + array.T) / 2 if name == "whitening" else array)
