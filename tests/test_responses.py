@@ -261,7 +261,7 @@ def test_a_diagnosis_that_raises_is_answered_as_the_unknown_is():
 
 def test_a_completion_that_raises_loses_the_row_and_not_the_guard(monkeypatch):
     env = NeuralASMSafety(Acting(offset), Judge({21}, "sensor"), on_alarm="graded")
-    monkeypatch.setattr(env._guard.responder.repair, "read", lambda row: 1 / 0)
+    monkeypatch.setattr(env._guard.responder.repair, "read", lambda row, whole=False: 1 / 0)
     with pytest.warns(UserWarning, match="completion: ZeroDivisionError"):
         infos(env, 2)
 
