@@ -46,7 +46,7 @@ from asm_gym.scripts.reproduce.two_links import DT, HAND, SPEC, Floats, demonstr
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "traces": {"hidden_size": 64},
-    "settling": {"hidden_size": 128, "learning_rate": 1e-2},
+    "settling": {"hidden_size": 128},
 }
 """What each dynamics learned best with, of what was tried on seed 0."""
 

@@ -160,7 +160,8 @@ def over(records: Sequence[Record], config: Config) -> Table:
     heads |= {name: name.replace("_", " ") + " [%]" for name in records[0] if name.startswith("found_")}
     parts = dict.fromkeys(str(r["part"]) for r in records)
     rows = [(p, *(shown(records, name, 3 if name == "auroc" else 0, part=p) for name in heads)) for p in parts]
-    return Table(f"Each part; mean ± SD over {config.seeds} seeds of the weights", ("", *heads.values()), rows)
+    seeds = ", ".join(map(str, config.repetitions))
+    return Table(f"Each part; mean ± SD over these seeds of the weights: {seeds}", ("", *heads.values()), rows)
 
 
 def bars(result: BenchmarkResult) -> Figure:
