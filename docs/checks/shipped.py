@@ -33,6 +33,5 @@ def main(robot: str) -> None:
         env.close()
 
 
-
 if __name__ == "__main__":
     main(sys.argv[1])
