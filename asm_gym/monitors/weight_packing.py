@@ -77,26 +77,27 @@ def unpacked(arrays: Mapping[str, NDArray[Any]]) -> Found:
     parts = dict(_together(*item) for item in arrays.items())
     found: Found = {}
     for name, array in parts.items():
-        own, _, end = name.rpartition(".")
+        own, dot, last = name.rpartition(".")
+        end = dot + last  # a name without a dot is no part of anything
         scale = parts.get(own + SCALE, np.zeros(0))
-        if "." + end == BITS:
+        if end == BITS:
             if array.dtype != np.int8 or array.ndim != 2 or scale.shape != (len(array), 1):
                 raise ValueError(f"{own} of 8 bits should have a scale for each of its rows, got {scale.shape}")
             found[own] = _of(array, scale)
-        elif "." + end in (HALF, ROOT):
+        elif end in (HALF, ROOT):
             size = round((np.sqrt(8 * array.size + 1) - 1) / 2)
             if array.ndim != 1 or size * (size + 1) // 2 != array.size:
                 raise ValueError(f"{array.size} numbers are no half of a symmetric {own}")
             whole = np.zeros((size, size), array.dtype)
             whole[np.tril_indices(size)] = array
-            if "." + end == ROOT:
+            if end == ROOT:
                 if array.dtype != np.int16 or scale.shape != ():
                     raise ValueError(f"the root of {own} should be of 16 bits with one scale, got {array.dtype}")
                 found[own] = _square(whole, scale)
             else:
                 whole.T[np.tril_indices(size)] = array
                 found[own] = whole
-        elif "." + end != SCALE:
+        elif end != SCALE:
             found[name] = array
     return found
 

@@ -48,7 +48,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "association_values+evidence": {"shrinkage": 1.0},
 }
 """The first as ``asm-gym fit`` has it of a log, the other without whitening, as the first has it beside."""
-INFORMED = ("kalman+evidence", "association_linear+evidence")
+INFORMED = {"kalman, told": "kalman+evidence", "ridge, told": "association_linear+evidence"}
 """Rivals that are told what arms are made of."""
 EXPERIMENTS = (*ARMS, "cobot", "executions")
 AROUND_S = 5.0
@@ -70,13 +70,13 @@ class Config(kit.Config):
     monitors: tuple[str, ...] = option(
         (
             *("neural_asm", "association_values+evidence", "association_linear+evidence", "kalman+evidence"),
-            *("window_pca+evidence", RULE, "channel_limit"),
+            *(*INFORMED, "window_pca+evidence", RULE, "channel_limit"),
         ),
         quick=("association_values+evidence", RULE),
         least=1,
-        known=(*MONITORS, RULE),
+        known=(*MONITORS, *INFORMED, RULE),
     )
-    """Names of monitors, and friction_rule."""
+    """Names of monitors, friction_rule, and rivals that are told of friction and weight."""
     piece: float = fixed(1.0)
     """Length of a piece [s]."""
     folds: int = fixed(4, least=2)
@@ -102,7 +102,7 @@ def run(config: Config) -> Findings:
         Job(name, monitor, seed, fold)
         for name in there
         for monitor in config.monitors
-        if not (monitor == RULE and name == "executions")
+        if not (monitor == RULE and name == "executions") and not (monitor in INFORMED and name not in ARMS)
         for seed in config.repetitions
         for fold in range(config.folds)
     ]
@@ -198,7 +198,8 @@ def fitted(job: Job, episodes: Sequence[Episode]) -> Any:
     else:
 
         def make(spec: StreamSpec) -> Any:
-            return make_monitor(job.monitor, spec, seed=job.seed, **SETTINGS.get(job.monitor, {}))
+            name = INFORMED.get(job.monitor, job.monitor)
+            return make_monitor(name, spec, seed=job.seed, **SETTINGS.get(job.monitor, {}))
 
         made = Informed(spec, make) if job.monitor in INFORMED else make(spec)
     return made.fit(list(episodes))

@@ -27,6 +27,9 @@ COLOURS = {"sense": BLUE, "command": GREEN, "label": VERMILLION}
 
 GREY = "#999999"
 
+NARROW = 0.05
+"""Steps of the clock are shown so much shorter and longer than usual at least: rounding is no jitter to look at."""
+
 
 def log_figure(found: Inspection) -> Figure:
     """A panel a channel, gaps shaded; the first one shows how long steps of the clock are."""
@@ -38,8 +41,10 @@ def log_figure(found: Inspection) -> Figure:
             ax.set_visible(False)
         _steps(panels[0], found)
         named = {c.name: values for c, values in zip(found.channels, found.columns.values(), strict=False)}
+        topics = {c.name.partition(".")[0] for c in drawn if "." in c.name} | {"" for c in drawn if "." not in c.name}
+        cut = len(topics.pop()) if len(topics) == 1 else 0  # one topic goes without saying
         for ax, channel in zip(panels[1:], drawn, strict=False):
-            _panel(ax, found, channel, named[channel.name])
+            _panel(ax, found, channel, named[channel.name], channel.name[cut:].lstrip("."))
         left_out = len([c for c in found.channels if c.role in COLOURS]) - len(drawn)
         more = f"; {left_out} more channels are in the table" if left_out else ""
         clock = found.clock
@@ -61,10 +66,13 @@ def _steps(ax: Axes, found: Inspection) -> None:
         return
     steps = 1e3 * np.diff(found.times)
     ax.hist(np.clip(steps, 0, 4e3 / found.clock.rate), bins=60, color=BLUE, log=True)
-    ax.axvline(1e3 / found.clock.rate, color=VERMILLION, linewidth=1)
+    usual = 1e3 / found.clock.rate
+    ax.axvline(usual, color=VERMILLION, linewidth=1)
+    low, high = ax.get_xlim()
+    ax.set_xlim(min(low, (1 - NARROW) * usual), max(high, (1 + NARROW) * usual))
 
 
-def _panel(ax: Axes, found: Inspection, channel: ChannelFound, values: NDArray[Any]) -> None:
+def _panel(ax: Axes, found: Inspection, channel: ChannelFound, values: NDArray[Any], name: str) -> None:
     apart = max(1, len(values) // MOST_POINTS)
     colour = GREY if channel.constant else COLOURS[channel.role]
     times, shown = found.times[::apart].astype(np.float64), values[::apart].astype(np.float64)
@@ -78,7 +86,7 @@ def _panel(ax: Axes, found: Inspection, channel: ChannelFound, values: NDArray[A
     what = "" if channel.role == "sense" else f" ({channel.role})"
     unit = f" [{channel.unit}]" if channel.unit else ""
     still = ", never moves" if channel.constant else ""
-    name = channel.name if len(channel.name) < 30 else "…" + channel.name[-29:]
+    name = name if len(name) < 30 else "…" + name[-29:]
     ax.set_title(f"{name}{unit}{what}{still}", fontsize=7, color=BLACK)
     ax.tick_params(labelsize=6)
     ax.margins(x=0)

@@ -160,9 +160,9 @@ class ValueAssociation(StreamModel):
         """Which values are, by their cross-fitted R² (X,)."""
         place = {int(column): k for k, column in enumerate(self.spec.sensory)}
         judged = told > TOLD
-        loads = [place[int(i)] for i in forces(self.spec)]
-        if loads:
-            judged[[place[int(i)] for i in motion(self.spec)]] = False
+        loads, moves = ([place[int(i)] for i in found] for found in (forces(self.spec), motion(self.spec)))
+        if loads and moves:
+            judged[moves] = False
             judged[loads] = True
         return np.flatnonzero(judged)
 
