@@ -40,7 +40,6 @@ def test_both_print_their_ratios(capsys):
     assert shown.count("×") >= 5
     assert "plain torch" in shown
     assert "under the wrapper" in shown
-    assert "A band takes" in shown
     assert "2 side by side under one wrapper keep" in shown
     assert "ONNX Runtime" in shown
     assert "warm" in shown

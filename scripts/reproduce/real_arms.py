@@ -70,7 +70,7 @@ class Config(kit.Config):
     monitors: tuple[str, ...] = option(
         (
             *("neural_asm", "association_values+evidence", "association_linear+evidence", "kalman+evidence"),
-            *(*INFORMED, "window_pca+evidence", RULE, "channel_limit"),
+            *(*INFORMED, "window_pca+evidence", "gru+evidence", RULE, "channel_limit"),
         ),
         quick=("association_values+evidence", RULE),
         least=1,
