@@ -41,3 +41,15 @@ def test_a_narrow_terminal_gets_a_line_for_each_cell() -> None:
 def test_a_wide_terminal_gets_a_line_for_each_row() -> None:
     row = ["default", "99.7", "%", "91.8", "%", "3", "1156", "of", "1200"]
     assert row in [line.split() for line in _printed(200, True).splitlines()]
+
+
+def test_a_heading_of_two_lines_is_as_wide_as_the_longer_one() -> None:
+    table = Table("Delays", ("", "delay [ms]\nmedian, 95 %"), [("push", "50, 100")])
+    console = Console(width=80, color_system=None)
+    with console.capture() as caught:
+        console.print(ConsoleTable(table, plain=True))
+    assert [line.rstrip() for line in caught.get().splitlines()[1:]] == [
+        "        delay [ms]",
+        "      median, 95 %",
+        "push       50, 100",
+    ]

@@ -88,7 +88,7 @@ class ConsoleTable:
 
 def _widths(columns: Sequence[Sequence[str]], left: int, room: int) -> list[int] | None:
     """How wide each column is so that no word is cut and few lines are needed; None where there is no room."""
-    most = [max(map(cell_len, cells)) for cells in columns]
+    most = [max(cell_len(line) for cell in cells for line in cell.split("\n")) for cells in columns]
     words = [[word for cell in cells for word in WITH_UNIT.sub("_", cell).split() or [""]] for cells in columns]
     widths = [max(map(cell_len, these)) for these in words]
     widths[:left] = most[:left]
