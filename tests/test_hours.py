@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asm_gym.detection import Blocks
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.rollouts.pretraining.model_card import Marks
-from asm_gym.scripts.reproduce.hours import Setting, each, kept, promised_to_each, records
+from asm_gym.scripts.reproduce.hours import Setting, each, kept, records
 
 
 def episode(seed, peak, onset=None, severity=""):
@@ -52,9 +51,3 @@ def test_a_promise_that_was_not_kept_is_called_broken(marks):
 def test_every_count_is_kept(marks):
     found = records(marks, [Setting("anew", {1.0: 4.5})])
     assert [(r["alarms"], r["promised"]) for r in found] == [(2, 1.0)]
-
-
-def test_each_task_has_its_promise_where_it_has_the_hours():
-    blocks = Blocks(np.arange(40.0), np.full(40, 0.01))  # 0.2 hours of each task
-    thresholds = promised_to_each(blocks, ["Lift"] * 20 + ["Door"] * 20)
-    assert thresholds == {10.0: 38.0, 5.0: 39.0}  # Door's: of 20 episodes 1, and none
