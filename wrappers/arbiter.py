@@ -242,7 +242,7 @@ class Arbiter:
         begun, self._refused = self._refused, False
         if self._reflex is None:
             return Decision(alarm, intervened, False, False)
-        failure = self._tell(sensed, intervened) if sensed.ends_step else ""
+        failure = self._tell(sensed.row, sensed.executed, intervened) if sensed.ends_step else ""
         if sensed.expected is not None and isinstance(self._reflex, Recall):
             self._reflex.expects(sensed.expected)
         situation = self._count(sensed, alarm, intervened)
@@ -254,6 +254,20 @@ class Arbiter:
         gave_up = self.state is State.ENDED
         acted_on = over or sensed.knocked or sensed.presses or name == "trial"
         return Decision(alarm, intervened, gave_up, acted_on, failure, name, self.state)
+
+    def let_pass(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], ends_step: bool) -> str:
+        """What ``decide`` comes to after a quiet row under the policy; what failed in the reflex."""
+        self._estranged(False)
+        if self._reflex is None:
+            return ""
+        c = self._counts
+        c.quiet, c.free, c.since = c.quiet + 1, 0, c.since + 1
+        return self._tell(row, executed, False) if ends_step else ""
+
+    @property
+    def most_impulse(self) -> float:
+        """How much an arm may press in an episode [N s]."""
+        return math.inf if self._reflex is None else self._rule.impulse or math.inf
 
     def _count(self, sensed: Sensed, alarm: bool, intervened: bool) -> Situation:
         """Counts the row, and says what it has come to."""
@@ -317,12 +331,12 @@ class Arbiter:
         if isinstance(self._reflex, Graded):
             self._reflex.choose(response)
 
-    def _tell(self, sensed: Sensed, intervened: bool) -> str:
+    def _tell(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], intervened: bool) -> str:
         """Lets the reflex feel the row, if it can; what failed at that."""
         if self._feeling is None:
             return ""
         try:
-            self._feeling.feel(sensed.row, sensed.executed, intervened)
+            self._feeling.feel(row, executed, intervened)
         except Exception as error:
             failure = f"reflex: {error!r}"
             self.warn(failure, "it has not felt this row")

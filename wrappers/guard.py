@@ -24,11 +24,13 @@ from asm_gym.wrappers.factory import (
     make_rule,
     names_causes,
 )
+from asm_gym.wrappers.hand import HandAgainstJoints
 from asm_gym.wrappers.observer import joined
 from asm_gym.wrappers.responses import NO_RESPONSE, Responder, responses_from
 from asm_gym.wrappers.severity import AGAIN, LEANS_S, Severity, SeverityEstimator
 from asm_gym.wrappers.step_report import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPRISE, RowReport
 from asm_gym.wrappers.substeps import Beneath, SubstepGuard
+from asm_gym.wrappers.transitions import State
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ class Guard:
         fallback = None if box is None else make_fallback(env)
         self.substeps = SubstepGuard(env, limits_of(options.contact_limits, monitor), acts, monitor)
         self.arbiter = Arbiter(reflex, threshold, rule.in_rows(rows_per_step), fallback, box)
-        self._severity = SeverityEstimator(monitor.spec)
+        self.severity = SeverityEstimator(monitor.spec)
         self.largest: float | None = None
         """Surprise in this episode, while the policy acted."""
 
@@ -106,8 +108,54 @@ class Guard:
         self.arbiter.reset()
         self.responder.reset()
         self.substeps.begin()
-        self._severity.reset()
+        self.severity.reset()
         self.largest = None
+        self._passed = 0  # rows, of which not all has been told
+
+    # ------------------------------------------------------------------ rows in which nothing happens
+
+    @property
+    def can_be_quiet(self) -> bool:
+        """Whether ``QuietRows`` can judge rows in its place."""
+        return len(self.responder.hands) <= 1 and not self.recalls
+
+    @property
+    def calm(self) -> bool:
+        """Whether they may judge the next row."""
+        return self.arbiter.state is State.POLICY and self.responder.calm and self.substeps.calm
+
+    @property
+    def hand(self) -> HandAgainstJoints | None:
+        """The one that is compared with its joints."""
+        return self.responder.hands[0] if self.responder.hands else None
+
+    @property
+    def columns(self) -> tuple[NDArray[np.intp], ...]:
+        """Those of ``SeverityEstimator`` in a row, and those of ``SubstepGuard`` in what was felt."""
+        return *self.severity.columns, *self.substeps.columns
+
+    @property
+    def patience(self) -> tuple[float, float]:
+        """For how long the arm may lean on something [s], and how much it may press in an episode [N s]."""
+        return LEANS_S / (1 + AGAIN * self.arbiter.strikes), self.arbiter.most_impulse
+
+    def let_pass(self, row: NDArray[np.float32], executed: NDArray[np.float32], value: float, ends_step: bool) -> str:
+        """A quiet row (D,), which is left alone from now on; what failed in the reflex."""
+        self._passed += 1
+        self.responder.let_pass(row)
+        self.largest = max(self.largest or 0.0, value)
+        if ends_step:
+            self.substeps.acted()
+        return self.arbiter.let_pass(row, executed, ends_step)
+
+    def passed(self, mean: NDArray[np.float64], impulse: float, leant: float) -> None:
+        """What the rows that were let pass have come to."""
+        if self._passed:
+            self.severity.pressed = impulse, leant
+            self.responder.passed(self._passed, mean)
+            self._passed = 0
+
+    # ------------------------------------------------------------------ all others
 
     def read(self, row: NDArray[np.float32], failure: str) -> tuple[NDArray[np.float32], str]:
         """(D,) the next row as the monitor is to see it, and what failed so far."""
@@ -147,7 +195,7 @@ class Guard:
         if failure:
             arbiter.warn(failure, "which counts as an alarm")
         held = arbiter.overriding
-        severity = self._severity.of(row, beneath, held, LEANS_S / (1 + AGAIN * arbiter.strikes))
+        severity = self.severity.of(row, beneath, held, self.patience[0])
         over, lost, contradicts = not value <= arbiter.threshold, self.responder.lost, self.responder.contradicts
         event = surprise.event(arbiter.threshold)
         knocked = event == KNOCK

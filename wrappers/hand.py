@@ -10,6 +10,7 @@ from their encoders can contradict nothing.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -75,7 +76,7 @@ class HandAgainstJoints:
         self._chain, self._size, self._dt = chain, spec.size, spec.dt
         self._q, self._v = columns("joint_position"), columns("joint_velocity")
         self._x = columns("hand_position", "hand_orientation")
-        self._at = np.concatenate([self._q, self._v, self._x])
+        self._at: NDArray[np.intp] = np.concatenate([self._q, self._v, self._x])
         self._one_over = 1.0 / (chain.noise * spec.noise[self._x])
         self._gain = min(1.0, spec.dt / OVER_S)
         sensors = {int(c): (name, own) for name, own in sensors_of(spec) for c in own}
@@ -92,7 +93,9 @@ class HandAgainstJoints:
 
     def reset(self) -> None:
         """A new episode begins."""
-        self._mean, self._left, self._waited = np.zeros(HAND), 0.0, 0
+        self._left, self._waited = 0.0, 0
+        self.mean = np.zeros(HAND)
+        """(9,) m, of the rows so far."""
         self._said: Contradiction | None = None
         self._whole = 0  # rows since a number was missing
         self._rows: list[NDArray[np.float64]] = []  # the last ones that were whole, (2 J + 9,) each
@@ -103,7 +106,7 @@ class HandAgainstJoints:
         """What is wrong by the next row (D,) as it was sensed, beside what is ``missing`` (D,) already."""
         now = np.asarray(row[self._at], np.float64)
         c, cap = self._chain, ONE * LIMIT / self._gain
-        size = _follow(now, c.axes, c.anchors, c.hand, c.late_s, self._one_over, self._gain, cap, self._mean)
+        size = _follow(now, c.axes, c.anchors, c.hand, c.late_s, self._one_over, self._gain, cap, self.mean)
         self._whole = 0 if size < 0.0 else self._whole + 1
         if size < 0.0:  # a number is missing
             return None
@@ -124,11 +127,25 @@ class HandAgainstJoints:
         return found
 
     @property
+    def arrays(self) -> tuple[NDArray[np.intp], list[NDArray[np.float64]], NDArray[np.float64]]:
+        """What ``_follow`` takes: (2 J + 9,) columns of a row; axes, anchors, hand and 1/σ; how late, gain and cap."""
+        c = self._chain
+        numbers = np.array([c.late_s, self._gain, ONE * LIMIT / self._gain])
+        return self._at, [c.axes, c.anchors, c.hand, self._one_over], numbers
+
+    def passed(self, rows: Sequence[NDArray[np.floating[Any]]], count: int, mean: NDArray[np.float64]) -> None:
+        """So many rows, the last of them ``rows`` (D,), were whole, contradicted nothing, and led to this ``mean``."""
+        self._rows = [*self._rows, *(np.asarray(row[self._at], np.float64) for row in rows[-WINDOW:])][-WINDOW:]
+        self._whole, self.mean = self._whole + count, np.array(mean)
+        self._good, self._left = self._rows[-1][: len(self._q)], 0.0
+        self._accused[:] = False
+
+    @property
     def vouched(self) -> Mask:
         """(D,) what is right by the last row: each tells the same of the hand, and of a joint's speed, and none repeats
         itself."""
         J, right = len(self._q), np.zeros(self._size, bool)
-        if self._whole < 2 or np.linalg.norm(self._mean) > LIMIT / 2:
+        if self._whole < 2 or np.linalg.norm(self.mean) > LIMIT / 2:
             return right
         before, now = self._rows[-2:]
         turned = (now[:J] - before[:J]) / self._dt

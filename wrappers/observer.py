@@ -55,6 +55,10 @@ class Observer:
         """The monitor's, after the last rows."""
         return self._state
 
+    @state.setter
+    def state(self, state: Any) -> None:
+        self._state = state
+
     def begin_in(self, begun: Mask) -> None:
         """New episodes in the streams of ``begun`` (n,)."""
         if begun.any():

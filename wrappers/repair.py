@@ -117,6 +117,16 @@ class Repair:
         return not (self._calm or self._returning)
 
     @property
+    def calm(self) -> bool:
+        """Whether there is nothing to do about a row that is whole."""
+        return self.judged and not self.settling and self.trusted
+
+    def passed(self, rows: Sequence[NDArray[np.floating[Any]]]) -> None:
+        """These rows (D,) were whole, while it was calm."""
+        before, now = (np.array(row, np.float64) for row in ([self._raw, *rows])[-2:])
+        self._earlier, self._raw, self._good, self._before = before, now, now, now
+
+    @property
     def unjudged(self) -> NDArray[np.bool_]:
         """(D,) at which numbers nobody is surprised: those that are missing, or were so recently that their changes are
         taken from what was completed."""

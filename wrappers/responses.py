@@ -128,13 +128,13 @@ class Responder:
         self.repair: Repair | None = None
         self._map: ObservationMap | None = None
         self._touch: ContactEstimator | None = None
-        self._hands = HandAgainstJoints.of(env, self._spec)
+        self.hands = HandAgainstJoints.of(env, self._spec)
         self._kept = WINDOW + 1 + round(LASTING["actuator"] / self._spec.dt)
         if self._diagnosis is not None:
             self._touch = ContactEstimator.where_measured(env, self._diagnosis.completion)
             self._map = self._mapped(env) if repairs else None
             self.repair = Repair(
-                self._diagnosis.completion, read=None if self._map is None else self._map.shown, hands=self._hands
+                self._diagnosis.completion, read=None if self._map is None else self._map.shown, hands=self.hands
             )
         self.reset()
 
@@ -153,7 +153,7 @@ class Responder:
         self._contradiction: Contradiction | None = None
         self._lost = NONE
         self._forget()
-        for hand in self._hands:
+        for hand in self.hands:
             hand.reset()
         if self.repair is not None:
             self.repair.reset()
@@ -216,7 +216,7 @@ class Responder:
         """(D,) the row as the monitor is to see it."""
         finite = np.isfinite(row)
         self._lost = NONE if finite.all() else np.flatnonzero(~finite)
-        found = [hand.read(row, self.missing) for hand in self._hands]
+        found = [hand.read(row, self.missing) for hand in self.hands]
         self._contradiction = next(filter(None, found), None)
         if self.repair is not None and self._map is not None:
             known = self.completed
@@ -231,6 +231,26 @@ class Responder:
         self._rows.append(row)
         del self._rows[: -self._kept]
         return row
+
+    @property
+    def calm(self) -> bool:
+        """Whether there is nothing to be done about a row that is quiet."""
+        return not (self._since or self._touched) and (self.repair is None or self.repair.calm)
+
+    def let_pass(self, row: NDArray[np.float32]) -> None:
+        """A quiet row (D,), which is left alone from now on; ``passed`` is told of it later."""
+        self._quiet, self._lost, self._contradiction = self._quiet + 1, NONE, None
+        self._rows.append(row)
+        if len(self._rows) > 2 * self._kept:
+            del self._rows[: -self._kept]
+
+    def passed(self, count: int, mean: NDArray[np.float64]) -> None:
+        """So many rows were let pass; see ``HandAgainstJoints.passed``."""
+        rows = self._rows[-count:]
+        for hand in self.hands:
+            hand.passed(rows, count, mean)
+        if self.repair is not None and self._map is not None:
+            self.repair.passed(rows)
 
     def observed(self, observation: Any) -> Any:
         """The observation as the policy is to see it."""
@@ -326,7 +346,7 @@ class Responder:
         if failed or self._diagnosis is None or not np.isfinite(rows).all():
             return None
         try:
-            vouched = [hand.vouched for hand in self._hands]
+            vouched = [hand.vouched for hand in self.hands]
             return self._diagnosis(rows, attribution, np.logical_or.reduce([self.missing, *vouched]))
         except Exception as error:
             # Whatever goes wrong here, an alarm is answered: by what is done about the unknown.

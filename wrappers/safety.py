@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
@@ -29,8 +29,8 @@ from asm_gym.wrappers.factory import (
 )
 from asm_gym.wrappers.guard import Guard, GuardOptions, nothing
 from asm_gym.wrappers.observer import Observer, joined
-from asm_gym.wrappers.step_report import INFO, STALE, RowReport, ends, report
-from asm_gym.wrappers.substeps import Beneath
+from asm_gym.wrappers.quiet import QuietRow, QuietRows
+from asm_gym.wrappers.step_report import INFO, STALE, RowReport, Said, ends, report
 
 
 class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -204,6 +204,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._running = running(self._adaptive, threshold)
         self._guard = Guard(self.env, monitor, self._options, threshold, self._box, self._rows_per_step)
         self._observer = Observer(monitor, recalls=self._guard.recalls)
+        learns = self.online_learning_rate > 0
+        self._quiet, self._calm = None if learns else QuietRows.of(monitor, self._guard), False
         self._monitor = self._next = monitor
         self._parts, self._promised = fitted_parts(monitor), threshold
         self._confirmed = False
@@ -234,6 +236,9 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._observer.begin()
         self._observation = observation
         self._guard.begin()
+        if self._quiet is not None:
+            self._quiet.begin()
+        self._calm = self._quiet is not None and self._guard.calm
         self._alarms = 0
         none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))
         self._ended = False
@@ -251,20 +256,22 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._failed = ""
         self._command(action)
         overridden = self._guard.arbiter.overriding or self._refused
-        self._rows: list[RowReport] = []
+        self._rows: list[RowReport | QuietRow] = []
         parts = zip(fitted_parts(self._monitor), self._parts, strict=True)
         self._stale = "" if all(a is b for a, b in parts) else STALE
         observation, reward, terminated, truncated, info = self._run()
         info = dict(info)  # an environment may use its own again
         row, failure = self._sensed(observation, info)
-        self._look(row, failure, self._guard.substeps.came(row, info))
+        self._look(row, failure, info)
         self._observation = observation = self._guard.responder.observed(observation)
         repaired = self._guard.responder.row()
         if repaired is not None and "stream" in info:
             info["stream"] = repaired
         info["overridden"] = overridden or bool(info.get("overridden"))
         asm = self._report(info, self._rows, self._executed)
-        if asm["gave_up"] or (self._guard.ends_on_alarm and any(map(ends, self._rows))):
+        if asm["gave_up"] or (
+            self._guard.ends_on_alarm and any(r.decision.alarm and ends(r.whole(self.threshold)) for r in self._rows)
+        ):
             terminated, truncated = terminated or not self._options.truncate, truncated or self._options.truncate
         self._ended = bool(terminated or truncated)
         return observation, reward, terminated, truncated, info
@@ -312,16 +319,21 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             return np.full(self.monitor.spec.size, np.nan, np.float32), f"stream: {error!r}"
         return row, ""
 
-    def _look(self, row: NDArray[np.float32], failure: str = "", beneath: Beneath | None = None) -> None:
-        """One row: what the monitor makes of it, and who acts next."""
-        guard = self._guard
+    def _look(self, row: NDArray[np.float32], failure: str = "", info: dict[str, Any] | None = None) -> None:
+        """One row: what the monitor makes of it, and who acts next; with ``info`` of the step that it ends."""
+        guard, late = self._guard, False
+        if self._calm and not (failure or self._refused or self._stale):
+            late = self._passes(row, info)
+            if self._calm:
+                return
+        beneath = None if info is None else guard.substeps.came(row, info)
         if self._refused:
             failure, self._refused = joined(self._failed, failure), False
         if self._stale:
             failure = joined(failure, self._stale)
         row, failure = guard.read(row, failure)
         surprise, expected, (failure,), latency = self._observer.observe(row[None], (failure,))
-        if self._late(latency):
+        if late or self._late(latency):
             surprise = surprise._replace(value=np.full(1, np.inf))
         surprise = guard.heard(surprise, bool(failure))
         if self.online_learning_rate > 0 and not guard.arbiter.overriding and not failure:
@@ -336,6 +348,32 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if guard.arbiter.overriding and not said.decision.intervened and beneath is None:
             self._command(self._executed)
             self.env.get_wrapper_attr("command")(self._executed)
+        self._calm = self._quiet is not None and guard.calm
+
+    def _passes(self, row: NDArray[np.float32], info: dict[str, Any] | None) -> bool:
+        """Lets a row pass in which nothing happens; else it is calm no more. Whether it was so late as to alarm."""
+        quiet, guard = self._quiet, self._guard
+        assert quiet is not None
+        quiet.take(self._observer.state)
+        row, late = np.array(row), False  # an environment may use its own again
+        said: RowReport | QuietRow | None = quiet.judge(row, info, guard.arbiter.threshold)
+        if said is not None:
+            late = self._late(said.latency)
+        if said is None or late:
+            self._interrupt()
+            return late
+        quiet.keep()
+        if failure := guard.let_pass(row, self._executed, said.value, info is not None):
+            decision = said.decision._replace(failure=failure)
+            said = said.whole(self.threshold)._replace(decision=decision, failure=failure)
+        self._rows.append(said)
+        return False
+
+    def _interrupt(self) -> None:
+        """Something may have happened: ``Observer`` and ``Guard`` go on from where the quiet rows have come to."""
+        self._calm, state = False, None if self._quiet is None else self._quiet.hand_back()
+        if state is not None:
+            self._observer.state = state
 
     def _late(self, latency: float) -> bool:
         """Whether the monitor took so long that it counts as an alarm."""
@@ -347,7 +385,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             )
         return late and self._on_overrun == "alarm"
 
-    def _report(self, info: dict[str, Any], rows: list[RowReport], executed: Any) -> dict[str, Any]:
+    def _report(self, info: dict[str, Any], rows: Sequence[Said], executed: Any) -> dict[str, Any]:
         """Says in ``info`` what came of a step."""
         failed, responder = self._failed if executed is not None else "", self._guard.responder
         asm = report(rows, self.monitor.spec, self.threshold, executed, failed)

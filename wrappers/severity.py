@@ -79,6 +79,7 @@ class ContactForce:
     """
 
     def __init__(self, wrists: NDArray[np.intp], joints: NDArray[np.intp]) -> None:
+        self.columns = wrists, joints
         self._wrists, self._joints = wrists.tolist(), joints.tolist()
 
     @classmethod
@@ -107,12 +108,16 @@ class SeverityEstimator:
 
     def __init__(self, spec: StreamSpec) -> None:
         self._dt = spec.dt
-        self._force, self._speeds = ContactForce.felt_by(spec.channels), _triples(spec, "hand_velocity").tolist()
+        self._force, hands = ContactForce.felt_by(spec.channels), _triples(spec, "hand_velocity")
+        self.columns = *self._force.columns, hands
+        """Of a row: (n, 3) forces at wrists, (J,) external torques, (n, 3) velocities of hands."""
+        self._speeds = hands.tolist()
         self.reset()
 
     def reset(self) -> None:
         """A new episode begins."""
-        self._impulse = self._leant = 0.0
+        self.pressed = 0.0, 0.0
+        """How much, beyond ``FREE_FORCE`` [N s], and for how long without a pause [s]."""
 
     def of(
         self, row: NDArray[np.floating[Any]], beneath: Beneath | None, held: bool, leans_s: float = LEANS_S
@@ -128,11 +133,11 @@ class SeverityEstimator:
         # What the arm feels itself is not what a faulty sensor says of it; where nobody else says, the row does.
         force = self._force(row) if math.isnan(force) else force
         more = max(force - FREE_FORCE, 0.0) if math.isfinite(force) else 0.0
-        self._impulse += more * self._dt
-        self._leant = self._leant + self._dt if more else 0.0
+        impulse, leant = self.pressed
+        impulse, leant = self.pressed = impulse + more * self._dt, leant + self._dt if more else 0.0
         speed = _largest_norm(row, self._speeds)
-        presses = load > 1.0 or math.isfinite(left_s) or self._leant > leans_s
-        return Severity(load, presses, force, self._impulse, speed, BLOW * speed, held, left_s)
+        presses = load > 1.0 or math.isfinite(left_s) or leant > leans_s
+        return Severity(load, presses, force, impulse, speed, BLOW * speed, held, left_s)
 
 
 def _triples(spec: StreamSpec, name: str) -> NDArray[np.intp]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,30 @@ class RowReport(NamedTuple):
     reason: str = ""
     event: str = NO_EVENT
 
+    @property
+    def value(self) -> float:
+        """Its surprise."""
+        return float(self.surprise.value[0])
+
+    def whole(self, threshold: float) -> RowReport:
+        """All that there is to say of it: this."""
+        return self
+
+
+class Said(Protocol):
+    """What became of one row, said in full when somebody asks."""
+
+    @property
+    def decision(self) -> Decision:
+        """Who acts next."""
+
+    @property
+    def value(self) -> float:
+        """Its surprise."""
+
+    def whole(self, threshold: float) -> RowReport:
+        """At the threshold of its episode."""
+
 
 def ends(row: RowReport) -> bool:
     """Whether an alarm ends the episode, where alarms do: a knock no harder than healthy motion does not."""
@@ -52,7 +76,7 @@ def ends(row: RowReport) -> bool:
 
 
 def report(
-    rows: Sequence[RowReport],
+    rows: Sequence[Said],
     spec: StreamSpec,
     threshold: float,
     executed: NDArray[np.float32] | None,
@@ -91,7 +115,7 @@ def report(
         without them, ``lost``, the numbers that were not finite, and ``alarms``, steps in alarm in this episode so far,
         for wrappers outside that skip steps.
     """
-    surprises = [float(row.surprise.value[0]) for row in rows]
+    surprises = [row.value for row in rows]
     now = {
         "surprise": max(surprises),
         "alarm": any(row.decision.alarm for row in rows),
@@ -99,7 +123,9 @@ def report(
         "gave_up": any(row.decision.gave_up for row in rows),
     }
     done = None if executed is None else np.array(executed)
-    return Lazily(now, lambda: _all_of(rows, surprises, spec, threshold, done, failed) | now)
+    return Lazily(
+        now, lambda: _all_of([row.whole(threshold) for row in rows], surprises, spec, threshold, done, failed) | now
+    )
 
 
 def _all_of(

@@ -81,6 +81,16 @@ class SubstepGuard:
         self._careful_steps = max(1, round(CAREFUL_S / control_period(env)))
         self._careful = 0  # steps of the policy for which its hand is slower still
 
+    @property
+    def columns(self) -> tuple[NDArray[np.intp], ...]:
+        """Of ``contact_felt``: (n, 3) forces at wrists, and (J,) external torques."""
+        return (np.zeros((0, 3), np.intp), np.zeros(0, np.intp)) if self._felt is None else self._felt.columns
+
+    @property
+    def calm(self) -> bool:
+        """Whether limits stay as they are while nothing happens."""
+        return not self._careful and self._familiar is None
+
     def begin(self) -> None:
         """A new episode has begun in the environment."""
         self._careful = 0

@@ -64,6 +64,11 @@ class Excuses:
         self._fingers = _columns(spec, lambda c: c.name.endswith("gripper_velocity") and c.unit == "m/s")
         self._rows = np.array([max(1, round(seconds / spec.dt)) for seconds in (KNOCKED_S, MOVED_S)])
 
+    @property
+    def arrays(self) -> tuple[list[NDArray[Any]], NDArray[np.float64]]:
+        """Columns of wrists, joints and fingers, and how many rows things last; (J, 2) the stops."""
+        return [self._wrist, self._joints, self._fingers, self._rows], self._ends
+
     def start(self, batch: int) -> NDArray[np.int64]:
         """(B, 2) for how many rows a knock is still felt, and fingers have just moved: none."""
         return np.zeros((batch, 2), np.int64)

@@ -35,6 +35,13 @@ from asm_gym.envs.mujoco_views import (
     NominalViews,
     SubstepLimits,
     Views,
+    _f2,
+    _f3,
+    arms_at,
+    goals_at,
+    limits_at,
+    nominal_at,
+    views_at,
 )
 
 # What one arm's sensors give in a substep, side by side.
@@ -45,6 +52,11 @@ CONTACT = slice(2 * JOINTS + 6, 2 * JOINTS + 9)
 VELOCITY = slice(2 * JOINTS + 9, 2 * JOINTS + 15)
 OUTSIDE = slice(2 * JOINTS + 15, 2 * JOINTS + 18)
 SAMPLE = OUTSIDE.stop
+
+ARMS_AT = len(Views._fields)
+GOALS_AT = ARMS_AT + len(Arms._fields)
+LIMITS_AT = GOALS_AT + len(Goals._fields)
+"""Where these begin in the table of ``run``, after Views."""
 
 # MuJoCo's own functions, linked by name so that the compiled loop can be cached on disk.
 binding.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
@@ -154,29 +166,21 @@ def must_stay(limits: SubstepLimits) -> bool:
 
 
 @partial(compiled, nogil=True)
-def run(
-    views: Views,
-    nominal: NominalViews,
-    arms: Arms,
-    goals: Goals,
-    limits: SubstepLimits,
-    deltas: Floats,
-    turns: Floats,
-    fresh: bool,
-    first: int,
-    count: int,
-    samples: Floats,
-) -> None:
+def run(t: Any, nominal_table: Any, fresh: bool, first: int, count: int) -> None:
     """Runs ``count`` physics substeps, controllers and sensors included.
 
     Args:
-        limits: from the substep after one is passed, the arms stay where they are, if that is asked for.
-        deltas: (A, JOINTS) the action in metres and radians.
-        turns: (A, 3, 3) the rotation it asks for, under operational space control.
-        fresh: the set-points are to be moved by these in the first of these substeps.
+        t: the ``table`` of Views, Arms, Goals, SubstepLimits, the action in metres and radians (A, JOINTS), the
+            rotation it asks for (A, 3, 3), and samples (A, K, SAMPLE), which are written at ``first`` and after. From
+            the substep after a limit is passed, the arms stay where they are, if that is asked for.
+        nominal_table: of NominalViews.
+        fresh: the set-points are to be moved by the action in the first of these substeps.
         first: which substep of the control step comes next.
-        samples: (A, K, SAMPLE) written at ``first`` and after.
     """
+    views, nominal, arms = views_at(t), nominal_at(nominal_table), arms_at(t[ARMS_AT:])
+    goals, limits = goals_at(t[GOALS_AT:]), limits_at(t[LIMITS_AT:])
+    last = len(t) - 3
+    deltas, turns, samples = _f2(t, last), _f3(t, last + 1), _f3(t, last + 2)
     for k in range(first, first + count):
         _step1(views.model, views.data)
         if nominal.model != 0:
@@ -191,6 +195,52 @@ def run(
         _step2(views.model, views.data)
         sample(views, nominal, arms, k, samples)
         feel(arms, limits, k, samples)
+
+
+@compiled
+def read(
+    samples: Any,
+    count: int,
+    mean: Any,
+    peak: Any,
+    last: Any,
+    qpos: Any,
+    qvel: Any,
+    ctrl: Any,
+    force: Any,
+    site: Any,
+    body: Any,
+    where: Any,
+    beside: Any,
+    noise: Any,
+    drawn: Any,
+    steps: Any,
+    carried: Any,
+    row: Any,
+    stream: Any,
+) -> tuple[float, float, float]:
+    """Summarises the first ``count`` samples, if there are any, and writes what the sensors read, and its stream.
+
+    Args:
+        where: (P, 2) of each number that the arms sense its source, in the order of the arguments, and its place there.
+        beside: (M - P,) what comes after them.
+        noise, drawn: (M,) standard deviations, and of how many each number is off.
+        steps: (M,) of resolution; 0 for what has none.
+        carried: (D,) what of a row the stream carries.
+        row, stream: (M,) and (D,) of single precision, written.
+    """
+    felt = summarise(samples, count, mean, peak, last) if count else (0.0, 0.0, 0.0)
+    sources = qpos, qvel, ctrl, force, site, body, mean.ravel(), peak.ravel(), last.ravel()
+    for n in range(len(row)):
+        if n < len(where):
+            value = sources[where[n, 0]][where[n, 1]]
+        else:
+            value = beside[n - len(where)]
+        value += noise[n] * drawn[n]
+        row[n] = np.rint(value / steps[n]) * steps[n] if steps[n] > 0.0 else value
+    for n in range(len(carried)):
+        stream[n] = np.float32(row[carried[n]])
+    return felt
 
 
 @compiled

@@ -37,7 +37,8 @@ class Layout:
     def __init__(self, measured: StreamSpec, groups: Sequence[str], flat: bool) -> None:
         chosen = tuple(c for c in measured.channels if c.group in groups)
         self.stream_spec = StreamSpec(chosen, measured.dt, measured.source) if chosen else None
-        self._to_stream = _indices(measured, [c.name for c in chosen])
+        self.carried = _indices(measured, [c.name for c in chosen])
+        """(D,) which numbers of a row the stream carries."""
         names = [c.name for c in measured.channels if c.name.endswith(_OBSERVED) or c.group == "object"]
         self._to_observation = _indices(measured, names)
         self._slices = {name: measured.slices[name] for name in names}
@@ -62,7 +63,7 @@ class Layout:
 
     def stream(self, row: NDArray[np.float64]) -> NDArray[np.float32]:
         """(D,) what of a row the stream carries."""
-        return as_float32(row[self._to_stream])  # what is too large becomes infinite, which ends the episode
+        return as_float32(row[self.carried])  # what is too large becomes infinite, which ends the episode
 
 
 def _shown(row: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -331,7 +331,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             for hook in self.substep_hooks:
                 hook(done - 1)
             if done % self._row_substeps == 0 and done < self.substeps:
-                row = self.to_stream(self._read(within=True)) if self._layout.stream_spec else np.zeros(0, np.float32)
+                measured = self._read(within=True)
+                row = self.to_stream(measured) if self.corruptions else self._carried
                 self.simulation.begin_row()
                 self._rows.append(row)
                 for feel in self.row_hooks:
@@ -394,10 +395,15 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
     def _read(self, within: bool = False) -> NDArray[np.float64]:
         """As ``measure``; ``within`` a control step objects stay where they were seen last, if nobody looks at them."""
-        if not (within and self._overlooked and not self.corruptions):
-            self._seen = self._objects.read()
-        row = np.concatenate([self.simulation.sense(), *self._seen, self._action])
-        return self._errors.added(row, self.corruptions, self.np_random)
+        faults, rng = self.corruptions, self.np_random
+        if faults or not (within and self._overlooked):
+            self._seen = np.concatenate([*self._objects.read(), np.zeros(0)])
+        beside = np.concatenate([self._seen, self._action])
+        if faults:
+            return self._errors.added(np.concatenate([self.simulation.sense(), beside]), faults, rng)
+        drawn = rng.standard_normal(self.measured_spec.size)
+        row, self._carried = self.simulation.read(beside, self._errors, drawn, self._layout.carried)
+        return row
 
     def to_stream(self, row: NDArray[np.float64]) -> NDArray[np.float32]:
         """(D,) what of a measured row the stream carries."""

@@ -115,6 +115,12 @@ class Proprioception:
             _fill(table, robot, arm, i * kernels.SAMPLE)
         self.channels = tuple(c for t in tables for c in t.channels)
         self._index = np.concatenate([index for t in tables for index in t.indices])
+        begins = np.array(list(starts.values()))
+        which = np.searchsorted(begins, self._index, side="right") - 1
+        self.where = np.stack([which, self._index - begins[which]], axis=1)
+        """(P, 2) of each of their numbers the source, and its place there."""
+        self.sources = list(self._sources.values())[:6]
+        """Arrays of MuJoCo's that are read as they are; mean, peak and last come after them."""
 
     def read(self) -> NDArray[np.float64]:
         """One number for every element of ``channels``; noiseless."""
@@ -131,19 +137,22 @@ class SensorErrors:
     """
 
     def __init__(self, spec: StreamSpec, scale: float) -> None:
-        self._noise = spec.noise * scale
-        self._stepped = np.flatnonzero(spec.resolution) if scale else np.zeros(0, np.intp)
-        self._steps = spec.resolution[self._stepped]
+        self.noise = spec.noise * scale
+        """(M,) standard deviations."""
+        self.steps = spec.resolution if scale else np.zeros(spec.size)
+        """(M,) of resolution; 0 for none."""
+        self._stepped = np.flatnonzero(self.steps)
 
     def added(
         self, row: NDArray[np.float64], faults: Sequence[Corruption], rng: np.random.Generator
     ) -> NDArray[np.float64]:
         """(M,) the row as it is read; it is changed in place."""
-        row += self._noise * rng.standard_normal(row.size)
+        row += self.noise * rng.standard_normal(row.size)
         for corrupt in faults:
             corrupt(row)
         with np.errstate(over="ignore"):  # of a simulation that diverges
-            row[self._stepped] = np.rint(row[self._stepped] / self._steps) * self._steps
+            steps = self.steps[self._stepped]
+            row[self._stepped] = np.rint(row[self._stepped] / steps) * steps
         return row
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -16,11 +16,23 @@ from asm_gym.contact_limits import ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.arms import bodies, compilable, describe
 from asm_gym.envs.control import hold_at
-from asm_gym.envs.mujoco_views import ACTS, ARMED, FELT, JOINTS, LEFT, Goals, SubstepLimits, Views
+from asm_gym.envs.mujoco_views import ACTS, ARMED, FELT, JOINTS, LEFT, Floats, Goals, Ints, NominalViews, SubstepLimits, Views, table
 from asm_gym.envs.nominal_robot import NominalDynamics
-from asm_gym.envs.sensors import Proprioception
+from asm_gym.envs.sensors import Proprioception, SensorErrors
 from asm_gym.envs.speeds import HandSpeeds
 from asm_gym.spec import Channel
+
+
+class Reading(NamedTuple):
+    """What sensors read.
+
+    Attributes:
+        row: (M,) as ``RobosuiteEnv.measured_spec`` names it.
+        stream: (D,) what of it the stream carries.
+    """
+
+    row: Floats
+    stream: NDArray[np.float32]
 
 
 class Simulation:
@@ -89,6 +101,9 @@ class Simulation:
         self._goals = Goals(np.zeros((n, 3)), np.zeros((n, 3, 3)), joints, joints.copy(), np.zeros(n, np.int64))
         self._deltas = np.zeros((n, JOINTS))
         self._turns = np.tile(np.eye(3), (n, 1, 1))
+        action = self._deltas, self._turns, self._samples
+        self._table = table((*self._views, *self._arms, *self._goals, *self._limits, *action))
+        self._nominal: NominalViews | None = None
         self._samples[:] = 0.0
         if must_compile(kernels.run):
             print("asm-gym: compiling the simulation loop, once on this machine (about 20 s)", file=sys.stderr)
@@ -137,10 +152,12 @@ class Simulation:
     def advance(self, count: int) -> None:
         """Runs ``count`` substeps of the control step that was begun."""
         if self.compiled:
-            wrenches = [self.data.sensordata[at : at + 6].copy() for at in self._arms.wrench]
-            self._run(count)
             if self.keeps_history and self._done == 0:
+                wrenches = [self.data.sensordata[at : at + 6].copy() for at in self._arms.wrench]
+                self._run(count)
                 self._remember(wrenches)
+            else:
+                self._run(count)
         else:
             for k in range(self._done, self._done + count):
                 self.env.sim.step1()
@@ -162,9 +179,10 @@ class Simulation:
         self._row_began = self._done
 
     def _run(self, count: int) -> None:
-        steps = (self._fresh, self._done - self._row_began, count, self._samples)
-        goals = self._goals, self._limits, self._deltas, self._turns
-        kernels.run(self._views, self.nominal.now(), self._arms, *goals, *steps)
+        nominal = self.nominal.now()
+        if nominal is not self._nominal:
+            self._nominal, self._nominal_table = nominal, table(nominal)
+        kernels.run(self._table, self._nominal_table, self._fresh, self._done - self._row_began, count)
 
     @property
     def passed_limit(self) -> int | None:
@@ -197,6 +215,23 @@ class Simulation:
         found: NDArray[np.float64] = np.linalg.norm(forces, axis=2).max(axis=0)
         return found
 
+    def read(self, beside: NDArray[np.float64], errors: SensorErrors, drawn: Floats, carried: Ints) -> Reading:
+        """What the sensors read now, summarised over the substeps since the row began.
+
+        Args:
+            beside: what comes after what the arms sense.
+            errors: of sensors; no fault among them.
+            drawn: (M,) of how many standard deviations each reading is off.
+            carried: (D,) which numbers the stream carries.
+        """
+        p, count = self.proprioception, self._done - self._row_began
+        found = Reading(np.empty(len(drawn)), np.empty(len(carried), np.float32))
+        steps = errors.noise, drawn, errors.steps, carried
+        felt = kernels.read(self._samples, count, p.mean, p.peak, p.last, *p.sources, p.where, beside, *steps, *found)
+        if count:
+            self._add_up(count, *felt)
+        return found
+
     def sense(self) -> NDArray[np.float64]:
         """What the arms' sensors read now, summarised over the substeps since the row began; noiseless."""
         if self._done > self._row_began:
@@ -215,7 +250,10 @@ class Simulation:
 
     def _summarise(self, count: int) -> None:
         p = self.proprioception
-        contact, external, mean = kernels.summarise(self._samples, count, p.mean, p.peak, p.last)
+        self._add_up(count, *kernels.summarise(self._samples, count, p.mean, p.peak, p.last))
+
+    def _add_up(self, count: int, contact: float, external: float, mean: float) -> None:
+        """Takes the forces of a row into those of the control step."""
         contact_before, external_before, sum_before = self._felt
         self.contact_force = _larger(contact, contact_before)
         self.external_force = _larger(external, external_before)

@@ -94,7 +94,7 @@ class CompiledRow:
         spec = model.spec
         whole, where_whole = _side_by_side(np.int64, spec.sensory, spec.motor, s.slow, network.spans)
         where = np.stack([*where_singles, *where_doubles, *where_whole])
-        self._learned: tuple[Any, ...] = (
+        self.learned: tuple[Any, ...] = (
             singles,
             doubles,
             whole,
@@ -117,15 +117,15 @@ class CompiledRow:
         found = np.empty(B), np.empty_like(rows)
         arrays: tuple[Any, ...] = (rows, *old, *new, *found)
         if B == 1:  # calls no BLAS
-            _observe(*arrays, *self._learned)
+            _observe(*arrays, *self.learned)
         else:
             parts = [[a[n : n + A_THREAD] for a in arrays] for n in range(0, B, A_THREAD)]
             with _ONE_THREAD:
                 if len(parts) == 1:
-                    _observe(*parts[0], *self._learned)
+                    _observe(*parts[0], *self.learned)
                 else:
                     with ThreadPoolExecutor() as threads:
-                        list(threads.map(lambda part: _observe(*part, *self._learned), parts))
+                        list(threads.map(lambda part: _observe(*part, *self.learned), parts))
         detection = EvidenceState(Evidence(*new[6:9]), Repetition(*new[9:]))
         return MonitorState(MemoryState(*new[:6]), detection), Surprise(*found)
 

@@ -244,7 +244,7 @@ class NeuralASM(CalibratedMonitor):
 
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
         self._fitted()
-        rows, row = self._rows(state, stream), self._compiled()
+        rows, row = self._rows(state, stream), self.compiled_row
         before, knock, held = state.skill, state.knock, state.values
         state, surprise = super().observe(state, rows) if row is None else row(state, rows)
         if self.values_ is not None:
@@ -260,8 +260,14 @@ class NeuralASM(CalibratedMonitor):
             state, surprise = state._replace(skill=after), self.skill_.joined(surprise, skill, self.alarm_on)
         return state, surprise
 
-    def _compiled(self) -> CompiledRow | None:
-        """``observe`` in one call, of the weights as they are now."""
+    @property
+    def events(self) -> Excuses | None:
+        """What tells knocks and stops from faults; None where nobody does."""
+        return self._excuses
+
+    @property
+    def compiled_row(self) -> CompiledRow | None:
+        """``observe`` in one call, of the weights as they are now; None where the parts have no such call."""
         evidence, of = self.detection, self._row_of
         now = self.model.network_, evidence.detector_ if isinstance(evidence, EvidenceDetection) else None, self.skills_
         if of is None or of[0] is not now[0] or of[1] is not now[1] or of[2] is not now[2]:
