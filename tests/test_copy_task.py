@@ -3,39 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from asm_gym.memory.dynamics import DYNAMICS
-from asm_gym.memory.energy import Array
-from asm_gym.memory.learning import Schedule, Trajectory
-
-SYMBOLS, HIDDEN, UPDATES = 8, 32, 2500
+from asm_gym.scripts.reproduce.sequences import copies, said_again
 
 
-def sequences(delay: int) -> Array:
-    """(SYMBOLS, T, SYMBOLS): each symbol is shown, then there is nothing for ``delay`` steps, then it comes again."""
-    rows = np.zeros((SYMBOLS, delay + 2, SYMBOLS), np.float32)
-    for symbol in range(SYMBOLS):
-        rows[symbol, [0, -1], symbol] = 2.0
-    return rows
+def test_every_order_is_shown_and_comes_again_after_nothing():
+    rows = copies(4, 2, 3)
+    assert rows.shape == (16, 7, 4)
+    np.testing.assert_array_equal(rows[:, :2], rows[:, -2:])
+    assert not rows[:, 2:5].any()
+    assert len({tuple(order) for order in rows[:, :2].argmax(axis=2)}) == 16
 
 
-def said_again(dynamics: str, shown: Array, rng: np.random.Generator) -> float:
-    """Share of the symbols that are expected rightly when they come again; (N, T, SYMBOLS)."""
-    one, how = np.ones((shown.shape[1], 1), np.float32), DYNAMICS[dynamics]
-    episodes = [Trajectory(rows, one, one) for rows in shown]
-    passes = round(UPDATES * 16 / (len(shown) * len(one)))
-    schedule = Schedule(passes, 16, 3e-3, how.iterations, how.prior_precision, 1.0, 0.0)
-    network = how.learn(episodes, HIDDEN, schedule, rng, lambda: None).network
-    c, u, seen = network.at_rest(SYMBOLS), np.ones((SYMBOLS, 1), np.float32), np.ones((SYMBOLS, SYMBOLS), np.float32)
-    for x in shown.transpose(1, 0, 2):
-        expected = network.predict(c, u)
-        c = network.follow(c, u, x, seen).traces
-    return float(np.mean(expected.argmax(axis=1) == np.arange(SYMBOLS)))
+def test_traces_carry_a_symbol_over_a_delay_and_a_state_that_one_step_teaches_does_not():
+    shown = copies(8, 1, 30)
+    assert said_again("traces", shown, 1, 2500, np.random.default_rng(0)) == 1.0
+    assert said_again("settling", shown, 1, 2500, np.random.default_rng(0)) < 0.7
 
 
-@pytest.mark.parametrize("delay", [10, 30])
-def test_traces_carry_a_symbol_over_the_delay_and_a_state_that_one_step_teaches_does_not(delay):
-    shown = sequences(delay)
-    assert said_again("traces", shown, np.random.default_rng(0)) == 1.0
-    assert said_again("settling", shown, np.random.default_rng(0)) < 0.7
+def test_a_network_trained_through_time_carries_a_symbol_too():
+    assert said_again("gru", copies(8, 1, 5), 1, 2500, np.random.default_rng(0)) == 1.0

@@ -28,7 +28,7 @@ def filmed(courses: Mapping[str, Mapping[str, Course]], truth: Floats) -> list[N
     """A letter (T, 2) written by each dynamics: one frame for each row."""
     names = [name for name in courses if name != "gru"]
     with figure(height=7.2, width=11) as fig:
-        canvas = FigureCanvasAgg(fig)
+        canvas: Any = FigureCanvasAgg(fig)
         fig.set_dpi(80)
         panels: list[Any] = []
         for axes, name in zip(fig.subplots(len(names), 3, squeeze=False), names, strict=True):

@@ -10,8 +10,8 @@ does not say what comes next, and only what came before does. Beside the network
 and the network by traces, which the paper does not have.
 
 Then the copy task: a symbol of eight is shown, and after a delay in which there is nothing it is to be expected again;
-or two of four symbols, in their order. A GRU and an LSTM learn the same by backpropagation through time, with as many
-weights as the settling network has with its units, and from as many rows.
+or two of four symbols, in their order. A GRU and an LSTM learn the same by backpropagation through time, with about as
+many weights as the settling network has, and from as many rows.
 
 Source: Tang, Barron and Bogacz 2023 (NeurIPS 36), and the scripts that they name, for the patterns and A B C B A, of
 digits there. Sompolinsky and Kanter 1986 (PRL 57(22)) for the asymmetric Hopfield network. Hochreiter
@@ -63,7 +63,7 @@ COPYING = {"settling": "settling", "traces": "traces", "gru": "GRU, BPTT", "lstm
 """What learns to say again."""
 
 COPIERS = {"settling": 32, "traces": 32, "gru": 16, "lstm": 14}
-"""Units of each: 1,600 weights by settling, 3,000 by traces, 1,400 in a GRU, 1,500 in an LSTM."""
+"""Units of each: 1,400 weights by settling, 3,600 by traces, and 1,500 in a GRU and in an LSTM."""
 
 RATE = 3e-2
 """Of the networks trained by backpropagation through time, the best of 1e-2, 3e-2 and 6e-2."""
