@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.addresses import flags2, floats1, floats2, singles1, singles2, table, whole1, whole2
 from asm_gym.compilation import compiled, must_compile
 from asm_gym.detection.detector import EvidenceState
 from asm_gym.detection.events import EVENTS, KNOCK, _step
@@ -39,6 +40,9 @@ SIZES, AT, WRIST, JOINTS, FINGERS, LASTING, WRISTS, TORQUES, HANDS, FELT_WRISTS,
 AXES, ANCHORS, REACH, ONE_OVER, ENDS, NUMBERS = range(11, 17)
 """Places of what stays as it is. ``SIZES`` are those of a state's arrays; the others are what ``HandAgainstJoints``,
 ``Excuses`` and ``SeverityEstimator`` know."""
+
+ITERATIONS, LOOKS, CHAINED, EXCUSES = range(7, 11)
+"""Places among ``SIZES``: what ``_observe`` is told, and whether there is a hand to compare and something to excuse."""
 
 VALUE, RAW, KIND, FORCE, IMPULSE, SPEED, LOAD, LEFT, LATENCY, FOUND = range(10)
 """Places of what is found of a row; then its attribution (D,)."""
@@ -94,21 +98,26 @@ class QuietRows:
     def __init__(self, monitor: NeuralASM, guard: Guard) -> None:
         assert monitor.compiled_row is not None
         self._monitor, self._row, self._guard = monitor, monitor.compiled_row, guard
-        model, (evidence, repetition) = (first := monitor.initial_state(1)).model, first.detection
+        first = monitor.initial_state(1)
+        model, evidence = first.model, first.detection.evidence
         (T, H, K), (_, lag, D) = (a.size for a in (model.traces, model.expected, model.skill)), model.before.shape
         (_, G, X), hand, excuses = evidence.vector.shape, guard.hand, monitor.events
         none: NDArray[Any] = np.zeros(0)
         at, chain, numbers = (none, [none.reshape(0, 3)] * 3 + [none], np.zeros(3)) if hand is None else hand.arrays
         senses, ends = ([none] * 4, none.reshape(0, 2)) if excuses is None else excuses.arrays
-        spans = np.array([T, H, K, lag, D, G, X])
+        *learned, pi_z, pi_x, curvature, iterations, looks = monitor.compiled_row.learned
+        spans = np.array([T, H, K, lag, D, G, X, iterations, looks, hand is not None, excuses is not None])
+        numbers = np.array([*numbers, monitor.spec.dt, pi_z, pi_x, curvature])
         ints, where = _side_by_side(np.int64, spans, at, *senses, *guard.columns)
-        doubles, and_where = _side_by_side(np.float64, *chain, ends, np.append(numbers, monitor.spec.dt))
-        self._fixed = ints, doubles, np.array([*where, *and_where]), hand is not None, excuses is not None
+        doubles, and_where = _side_by_side(np.float64, *chain, ends, numbers)
+        self._fixed = ints, doubles, np.array([*where, *and_where]), *learned
+
         # Of each kind of number the state now and the next one, in turns.
         sizes = T + H + K, 2 * lag * D + G * X + H + 2 * X + HAND + 2, 4, X
         kinds = np.float32, np.float64, np.int64, np.bool_
         self._state = tuple(np.zeros((2, n), kind) for n, kind in zip(sizes, kinds, strict=True))
-        self._now, self._size, self._runs = 0, FOUND + D, False
+        self._table = table((*self._state, *self._fixed))
+        self._now, self._size, self._runs, self._patience = 0, FOUND + D, False, (0.0, 0.0)
         if must_compile(_quiet):
             print("asm-gym: compiling the guard, once on this machine (about a minute)", file=sys.stderr)
         self.judge(np.full(D, np.nan, np.float32), None, 0.0)
@@ -119,6 +128,11 @@ class QuietRows:
         if type(monitor) is not NeuralASM or monitor.compiled_row is None or not guard.can_be_quiet:
             return None
         return None if monitor.values_ is not None or monitor.skill_ is not None else cls(monitor, guard)
+
+    @property
+    def stale(self) -> bool:
+        """Whether the monitor was fitted since."""
+        return self._monitor.compiled_row is not self._row
 
     def begin(self) -> None:
         """A new episode has begun: whatever ran is over."""
@@ -135,11 +149,8 @@ class QuietRows:
         if info is not None:
             load, left = float(info.get("contact_load", math.nan)), float(info.get("contact_left_s", math.nan))
             felt = np.array(info.get("contact_felt", NOTHING_FELT), np.float64)
-        if self._monitor.compiled_row is not self._row:
-            return None  # it was fitted meanwhile
-        told = float(threshold), load, left, *self._guard.patience
         start = time.perf_counter()
-        quiet = _quiet(row, felt, found, *told, *self._state, self._now, *self._fixed, *self._row.learned)
+        quiet = _quiet(row, felt, found, threshold, load, left, *self._patience, self._now, self._table)
         found[LATENCY] = time.perf_counter() - start
         return QuietRow(found) if quiet else None
 
@@ -151,7 +162,7 @@ class QuietRows:
         """Takes up what all other rows have come to; nothing where it has."""
         if self._runs:
             return
-        self._runs = True
+        self._runs, self._patience = True, self._guard.patience
         model, (evidence, repetition) = state.model, state.detection
         guard = () if self._guard.hand is None else (self._guard.hand.mean,)
         parts: list[list[Any]] = [
@@ -234,25 +245,8 @@ def _quiet(
     left: float,
     leans: float,
     most: float,
-    singles: Any,
-    doubles: Any,
-    whole: Any,
-    flags: Any,
     now: int,
-    ints: Any,
-    fixed: Any,
-    where: Any,
-    chained: bool,
-    excuses: bool,
-    learned_singles: Any,
-    learned_doubles: Any,
-    learned_whole: Any,
-    learned_where: Any,
-    pi_z: Any,
-    pi_x: Any,
-    curvature: Any,
-    iterations: int,
-    looks: bool,
+    t: Any,
 ) -> bool:
     """Whether nothing happens in a row (D,); writes what is ``found`` of it, and the next state beside the one now.
 
@@ -260,7 +254,11 @@ def _quiet(
         felt: (N,) what the arm felt in the step that the row ends, empty where it ends none.
         leans: how long the arm may lean on something [s].
         most: how much it may press in an episode [N s].
+        now: which of the states is that before the row.
+        t: the ``table`` of states, of what stays as it is, and of what was learned.
     """
+    singles, doubles, whole, flags = singles2(t, 0), floats2(t, 1), whole2(t, 2), flags2(t, 3)
+    ints, fixed, where = whole1(t, 4), floats1(t, 5), whole2(t, 6)
     D = len(row)
     rows = np.empty((1, D))
     for i in range(D):
@@ -269,11 +267,12 @@ def _quiet(
         rows[0, i] = row[i]
     numbers = _vector(fixed, where, NUMBERS)
     late, gain, cap, dt = numbers[0], numbers[1], numbers[2], numbers[3]
+    pi_z, pi_x, curvature = np.float32(numbers[4]), np.float32(numbers[5]), np.float32(numbers[6])
     own, after = doubles[now], doubles[1 - now]
     first = len(own) - HAND - 2
     after[first:] = own[first:]
     mean = after[first : first + HAND]
-    if chained:
+    if ints[CHAINED]:
         at = _vector(ints, where, AT)
         sensed = np.empty(len(at))
         for i in range(len(at)):
@@ -297,10 +296,11 @@ def _quiet(
     old = _state(singles[now], own, whole[now], flags[now], ints)
     new = _state(singles[1 - now], after, whole[1 - now], flags[1 - now], ints)
     value, shares = found[VALUE : VALUE + 1], found[FOUND:].reshape((1, D))
-    learned = learned_singles, learned_doubles, learned_whole, learned_where
-    _observe(rows, *old[:12], *new[:12], value, shares, *learned, pi_z, pi_x, curvature, iterations, looks)
+    learned = singles1(t, 7), floats1(t, 8), whole1(t, 9), whole2(t, 10)
+    how = pi_z, pi_x, curvature, ints[ITERATIONS], ints[LOOKS] != 0
+    _observe(rows, *old[:12], *new[:12], value, shares, *learned, *how)
     found[RAW], found[KIND] = value[0], -1.0
-    if excuses:
+    if ints[EXCUSES]:
         senses = _vector(ints, where, WRIST), _vector(ints, where, JOINTS), _matrix(fixed, where, ENDS)
         lasting = _vector(ints, where, FINGERS), _vector(ints, where, LASTING)
         knocks, kind, divisor = _step(old[12], rows, *senses, *lasting)
