@@ -27,13 +27,14 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.shipped import USUAL
 from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
+from asm_gym.rollouts.corpus import Corpus
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
-from asm_gym.rollouts.pretraining.healthy import calibrate_body, healthy, held_out, learn_body
+from asm_gym.rollouts.pretraining.healthy import apart, calibrate_body, healthy, held_out, learn_body
 from asm_gym.rollouts.pretraining.model_card import Exam, Marks, at_rates, card, examine, usual_force
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.record import record
-from asm_gym.rollouts.run_folder import claimed, labelled, make_missing, versions
+from asm_gym.rollouts.run_folder import NOMINAL_ROLES, claimed, labelled, make_missing, versions
 from asm_gym.rollouts.scoring import code_digest
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.staging import environment
@@ -79,6 +80,10 @@ class Args:
     """Agents to examine under, as guides are named; by default all that are shipped and fit this arm."""
     exam_episodes: int = option(60, quick=2, least=0)
     """Healthy episodes of each examination; 0 examines nothing."""
+    healthy_episodes: int = option(HEALTHY, quick=0, least=0)
+    """Episodes of the expert of each task to calibrate on, beside the lessons that are left out."""
+    corpus: Path | None = option(None, metavar="FOLDER")
+    """What asm-gym corpus has recorded: the experts' healthy hours in it are calibrated on, too."""
     workers: str = option("2", check=ParallelConfig.named, metavar="N")
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
     seed: int = option(0, least=0)
@@ -87,8 +92,6 @@ class Args:
     """Folder of the run."""
     quick: bool = False
     """To see that everything runs, not to judge the figures."""
-    healthy_episodes: int = fixed(HEALTHY, quick=0)
-    """Episodes of the expert of each task to calibrate on, beside the lessons that are left out."""
     exam_faults: tuple[str, ...] = fixed((TEST,), quick=())
     """Kinds of fault, each medium and strong but for pushes of 20 N, where the policy or the task was left out."""
     exam_pushes: int = fixed(3, quick=0)
@@ -188,6 +191,7 @@ def learn(args: Args, console: Console) -> NeuralASM:
     lessons = healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
     hours = [e for e in healthy_hours(args, console) if e.success]
     inner: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
+    whole = [*lessons.whole, *hours]
     about = {
         "name": args.name,
         "controller": inner.controller,
@@ -195,8 +199,9 @@ def learn(args: Args, console: Console) -> NeuralASM:
         **{n: getattr(args, n) for n in ("guides", "reaching", "episodes", "seed", "false_alarms_per_hour")},
         "lessons": len(lessons.fit),
         "rows": sum(map(len, lessons.fit)),
-        "calibrated_on": len(lessons.whole) + len(hours),
-        "hours": sum(len(e) * e.spec.dt for e in [*lessons.whole, *hours]) / 3600,
+        "calibrated_on": len(whole),
+        "hours": sum(len(e) * e.spec.dt for e in whole) / 3600,
+        "each": bool(apart(whole, args.false_alarms_per_hour)),
         "code": code_digest(names=LEARNING),
         **versions(),
     }
@@ -214,7 +219,7 @@ def learn(args: Args, console: Console) -> NeuralASM:
 
 
 def healthy_hours(args: Args, console: Console) -> list[Episode]:
-    """Episodes of the experts of the tasks that are shown; those that are missing are recorded."""
+    """Episodes of the experts of the tasks that are shown; those that are missing are recorded, a corpus is read."""
     folder = (args.out / "hours").resolve()
     labels = [
         EpisodeLabel(task, "nominal", seed=seed)
@@ -224,7 +229,10 @@ def healthy_hours(args: Args, console: Console) -> list[Episode]:
     with stage("healthy hours", console, {}) as progress:
         make = partial(record, config=args.config, folder=folder)
         make_missing(make, labels, partial(_place, folder=folder), args.parallel, progress)
-    return labelled(folder, labels)
+    recorded = labelled(folder, labels)
+    if args.corpus is None:
+        return recorded
+    return [*recorded, *Corpus.open(args.corpus).episodes(*NOMINAL_ROLES, policies=("scripted",), tasks=args.shown)]
 
 
 def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:

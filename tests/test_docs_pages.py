@@ -72,6 +72,15 @@ def test_printing_replaces_what_was_printed_and_keeps_the_text_around_it(page):
     assert pages.Page.read(page.path).text == again.text
 
 
+def test_what_printing_cost_is_told_apart_from_how_long_it_took(page):
+    page.meta["command"] = "python -c 'import time; time.sleep(2)'"
+    page = pages.run(page)
+    assert page.meta["seconds"] >= 2
+    assert page.meta["processor"] < page.meta["seconds"]
+    page.meta.update(seconds=7200, processor=3600)
+    assert pages._total([page]) == "1.0 h, and 0 that were not timed yet"
+
+
 def test_what_a_command_ran_is_kept_with_its_ids_from_processes_that_it_started_too(page, tmp_path):
     (tmp_path / "inner.py").write_text("import asm_gym; open('pyproject.toml').read(); open('/dev/null').read()")
     (tmp_path / "outer.py").write_text(

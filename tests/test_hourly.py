@@ -113,3 +113,19 @@ def test_a_rate_that_is_none_is_refused(rate):
 def test_as_many_hours_as_are_asked_for_are_enough():
     for rate in (0.1, 0.3, 1.0, 3.0, 7.0):
         assert hourly_threshold(Blocks(np.arange(10.0), np.full(10, 1.0 / rate / 10)), rate) == 9.0
+
+
+def test_a_promise_to_each_group_is_the_one_that_needs_most():
+    values = [np.full(round(360 / DT), v) for v in range(40)]  # 0.1 hours each, cut into six blocks
+    blocks = Blocks.of(values, DT, ["Lift"] * 20 + ["Door"] * 20)
+    assert hourly_threshold(blocks, 10.0) == 36.0  # of Door's 2 hours 19 blocks may exceed it: six of 39, 38, 37 each
+    assert hourly_threshold(Blocks(*blocks[:2]), 10.0) == 33.0  # 39 of all 4 hours'
+    assert Blocks.restored(blocks.array).apart[1].maxima.tolist() == blocks.maxima[120:].tolist()
+    promise = hourly_promise(blocks, 37.0, 40)
+    assert (promise.rate, promise.hours) == (pytest.approx(13 / 2), pytest.approx(4))
+
+
+def test_hours_that_one_group_lacks_are_refused():
+    blocks = Blocks.of([np.ones(ROWS)] * 61, DT, ["Lift"] * 60 + ["Door"])
+    with pytest.raises(ValueError, match=r"got 0\.0167"):
+        hourly_threshold(blocks, 1.0)

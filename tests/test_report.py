@@ -16,6 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from PIL import Image
 
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.detection_tables import detection_table, headline, outcome_table
@@ -24,7 +25,7 @@ from asm_gym.evaluation.report import write_json, write_report
 from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode, TraceDetail, moments_of
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Column, Table, tabulate
-from asm_gym.view.film import write_video
+from asm_gym.view.film import write_gif, write_video
 
 
 def a_trace(condition: str, seed: int, acting: str = "policy alone") -> ScoredEpisode:
@@ -283,6 +284,18 @@ def test_a_video_reads_back_with_its_frames_rate_and_colours(tmp_path: Path):
     for frame, colour in zip(back, colours, strict=True):
         assert np.abs(frame.reshape(-1, 3).mean(axis=0) - colour).max() < 12
     assert path.read_bytes().index(b"moov") < path.read_bytes().index(b"mdat")  # plays before it is all there
+
+
+def test_a_gif_reads_back_with_its_frames_rate_and_colours(tmp_path: Path):
+    frames = [np.zeros((30, 40, 3), np.uint8) for _ in range(3)]
+    for k, frame in enumerate(frames):
+        frame[:, : 10 * (k + 1)] = (200, 30, 30)
+    with Image.open(write_gif(tmp_path / "v.gif", frames, fps=20)) as back:
+        assert (back.size, back.n_frames, back.info["loop"]) == ((40, 30), 3, 0)
+        for k, frame in enumerate(frames):
+            back.seek(k)
+            assert back.info["duration"] == 50  # [ms]
+            np.testing.assert_array_equal(np.asarray(back.convert("RGB")), frame)
 
 
 def test_a_video_that_fails_leaves_nothing_behind(tmp_path: Path):

@@ -39,20 +39,36 @@ class Blocks(NamedTuple):
 
     maxima: NDArray[np.float64]  # (n,) the largest value in each block
     hours: NDArray[np.float64]  # (n,) how long each lasted
+    group: NDArray[np.float64] = np.zeros(0)  # (n,) the number of its task, in each of which a promise holds; or none
 
     @classmethod
-    def of(cls, values: Sequence[Array], dt: float) -> Blocks:
-        """Of the values (T,) of whole episodes, a row each ``dt`` [s]."""
-        rows = _rows(dt)
-        cut = [value[begin : begin + rows] for value in values for begin in range(0, len(value), rows)]
-        return cls(np.array([float(v.max()) for v in cut]), np.array([len(v) * dt / 3600 for v in cut]))
+    def of(cls, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> Blocks:
+        """Of the values (T,) of whole episodes, a row each ``dt`` [s]; ``each`` names the group of every episode."""
+        rows, number = _rows(dt), {name: n for n, name in enumerate(dict.fromkeys(each))}
+        named = zip(values, each or [""] * len(values), strict=True)
+        cut = [(v[at : at + rows], number.get(name, 0)) for v, name in named for at in range(0, len(v), rows)]
+        kept = [(float(v.max()), len(v) * dt / 3600, group) for v, group in cut]
+        maxima, hours, group = np.array(kept, float).reshape(-1, 3).T
+        return cls(maxima, hours, group) if len(number) > 1 else cls(maxima, hours)
 
     @classmethod
     def restored(cls, kept: NDArray[np.float64]) -> Blocks:
-        """Of a file (2, n). Raises ValueError where that is no maxima and hours."""
-        if kept.ndim != 2 or len(kept) != 2 or not kept.size or not (kept[1] > 0).all():
-            raise ValueError(f"blocks should be maxima and hours in the shape (2, n), found {shown(kept)}")
+        """Of a file (3, n), or (2, n) where all is one group. Raises ValueError where that is no maxima and hours."""
+        if kept.ndim != 2 or len(kept) not in (2, 3) or not kept.size or not (kept[1] > 0).all():
+            raise ValueError(f"blocks should be maxima and hours in the shape (2, n) or (3, n), found {shown(kept)}")
         return cls(*kept)
+
+    @property
+    def array(self) -> NDArray[np.float64]:
+        """For a file (3, n), or (2, n)."""
+        return np.stack([part for part in self if part.size])
+
+    @property
+    def apart(self) -> list[Blocks]:
+        """Those of each group."""
+        if not self.group.size:
+            return [self]
+        return [Blocks(*(part[self.group == group] for part in self[:2])) for group in np.unique(self.group)]
 
     @property
     def total(self) -> float:
@@ -86,10 +102,14 @@ def check_hours(rate: float, hours: float) -> None:
 def hourly_threshold(blocks: Blocks, rate: float) -> float:
     """The q that healthy operation exceeds in at most ``rate`` blocks an hour, on average over calibrations.
 
+    Of several groups it is the greatest that one of them needs, so that the rate holds in each.
+
     Raises:
         ValueError: there are too few hours for this rate; the message says how many more it takes.
     """
     check_per_hour(rate)
+    if len(groups := blocks.apart) > 1:
+        return max(hourly_threshold(own, rate) for own in groups)
     check_hours(rate, blocks.total)
     allowed = math.floor(rate * blocks.total + ROUNDING) - 1  # blocks that may exceed it
     maxima = np.sort(blocks.maxima)
@@ -103,7 +123,10 @@ def _least(hours: float) -> float:
 
 
 def hourly_promise(blocks: Blocks, threshold: float, episodes: int) -> Promise:
-    """What a threshold promises of the hours to come; ``episodes`` is how many were cut into the blocks."""
+    """What a threshold promises of the hours to come, in the group that has most; ``episodes``: cut into the blocks."""
+    if len(groups := blocks.apart) > 1:
+        worst = max((hourly_promise(own, threshold, episodes) for own in groups), key=lambda each: each.rate)
+        return worst._replace(hours=blocks.total)
     n, hours, beyond = len(blocks.maxima), blocks.total, int((blocks.maxima > threshold).sum())
     return Promise(episodes, (beyond + 1) / hours, surely_below(beyond, n) * n / hours, HOUR, hours)
 

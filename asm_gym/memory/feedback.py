@@ -26,8 +26,9 @@ from asm_gym.memory.energy import Array, activate, outward
 from asm_gym.memory.learning import Synapse, coincidence, power_iteration
 from asm_gym.memory.linear import learn_by_delta
 
-FAINTNESS = 0.1
-"""Gain of the weights that errors come back by, before anything is learned; U begins at 0."""
+FAINTNESS, FAINTEST = 0.1, 1e-3
+"""Gain of the weights that errors come back by, before anything is learned, where they stay and where they learn. U
+begins at 0: from 0.1, the first errors that come back are of no use to V, whose steps are as large as later ones."""
 
 DECAY = 0.3
 """Share of its step by which a synapse of U or B decays towards 0."""
@@ -42,11 +43,12 @@ ITERATIONS = 5
 class Random(Feedback):
     """Errors come back by weights of their own, which stay as they are."""
 
+    gain = FAINTNESS
     B: Array  # (X, M)
 
     def begin(self, exists: Array, rng: np.random.Generator) -> None:
         each = np.maximum(exists.sum(axis=1, keepdims=True), 1.0)
-        self.B = (FAINTNESS * rng.standard_normal(exists.shape) / np.sqrt(each)).astype(np.float32) * exists
+        self.B = (self.gain * rng.standard_normal(exists.shape) / np.sqrt(each)).astype(np.float32) * exists
 
     def back(self, U: Array) -> Array:
         return self.B
@@ -54,6 +56,8 @@ class Random(Feedback):
 
 class Learned(Random):
     """Errors come back by weights of their own, which learn what the weights that predict learn."""
+
+    gain = FAINTEST
 
     def begin(self, exists: Array, rng: np.random.Generator) -> None:
         super().begin(exists, rng)

@@ -75,7 +75,7 @@ def calibration_arrays(
     maxima: NDArray[np.float64] | None, blocks: Blocks | None, learned_from: NDArray[np.float64] | None
 ) -> Arrays:
     """What a checkpoint keeps of them, by name; of what there is."""
-    by_hour = None if blocks is None else np.stack(blocks)
+    by_hour = None if blocks is None else blocks.array
     found = {MAXIMA: maxima, BLOCKS: by_hour, LEARNED_FROM: learned_from}
     return {name: array for name, array in found.items() if array is not None}
 

@@ -204,7 +204,7 @@ class SkillSurprise:
         row = ALARMS_ON.index(which)
         own, by_hour = self.maxima[row], None
         if blocks is not None and self.blocks is not None:
-            by_hour = Blocks(self.blocks[row], blocks.hours)
+            by_hour = blocks._replace(maxima=self.blocks[row])
         if promised == HOUR:
             if blocks is None or by_hour is None:
                 return None, own, None

@@ -76,7 +76,7 @@ class Calibrated:
     def _set_threshold(self, scores: Sequence[Surprise], asked: Asked, each: Sequence[str]) -> None:
         """By what was made of nominal episodes. Raises ValueError, and changes nothing, where they are too few."""
         maxima = np.array([s.value.max() for s in scores])
-        blocks = Blocks.of([s.value for s in scores], self.spec.dt)
+        blocks = Blocks.of([s.value for s in scores], self.spec.dt, each)
         threshold = asked.threshold(maxima, blocks)
         for name in dict.fromkeys(each):
             own = [s.value for s, of in zip(scores, each, strict=True) if of == name]

@@ -1,14 +1,17 @@
-"""Frames to an MP4 that every browser plays: H.264, yuv420p, index first."""
+"""Frames to an MP4 that every browser plays: H.264, yuv420p, index first; or to a GIF, which every page shows."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+
+from asm_gym.files import written_whole
 
 
 def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> Path:
@@ -50,6 +53,18 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
         writer.close()
         unfinished.unlink(missing_ok=True)
     return path
+
+
+def write_gif(path: str | Path, frames: Sequence[NDArray[np.uint8]], fps: float, colours: int = 64) -> Path:
+    """Writes ``frames``, each (H, W, 3) uint8 and all of one size, at ``fps`` [1/s], to be shown over and over.
+
+    Colours are those of the last frame, the most common ``colours`` of it; without dithering, for drawings.
+    """
+    palette = Image.fromarray(frames[-1]).quantize(colours, dither=Image.Dither.NONE)
+    each = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
+    with written_whole(Path(path)) as file:
+        each[0].save(file, "GIF", save_all=True, append_images=each[1:], duration=round(1000 / fps), loop=0)
+    return Path(path)
 
 
 def _even(frame: NDArray[Any]) -> NDArray[np.uint8]:

@@ -26,6 +26,7 @@ from asm_gym.evaluation.statistics import auroc
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.abstract_film import SHOWN, filmed
 from asm_gym.scripts.reproduce.abstract_report import TITLES, drawn, tables
 from asm_gym.scripts.reproduce.closed_loop import (
     CUE,
@@ -148,6 +149,8 @@ def one(job: tuple[str, int], config: Config) -> tuple[list[Record], dict[str, C
     for row in (CUE, EVENT, STEPS - 1):
         right = [named.skills(e.stream[: row + 1])[-1] == e.info["skill"] for e in told.tests]
         note("named", row=row, right=float(np.mean(right)))
+    for way in SHOWN:
+        courses[way].named = [str(name) for name in named.skills(courses[way].rows[:, 0])]
     return made, courses
 
 
@@ -180,4 +183,4 @@ def run(config: Config) -> Findings:
     records = kit.together([own for own, _ in found])
     first = {name: courses for (name, seed), (_, courses) in zip(jobs, found, strict=True) if seed == config.seed}
     letter = lessons(config.seed, config).tests[0].stream[:, HAND].astype(np.float64)
-    return Findings(records, tables(records, config.skills), drawn(first, letter))
+    return Findings(records, tables(records, config.skills), drawn(first, letter), film=filmed(first, letter))

@@ -35,7 +35,10 @@ class Course:
     surprise: Floats  # (T, B)
     energy: Floats  # (T, B) F; not a number where it was not asked for
     alarm: NDArray[np.intp]  # (B,) the first row in alarm from the event on; T where none
-    blamed: list[str] = field(default_factory=list)  # the sense that was most surprising in that row
+    blamed: list[str]  # the sense that was most surprising in that row
+    rows: Floats  # (T, B, 6) what was read; what was left out is not a number
+    threshold: float  # of surprise
+    named: list[str] = field(default_factory=list)  # (T,) which letter the first of them seems to be
 
 
 class Drives(Protocol):
@@ -96,7 +99,8 @@ def written(
     """
     rng, (T, B, _) = np.random.default_rng(seed), cues.shape
     pushes = PUSH * rng.choice([-1.0, 1.0], (B, 2))
-    found = Course(np.zeros((T, B, 2)), np.zeros((T, B)), np.full((T, B), np.nan), np.full(B, T), [""] * B)
+    unknown = np.full((T, B), np.nan)
+    found = Course(np.zeros((T, B, 2)), np.zeros((T, B)), unknown, np.full(B, T), [""] * B, cues.copy(), threshold)
     q, stuck = np.zeros((B, 2)), np.zeros(B)
     for t in range(T):
         if t < CUE:
@@ -122,7 +126,7 @@ def written(
             for n in range(B):
                 before = moment(drives.state, n)
                 found.energy[t, n] = energy.terms(before, rows[n], energy.inferred(before, rows[n])).total
-        found.path[t], found.surprise[t] = hand(q), drives.read(rows)
+        found.path[t], found.rows[t], found.surprise[t] = hand(q), rows, drives.read(rows)
         for n in np.flatnonzero((found.surprise[t] > threshold) & (found.alarm == T)) if t >= EVENT else ():
             found.alarm[n], found.blamed[n] = t, blamed(drives.attribution[n])  # type: ignore[attr-defined]
     return found

@@ -12,23 +12,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from asm_gym.detection import Blocks, hourly_threshold
 from asm_gym.evaluation.defaults import WINDOW_S
-from asm_gym.evaluation.metrics import hourly_alarms
+from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
 from asm_gym.evaluation.standing import kept_rate
 from asm_gym.evaluation.statistics import Rate, Share
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.corpus import Corpus
-from asm_gym.rollouts.pretraining.model_card import Alarms, Exam, Marks, examine, usual_force
+from asm_gym.rollouts.pretraining.model_card import SEVERITIES, Alarms, Exam, Marks, examine, usual_force
+from asm_gym.rollouts.run_folder import NOMINAL_ROLES
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record
 
-PROMISES = (10.0, 5.0, 1.0)
+PROMISES = (10.0, 5.0, 3.0, 1.0)
 """False alarms an hour."""
+FOUND = SEVERITIES, ("mild",)
+"""Severities of faults that are counted together; mild ones are hardly to be seen."""
 EXPERT = "scripted"
 
 
@@ -57,28 +57,17 @@ def run(config: Config) -> Findings:
     known = tuple(memory.about["tasks"])
     shipped = Setting("as shipped", {r: memory.threshold_at(false_alarms_per_hour=r) for r in PROMISES})
     with kit.stage("calibrating on healthy hours"):
-        nominal = corpus.episodes("fit", "calibration", "nominal", policies=(EXPERT,), tasks=known)
+        nominal = corpus.episodes(*NOMINAL_ROLES, policies=(EXPERT,), tasks=known)
         healthy = [episode for episode in nominal if episode.success]
         hours = sum(len(e) * e.spec.dt for e in healthy) / 3600
         memory.calibrate(healthy, false_alarms_per_hour=PROMISES[0])
     anew = {r: memory.threshold_at(false_alarms_per_hour=r) for r in PROMISES if r * hours >= 1.0}
-    where = f"from {hours:.1f} hours of {len(healthy)} episodes"
-    assert memory.blocks_ is not None
-    each_of = promised_to_each(memory.blocks_, [e.labelled.task for e in healthy])
-    settings = [shipped, Setting(where, anew), Setting(f"{where}, of each task", each_of)]
+    settings = [shipped, Setting(f"from {hours:.1f} hours of {len(healthy)} episodes, whatever the task", anew)]
     marks = examined(corpus, memory, known)
     return Findings(
         records(marks, settings),
         [kept(marks, settings), *(each(marks, setting) for setting in settings if setting.thresholds)],
     )
-
-
-def promised_to_each(blocks: Blocks, tasks: Sequence[str]) -> dict[float, float]:
-    """The thresholds that keep each promise in each task, where all of them have hours enough; a block an episode."""
-    names = np.array(tasks)
-    own = [Blocks(*(part[names == task] for part in blocks)) for task in dict.fromkeys(tasks)]
-    possible = (r for r in PROMISES if all(r * b.total >= 1.0 for b in own))
-    return {r: max(hourly_threshold(b, r) for b in own) for r in possible}
 
 
 def examined(corpus: Corpus, memory: NeuralASM, known: Sequence[str]) -> list[Marks]:
@@ -96,11 +85,15 @@ def examined(corpus: Corpus, memory: NeuralASM, known: Sequence[str]) -> list[Ma
     return marks
 
 
-def together(marks: Sequence[Marks], threshold: float) -> tuple[Alarms, Rate, Share]:
-    """In all examinations at this threshold: events, alarms for nothing, and faults found."""
+def together(marks: Sequence[Marks], threshold: float) -> tuple[Alarms, Rate, list[Share]]:
+    """In all examinations at this threshold: events, alarms for nothing, and faults found of each of ``FOUND``."""
     there = [m.at(threshold) for m in marks]
     healthy = [t for m in there for t in m.solved]
-    found = Share(sum(m.metrics.detected.k for m in there), sum(m.metrics.detected.n for m in there))
+    faulty = [t for m in there for t in m.metrics.faulty]
+    found = [
+        DetectionMetrics("", [t for t in faulty if t.severity in severities], healthy, WINDOW_S).detected
+        for severities in FOUND
+    ]
     return Alarms.of(healthy), hourly_alarms(healthy), found
 
 
@@ -111,13 +104,22 @@ def kept(marks: Sequence[Marks], settings: Sequence[Setting]) -> Table:
         for promised, threshold in setting.thresholds.items():
             events, alarms, found = together(marks, threshold)
             cells = kept_rate(alarms, promised), f"{events.knock.value:.1f}", f"{events.stop.value:.1f}"
-            rows.append((setting.name, f"{promised:g}", f"{threshold:.3g}", *cells, f"{percent(found)} of {found.n}"))
+            each = (f"{percent(share)} of {share.n}" for share in found)
+            rows.append((setting.name, f"{promised:g}", f"{threshold:.3g}", *cells, *each))
     hours = sum(len(t) * t.dt for m in marks for t in m.solved) / 3600
     return Table(
         f"Alarms an hour in {hours:.2f} healthy hours of policies and tasks that the memory never met, by what was "
         "promised; 95 % Poisson intervals; one that comes back within a minute is counted once. Broken: the interval "
-        f"lies above. Faults that an ideal observer could see, of three severities, found within {WINDOW_S:g} s.",
-        ("threshold", "promised", "", "faults that are none", "knocks", "stops", "found"),
+        f"lies above. Faults that an ideal observer could see, of each severity, found within {WINDOW_S:g} s.",
+        (
+            "threshold",
+            "promised",
+            "",
+            "faults that are none",
+            "knocks",
+            "stops",
+            *(f"{' and '.join(s)} found" for s in FOUND),
+        ),
         rows,
     )
 

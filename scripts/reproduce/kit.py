@@ -31,6 +31,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
@@ -42,6 +43,7 @@ from asm_gym.rollouts.parallel import Progress, parallel_map
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.scripts import command
 from asm_gym.scripts.options import check_options, option
+from asm_gym.view.film import write_gif
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -81,6 +83,7 @@ class Findings(NamedTuple):
     tables: Sequence[Table]
     figure: Figure | None = None
     facts: Mapping[str, Any] = {}  # whatever else is worth keeping; JSON-serialisable
+    film: Sequence[NDArray[np.uint8]] = ()  # frames (H, W, 3), 20 a second
 
 
 @dataclass
@@ -141,17 +144,19 @@ def conduct(name: str, study: Callable[[Any], Findings], config: Any, console: C
     publish(name, found, config, sitting.seconds)
     for table in found.tables:
         console.print(ConsoleTable(table))
-    kinds = ".png, .svg, .csv" if found.figure else ".csv"
+    kinds = (".png, .svg, " if found.figure else "") + (".gif, " if found.film else "") + ".csv"
     console.print(f"Wrote {config.out / name}{kinds}, .md and .json")
 
 
 def publish(name: str, found: Findings, config: Any, seconds: Mapping[str, float]) -> None:
-    """Writes the figure (PNG, SVG), every measurement (CSV), the tables (Markdown), and how it was made (JSON)."""
+    """Writes figure (PNG, SVG), film (GIF), every measurement (CSV), tables (Markdown), and how it was made (JSON)."""
     folder: Path = config.out
     folder.mkdir(parents=True, exist_ok=True)
     if found.figure is not None:
         save(found.figure, folder / f"{name}.png")
         found.figure.savefig(folder / f"{name}.svg", format="svg", metadata={"Date": None})
+    if found.film:
+        write_gif(folder / f"{name}.gif", found.film, fps=20)
     columns = list(dict.fromkeys(key for r in found.records for key in r))
     with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns)

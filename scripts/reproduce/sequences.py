@@ -9,8 +9,13 @@ does not say what comes next, and only what came before does. Beside the network
 
 and the network by traces, which the paper does not have.
 
+Then the copy task: a symbol of eight is shown, and after a delay in which there is nothing it is to be expected again;
+or two of four symbols, in their order. A GRU and an LSTM learn the same by backpropagation through time, with as many
+weights as the settling network has with its units, and from as many rows.
+
 Source: Tang, Barron and Bogacz 2023 (NeurIPS 36), and the scripts that they name, for the patterns and A B C B A, of
-digits there. Sompolinsky and Kanter 1986 (PRL 57(22)) for the asymmetric Hopfield network.
+digits there. Sompolinsky and Kanter 1986 (PRL 57(22)) for the asymmetric Hopfield network. Hochreiter
+and Schmidhuber 1997 (Neural Computation 9(8)) for the copy task.
 """
 
 from __future__ import annotations
@@ -29,8 +34,8 @@ from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import DYNAMICS
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.recall import follow, run_on
-from asm_gym.scripts.options import option
-from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.options import fixed, option
+from asm_gym.scripts.reproduce import kit, recurrent
 from asm_gym.scripts.reproduce.curves import points
 from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds, shown
 from asm_gym.validation import check_number
@@ -54,7 +59,20 @@ MODELS = {
 }
 
 
+COPYING = {"settling": "settling", "traces": "traces", "gru": "GRU, BPTT", "lstm": "LSTM, BPTT"}
+"""What learns to say again."""
+
+COPIERS = {"settling": 32, "traces": 32, "gru": 16, "lstm": 14}
+"""Units of each: 1,600 weights by settling, 3,000 by traces, 1,400 in a GRU, 1,500 in an LSTM."""
+
+RATE = 3e-2
+"""Of the networks trained by backpropagation through time, the best of 1e-2, 3e-2 and 6e-2."""
+
+COPIED = {"one of 8": (8, 1), "two of 4": (4, 2)}
+"""Symbols, and how many are shown."""
+
 _LENGTH = partial(check_number, "the length of a sequence", low=2, whole=True)
+_DELAY = partial(check_number, "a delay", low=1, whole=True)
 
 
 @dataclass(frozen=True)
@@ -71,6 +89,10 @@ class Config(kit.Config):
     """Hidden units."""
     updates: int = option(3000, quick=300, least=1)
     """Steps in which the synapses change, with 16 streams side by side."""
+    delays: tuple[int, ...] = option((10, 30), quick=(5,), least=1, check=_DELAY)
+    """Steps after which a symbol is to be said again."""
+    copying: int = fixed(10000, quick=1000, least=1)
+    """Steps in which the synapses change to learn that."""
 
 
 def patterns(count: int, size: int, alike: float, rng: np.random.Generator) -> Patterns:
@@ -126,6 +148,32 @@ def recalled(found: Patterns, sequence: Patterns) -> tuple[float, float]:
     return float(np.mean(agree >= RIGHT)), float(np.mean((found[1:] - sequence[1:]) ** 2))
 
 
+def copies(symbols: int, shown: int, delay: int) -> NDArray[np.float32]:
+    """(N, T, symbols): every order of so many symbols, then nothing for ``delay`` steps, then the same again."""
+    orders = list(product(range(symbols), repeat=shown))
+    rows = np.zeros((len(orders), delay + 2 * shown, symbols), np.float32)
+    for row, order in zip(rows, orders, strict=True):
+        row[np.arange(shown), order] = row[np.arange(-shown, 0), order] = 2.0
+    return rows
+
+
+def said_again(model: str, rows: NDArray[np.float32], shown: int, updates: int, rng: np.random.Generator) -> float:
+    """Share of the last ``shown`` symbols of rows (N, T, S) that are expected rightly, once learned."""
+    N, T = rows.shape[:2]
+    idle = np.tile(np.array([0.0, 1.0], np.float32), (T, 1))  # nothing is commanded
+    taught = [Trajectory(x, idle, x) for x in rows]
+    side_by_side, commands = rows.transpose(1, 0, 2), np.repeat(idle[:, None], N, axis=1)
+    if model in DYNAMICS:
+        how = DYNAMICS[model]
+        schedule = Schedule(round(16 * updates / (N * T)) or 1, 16, 3e-3, how.iterations, how.prior_precision, 1.0, 0.0)
+        network = how.learn(taught, COPIERS[model], schedule, rng, lambda: None).network
+        expected = follow(network, network.at_rest(N), side_by_side, commands).senses
+    else:
+        made = recurrent.train(taught, model, COPIERS[model], max(1, round(updates / T)), rng, 0.0, RATE)
+        expected, _ = recurrent.expected(made, side_by_side, commands, T)
+    return float(np.mean(expected[-shown:].argmax(axis=2) == side_by_side[-shown:].argmax(axis=2)))
+
+
 def one_seed(seed: int, config: Config) -> list[Record]:
     """Every sequence by every model."""
     rng, records = np.random.default_rng(seed), []
@@ -135,12 +183,19 @@ def one_seed(seed: int, config: Config) -> list[Record]:
         for model, found in models.items():
             right, mse = recalled(found, sequence)
             records.append({"seed": seed, "kind": kind, "length": count, "model": model, "right": right, "mse": mse})
+    for (kind, (symbols, many)), delay, model in product(COPIED.items(), config.delays, COPYING):
+        share = said_again(model, copies(symbols, many, delay), many, config.copying, rng)
+        records.append({"seed": seed, "kind": kind, "delay": delay, "model": model, "right": share})
     return records
 
 
 def tables(records: Sequence[Record], config: Config) -> list[Table]:
     """Patterns recalled rightly, and errors."""
-    asked = list(dict.fromkeys((r["kind"], r["length"]) for r in records))
+    asked = list(dict.fromkeys((r["kind"], r["length"]) for r in records if "length" in r))
+    copied = {
+        f"{kind}, {delay} steps": {"kind": kind, "delay": delay} for kind, delay in product(COPIED, config.delays)
+    }
+    copiers = {title: {"model": model} for model, title in COPYING.items()}
     return [
         Table(
             f"{title}, from the first alone; {config.size} bits, {config.hidden} units; mean ± SD over seeds",
@@ -151,7 +206,7 @@ def tables(records: Sequence[Record], config: Config) -> list[Table]:
             ],
         )
         for value, title in (("right", "Share of the patterns that are right"), ("mse", "Mean squared error of a bit"))
-    ]
+    ] + [kit.grid("The copy task: share of the symbols that are said again rightly", records, "right", copied, copiers)]
 
 
 def drawn(records: Sequence[Record], config: Config) -> Figure:

@@ -145,11 +145,12 @@ class _Forest:
 def _said(a: Any, nodes: Any, first: Any, output: Any, base: Any) -> Any:
     """(B, X) the sums of the trees for inputs (B, I); the others as in ``_Forest.arrays``."""
     out = np.empty((a.shape[0], base.shape[0]))
-    for b in range(a.shape[0]):
-        out[b] = base
-        for t in range(first.shape[0]):
-            n = int(first[t])
+    out[:] = base
+    for t in range(first.shape[0]):  # all rows go through one tree while the processor has it at hand
+        root, place = int(first[t]), int(output[t])
+        for b in range(a.shape[0]):
+            n = root
             while nodes[n, 2] >= 0:
                 n = int(nodes[n, 2]) if a[b, int(nodes[n, 0])] <= nodes[n, 1] else int(nodes[n, 3])
-            out[b, int(output[t])] += nodes[n, 4]
+            out[b, place] += nodes[n, 4]
     return out

@@ -151,12 +151,24 @@ def learn_body(lessons: Lessons, spec: StreamSpec, seed: int, progress: Progress
 def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode], per_hour: float) -> NeuralASM:
     """Calibrated so that so many faults are said in an hour of healthy episodes, hits and all.
 
+    In an hour of each task, where all have so many hours that it can be promised.
+
     How hard healthy motion presses is told by what presses no harder than is usual: a limit that a hit has raised would
     be none.
 
     Args:
         hours: of healthy episodes beside the lessons that are left out.
     """
-    memory.calibrate([*lessons.whole, *hours], false_alarms_per_hour=per_hour)
+    whole = [*lessons.whole, *hours]
+    memory.calibrate(whole, false_alarms_per_hour=per_hour, each=apart(whole, per_hour))
     memory.healthy_ = healthy_forces([episode.stream for episode in lessons.calibration], memory.spec)
     return memory
+
+
+def apart(episodes: Sequence[Episode], per_hour: float) -> list[str]:
+    """The task of each, where every one has the hours that this rate takes; none where one has not."""
+    tasks = [episode.labelled.task for episode in episodes]
+    hours: defaultdict[str, float] = defaultdict(float)
+    for episode, task in zip(episodes, tasks, strict=True):
+        hours[task] += len(episode) * episode.spec.dt / 3600
+    return tasks if min(hours.values()) * per_hour >= 1.0 else []

@@ -160,8 +160,9 @@ def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Ta
     """A row for each exam."""
     about = memory.about
     learned = f"learned from {about['lessons']} lessons of {', '.join(about['tasks'])} ({about['rows']} rows)"
+    where = "an hour of each task" if about.get("each") else "an hour"
     limit = (
-        f"threshold {memory.threshold:.3g} for {about['false_alarms_per_hour']:g} an hour, from "
+        f"threshold {memory.threshold:.3g} for {about['false_alarms_per_hour']:g} {where}, from "
         f"{about['calibrated_on']} others of {about['hours']:.2f} hours"
     )
     return tabulate(
