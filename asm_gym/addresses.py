@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numba import carray, types
+from numba import carray, types  # type: ignore[attr-defined]
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ def table(parts: Iterable[NDArray[Any] | int]) -> NDArray[np.int64]:
 
     Whoever keeps the table keeps the arrays, and none of them may be exchanged for another.
     """
-    found = []
+    found: list[tuple[int, ...]] = []
     for part in parts:
         if isinstance(part, int):
             found.append((part, 0, 0, 0))
@@ -30,14 +30,16 @@ def table(parts: Iterable[NDArray[Any] | int]) -> NDArray[np.int64]:
     return np.array(found, np.int64)
 
 
-@intrinsic
-def _at(context: Any, address: Any) -> Any:
+def _address(context: Any, address: Any) -> Any:
     """What lies at an address, for compiled code."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.inttoptr(arguments[0], cgutils.voidptr_t)
 
     return types.voidptr(types.int64), code
+
+
+_at: Any = intrinsic(_address)
 
 
 @compiled

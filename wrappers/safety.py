@@ -239,7 +239,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._quiet is not None:
             self._quiet.begin()
         self._calm = self._quiet is not None and self._guard.calm
-        self._threshold, self._passing = float(self.threshold), []
+        self._threshold = float(self.threshold)
+        self._passing: list[NDArray[np.float32]] = []  # quiet rows of which the guard has not been told
         self._alarms = 0
         none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))
         self._ended = False
