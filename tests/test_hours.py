@@ -8,7 +8,7 @@ import pytest
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.rollouts.pretraining.model_card import Marks
-from asm_gym.scripts.reproduce.hours import Setting, each, kept, records
+from asm_gym.scripts.reproduce.hours import Setting, each, kept, missed, records
 
 
 def episode(seed, peak, onset=None, severity=""):
@@ -51,3 +51,8 @@ def test_a_promise_that_was_not_kept_is_called_broken(marks):
 def test_every_count_is_kept(marks):
     found = records(marks, [Setting("anew", {1.0: 4.5})])
     assert [(r["alarms"], r["promised"]) for r in found] == [(2, 1.0)]
+
+
+def test_kinds_that_are_missed_most_come_first(marks):
+    table = missed(marks, Setting("as shipped", {1.0: 4.5, 5.0: 2.2}))
+    assert table.rows == [("push", "3", "33 %", "67 %")]

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
+from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.standing import kept_rate
 from asm_gym.evaluation.statistics import Rate, Share
 from asm_gym.evaluation.tables import Table, percent
@@ -66,7 +67,11 @@ def run(config: Config) -> Findings:
     marks = examined(corpus, memory, known)
     return Findings(
         records(marks, settings),
-        [kept(marks, settings), *(each(marks, setting) for setting in settings if setting.thresholds)],
+        [
+            kept(marks, settings),
+            *(each(marks, setting) for setting in settings if setting.thresholds),
+            missed(marks, shipped),
+        ],
     )
 
 
@@ -90,11 +95,13 @@ def together(marks: Sequence[Marks], threshold: float) -> tuple[Alarms, Rate, li
     there = [m.at(threshold) for m in marks]
     healthy = [t for m in there for t in m.solved]
     faulty = [t for m in there for t in m.metrics.faulty]
-    found = [
-        DetectionMetrics("", [t for t in faulty if t.severity in severities], healthy, WINDOW_S).detected
-        for severities in FOUND
-    ]
-    return Alarms.of(healthy), hourly_alarms(healthy), found
+    shares = [found([t for t in faulty if t.severity in severities]) for severities in FOUND]
+    return Alarms.of(healthy), hourly_alarms(healthy), shares
+
+
+def found(faulty: Sequence[ScoredEpisode]) -> Share:
+    """Of these faults, within the window."""
+    return DetectionMetrics("", list(faulty), [], WINDOW_S).detected
 
 
 def kept(marks: Sequence[Marks], settings: Sequence[Setting]) -> Table:
@@ -102,9 +109,9 @@ def kept(marks: Sequence[Marks], settings: Sequence[Setting]) -> Table:
     rows = []
     for setting in settings:
         for promised, threshold in setting.thresholds.items():
-            events, alarms, found = together(marks, threshold)
+            events, alarms, shares = together(marks, threshold)
             cells = kept_rate(alarms, promised), f"{events.knock.value:.1f}", f"{events.stop.value:.1f}"
-            each = (f"{percent(share)} of {share.n}" for share in found)
+            each = (f"{percent(share)} of {share.n}" for share in shares)
             rows.append((setting.name, f"{promised:g}", f"{threshold:.3g}", *cells, *each))
     hours = sum(len(t) * t.dt for m in marks for t in m.solved) / 3600
     return Table(
@@ -137,6 +144,21 @@ def each(marks: Sequence[Marks], setting: Setting) -> Table:
         "them promises nothing of one.",
         ("", "solved", "hours", *promised),
         rows,
+    )
+
+
+def missed(marks: Sequence[Marks], setting: Setting) -> Table:
+    """A row for each kind of fault, the hardest first."""
+    faults = {r: [t for m in marks for t in m.at(q).metrics.faulty] for r, q in setting.thresholds.items()}
+    kinds = dict.fromkeys(t.kind for own in faults.values() for t in own)
+    shares = {kind: [found([t for t in own if t.kind == kind]) for own in faults.values()] for kind in kinds}
+    rows = [
+        (kind, str(own[0].n), *(percent(share) for share in own))
+        for kind, own in sorted(shares.items(), key=lambda item: [share.value for share in item[1]])
+    ]
+    promised = (f"promised {r:g}" for r in setting.thresholds)
+    return Table(
+        f"Faults found of each kind, at thresholds {setting.name}, of all severities.", ("", "faults", *promised), rows
     )
 
 
