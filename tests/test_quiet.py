@@ -137,6 +137,15 @@ def test_a_quiet_row_that_is_late_is_an_alarm_too(memory, monkeypatch):
     assert said == [False, False, False, True, True]
 
 
+@pytest.mark.parametrize("rows", [np.zeros(13, np.float32), np.zeros(14), np.zeros((1, 14), np.float32)])
+def test_a_row_that_is_none_is_left_to_who_says_so(memory, rows):
+    (episode,) = sine_episodes(1, seed=50, steps=(55, 55))
+    env = NeuralASMSafety(Replayed(sine_spec(), episode.stream), memory.with_threshold(1e6), "monitor")
+    env.reset(seed=0)
+    assert env._quiet.judge(episode.stream[0], None, 1e6) is not None
+    assert env._quiet.judge(rows, None, 1e6) is None
+
+
 def test_a_memory_that_is_calibrated_while_it_watches_is_taken_over_at_the_next_reset(memory):
     (episode,) = sine_episodes(1, seed=50, steps=(55, 55))
     mine = memory.with_threshold(1e6)

@@ -111,13 +111,14 @@ class QuietRows:
         ints, where = _side_by_side(np.int64, spans, at, *senses, *guard.columns)
         doubles, and_where = _side_by_side(np.float64, *chain, ends, numbers)
         self._fixed = ints, doubles, np.array([*where, *and_where]), *learned
-
         # Of each kind of number the state now and the next one, in turns.
         sizes = T + H + K, 2 * lag * D + G * X + H + 2 * X + HAND + 2, 4, X
         kinds = np.float32, np.float64, np.int64, np.bool_
         self._state = tuple(np.zeros((2, n), kind) for n, kind in zip(sizes, kinds, strict=True))
         self._table = table((*self._state, *self._fixed))
-        self._now, self._size, self._runs, self._patience = 0, FOUND + D, False, (0.0, 0.0)
+        self._shape, self._size = (D,), FOUND + D
+        self._felt = max((1 + int(c.max()) for c in guard.substeps.columns if c.size), default=0)
+        self._now, self._runs, self._patience = 0, False, (0.0, 0.0)
         if must_compile(quiet):
             print("asm-gym: compiling the guard, once on this machine (about a minute)", file=sys.stderr)
         self.judge(np.full(D, np.nan, np.float32), None, 0.0)
@@ -148,7 +149,9 @@ class QuietRows:
         found, load, left, felt = np.empty(self._size), math.nan, math.nan, NOTHING_FELT
         if info is not None:
             load, left = float(info.get("contact_load", math.nan)), float(info.get("contact_left_s", math.nan))
-            felt = np.array(info.get("contact_felt", NOTHING_FELT), np.float64)
+            felt = np.array(info.get("contact_felt", NOTHING_FELT), np.float64).ravel()
+        if row.dtype != np.float32 or row.shape != self._shape or 0 < len(felt) < self._felt:
+            return None  # compiled code would read beyond its end
         start = time.perf_counter()
         passes = quiet(row, felt, found, threshold, load, left, *self._patience, self._now, self._table)
         found[LATENCY] = time.perf_counter() - start
