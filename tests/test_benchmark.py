@@ -35,7 +35,7 @@ def test_the_torch_rival_computes_the_same_surprise(channels):
 
 def test_both_print_their_ratios(capsys):
     assert main(["memory", "--hidden", "16", "--channels", "10", "--steps", "5", "--no-sweep", "--even-if-busy"]) == 0
-    assert main(["safety", "--hidden", "16", "--steps", "3", "--members", "2", "--even-if-busy"]) == 0
+    assert main(["safety", "--steps", "3", "--members", "2", "--even-if-busy"]) == 0
     shown = capsys.readouterr().out
     assert shown.count("×") >= 5
     assert "plain torch" in shown

@@ -255,14 +255,15 @@ class Arbiter:
         acted_on = over or sensed.knocked or sensed.presses or name == "trial"
         return Decision(alarm, intervened, gave_up, acted_on, failure, name, self.state)
 
-    def let_pass(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], ends_step: bool) -> str:
-        """What ``decide`` comes to after a quiet row under the policy; what failed in the reflex."""
-        self._estranged(False)
+    def let_pass(self, rows: list[NDArray[np.float32]], executed: NDArray[np.float32], ends_step: bool) -> str:
+        """What ``decide`` comes to after quiet rows under the policy; what failed in the reflex."""
+        for _ in rows:
+            self._estranged(False)
         if self._reflex is None:
             return ""
         c = self._counts
-        c.quiet, c.free, c.since = c.quiet + 1, 0, c.since + 1
-        return self._tell(row, executed, False) if ends_step else ""
+        c.quiet, c.free, c.since = c.quiet + len(rows), 0, c.since + len(rows)
+        return self._tell(rows[-1], executed, False) if ends_step else ""
 
     @property
     def most_impulse(self) -> float:

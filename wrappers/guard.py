@@ -139,14 +139,22 @@ class Guard:
         """For how long the arm may lean on something [s], and how much it may press in an episode [N s]."""
         return LEANS_S / (1 + AGAIN * self.arbiter.strikes), self.arbiter.most_impulse
 
-    def let_pass(self, row: NDArray[np.float32], executed: NDArray[np.float32], value: float, ends_step: bool) -> str:
-        """A quiet row (D,), which is left alone from now on; what failed in the reflex."""
-        self._passed += 1
-        self.responder.let_pass(row)
-        self.largest = max(self.largest or 0.0, value)
+    def let_pass(
+        self, rows: list[NDArray[np.float32]], executed: NDArray[np.float32], largest: float, ends_step: bool
+    ) -> str:
+        """Quiet rows (D,), which are left alone from now on; what failed in the reflex.
+
+        Args:
+            executed: (A,).
+            largest: of their surprise.
+            ends_step: the last of them ends a control step.
+        """
+        self._passed += len(rows)
+        self.responder.let_pass(rows)
+        self.largest = max(self.largest or 0.0, largest)
         if ends_step:
             self.substeps.acted()
-        return self.arbiter.let_pass(row, executed, ends_step)
+        return self.arbiter.let_pass(rows, executed, ends_step)
 
     def passed(self, mean: NDArray[np.float64], impulse: float, leant: float) -> None:
         """What the rows that were let pass have come to."""

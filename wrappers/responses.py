@@ -237,10 +237,10 @@ class Responder:
         """Whether there is nothing to be done about a row that is quiet."""
         return not (self._since or self._touched) and (self.repair is None or self.repair.calm)
 
-    def let_pass(self, row: NDArray[np.float32]) -> None:
-        """A quiet row (D,), which is left alone from now on; ``passed`` is told of it later."""
-        self._quiet, self._lost, self._contradiction = self._quiet + 1, NONE, None
-        self._rows.append(row)
+    def let_pass(self, rows: list[NDArray[np.float32]]) -> None:
+        """Quiet rows (D,), which are left alone from now on; ``passed`` is told of them later."""
+        self._quiet, self._lost, self._contradiction = self._quiet + len(rows), NONE, None
+        self._rows += rows
         if len(self._rows) > 2 * self._kept:
             del self._rows[: -self._kept]
 

@@ -239,6 +239,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._quiet is not None:
             self._quiet.begin()
         self._calm = self._quiet is not None and self._guard.calm
+        self._threshold = float(self.threshold)
+        self._passing: list[NDArray[np.float32]] = []  # quiet rows of which the guard has not been told
         self._alarms = 0
         none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))
         self._ended = False
@@ -259,6 +261,9 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._rows: list[RowReport | QuietRow] = []
         parts = zip(fitted_parts(self._monitor), self._parts, strict=True)
         self._stale = "" if all(a is b for a, b in parts) else STALE
+        if self._calm and self._quiet is not None and self._quiet.stale:
+            self._interrupt()
+            self._quiet = None
         observation, reward, terminated, truncated, info = self._run()
         info = dict(info)  # an environment may use its own again
         row, failure = self._sensed(observation, info)
@@ -322,10 +327,13 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def _look(self, row: NDArray[np.float32], failure: str = "", info: dict[str, Any] | None = None) -> None:
         """One row: what the monitor makes of it, and who acts next; with ``info`` of the step that it ends."""
         guard, late = self._guard, False
-        if self._calm and not (failure or self._refused or self._stale):
-            late = self._passes(row, info)
-            if self._calm:
-                return
+        if self._calm:
+            if failure or self._refused or self._stale:
+                self._interrupt()
+            else:
+                late = self._passes(row, info)
+                if self._calm:
+                    return
         beneath = None if info is None else guard.substeps.came(row, info)
         if self._refused:
             failure, self._refused = joined(self._failed, failure), False
@@ -352,25 +360,33 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _passes(self, row: NDArray[np.float32], info: dict[str, Any] | None) -> bool:
         """Lets a row pass in which nothing happens; else it is calm no more. Whether it was so late as to alarm."""
-        quiet, guard = self._quiet, self._guard
+        quiet = self._quiet
         assert quiet is not None
         quiet.take(self._observer.state)
-        row, late = np.array(row), False  # an environment may use its own again
-        said: RowReport | QuietRow | None = quiet.judge(row, info, guard.arbiter.threshold)
-        if said is not None:
-            late = self._late(said.latency)
+        row = np.array(row)  # an environment may use its own again
+        said = quiet.judge(row, info, self._threshold)
+        late = said is not None and self._late(said.latency)
         if said is None or late:
             self._interrupt()
             return late
         quiet.keep()
-        if failure := guard.let_pass(row, self._executed, said.value, info is not None):
-            decision = said.decision._replace(failure=failure)
-            said = said.whole(self.threshold)._replace(decision=decision, failure=failure)
+        self._passing.append(row)
         self._rows.append(said)
+        if info is not None and (failure := self._let_pass(ends_step=True)):
+            decision = said.decision._replace(failure=failure)
+            self._rows[-1] = said.whole(self._threshold)._replace(decision=decision, failure=failure)
         return False
+
+    def _let_pass(self, ends_step: bool) -> str:
+        """Tells the guard of the quiet rows of this step; what failed."""
+        rows, self._passing = self._passing, []
+        largest = max(said.value for said in self._rows[-len(rows) :])
+        return self._guard.let_pass(rows, self._executed, largest, ends_step)
 
     def _interrupt(self) -> None:
         """Something may have happened: ``Observer`` and ``Guard`` go on from where the quiet rows have come to."""
+        if self._passing:
+            self._let_pass(ends_step=False)
         self._calm, state = False, None if self._quiet is None else self._quiet.hand_back()
         if state is not None:
             self._observer.state = state

@@ -18,6 +18,7 @@ import numpy as np
 from llvmlite import binding
 from numba import types
 
+from asm_gym.addresses import floats1, floats2, floats3, whole1, whole2
 from asm_gym.compilation import compiled
 from asm_gym.envs.control import brake, control, hand_velocity, hold_at, set_goal
 from asm_gym.envs.mujoco_views import (
@@ -35,8 +36,6 @@ from asm_gym.envs.mujoco_views import (
     NominalViews,
     SubstepLimits,
     Views,
-    _f2,
-    _f3,
     arms_at,
     goals_at,
     limits_at,
@@ -165,7 +164,7 @@ def must_stay(limits: SubstepLimits) -> bool:
     return bool(now)
 
 
-@partial(compiled, nogil=True)
+@partial(compiled, calls=(".",), nogil=True)
 def run(t: Any, nominal_table: Any, fresh: bool, first: int, count: int) -> None:
     """Runs ``count`` physics substeps, controllers and sensors included.
 
@@ -180,7 +179,7 @@ def run(t: Any, nominal_table: Any, fresh: bool, first: int, count: int) -> None
     views, nominal, arms = views_at(t), nominal_at(nominal_table), arms_at(t[ARMS_AT:])
     goals, limits = goals_at(t[GOALS_AT:]), limits_at(t[LIMITS_AT:])
     last = len(t) - 3
-    deltas, turns, samples = _f2(t, last), _f3(t, last + 1), _f3(t, last + 2)
+    deltas, turns, samples = floats2(t, last), floats3(t, last + 1), floats3(t, last + 2)
     for k in range(first, first + count):
         _step1(views.model, views.data)
         if nominal.model != 0:
@@ -197,50 +196,36 @@ def run(t: Any, nominal_table: Any, fresh: bool, first: int, count: int) -> None
         feel(arms, limits, k, samples)
 
 
-@compiled
-def read(
-    samples: Any,
-    count: int,
-    mean: Any,
-    peak: Any,
-    last: Any,
-    qpos: Any,
-    qvel: Any,
-    ctrl: Any,
-    force: Any,
-    site: Any,
-    body: Any,
-    where: Any,
-    beside: Any,
-    noise: Any,
-    drawn: Any,
-    steps: Any,
-    carried: Any,
-    row: Any,
-    stream: Any,
-) -> tuple[float, float, float]:
+@partial(compiled, calls=(".",))
+def read(t: Any, count: int, beside: Any, row: Any, stream: Any) -> tuple[float, float, float, bool, bool]:
     """Summarises the first ``count`` samples, if there are any, and writes what the sensors read, and its stream.
 
     Args:
-        where: (P, 2) of each number that the arms sense its source, in the order of the arguments, and its place there.
-        beside: (M - P,) what comes after them.
-        noise, drawn: (M,) standard deviations, and of how many each number is off.
-        steps: (M,) of resolution; 0 for what has none.
-        carried: (D,) what of a row the stream carries.
-        row, stream: (M,) and (D,) of single precision, written.
+        t: the ``table`` of samples, their mean, peak and last, arrays of MuJoCo's, ``where`` (P, 2) of each number that
+            the arms sense its source among mean and those after it, and its place there, the (M,) noise, the (M,) steps
+            of resolution, 0 for none, and (D,) which numbers of a row the stream carries.
+        beside: (M - P,) what comes after what the arms sense.
+        row: (M,) of how many standard deviations each number is off; what is read is written there.
+        stream: (D,) of single precision, written.
+
+    Returns:
+        What ``summarise`` does, and whether the row and the stream are finite, in single precision.
     """
-    felt = summarise(samples, count, mean, peak, last) if count else (0.0, 0.0, 0.0)
-    sources = qpos, qvel, ctrl, force, site, body, mean.ravel(), peak.ravel(), last.ravel()
+    mean, peak, last = floats2(t, 1), floats2(t, 2), floats2(t, 3)
+    contact, external, usual = summarise(floats3(t, 0), count, mean, peak, last) if count else (0.0, 0.0, 0.0)
+    arms = mean.ravel(), peak.ravel(), last.ravel()
+    sources = *arms, floats1(t, 4), floats1(t, 5), floats1(t, 6), floats1(t, 7), floats1(t, 8), floats1(t, 9)
+    where, noise, steps, carried = whole2(t, 10), floats1(t, 11), floats1(t, 12), whole1(t, 13)
+    whole = through = True
     for n in range(len(row)):
-        if n < len(where):
-            value = sources[where[n, 0]][where[n, 1]]
-        else:
-            value = beside[n - len(where)]
-        value += noise[n] * drawn[n]
+        value = sources[where[n, 0]][where[n, 1]] if n < len(where) else beside[n - len(where)]
+        value += noise[n] * row[n]
         row[n] = np.rint(value / steps[n]) * steps[n] if steps[n] > 0.0 else value
+        whole = whole and np.isfinite(np.float32(row[n]))
     for n in range(len(carried)):
         stream[n] = np.float32(row[carried[n]])
-    return felt
+        through = through and np.isfinite(stream[n])
+    return contact, external, usual, whole, through
 
 
 @compiled

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numba import carray, types
-from numba.core import cgutils
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from asm_gym.addresses import flags1, floats1, floats2, floats3, shorts1, whole1, whole2
 from asm_gym.compilation import compiled
 
 Floats = NDArray[np.float64]
@@ -138,93 +135,63 @@ ARMED, ACTS, PASSED, LEFT, STAYED = range(5)
 control step began; in which of them one was first passed, -1 for none; whether they were told to stay."""
 
 
-def table(parts: Iterable[NDArray[Any] | int]) -> Ints:
-    """(N, 4) where each array lies, and its shape; a number stands for itself.
-
-    Handing over sixty arrays takes compiled code 9 µs, and one table of them none. Whoever keeps the table keeps them.
-    """
-    found = []
-    for part in parts:
-        if isinstance(part, int):
-            found.append((part, 0, 0, 0))
-            continue
-        if not part.flags.c_contiguous:
-            raise ValueError(f"an array of shape {part.shape} does not lie in one piece")
-        found.append((part.ctypes.data, *part.shape, *(0,) * (3 - part.ndim)))
-    return np.array(found, np.int64)
-
-
-@intrinsic
-def _at(context: Any, address: Any) -> Any:
-    """What lies at an address, for compiled code."""
-
-    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
-
-    return types.voidptr(types.int64), code
-
-
-@compiled
-def _f1(t: Any, k: int) -> Any:
-    return carray(_at(t[k, 0]), (t[k, 1],), np.float64)
-
-
-@compiled
-def _f2(t: Any, k: int) -> Any:
-    return carray(_at(t[k, 0]), (t[k, 1], t[k, 2]), np.float64)
-
-
-@compiled
-def _f3(t: Any, k: int) -> Any:
-    return carray(_at(t[k, 0]), (t[k, 1], t[k, 2], t[k, 3]), np.float64)
-
-
-@compiled
-def _n1(t: Any, k: int) -> Any:
-    return carray(_at(t[k, 0]), (t[k, 1],), np.int64)
-
-
-@compiled
-def _n2(t: Any, k: int) -> Any:
-    return carray(_at(t[k, 0]), (t[k, 1], t[k, 2]), np.int64)
-
-
-@compiled
-def _s1(t: Any, k: int) -> Any:
-    return carray(_at(t[k, 0]), (t[k, 1],), np.int32)
-
-
 @compiled
 def views_at(t: Any) -> Any:
     """``Views`` of its table."""
-    state = _f1(t, 2), _f1(t, 3), _f1(t, 4), _f1(t, 5), _f1(t, 6), _f1(t, 7), _f1(t, 8), _f1(t, 9)
-    bodies = _f2(t, 10), _f2(t, 11), _f2(t, 12), _f2(t, 13), _f2(t, 14)
-    rest = _f1(t, 15), _f2(t, 16), _f2(t, 17), _f2(t, 18), _f1(t, 19), _s1(t, 20), _s1(t, 21)
+    state = (
+        floats1(t, 2),
+        floats1(t, 3),
+        floats1(t, 4),
+        floats1(t, 5),
+        floats1(t, 6),
+        floats1(t, 7),
+        floats1(t, 8),
+        floats1(t, 9),
+    )
+    bodies = floats2(t, 10), floats2(t, 11), floats2(t, 12), floats2(t, 13), floats2(t, 14)
+    rest = (
+        floats1(t, 15),
+        floats2(t, 16),
+        floats2(t, 17),
+        floats2(t, 18),
+        floats1(t, 19),
+        shorts1(t, 20),
+        shorts1(t, 21),
+    )
     return Views(t[0, 0], t[1, 0], *state, *bodies, *rest)
 
 
 @compiled
 def nominal_at(t: Any) -> Any:
     """``NominalViews`` of its table."""
-    return NominalViews(t[0, 0], t[1, 0], _f1(t, 2), _f1(t, 3), _f1(t, 4), _f1(t, 5), _f1(t, 6))
+    return NominalViews(t[0, 0], t[1, 0], floats1(t, 2), floats1(t, 3), floats1(t, 4), floats1(t, 5), floats1(t, 6))
 
 
 @compiled
 def arms_at(t: Any) -> Any:
     """``Arms`` of its table."""
-    joints = _n1(t, 0), _n2(t, 1), _n2(t, 2), _n2(t, 3)
-    places = _n1(t, 4), _n1(t, 5), _n1(t, 6), _n1(t, 7), _n1(t, 8), _n2(t, 9), _n2(t, 10), _n1(t, 11)
-    compensate = carray(_at(t[14, 0]), (t[14, 1],), np.bool_)
-    return Arms(*joints, *places, _f2(t, 12), _f2(t, 13), compensate, _f2(t, 15), _f3(t, 16))
+    joints = whole1(t, 0), whole2(t, 1), whole2(t, 2), whole2(t, 3)
+    places = (
+        whole1(t, 4),
+        whole1(t, 5),
+        whole1(t, 6),
+        whole1(t, 7),
+        whole1(t, 8),
+        whole2(t, 9),
+        whole2(t, 10),
+        whole1(t, 11),
+    )
+    compensate = flags1(t, 14)
+    return Arms(*joints, *places, floats2(t, 12), floats2(t, 13), compensate, floats2(t, 15), floats3(t, 16))
 
 
 @compiled
 def goals_at(t: Any) -> Any:
     """``Goals`` of its table."""
-    return Goals(_f2(t, 0), _f3(t, 1), _f2(t, 2), _f2(t, 3), _n1(t, 4))
+    return Goals(floats2(t, 0), floats3(t, 1), floats2(t, 2), floats2(t, 3), whole1(t, 4))
 
 
 @compiled
 def limits_at(t: Any) -> Any:
     """``SubstepLimits`` of its table."""
-    return SubstepLimits(_f2(t, 0), _f1(t, 1), _n1(t, 2))
+    return SubstepLimits(floats2(t, 0), floats1(t, 1), whole1(t, 2))

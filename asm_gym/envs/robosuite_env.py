@@ -298,6 +298,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.simulation.begin(limits, self.felt_channels)
         self._command(action)
         self._rows: list[NDArray[np.float32]] = []
+        self._finite = True
         self._advance()
         if limits is not None and limits.stays and self.simulation.passed_limit is not None:
             # What was done last is what the stream says was commanded.
@@ -307,8 +308,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         reward = self._rewards(self._action)
         self._row = self.measure()
         # As float32, for a number that is too large for the stream is infinite there.
-        rows = [*self._rows, as_float32(self._row)]
-        if unstable := self._bad_count() != self._warnings or not all(np.isfinite(row).all() for row in rows):
+        self._finite &= bool(np.isfinite(as_float32(self._row)).all()) if self.corruptions else self._reading.whole
+        if unstable := self._bad_count() != self._warnings or not self._finite:
             # What the simulation holds now, MuJoCo's initial state as a rule, is nothing that the robot could sense.
             self._row[:] = np.nan
             reward = RewardTerms(dict.fromkeys(reward.terms, 0.0), False)
@@ -332,7 +333,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
                 hook(done - 1)
             if done % self._row_substeps == 0 and done < self.substeps:
                 measured = self._read(within=True)
-                row = self.to_stream(measured) if self.corruptions else self._carried
+                row = self.to_stream(measured) if self.corruptions else self._reading.stream
+                self._finite &= bool(np.isfinite(row).all()) if self.corruptions else self._reading.through
                 self.simulation.begin_row()
                 self._rows.append(row)
                 for feel in self.row_hooks:
@@ -402,8 +404,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         if faults:
             return self._errors.added(np.concatenate([self.simulation.sense(), beside]), faults, rng)
         drawn = rng.standard_normal(self.measured_spec.size)
-        row, self._carried = self.simulation.read(beside, self._errors, drawn, self._layout.carried)
-        return row
+        self._reading = self.simulation.read(beside, self._errors, drawn, self._layout.carried)
+        return self._reading.row
 
     def to_stream(self, row: NDArray[np.float64]) -> NDArray[np.float32]:
         """(D,) what of a measured row the stream carries."""

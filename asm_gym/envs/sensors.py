@@ -98,15 +98,15 @@ class Proprioception:
         shape = (len(parts), kernels.SAMPLE)
         self.mean, self.peak, self.last = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         self._sources = {
+            "mean": self.mean.ravel(),
+            "peak": self.peak.ravel(),
+            "last": self.last.ravel(),
             "qpos": views.qpos,
             "qvel": views.qvel,
             "ctrl": views.ctrl,
             "force": views.actuator,
             "site": views.site_xpos.ravel(),
             "body": data.xmat.ravel(),
-            "mean": self.mean.ravel(),
-            "peak": self.peak.ravel(),
-            "last": self.last.ravel(),
         }
         ends = np.cumsum([a.size for a in self._sources.values()])
         starts = {n: int(e) - a.size for (n, a), e in zip(self._sources.items(), ends, strict=True)}
@@ -119,8 +119,8 @@ class Proprioception:
         which = np.searchsorted(begins, self._index, side="right") - 1
         self.where = np.stack([which, self._index - begins[which]], axis=1)
         """(P, 2) of each of their numbers the source, and its place there."""
-        self.sources = list(self._sources.values())[:6]
-        """Arrays of MuJoCo's that are read as they are; mean, peak and last come after them."""
+        self.sources = [self.mean, self.peak, self.last, *list(self._sources.values())[3:]]
+        """What they are read from."""
 
     def read(self) -> NDArray[np.float64]:
         """One number for every element of ``channels``; noiseless."""

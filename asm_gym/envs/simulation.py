@@ -11,12 +11,25 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.addresses import table
 from asm_gym.compilation import must_compile
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.arms import bodies, compilable, describe
 from asm_gym.envs.control import hold_at
-from asm_gym.envs.mujoco_views import ACTS, ARMED, FELT, JOINTS, LEFT, Floats, Goals, Ints, NominalViews, SubstepLimits, Views, table
+from asm_gym.envs.mujoco_views import (
+    ACTS,
+    ARMED,
+    FELT,
+    JOINTS,
+    LEFT,
+    Floats,
+    Goals,
+    Ints,
+    NominalViews,
+    SubstepLimits,
+    Views,
+)
 from asm_gym.envs.nominal_robot import NominalDynamics
 from asm_gym.envs.sensors import Proprioception, SensorErrors
 from asm_gym.envs.speeds import HandSpeeds
@@ -29,10 +42,13 @@ class Reading(NamedTuple):
     Attributes:
         row: (M,) as ``RobosuiteEnv.measured_spec`` names it.
         stream: (D,) what of it the stream carries.
+        whole, through: whether they are finite in single precision.
     """
 
     row: Floats
     stream: NDArray[np.float32]
+    whole: bool
+    through: bool
 
 
 class Simulation:
@@ -104,6 +120,7 @@ class Simulation:
         action = self._deltas, self._turns, self._samples
         self._table = table((*self._views, *self._arms, *self._goals, *self._limits, *action))
         self._nominal: NominalViews | None = None
+        self._reads_by: SensorErrors | None = None
         self._samples[:] = 0.0
         if must_compile(kernels.run):
             print("asm-gym: compiling the simulation loop, once on this machine (about 20 s)", file=sys.stderr)
@@ -215,22 +232,27 @@ class Simulation:
         found: NDArray[np.float64] = np.linalg.norm(forces, axis=2).max(axis=0)
         return found
 
-    def read(self, beside: NDArray[np.float64], errors: SensorErrors, drawn: Floats, carried: Ints) -> Reading:
+    def read(self, beside: Floats, errors: SensorErrors, drawn: Floats, carried: Ints) -> Reading:
         """What the sensors read now, summarised over the substeps since the row began.
 
         Args:
             beside: what comes after what the arms sense.
             errors: of sensors; no fault among them.
-            drawn: (M,) of how many standard deviations each reading is off.
+            drawn: (M,) of how many standard deviations each reading is off; taken for the row.
             carried: (D,) which numbers the stream carries.
         """
-        p, count = self.proprioception, self._done - self._row_began
-        found = Reading(np.empty(len(drawn)), np.empty(len(carried), np.float32))
-        steps = errors.noise, drawn, errors.steps, carried
-        felt = kernels.read(self._samples, count, p.mean, p.peak, p.last, *p.sources, p.where, beside, *steps, *found)
+        count, stream = self._done - self._row_began, np.empty(len(carried), np.float32)
+        if self._reads_by is not errors:
+            p = self.proprioception
+            self._reads_by, self._kept = (
+                errors,
+                (self._samples, *p.sources, p.where, errors.noise, errors.steps, carried),
+            )
+            self._senses = table(self._kept)
+        *felt, whole, through = kernels.read(self._senses, count, beside, drawn, stream)
         if count:
             self._add_up(count, *felt)
-        return found
+        return Reading(drawn, stream, whole, through)
 
     def sense(self) -> NDArray[np.float64]:
         """What the arms' sensors read now, summarised over the substeps since the row began; noiseless."""
@@ -321,4 +343,4 @@ class Simulation:
 
 def _larger(now: float, before: float) -> float:
     """Of two forces; what is not finite stays so."""
-    return float(np.maximum(now, before))
+    return now if now != now or now > before else before

@@ -14,9 +14,10 @@ from rich.console import Console
 
 from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.monitors import NeuralASM
-from asm_gym.rollouts.collect import collect
 from asm_gym.scripts.benchmark.turns import take_turns
+from asm_gym.stream_source import StreamSource
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
+from asm_gym.wrappers.factory import body_memory
 
 
 @dataclass
@@ -25,8 +26,6 @@ class Safety:
 
     task: str = "Lift"
     """Name of the task."""
-    hidden: int = 256
-    """Hidden units of the memory."""
     steps: int = 400
     """Control steps of each rival."""
     monitor_freq: int = 100
@@ -39,19 +38,20 @@ class Safety:
     def run(self, console: Console) -> int:
         """Prints the table."""
         plain = self._make(None)
-        memory = self._memory(None)
+        memory = self._memory(plain)
         guarded = "step under the wrapper"
         envs = {"step": plain, guarded: NeuralASMSafety(self._make(None), memory)}
         envs[f"{guarded}, info flat"] = NeuralASMSafety(self._make(None), memory, info="flat")
         rate = self.monitor_freq
-        watched = NeuralASMSafety(self._make(rate), self._memory(rate), monitor_freq=rate)
-        envs |= {f"step, stream at {rate} Hz": self._make(rate), f"step under the wrapper at {rate} Hz": watched}
+        often = self._make(rate)
+        watched = NeuralASMSafety(self._make(rate), self._memory(often), monitor_freq=rate)
+        envs |= {f"step, stream at {rate} Hz": often, f"step under the wrapper at {rate} Hz": watched}
         action = np.zeros(plain.action_space.shape or (), np.float32)
         for env in envs.values():
             env.reset(seed=0)
         rivals: dict[str, Callable[[], Any]] = {name: partial(env.step, action) for name, env in envs.items()}
         turns = take_turns(rivals, self.steps, console, self.even_if_busy)
-        caption = f"{self.task}, 20 Hz, {self.hidden} hidden units: a control step"
+        caption = f"{self.task}, 20 Hz, shipped memories: a control step"
         rows = [
             (name, *(f"{1e3 * turns.quantile(name, q):.2f}" for q in (0.5, 0.99)), turns.times(name, "step"))
             for name in rivals
@@ -82,9 +82,6 @@ class Safety:
         env_id = f"asm_gym/{self.task}-v0"
         return gym.make(env_id, horizon=10**9, stream_freq=rate, disable_env_checker=True)
 
-    def _memory(self, rate: int | None) -> NeuralASM:
-        """One that has learned little, and whose threshold is out of reach: the cost is the same."""
-        env_id = f"asm_gym/{self.task}-v0"
-        episodes = collect(env_id, episodes=4, workers=1, horizon=40, stream_freq=rate)
-        asm = NeuralASM(episodes[0].spec, hidden_size=self.hidden, epochs=1).fit(episodes)
-        return asm.with_threshold(1e300)  # beyond any surprise of these rows: nothing is to be held
+    def _memory(self, env: gym.Env[Any, Any]) -> NeuralASM:
+        """The shipped one, with a threshold out of reach: nothing is to be held."""
+        return body_memory(env, StreamSource(env).spec).with_threshold(1e300)
