@@ -19,11 +19,11 @@ from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_mo
 from asm_gym.monitors.baselines.arm_inputs import forces, motion, speeds
 from asm_gym.monitors.baselines.association_values import ValueAssociation
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.monitors.baselines.same_inputs import Informed
 from asm_gym.monitors.onnx_export import write_onnx
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.reproduce.pushed import FAULTS, NEWTONS, SLIP, TABLES, _about_x, _about_z, jacobian
 from asm_gym.scripts.reproduce.real_arms import Config, Job, on_an_arm
-from asm_gym.scripts.reproduce.same_inputs import Informed
 from asm_gym.spec import Channel, StreamSpec
 
 REAL = Path(os.environ.get("ASM_GYM_REAL", "/nowhere"))
@@ -190,7 +190,8 @@ def test_a_memory_judges_values_beside_changes_and_keeps_both(tmp_path):
     score = asm.score(faulty[0])
     np.testing.assert_allclose(score.attribution.sum(axis=1), score.value)
     assert np.argmax(score.attribution[-1]) == 4
-    body = asm.values_.score(faulty[0]).value
+    assert asm.values_.monitor is not None
+    body = asm.values_.monitor.score(faulty[0]).value
     assert (score.value >= body).all()
     with pytest.raises(ValueError, match="values=False"):
         write_onnx(asm, tmp_path / "x.onnx")
@@ -200,7 +201,8 @@ def test_a_memory_of_what_nothing_tells_judges_changes_alone():
     rng = np.random.default_rng(0)
     spec = StreamSpec((Channel("a", 1), Channel("b", 1)), dt=0.05)
     episodes = [Episode.from_stream(rng.normal(size=(60, 2)), spec) for _ in range(10)]
-    assert NeuralASM(spec, hidden_size=8, association_size=8, epochs=1, values=True).fit(episodes).values_ is None
+    asm = NeuralASM(spec, hidden_size=8, association_size=8, epochs=1, values=True).fit(episodes)
+    assert asm.values_.monitor is None
 
 
 def test_rivals_are_told_friction_and_weight_of_the_row_before():
