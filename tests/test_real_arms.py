@@ -16,14 +16,17 @@ from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.scores import Largest
 from asm_gym.episode import Episode
 from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_monitor
+from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.baselines.arm_inputs import forces, motion, speeds
 from asm_gym.monitors.baselines.association_values import ValueAssociation
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.monitors.baselines.same_inputs import Informed
+from asm_gym.monitors.monitor import MonitorState
 from asm_gym.monitors.onnx_export import write_onnx
+from asm_gym.monitors.values import Values
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.reproduce.pushed import FAULTS, NEWTONS, SLIP, TABLES, _about_x, _about_z, jacobian
 from asm_gym.scripts.reproduce.real_arms import Config, Job, on_an_arm
-from asm_gym.scripts.reproduce.same_inputs import Informed
 from asm_gym.spec import Channel, StreamSpec
 
 REAL = Path(os.environ.get("ASM_GYM_REAL", "/nowhere"))
@@ -190,17 +193,48 @@ def test_a_memory_judges_values_beside_changes_and_keeps_both(tmp_path):
     score = asm.score(faulty[0])
     np.testing.assert_allclose(score.attribution.sum(axis=1), score.value)
     assert np.argmax(score.attribution[-1]) == 4
-    body = asm.values_.score(faulty[0]).value
+    assert asm.values_.monitor is not None
+    body = asm.values_.monitor.score(faulty[0]).value
     assert (score.value >= body).all()
     with pytest.raises(ValueError, match="values=False"):
         write_onnx(asm, tmp_path / "x.onnx")
+
+
+def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_says():
+    cut = pieces(Episode.from_table(arm(3000)), 1.0)
+    values = Values.learned(cut[:20], seed=0)
+    assert values.monitor is not None
+    senses = values.monitor.model.senses_
+    z = [np.hstack([senses.read_episode(e.stream).inputs, np.ones((len(e), 1))]) for e in (*cut[:20], cut[25])]
+    shown, asked = np.concatenate(z[:-1]).astype(np.float64), z[-1].astype(np.float64)
+    inverse = np.linalg.inv(shown.T @ shown + 1e-2 * len(shown) * np.eye(shown.shape[1]))
+    h, usual = (np.einsum("ni,ij,nj->n", rows, inverse, rows) for rows in (asked, shown))
+    root = np.sqrt(np.maximum(1.0, (1.0 + 10 * h) / (1.0 + 10 * np.median(usual))))  # a tenth of a second is 10 rows
+    one = Surprise(np.ones(1), np.full((1, 6), 1 / 6))
+    state, found = values.start(1), []
+    for row in cut[25].stream.astype(np.float64):
+        found.append(values._farther(state, row[None])[0])
+        now, judged = values.step(state, row[None], MonitorState((), ()), one)
+        state = now.values
+        assert judged.value[0] >= 1 / found[-1] - 1e-12
+    lag = senses.lag
+    np.testing.assert_allclose(found[:lag], 1.0)  # no change is known yet
+    np.testing.assert_allclose(found[lag:], root[lag:], rtol=1e-4)
+    arrays = {name.removeprefix("values."): array for name, array in values.arrays.items()}
+    again = Values.found(cut[0].spec, arrays, seed=0)
+    np.testing.assert_array_equal(again.far, values.far)
+    older = Values.found(cut[0].spec, {n: a for n, a in arrays.items() if n not in ("leverage", "usual")}, seed=0)
+    assert older._farther(older.start(1), cut[0].stream[:1].astype(np.float64)) == pytest.approx([1.0])
+    with pytest.raises(ValueError, match="the leverage of values should be of shape"):
+        Values.found(cut[0].spec, arrays | {"leverage": np.eye(3)}, seed=0)
 
 
 def test_a_memory_of_what_nothing_tells_judges_changes_alone():
     rng = np.random.default_rng(0)
     spec = StreamSpec((Channel("a", 1), Channel("b", 1)), dt=0.05)
     episodes = [Episode.from_stream(rng.normal(size=(60, 2)), spec) for _ in range(10)]
-    assert NeuralASM(spec, hidden_size=8, association_size=8, epochs=1, values=True).fit(episodes).values_ is None
+    asm = NeuralASM(spec, hidden_size=8, association_size=8, epochs=1, values=True).fit(episodes)
+    assert asm.values_.monitor is None
 
 
 def test_rivals_are_told_friction_and_weight_of_the_row_before():

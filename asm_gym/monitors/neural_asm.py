@@ -33,11 +33,11 @@ from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState
 from asm_gym.monitors.monitor_file import restored
 from asm_gym.monitors.promise import Asked
 from asm_gym.monitors.shipped import pretrained_file
-from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise, apart, taken_up
+from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise, apart
 from asm_gym.monitors.stream_model import parameter_names
 from asm_gym.monitors.training_data import check_nominal
 from asm_gym.monitors.values import PREFIX as VALUES
-from asm_gym.monitors.values import greater, learned_values, values_monitor
+from asm_gym.monitors.values import Values
 from asm_gym.monitors.weight_packing import rounded, unpacked
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
@@ -87,7 +87,7 @@ class NeuralASM(CalibratedMonitor):
         maxima_: largest surprise in each episode that ``calibrate`` was given; None before.
         blocks_: the same by the hour; None before, and in memories that were saved before it was kept.
         skill_: what listens for skills; None before ``learn_skills``.
-        values_: what judges values; None before ``fit``, where nobody asked for it, and where nothing tells any.
+        values_: what judges values; empty before ``fit``, where nobody asked for it, and where nothing tells any.
 
     Example:
         >>> import numpy as np
@@ -154,7 +154,7 @@ class NeuralASM(CalibratedMonitor):
         self._row: CompiledRow | None = None
         self._row_of: tuple[Any, ...] | None = None
         self.skill_: SkillSurprise | None = None
-        self.values_: CalibratedMonitor | None = None
+        self.values_ = Values()
 
     def rounded(self) -> Self:
         """The same memory in fewer bits, weights in 8, which takes a quarter of the space when it is saved.
@@ -247,9 +247,7 @@ class NeuralASM(CalibratedMonitor):
         rows, row = self._rows(state, stream), self.compiled_row
         before, knock, held = state.skill, state.knock, state.values
         state, surprise = super().observe(state, rows) if row is None else row(state, rows)
-        if self.values_ is not None:
-            held, of_values = self.values_.observe(held, rows)
-            state, surprise = state._replace(values=held), greater(surprise, of_values)
+        state, surprise = self.values_.step(held, rows, state, surprise)
         if self._excuses is not None:
             knock, excused = self._excuses.step(knock, rows)
             state, surprise = state._replace(knock=knock), surprise.excused(excused)
@@ -276,23 +274,18 @@ class NeuralASM(CalibratedMonitor):
 
     def initial_state(self, batch: int = 1, told: Sequence[Told] = ()) -> MonitorState:
         state = super().initial_state(batch, told)
+        state = state._replace(values=self.values_.start(batch))
         if self._excuses is not None:
             state = state._replace(knock=self._excuses.start(batch))
-        if self.values_ is not None:
-            state = state._replace(values=self.values_.initial_state(batch))
         return state if self.skill_ is None else state._replace(skill=self.skill_.monitor.initial_state(batch))
 
     def reset_evidence(self, state: MonitorState) -> MonitorState:
-        state = super().reset_evidence(state)
-        if self.values_ is not None:
-            state = state._replace(values=self.values_.reset_evidence(state.values))
+        state = super().reset_evidence(state)._replace(values=self.values_.reset(state.values))
         return state if self.skill_ is None else state._replace(skill=self.skill_.monitor.reset_evidence(state.skill))
 
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
-        found = super().learned_
-        if self.values_ is not None:
-            found |= {VALUES + name: array for name, array in self.values_.learned_.items()}
+        found = super().learned_ | self.values_.arrays
         return found if self.skill_ is None else found | self.skill_.arrays
 
     def restore(self, saved: Checkpoint) -> Self:
@@ -300,7 +293,7 @@ class NeuralASM(CalibratedMonitor):
         own, values = apart(own, VALUES)
         super().restore(own)
         self.skill_ = SkillSurprise.found(self.spec, skill, self.seed) if skill else None
-        self.values_ = taken_up(values_monitor(self.spec, self.seed), values) if values else None
+        self.values_ = Values.found(self.spec, values, self.seed)
         if self.alarm_on != "body" and self.skill_ is None:
             raise ValueError(f"the checkpoint alarms on {shown(self.alarm_on)} surprise, and holds no skills")
         check_choice("alarm_on", self.alarm_on, ALARMS_ON)
@@ -309,7 +302,7 @@ class NeuralASM(CalibratedMonitor):
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
         self.skill_ = None  # it was weighed against the memory as it was
         super()._learn(episodes, progress, warm_start)
-        self.values_ = learned_values(episodes, self.seed) if self.values else None
+        self.values_ = Values.learned(episodes, self.seed) if self.values else Values()
 
     def _set_threshold(self, scores: Sequence[Surprise], asked: Asked, each: Sequence[str]) -> None:
         super()._set_threshold(scores, asked, each)

@@ -53,7 +53,7 @@ def write_onnx(asm: NeuralASM, path: str | Path) -> Path:
         raise ValueError(
             f"an ONNX graph is of dynamics='traces' under evidence, got {asm.dynamics!r}, {detection.name!r}"
         )
-    if asm.values_ is not None:
+    if asm.values_.monitor is not None:
         raise ValueError("an ONNX graph judges changes alone, and this memory values too: fit one with values=False")
     made = _Graph(onnx)
     _step(made, model, detection)

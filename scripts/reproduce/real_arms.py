@@ -35,11 +35,11 @@ from asm_gym.evaluation.statistics import auroc
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.monitors.baselines.same_inputs import Informed
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.scripts.reproduce.pushed import FAULTS
-from asm_gym.scripts.reproduce.same_inputs import Informed
 from asm_gym.spec import StreamSpec
 
 RULE = "friction_rule"
