@@ -128,7 +128,7 @@ class QuietRows:
         """Those of a monitor and a guard; None where there are none for them."""
         if type(monitor) is not NeuralASM or monitor.compiled_row is None or not guard.can_be_quiet:
             return None
-        return None if monitor.values_ is not None or monitor.skill_ is not None else cls(monitor, guard)
+        return None if monitor.values_.monitor is not None or monitor.skill_ is not None else cls(monitor, guard)
 
     @property
     def stale(self) -> bool:

@@ -113,7 +113,8 @@ class Values(NamedTuple):
             return np.ones(len(rows))
         _, read, known = associated(_senses(self.monitor), before.model, rows)
         f = self.usual + _squares(_with_one(read.inputs), self.far)
-        return np.sqrt(np.where(known[:, 0] > 0, np.maximum(1.0, f), 1.0))
+        root: NDArray[np.float64] = np.sqrt(np.where(known[:, 0] > 0, np.maximum(1.0, f), 1.0))
+        return root
 
 
 def _monitor(spec: StreamSpec, seed: int) -> CalibratedMonitor:
