@@ -97,3 +97,16 @@ def test_the_command_prints_a_table_and_draws_a_picture(tmp_path, capsys, monkey
 
 def test_times_are_said_as_people_say_them():
     assert [in_time(s) for s in (0.5, 90, 300, 26320)] == ["0.5 s", "90 s", "5 min", "7.31 h"]
+
+
+def test_logs_of_different_columns_are_one_line_each(tmp_path, capsys):
+    for n, name in enumerate(("q_2", "q_3")):
+        rows = np.random.default_rng(n).normal(size=(600, 2)).cumsum(axis=0)
+        table = np.column_stack([np.arange(600) / 100, rows])
+        np.savetxt(tmp_path / f"{n}.csv", table, "%.5f", ",", header=f"time,q_1,{name}", comments="")
+    assert main(["inspect", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
+    assert "1.csv has other columns than 0.csv: q_2, q_3" in capsys.readouterr().out
+    assert main(["fit", str(tmp_path), "--out", str(tmp_path / "m.asm")]) == 2
+    said = capsys.readouterr()
+    assert "1.csv: the memory reads channels that are not there: q[2]" in said.out + said.err
+    assert not (tmp_path / "m.asm").exists()
