@@ -78,8 +78,6 @@ class Args:
     """Rows of the stream a second; one each control step by default."""
     exam_policies: tuple[str, ...] | None = fixed(None, quick=())
     """Agents to examine under, as guides are named; by default all that are shipped and fit this arm."""
-    exam_episodes: int = option(60, quick=2, least=0)
-    """Healthy episodes of each examination; 0 examines nothing."""
     healthy_episodes: int = option(HEALTHY, quick=0, least=0)
     """Episodes of the expert of each task to calibrate on, beside the lessons that are left out."""
     corpus: Path | None = option(None, metavar="FOLDER")
@@ -92,6 +90,8 @@ class Args:
     """Folder of the run."""
     quick: bool = False
     """To see that everything runs, not to judge the figures."""
+    exam_episodes: int = fixed(60, quick=2, least=0)
+    """Healthy episodes of each examination; 0 examines nothing."""
     exam_faults: tuple[str, ...] = fixed((TEST,), quick=())
     """Kinds of fault, each medium and strong but for pushes of 20 N, where the policy or the task was left out."""
     exam_pushes: int = fixed(3, quick=0)
