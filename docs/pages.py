@@ -16,8 +16,8 @@ The front matter of a page in ``docs/results`` says so:
     seconds: 812                     what printing took
     processor: 1540                  what it cost, in seconds of a core: the same on a busy machine
 
-At the end of the page, in a comment, stand the files that the command ran, each with git's id of its content, and what
-the check printed. What has changed since is found out by whoever asks: the site, or this list.
+Beside the pages, in ``ran/NAME.json``, stand the files that the command ran, each with git's id of its content, and
+what the check printed. What has changed since is found out by whoever asks: the site, or this list.
 
     python docs/pages.py                     lists the pages, what has changed since, and what each costs
     python docs/pages.py print PAGE …        runs the command of a page, and replaces what it printed
@@ -28,6 +28,7 @@ the check printed. What has changed since is found out by whoever asks: the site
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import resource
@@ -49,7 +50,7 @@ ROOT = ran.ROOT
 RESULTS = ROOT / "docs" / "results"
 ARCHIVE = RESULTS / "archive"
 BEGIN, END = "<!-- printed by the command above: edits are lost -->", "<!-- end of what was printed -->"
-RAN = "<!-- what ran: edits are lost\n"
+RAN = "<!-- what ran: edits are lost\n"  # at the end of pages that were printed before it had a file of its own
 REQUIRED = ("command", "version", "date", "commit")
 MOST = 20  # live pages
 ALLOWED = 30.0  # for a check [s of a core]
@@ -57,7 +58,7 @@ ALLOWED = 30.0  # for a check [s of a core]
 
 @dataclass(frozen=True)
 class Page:
-    """A page of results: what stands in its front matter, the text below, and what is kept at its end."""
+    """A page of results: what stands in its front matter, the text below, and what is kept beside it."""
 
     path: Path
     meta: dict[str, Any]
@@ -78,16 +79,17 @@ class Page:
             raise ValueError(f"{path}: the front matter lacks {', '.join(missing)}")
         if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
             raise ValueError(f"{path}: what was printed must stand once between {BEGIN} and {END}")
-        text, _, kept = text.partition(RAN)
+        text, _, old = text.partition(RAN)
         meta["commit"] = str(meta["commit"])  # one of digits alone is a number in YAML
-        return cls(path, meta, text, yaml.safe_load(kept.removesuffix("-->\n")) or {} if kept else {})
+        beside = _beside(path)
+        kept = json.loads(beside.read_text()) if beside.is_file() else yaml.safe_load(old.removesuffix("-->\n"))
+        return cls(path, meta, text, kept or {})
 
     def write(self) -> None:
-        """Replaces the file at once, or not at all."""
-        new = self.path.with_suffix(".new")
-        kept = f"\n{RAN}{_yaml(self.kept)}-->\n" if self.kept else ""
-        new.write_text(f"---\n{_yaml(self.meta)}---\n{self.text.rstrip()}\n{kept}", encoding="utf-8")
-        new.replace(self.path)
+        """Replaces each file at once, or not at all."""
+        if self.kept:
+            _replace(_beside(self.path), json.dumps(self.kept, indent=1) + "\n")
+        _replace(self.path, f"---\n{_yaml(self.meta)}---\n{self.text.rstrip()}\n")
 
     @property
     def files(self) -> dict[str, str]:
@@ -108,6 +110,18 @@ class Page:
         before, _, rest = self.text.partition(BEGIN)
         _, _, after = rest.partition(END)
         return replace(self, text=f"{before}{BEGIN}\n\n{printed.strip()}\n\n{END}{after}")
+
+
+def _beside(page: Path) -> Path:
+    """The file that holds what a page's command ran."""
+    return page.parent / "ran" / f"{page.stem}.json"
+
+
+def _replace(path: Path, text: str) -> None:
+    path.parent.mkdir(exist_ok=True)
+    new = path.with_suffix(".new")
+    new.write_text(text, encoding="utf-8")
+    new.replace(path)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -221,23 +235,26 @@ def print_all(again: bool) -> int:
 
 def verify(live: list[Page]) -> int:
     """Runs the checks; 1 where one prints something else, or takes longer than it may."""
-    wrong = 0
+    wrong = unkept = 0
+    began = _processor()
     for page in live:
         if "check" not in page.kept:
-            print(f"{page.name}: no check")
+            print(f"{page.name}: nothing is kept of a check")
+            unkept += 1
             continue
-        spent = _processor()
+        before = _processor()
         try:
             said, _ = _said(page.meta["check"])
         except subprocess.CalledProcessError as error:
             said = str(error)
-        seconds = _processor() - spent
+        seconds = _processor() - before
         differences = different(page.kept["check"]["printed"], said, page.meta.get("tolerance", TOLERANCE))
         late = f"; {ALLOWED:.0f} are allowed" if seconds > ALLOWED else ""
         verdict = "prints something else: superseded" if differences else "holds"
         print(f"{page.name}: {verdict}, {seconds:.0f} s of a core{late}", *differences, sep="\n    ", flush=True)
         wrong += bool(differences)
-    print(f"{wrong} of {len(live)} pages are superseded")
+    spent = f"{_processor() - began:.0f} s of a core"
+    print(f"{wrong} of {len(live)} pages are superseded, {unkept} were not checked; {spent}")
     return int(wrong > 0)
 
 

@@ -106,6 +106,7 @@ def test_the_banner_counts_what_has_changed_since(page):
     banner = printed.banner(replace(page, kept={"files": {FILE: files[FILE]}}))
     assert "none of its 1 files changed since" in banner
     assert "was not recorded" in printed.banner(page)
+    assert "on a machine that was not noted" in printed.banner(page)
 
 
 def test_a_file_that_was_moved_or_whose_comments_are_others_has_not_changed():
@@ -195,7 +196,9 @@ def test_a_check_that_prints_something_else_makes_its_page_superseded(page, caps
 
 def test_a_page_without_a_check_is_passed_over_and_said(page, capsys):
     assert pages.verify([page]) == 0
-    assert "no check" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "nothing is kept of a check" in said
+    assert "0 of 1 pages are superseded, 1 were not checked; 0 s of a core" in said
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ def banner(page: Page) -> str:
     """In MyST: the command, the commit, and how much of what it ran has changed; or that the page is of the archive."""
     meta = page.meta
     command = f"```sh\n{meta['command'].strip()}\n```"
-    where = f" on {meta['machine']}" if "machine" in meta else ""
+    where = f" on {meta['machine']}" if "machine" in meta else " on a machine that was not noted"
     cost = f", in {meta['seconds'] / 60:.0f} min" if meta.get("seconds", 0) >= 60 else ""
     since = state(page)
     when = f"Measured at {meta['commit']}; {since}{_names(page)}.\n\n"
