@@ -54,6 +54,7 @@ RAN = "<!-- what ran: edits are lost\n"  # at the end of pages that were printed
 REQUIRED = ("command", "version", "date", "commit")
 MOST = 20  # live pages
 ALLOWED = 30.0  # for a check [s of a core]
+MOST_SAID = 12  # lines that a check prints otherwise
 
 
 @dataclass(frozen=True)
@@ -251,7 +252,9 @@ def verify(live: list[Page]) -> int:
         differences = different(page.kept["check"]["printed"], said, page.meta.get("tolerance", TOLERANCE))
         late = f"; {ALLOWED:.0f} are allowed" if seconds > ALLOWED else ""
         verdict = "prints something else: superseded" if differences else "holds"
-        print(f"{page.name}: {verdict}, {seconds:.0f} s of a core{late}", *differences, sep="\n    ", flush=True)
+        more = [f"and {(len(differences) - MOST_SAID) // 2} more"] if len(differences) > MOST_SAID else []
+        shown = [*differences[:MOST_SAID], *more]
+        print(f"{page.name}: {verdict}, {seconds:.0f} s of a core{late}", *shown, sep="\n    ", flush=True)
         wrong += bool(differences)
     spent = f"{_processor() - began:.0f} s of a core"
     print(f"{wrong} of {len(live)} pages are superseded, {unkept} were not checked; {spent}")
