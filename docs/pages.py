@@ -94,8 +94,8 @@ class Page:
 
     @property
     def files(self) -> dict[str, str]:
-        """What the command ran: path to id; empty where that was not recorded."""
-        return dict(self.kept.get("files", {}))
+        """What the command ran, or else its check: path to id; empty where neither was recorded."""
+        return dict(self.kept.get("files") or self.kept.get("check", {}).get("files", {}))
 
     @property
     def changed(self) -> list[str]:
@@ -175,9 +175,12 @@ def _processor() -> float:
 
 
 def checked(page: Page) -> Page:
-    """The page with what its check prints now."""
-    said, _ = _said(page.meta["check"])
-    return replace(page, kept=page.kept | {"check": {"commit": ran.commit(), "printed": rounded(said) + "\n"}})
+    """The page with what its check prints now, and which files that ran where those of its command are not known."""
+    said, files = _said(page.meta["check"])
+    check: dict[str, Any] = {"commit": ran.commit(), "printed": rounded(said) + "\n"}
+    if "files" not in page.kept:
+        check["files"] = {name: ran.blob_at(page.meta["commit"], name) for name in files}
+    return replace(page, kept=page.kept | {"check": check})
 
 
 def _said(command: str) -> tuple[str, dict[str, str]]:
@@ -199,7 +202,8 @@ def state(page: Page) -> str:
     if not page.files:
         return "which files it ran was not recorded"
     changed, count = len(page.changed), len(page.files)
-    return f"{changed} of its {count} files changed since" if changed else f"none of its {count} files changed since"
+    files = f"of its {count} files" if "files" in page.kept else f"of the {count} files that its check runs"
+    return f"{changed or 'none'} {files} changed since"
 
 
 def to_print(live: list[Page], again: bool) -> list[Page]:

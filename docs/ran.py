@@ -41,6 +41,11 @@ def blob(path: Path) -> str:
     return _blob(path, path.stat().st_mtime_ns)
 
 
+def blob_at(commit: str, name: str) -> str:
+    """Git's id of what a file held at a commit, shortened; "" where it was not there, or git has no such commit."""
+    return _git("rev-parse", "--quiet", "--verify", f"{commit}:{name}").strip()[:DIGITS]
+
+
 @cache
 def _blob(path: Path, _written: int) -> str:
     content = path.read_bytes()

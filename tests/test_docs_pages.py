@@ -194,6 +194,18 @@ def test_a_check_that_prints_something_else_makes_its_page_superseded(page, caps
     assert pages.verify([checked]) == 1
 
 
+def test_a_page_whose_command_was_not_watched_counts_what_its_check_runs(page):
+    page.meta.update(commit="HEAD", check="python -c 'import asm_gym'")
+    checked = pages.checked(page)
+    assert checked.files[FILE] == ran.blob_at("HEAD", FILE)
+    assert ran._git("rev-parse", f"HEAD:{FILE}").startswith(checked.files[FILE])
+    assert f"of the {len(checked.files)} files that its check runs changed since" in pages.state(checked)
+    gone = pages.checked(replace(page, meta=page.meta | {"commit": "0123456"}))
+    assert set(gone.changed) == set(gone.files)
+    watched = replace(page, kept={"files": {"LICENSE": "1" * 12}})
+    assert "files" not in pages.checked(watched).kept["check"]
+
+
 def test_a_page_without_a_check_is_passed_over_and_said(page, capsys):
     assert pages.verify([page]) == 0
     said = capsys.readouterr().out
