@@ -27,14 +27,27 @@ class Wordy(IsolationForest):
         return np.zeros((len(X), 2))
 
 
-class Lopsided(Persistence):
-    """Forgets a sense."""
-
-    kind = "lopsided"
+def saying(name, change):
+    """A class of models whose ``predict`` gives ``change(state, output)``."""
 
     def predict(self, state, rows):
-        state, output = super().predict(state, rows)
-        return state, output._replace(errors=output.errors[:, 1:])
+        return change(*Persistence.predict(self, state, rows))
+
+    return type(name, (Persistence,), {"kind": name, "predict": predict})
+
+
+Lopsided = saying("lopsided", lambda state, said: (state, said._replace(errors=said.errors[:, 1:])))
+Stateless = saying("stateless", lambda state, said: said)
+Bare = saying("bare", lambda state, said: (state, tuple(said)))
+Late = saying("late", lambda state, said: (state, said._replace(contexts=said.contexts[1:])))
+Lost = saying("lost", lambda state, said: (state, said._replace(errors=said.errors * np.nan)))
+
+
+class Unlearned:
+    """An estimator that learns nothing."""
+
+    def score_samples(self, rows):
+        return rows[:, 0]
 
 
 @pytest.fixture(autouse=True)
@@ -75,13 +88,25 @@ def test_workers_know_it_too():
 def test_what_is_no_model_is_refused_in_a_line():
     with pytest.raises(ValueError, match="is no model: it has no kind, fit, start, predict, restore; derive from"):
         monitor_class("tests.test_estimators:Mute")
+    with pytest.raises(ValueError, match="is no model: it has no kind, fit, start"):
+        monitor_class("tests.test_estimators:Unlearned")
     with pytest.raises(ValueError, match=r"score_samples of Wordy must give \(\d+,\).*got \(\d+, 2\)"):
         judged("tests.test_estimators:Wordy")
 
 
-def test_errors_of_another_shape_are_refused_in_a_line():
-    with pytest.raises(ValueError, match=r"predict of lopsided must give errors \(\d+, 12\), got \(\d+, 11\)"):
-        judged("tests.test_estimators:Lopsided")
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Lopsided", r"predict of lopsided must give errors \(\d+, 12\), got \(\d+, 11\)"),
+        ("Stateless", "must give a state and a ModelOutput, got ModelOutput"),
+        ("Bare", "must give a state and a ModelOutput, got .*, tuple"),
+        ("Late", r"must give contexts \((\d+), C\), got \(\d+, 0\)"),
+        ("Lost", "must give errors that are finite where the rows are"),
+    ],
+)
+def test_what_a_model_may_not_say_is_refused_in_a_line(name, message):
+    with pytest.raises(ValueError, match=message):
+        judged(f"tests.test_estimators:{name}")
 
 
 def test_its_score_is_of_rows_that_were_not_learned():

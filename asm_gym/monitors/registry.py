@@ -190,7 +190,7 @@ def check_monitor(name: str) -> None:
 
 def _model_class(own: Any, name: str) -> Any:
     """A class of models or of whole monitors. Raises ValueError where it lacks what it takes."""
-    if hasattr(own, "score_samples") and not hasattr(own, "kind"):
+    if hasattr(own, "score_samples") and hasattr(own, "fit") and not hasattr(own, "kind"):
         return adapted(own)
     whole = isinstance(own, type) and issubclass(own, CalibratedMonitor)
     missing = [n for n in ("kind", "fit", *(() if whole else ("start", "predict", "restore"))) if not hasattr(own, n)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -114,20 +115,33 @@ def running(episode: Episode) -> NDArray[np.str_]:
 
 
 def model_outputs(model: Model, episodes: Sequence[Episode]) -> list[ModelOutput]:
-    """What a model says of each episode: errors (T, X) and contexts (T, C).
+    """What a model says of each episode, whose numbers are finite: errors (T, X) and contexts (T, C).
 
     Raises:
-        ValueError: errors of another shape.
+        ValueError: it says anything else, as a model of others may.
     """
     outputs: dict[int, ModelOutput] = {}
-    for group, steps in side_by_side(episodes, model.start, model.predict):
-        wanted = len(group), len(model.error_columns)
-        if np.shape(steps[0].errors) != wanted:
-            raise ValueError(f"predict of {model.kind} must give errors {wanted}, got {np.shape(steps[0].errors)}")
+    for group, steps in side_by_side(episodes, model.start, partial(_predicted, model)):
         for n, i in enumerate(group):
             mine = steps[: len(episodes[i])]
             outputs[i] = ModelOutput(np.array([s.errors[n] for s in mine]), np.array([s.contexts[n] for s in mine]))
     return [outputs[i] for i in range(len(episodes))]
+
+
+def _predicted(model: Model, state: State, rows: NDArray[np.float64]) -> tuple[State, ModelOutput]:
+    said: Any = model.predict(state, rows)
+    asked, wanted = f"predict of {model.kind} must give", (len(rows), len(model.error_columns))
+    if not isinstance(said, tuple) or len(said) != 2 or not isinstance(said[1], ModelOutput):
+        got = [type(part).__name__ for part in (said if type(said) is tuple else [said])]
+        raise ValueError(f"{asked} a state and a ModelOutput, got {', '.join(got)}")
+    errors, contexts = said[1]
+    if np.shape(errors) != wanted:
+        raise ValueError(f"{asked} errors {wanted}, got {np.shape(errors)}")
+    if np.ndim(contexts) != 2 or len(contexts) != len(rows):
+        raise ValueError(f"{asked} contexts ({len(rows)}, C), got {np.shape(contexts)}")
+    if not np.isfinite(errors).all():
+        raise ValueError(f"{asked} errors that are finite where the rows are")
+    return said[0], said[1]
 
 
 def side_by_side(

@@ -20,7 +20,8 @@ def main() -> None:
     for name, attack in ATTACKS.items():
         said = attacked((attack, 2000), Config(task="Lift"))
         what, unit = ("drift", "rad") if attack.joint >= 0 else ("seconds", "s")
-        reached = (f"{who} {said[f'{what}_{who}']:.3f} {unit}" for who in ("memory", "guard") if said[f"found_by_{who}"])
+        found = [who for who in ("memory", "guard") if said[f"found_by_{who}"]]
+        reached = (f"{who} {said[f'{what}_{who}']:.3f} {unit}" for who in found)
         print(f"{name}: {', '.join(reached) or 'never'}")
 
 
