@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import json
 import platform
 import subprocess
 import sys
@@ -55,7 +56,7 @@ class Args:
 def run_checks() -> list[Check]:
     """Every check, in the order in which a remedy for one helps the next."""
     libraries = [library(name, package) for name, package in LIBRARIES.items()] if sys.platform == "linux" else []
-    return [python(), *map(package, PACKAGES), compiled_code(), *libraries, rendering(), encoder()]
+    return [python(), *map(package, PACKAGES), compiled_code(), matrix_products(), *libraries, rendering(), encoder()]
 
 
 def python() -> Check:
@@ -141,6 +142,30 @@ def compiled_code() -> Check:
         if missing == "1"
         else Check("compiled code", True, False, where)
     )
+
+
+KERNELS = """
+import json
+import numpy
+from llvmlite.binding import get_host_cpu_features
+from threadpoolctl import threadpool_info
+print(json.dumps([[p["architecture"] for p in threadpool_info() if p.get("internal_api") == "openblas"],
+                  [name for name, there in get_host_cpu_features().items() if there]]))
+"""
+OLD_KERNELS = {"Prescott", "Core2", "Penryn", "Dunnington", "Atom", "Nano", "Nehalem", "Barcelona", "Generic"}
+"""Of OpenBLAS, without AVX: what it takes for a processor that is newer than itself."""
+
+
+def matrix_products() -> Check:
+    """Whether NumPy's OpenBLAS uses what the processor has: an older one does not know the newest processors."""
+    done = subprocess.run([sys.executable, "-c", KERNELS], capture_output=True, text=True, check=False)
+    kernels, features = json.loads(done.stdout) if done.returncode == 0 else ([], [])
+    slow = [name for name in kernels if name in OLD_KERNELS] if "avx2" in features else []
+    if not slow:
+        return Check("matrix products", True, False, f"OpenBLAS for {kernels[0]}" if kernels else "not by OpenBLAS")
+    better = "SkylakeX" if "avx512f" in features else "Haswell"
+    detail = f"NumPy's OpenBLAS takes this processor for a {slow[0]}: learning takes longer"
+    return Check("matrix products", False, False, detail, f"export OPENBLAS_CORETYPE={better}")
 
 
 def library(name: str, package: str) -> Check:

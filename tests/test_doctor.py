@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from llvmlite.binding import get_host_cpu_features
 
 from asm_gym import extras, graphics
 from asm_gym.scripts import cli, doctor
@@ -50,6 +52,7 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         monkeypatch.setattr(graphics, "draws_a_frame", lambda backend: backend in draws)
         monkeypatch.setattr(sys, "platform", "linux")
         monkeypatch.setattr(doctor, "compiled_code", lambda: doctor.Check("compiled code", True, False, "in a folder"))
+        monkeypatch.setattr(doctor, "matrix_products", lambda: doctor.Check("matrix products", True, False, "known"))
 
     return make
 
@@ -246,6 +249,18 @@ def test_code_that_is_still_to_be_compiled_is_said_with_what_compiles_it(monkeyp
     check = doctor.compiled_code()
     assert (check.ok, check.needed, check.remedy) == (False, False, "asm-gym warmup")
     assert check.detail.startswith(f"not yet in {tmp_path}")
+
+
+def test_kernels_of_a_processor_without_avx_are_named_on_one_with_it(monkeypatch: Any) -> None:
+    monkeypatch.setenv("OPENBLAS_CORETYPE", "Haswell")
+    assert doctor.matrix_products().ok
+    if not get_host_cpu_features().get("avx2"):
+        pytest.skip("this processor has none")
+    monkeypatch.setenv("OPENBLAS_CORETYPE", "Nehalem")
+    check = doctor.matrix_products()
+    assert (check.ok, check.needed) == (False, False)
+    assert "takes this processor for a Nehalem" in check.detail
+    assert re.fullmatch("export OPENBLAS_CORETYPE=(SkylakeX|Haswell)", check.remedy)
 
 
 def test_python_3_13_is_told_why_it_has_no_robosuite(machine: Any, monkeypatch: Any) -> None:
