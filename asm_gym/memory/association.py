@@ -155,7 +155,7 @@ def complete(f: Array, a: Array, U: Array, D: Array) -> Array:
 @kernel
 def inward(pulled: Array, f: Array, back: Array) -> Array:
     """f'(h) ⊙ Bᵀ ε (B, M): the errors (B, X) that come back to the hidden units ``f`` (B, M) by ``back`` (X, M)."""
-    out = np.dot(pulled, back)
+    out: Array = np.dot(pulled, back)
     for n in range(out.shape[0]):
         for j in range(out.shape[1]):
             out[n, j] *= np.float32(1) - f[n, j] * f[n, j]

@@ -48,7 +48,9 @@ def rounded(arrays: Mapping[str, NDArray[Any]]) -> Found:
     found: Found = {}
     for name, array in arrays.items():
         if name in WEIGHTS and not np.isfinite(array).all():
-            raise ValueError(f"{name} has weights that are not finite, for which no integer stands: fit the memory anew")
+            raise ValueError(
+                f"{name} has weights that are not finite, for which no integer stands: fit the memory anew"
+            )
         if _is_weight(name, array):
             found[name] = _of(*_split(array))
         elif name in COVARIANCES and np.trace(array) > 0 and _root_of(name, array) is None:
