@@ -1,5 +1,6 @@
 """The benchmarks of watching: what they time is what they say."""
 
+import socket
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -15,7 +16,7 @@ from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.scripts.benchmark import main
 from asm_gym.scripts.benchmark.experts import Attempt, _row, attempt
 from asm_gym.scripts.benchmark.fit import errors, repeated
-from asm_gym.scripts.benchmark.fleet import Fleet
+from asm_gym.scripts.benchmark.fleet import ROOM, Fleet, Inbox
 from asm_gym.scripts.benchmark.memory import PlainTorch, synthetic
 from asm_gym.scripts.benchmark.turns import BusyError, Turns, check_quiet
 from asm_gym.scripts.benchmark.vector import vector_table
@@ -160,6 +161,27 @@ def test_a_fleet_is_watched_as_each_robot_alone_is():
         for robot, value in zip(robots, fleet.observe(robots, np.array([row for _, row in now])), strict=True):
             found[robot].append(value)
     np.testing.assert_allclose(found, alone, rtol=1e-4)
+
+
+def test_datagrams_are_read_many_at_a_time_in_their_order_and_what_is_no_row_is_left_out():
+    inbox = Inbox(3)
+    inbox.drain()
+    assert len(inbox.taken()) == 0
+    rows = np.zeros(5, inbox.kind)
+    rows["stream"], rows["sent"], rows["row"] = np.arange(5), 0.5, np.arange(15).reshape(5, 3)
+    robot = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    for datagram in (rows[0].tobytes(), b"noise", *(row.tobytes() for row in rows[1:])):
+        robot.sendto(datagram, inbox.socket.getsockname())
+    inbox.drain()
+    assert inbox.taken().tobytes() == rows.tobytes()
+    for _ in range(2 * ROOM):
+        robot.sendto(rows[3].tobytes(), inbox.socket.getsockname())
+        inbox.drain()
+    assert len(inbox.taken()) == ROOM  # the socket keeps the rest
+    inbox.drain()
+    assert (inbox.taken() == rows[3]).all()
+    robot.close()
+    inbox.socket.close()
 
 
 def test_rows_are_timed_against_their_deadline(capsys):

@@ -76,6 +76,24 @@ def test_weights_that_would_be_lost_are_not_packed():
     assert "V.planesf4" in packed(weights())
 
 
+@pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan])
+def test_weights_that_no_integer_stands_for_are_refused_by_name_and_kept_as_they_are(bad):
+    arrays = weights()
+    arrays["V"][3, 4] = bad
+    with pytest.raises(ValueError, match="V has weights that are not finite"):
+        rounded(arrays)
+    np.testing.assert_array_equal(unpacked(packed(arrays))["V"], arrays["V"])
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e30])
+def test_weights_of_any_size_are_rounded_to_a_share_of_the_largest(size):
+    V = (size * weights()["V"].astype(np.float64)).astype(np.float32)
+    after = rounded({"V": V})["V"]
+    largest = np.abs(V).max(axis=1, keepdims=True)
+    assert (np.abs(after - V) <= 1.01 * largest / 127).all()
+    assert unpacked(packed({"V": after}))["V"].tobytes() == after.tobytes()
+
+
 def test_parts_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="V of 8 bits should have a scale for each of its rows, got"):
         unpacked({"V.bits": np.zeros((2, 2), np.int8)})

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.base import Array
+from asm_gym.memory.linear import gram
 
 MOST_ERRORS = 8192
 """Their covariance takes 0.5 GiB, and its eigenvectors minutes."""
@@ -33,7 +34,7 @@ def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
     if not 0.0 <= shrinkage <= 1.0:
         raise ValueError(f"shrinkage must be in [0, 1], got {shrinkage}")
     exact = np.asarray(errors, np.float64)
-    covariance = exact.T @ exact / len(exact)  # (X, X)
+    covariance = gram(exact) / len(exact)  # (X, X)
     scale = float(np.trace(covariance)) / len(covariance)
     target = (scale if scale > 0 else 1.0) * np.eye(len(covariance))
     values, vectors = np.linalg.eigh((1.0 - shrinkage) * covariance + shrinkage * target)

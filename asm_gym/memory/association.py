@@ -153,6 +153,16 @@ def complete(f: Array, a: Array, U: Array, D: Array) -> Array:
 
 
 @kernel
+def inward(pulled: Array, f: Array, back: Array) -> Array:
+    """f'(h) ⊙ Bᵀ ε (B, M): the errors (B, X) that come back to the hidden units ``f`` (B, M) by ``back`` (X, M)."""
+    out: Array = np.dot(pulled, back)
+    for n in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[n, j] *= np.float32(1) - f[n, j] * f[n, j]
+    return out
+
+
+@kernel
 def normalised_errors(
     inputs: Array,
     changes: Array,
@@ -208,7 +218,7 @@ def association_change(
     f = hidden_units(a, V)
     error = delta - (complete(f, a, U, D) if D.size else outward(f, U))
     pulled = np.clip(error / spread, np.float32(-bound), np.float32(bound))
-    upstream = (np.float32(1) - f * f) * (pulled @ (U if back is None else back))  # (B, M) ε_h
+    upstream = inward(pulled, f, U if back is None else back)  # (B, M) ε_h
     return Change(coincidence(upstream, a), coincidence(pulled, f), coincidence(pulled, a) if D.size else D), error
 
 
@@ -241,19 +251,20 @@ def learn_association(
     few, feedback = (apart or len(a)) < ROWS_PER_INPUT * a.shape[1], feedback or Feedback()
     exists = synapses(groups, changes, a.shape[1], size)
     D = learn_from_past(a, changes) if few else feedback.linear(a, groups, changes, exists.D, rng)
-    remainder = np.maximum(np.sqrt(np.mean((delta - a @ D.T) ** 2, axis=0)), SMALLEST_SPREAD)  # (X,)
+    left = delta - outward(a, D)
+    remainder = np.maximum(np.sqrt(np.mean(left**2, axis=0)), SMALLEST_SPREAD)  # (X,)
     if few:
         for _ in range(ALL_TICKS):
             tick()
         return _linear_alone(D, remainder, _random(exists.V, rng))
-    left = (delta - a @ D.T) / remainder
+    left /= remainder
 
     def learned(rows: NDArray[np.bool_] | slice) -> tuple[Array, Array]:
         return _learn_hidden(a[rows], left[rows], exists, rng, tick, updates, passes, feedback)
 
     def expect(learned_from: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Array:
         V, U = learned(learned_from)
-        return hidden_units(a[asked], V) @ U.T
+        return outward(hidden_units(a[asked], V), U)
 
     # How far units go wrong in rows that they have learned says too little of how far they will.
     expected = crossfit(expect, thirds(len(a), lengths, rng), left.shape[1])

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.memory.linear import along, gram
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 
@@ -92,7 +93,7 @@ class Completion:
             return np.asarray(sum(part(blank.lift(s)) for s in streams)) / rows
 
         centre = mean(lambda y: y.sum(axis=0))
-        covariance = mean(lambda y: (y - centre).T @ (y - centre))
+        covariance = mean(lambda y: gram(y - centre))
         learned = cls(senses, products, covariance, centre, np.ones(D))
         error = np.ones(D)
         error[spec.sensory] = np.sqrt(mean(lambda y: np.sum(learned.unexplained(y) ** 2, axis=0)))
@@ -189,7 +190,7 @@ class Completion:
     def unexplained(self, lifted: Floats) -> Floats:
         """(T, S) what of each sense its sensor's completion from all else leaves, in spreads, for y (T, Y)."""
         centred = lifted - self.centre
-        return centred[:, : len(self.spec.sensory)] - centred @ self.each_alone.T
+        return centred[:, : len(self.spec.sensory)] - along(centred, self.each_alone)
 
 
 def sensors_of(spec: StreamSpec) -> tuple[tuple[str, NDArray[np.intp]], ...]:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from asm_gym.memory.association import Association, hidden_units
 from asm_gym.memory.energy import Array
 from asm_gym.memory.inference import Weights
+from asm_gym.memory.linear import gram
 from asm_gym.memory.precision import log_variance
 from asm_gym.memory.settling import SettlingWeights
 from asm_gym.memory.traces import DECAYS
@@ -44,7 +45,7 @@ ONE = ("one", 0)
 def moments(inputs: Array) -> NDArray[np.float32]:
     """C (I, I) of rows (N, I)."""
     exact = np.asarray(inputs, np.float64)
-    return (exact.T @ exact / len(exact)).astype(np.float32)
+    return (gram(exact) / len(exact)).astype(np.float32)
 
 
 def association_inputs(senses: StreamScaler, columns: Columns | None = None) -> list[Hashable]:

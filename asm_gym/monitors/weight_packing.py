@@ -44,9 +44,13 @@ Found = dict[str, NDArray[Any]]
 
 
 def rounded(arrays: Mapping[str, NDArray[Any]]) -> Found:
-    """The same in fewer bits."""
+    """The same in fewer bits. Raises ValueError where a weight is not finite, for which no integer stands."""
     found: Found = {}
     for name, array in arrays.items():
+        if name in WEIGHTS and not np.isfinite(array).all():
+            raise ValueError(
+                f"{name} has weights that are not finite, for which no integer stands: fit the memory anew"
+            )
         if _is_weight(name, array):
             found[name] = _of(*_split(array))
         elif name in COVARIANCES and np.trace(array) > 0 and _root_of(name, array) is None:
@@ -103,7 +107,8 @@ def unpacked(arrays: Mapping[str, NDArray[Any]]) -> Found:
 
 
 def _is_weight(name: str, array: NDArray[Any]) -> bool:
-    return name in WEIGHTS and array.ndim == 2 and array.size > 0 and array.dtype == np.float32
+    fits = name in WEIGHTS and array.ndim == 2 and array.size > 0 and array.dtype == np.float32
+    return fits and bool(np.isfinite(array).all())
 
 
 def _is_symmetric(array: NDArray[Any]) -> bool:
