@@ -205,7 +205,8 @@ def hardest(results: Sequence[BenchmarkResult]) -> Table:
         shares = [k[kind, severity].found[rate] for k in own if (kind, severity) in k]
         return Share(sum(s.k for s in shares), sum(s.n for s in shares))
 
-    columns = [(r, severity) for r in KINDS_AT for severity in SEVERITIES]
+    rates = (r for r in KINDS_AT if r in results[0].on_visible[0].thresholds)
+    columns = [(r, severity) for r in rates for severity in SEVERITIES]
     rows = [(kind, [found(kind, severity, r) for r, severity in columns]) for kind in kinds]
     rows.sort(key=lambda row: float(np.nanmean([share.value for share in row[1]])))
     return Table(
