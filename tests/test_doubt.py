@@ -57,7 +57,7 @@ def test_a_threshold_that_a_crash_has_set_is_doubted_and_the_episode_named(monit
         high = monitor.calibrate(crashed, **asked).threshold
     (said,) = (r.getMessage() for r in caplog.records)
     assert "2 of 42 episodes press more than 2 times as hard as is usual" in said
-    assert re.search(r"The worst is episode 30, \d.* harmless\(episodes\)", said)
+    assert re.search(r"The worst is episode 30, \d.* asm_gym.harmless\(episodes\) does", said)
     caplog.clear()
     with caplog.at_level(logging.WARNING):
         low = monitor.calibrate(harmless(crashed), **asked).threshold  # what it says to do

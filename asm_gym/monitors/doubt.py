@@ -40,8 +40,8 @@ def doubt_crashes(
         return
     worst = max(hit, key=lambda n: float(values[n].max()))
     LOG.warning(
-        "%d of %d episodes press more than %g times as hard as is usual; with them the threshold is %.3g, without %.3g. "
-        "The worst is episode %d, %.1f times as hard: look at it, and leave out what is not healthy, as "
+        "%d of %d episodes press more than %g times as hard as is usual; with them the threshold is %.3g, without "
+        "%.3g. The worst is episode %d, %.1f times as hard: look at it, and leave out what is not healthy, as "
         "asm_gym.harmless(episodes) does",
         *(len(hit), len(episodes), CRASH, threshold, without, worst, hit[worst]),
     )
