@@ -123,7 +123,9 @@ def _step(g: _Graph, model: Any, detection: Any) -> None:
         g("Concat", kept, g.column(row), axis=1, out=f"next_{name}")
     g("Add", "steps", np.int64(1), out="next_steps")
     listens = bool(detection.detector_.context_quantile[:-1].any())
-    errors = g("Mul", _errors(g, model, last, past, due, moved, listens), g("Where", long, np.float64(1), np.float64(UNSURE)))
+    errors = g(
+        "Mul", _errors(g, model, last, past, due, moved, listens), g("Where", long, np.float64(1), np.float64(UNSURE))
+    )
     shares = _evidence(g, detection.detector_, errors)
     _surprise(g, shares, _repetitions(g, detection.repeating, model.spec.sensory), detection.repeating[2], model.spec)
 
