@@ -23,7 +23,8 @@ def peak_torques(episode: Episode) -> NDArray[np.float64]:
     slices = episode.spec.slices
     sensed = [[s for name, s in slices.items() if name.endswith(f"external_torque{end}")] for end in ("_peak", "")]
     torques = [np.abs(episode.stream[:, s]).max(axis=1) for s in sensed[0] or sensed[1]]
-    return np.max([np.zeros(len(episode)), *torques], axis=0)
+    found: NDArray[np.float64] = np.max([np.zeros(len(episode)), *torques], axis=0)
+    return found
 
 
 def crashes(episodes: Sequence[Episode], tasks: Sequence[str]) -> dict[int, float]:
