@@ -43,7 +43,6 @@ class CarryTask(NamedTuple):
         headings: those of its x axis that fit the place [rad]; empty where every one does.
         heading_fit: how exactly it must have one of them before it is lowered [rad].
         fit: how exactly it must stand over its place before it is lowered [m].
-        reach: how near to its grip the fingers close [m].
     """
 
     name: str
@@ -56,7 +55,6 @@ class CarryTask(NamedTuple):
     headings: tuple[float, ...] = ()
     heading_fit: float = 0.06
     fit: float = 0.02
-    reach: float = 0.011
 
 
 class CarryState(NamedTuple):
@@ -122,7 +120,7 @@ class CarryExpert(PhasedExpert):
             above = np.linalg.norm(off[:2] - state.spread[:2] * 0.3) < 0.02 and abs(off[2] - task.clearance) < 0.03
             return to(DESCEND) if above and aligned else state
         if phase == DESCEND:
-            if np.linalg.norm(off) < task.reach or (state.since > 30 and np.linalg.norm(off) < 0.02):
+            if np.linalg.norm(off) < 0.011 or (state.since > 30 and np.linalg.norm(off) < 0.02):
                 return to(GRASP)
             return to(REACH) if state.since > 60 or np.linalg.norm(off[:2]) > 0.06 else state
         if phase == GRASP:
