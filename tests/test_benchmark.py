@@ -116,13 +116,19 @@ def test_an_attempt_says_what_the_episode_was():
     assert made.held
     assert 20 < made.steps < 100
     assert 1 < made.force < 40
+    assert 0.1 < made.room < 2
     assert attempt(3, "Lift", "Panda") == made
 
 
 def test_a_row_counts_what_was_solved_held_and_how_long_it_took():
-    row = _row([Attempt(True, True, 10, 1.0), Attempt(True, False, 20, 2.0), Attempt(False, False, 100, 9.0)])
+    made = [
+        Attempt(True, True, 10, 1.0, 0.2),
+        Attempt(True, False, 20, 70.0, 0.01),
+        Attempt(False, False, 99, 90.0, 0.0),
+    ]
+    row = _row(made)
     assert row[0] == "2 of 3"
-    assert row[2:] == ("1", "15", "2")
+    assert row[2:] == ("1", "15", "70", "1", "1")
 
 
 @pytest.mark.parametrize(

@@ -128,6 +128,18 @@ def test_parts_of_the_memory_are_judged_by_it(pushed, tmp_path):
         parts_study.Config(corpus=pushed, ways=("none",))
 
 
+def test_of_the_memory_whole_each_kind_is_counted_over_all_seeds(pushed, tmp_path):
+    asked = ["--corpus", str(pushed), "--tasks", "Lift", "--ways", "learned traces", "--whole", "--seeds", "2"]
+    assert reproduce(["parts", *asked, "--quick", "--workers", "1", "--out", str(tmp_path / "out")]) == 0
+    rows = list(csv.DictReader((tmp_path / "out/parts.csv").open()))
+    assert [(r["part"], r["seed"]) for r in rows] == [("all", "0"), ("all", "1")]
+    assert {r["at 50 %"] for r in rows} == {"100.0"}
+    text = (tmp_path / "out/parts.md").read_text()
+    assert "| push |  |  | 100 % |" in text
+    with pytest.raises(ValueError, match="Reach"):
+        parts_study.Config(corpus=pushed, tasks=("Reach",))
+
+
 @pytest.fixture
 def asked(pushed, tmp_path):
     """How it is judged, without the monitors."""

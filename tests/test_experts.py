@@ -1,6 +1,5 @@
 """Every scripted expert solves its task, keeps it solved, and varies."""
 
-import re
 from functools import partial
 
 import gymnasium as gym
@@ -9,7 +8,6 @@ import pytest
 
 import asm_gym  # noqa: F401
 from asm_gym import collect
-from asm_gym.envs.simulation import Simulation
 from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS
 from asm_gym.policies.scripted.base import ObservationReader, Style, grasping, gripping, has_settled, rotation
@@ -18,7 +16,7 @@ from asm_gym.policies.scripted.handover import Hammer, Meeting
 from asm_gym.policies.scripted.two_arms import Hand, move_arm
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.scripts.benchmark.experts import attempt
+from asm_gym.scripts.benchmark.experts import attempt, room_to_the_stops
 from tests.rates import failures, too_few
 
 QUICK = [
@@ -63,16 +61,6 @@ def test_an_expert_solves_its_task_and_leaves_it_solved(task):
 
     assert not failures(trial, range(10), 0.95)
     env.close()
-
-
-def room_to_the_stops(simulation: Simulation) -> float:
-    """How far the arms' joint that is nearest to one of its stops is from it [rad]."""
-    joints = [simulation.model.joint(i) for i in range(simulation.model.njnt)]
-    arms = [joint for joint in joints if re.fullmatch(r"robot\d_joint\d", joint.name)]
-    assert arms
-    angles = np.array([simulation.data.joint(joint.name).qpos[0] for joint in arms])
-    low, high = np.array([joint.range for joint in arms]).T
-    return float(np.minimum(angles - low, high - angles).min())
 
 
 @pytest.mark.floats

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -119,6 +121,20 @@ def test_what_cannot_be_promised_is_refused_in_a_line_and_nothing_changes(monito
         monitor.calibrate(episodes, **asked)
     assert "\n" not in str(refused.value)
     assert (monitor.threshold, monitor.promise) == before
+
+
+@pytest.mark.parametrize(
+    ("added", "message"),
+    [
+        (NOMINAL[7], "episodes 7 and 120 overlap.* give each hour once; the"),
+        (episode(3), "episode 120 was learned from"),
+    ],
+)
+def test_a_promise_by_the_episode_says_so_and_is_made_all_the_same(monitor, caplog, added, message):
+    with caplog.at_level("WARNING"):
+        monitor.calibrate([*NOMINAL, added], 0.1)
+    assert re.search(f"{message}.* promise by the episode does not hold", caplog.text)
+    assert monitor.promise.episodes == 121
 
 
 def test_a_loaded_memory_still_knows_what_it_learned_from(monitor, tmp_path):

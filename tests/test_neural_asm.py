@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from asm_gym.episode import Episode
+from asm_gym.memory.state import past
 from asm_gym.monitors import Monitor, NeuralASM, make_monitor
 from asm_gym.spec import Channel, StreamSpec
 from tests.memories import SMALL, learned_bytes, sine_memory
@@ -148,6 +149,16 @@ def test_an_episode_that_begins_with_absurd_numbers_alarms_within_five_rows(asm,
         state, surprise = asm.observe(state, row[None])
         alarms.append(surprise.value[0] > asm.threshold)
     assert any(alarms[: 5 if rows == 25 else 3])
+
+
+def test_errors_count_little_until_it_is_known_how_the_arm_moved(asm):
+    model, state = asm.model, asm.model.start(1)
+    rows = sine_episodes(1, seed=3)[0].stream[40:44].astype(np.float64)  # in mid-motion
+    for row, counts in zip(rows, (0.0, 0.1, 1.0, 1.0), strict=True):
+        error, _ = model.network.associate(model.senses_.read(row[None], *past(state, row[None])))
+        state, output = model.predict(state, row[None])
+        np.testing.assert_allclose(output.errors, counts * error, rtol=1e-6)
+        assert np.abs(error).max() > 0.1 or counts == 0.0
 
 
 def test_one_seed_gives_one_memory_and_another_seed_another():

@@ -16,6 +16,10 @@ from asm_gym.scaling import ScaledRows
 
 Rows = NDArray[np.float64]
 
+UNSURE = np.float32(0.1)
+"""What an error counts of itself in the first rows that something came before, but nothing before that: whoever begins
+in mid-motion does not know how it moved, and is wrong."""
+
 
 class MemoryState(NamedTuple):
     """Where the memory is, one entry a stream; a value, never changed in place."""
@@ -58,6 +62,11 @@ def past(state: Remembers, rows: Rows) -> tuple[Rows, Rows]:
         before = np.where(state.steps[:, None] >= lag, before, rows)
         earlier = np.where(state.steps[:, None] >= 2 * lag, earlier, before)
     return before, earlier
+
+
+def sure(steps: NDArray[np.int64], lag: int) -> NDArray[np.float32]:
+    """(B, 1) what errors count of themselves after so many rows: nothing while no change is known."""
+    return np.where(steps < lag, np.float32(0), np.where(steps < 2 * lag, UNSURE, np.float32(1)))[:, None]
 
 
 def carry_on(

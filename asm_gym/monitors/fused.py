@@ -28,7 +28,7 @@ from asm_gym.memory.association import normalised_errors
 from asm_gym.memory.inference import carry
 from asm_gym.memory.network import Network
 from asm_gym.memory.readout import add_up
-from asm_gym.memory.state import MemoryState
+from asm_gym.memory.state import UNSURE, MemoryState
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.monitor import MonitorState
@@ -237,6 +237,8 @@ def _observe(
     for n in range(B):
         if steps[n] < lag:
             error[n] = 0.0  # nothing came before, so that no change is known
+        elif steps[n] < 2 * lag:
+            error[n] *= UNSURE
     if skill.shape[1]:
         new_skill[:] = add_up(skill, units, new_expected, _matrix(S, w, W_K), _vector(S, w, B_K))
 

@@ -28,7 +28,7 @@ from asm_gym.memory.online import followed
 from asm_gym.memory.readout import add_up, learn_readout
 from asm_gym.memory.recall import continued
 from asm_gym.memory.specialise import specialise
-from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past
+from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past, sure
 from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.base import Progress, Told
 from asm_gym.monitors.stream_model import StreamModel, model_outputs, running
@@ -166,8 +166,8 @@ class MemoryModel(StreamModel):
         reading = self.senses_.read(rows, before, earlier)
         traces, expected = carry_on(self.network, state, reading)
         error, units = self.network.associate(reading)
-        if state.steps.min() < self.lag:
-            error[state.steps < self.lag] = 0.0  # nothing came before, so that no change is known
+        if state.steps.min() < 2 * self.lag:
+            error = error * sure(state.steps, self.lag)
         skill = state.skill
         if self.skills_:
             skill = add_up(skill, units, expected, self.learned_["W_K"], self.learned_["b_K"])

@@ -19,6 +19,7 @@ from asm_gym.episode import Episode
 from asm_gym.familiar_speed import FamiliarSpeed
 from asm_gym.monitors.base import Model, Progress, Specialises, State, Surprise, Told
 from asm_gym.monitors.blindness import require_sight
+from asm_gym.monitors.doubt import LOG, doubt_crashes
 from asm_gym.monitors.monitor_file import SavedMonitor, calibration_arrays
 from asm_gym.monitors.overlap import Marks, check_fresh, sketch
 from asm_gym.monitors.promise import Asked
@@ -192,18 +193,24 @@ class CalibratedMonitor(Calibrated):
 
         Raises:
             ValueError: too few episodes or hours for this rate (the message says which they can promise), or bad ones;
-                by the hour also episodes that overlap, or that ``fit`` has learned from. Or not one rate, but none or
-                both.
+                by the hour also episodes that overlap, or that ``fit`` has learned from, which are only said where the
+                rate is per episode. Or not one rate, but none or both.
         """
         self._fitted()
         asked = Asked.of(false_alarm_rate, false_alarms_per_hour)  # refuses a bad rate before the work begins
         check_nominal(episodes, self.spec, self.model.shortest)
         if each and len(each) != len(episodes):
             raise ValueError(f"each must name one group an episode, got {len(each)} for {len(episodes)} episodes")
-        if asked.per == HOUR:
-            asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
+        asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
+        try:
             check_fresh(episodes, self._learned_from)
-        self._set_threshold(self.score_episodes(episodes), asked, each)
+        except ValueError as error:
+            if asked.per == HOUR:
+                raise
+            LOG.warning("%s; the promise by the episode does not hold for these", error)
+        scores = self.score_episodes(episodes)
+        self._set_threshold(scores, asked, each)
+        doubt_crashes(episodes, [s.value for s in scores], self.threshold, asked, each)
         streams = [episode.stream for episode in episodes]
         self.healthy_ = healthy_forces(streams, self.spec)
         self.familiar_ = FamiliarSpeed.learned(streams, self.spec)

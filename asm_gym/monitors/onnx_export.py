@@ -24,6 +24,7 @@ from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY
 from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.extras import require
 from asm_gym.memory.network import Network
+from asm_gym.memory.state import UNSURE
 from asm_gym.memory.traces import DECAYS
 from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.scaling import FARTHEST
@@ -122,7 +123,10 @@ def _step(g: _Graph, model: Any, detection: Any) -> None:
         g("Concat", kept, g.column(row), axis=1, out=f"next_{name}")
     g("Add", "steps", np.int64(1), out="next_steps")
     listens = bool(detection.detector_.context_quantile[:-1].any())
-    shares = _evidence(g, detection.detector_, _errors(g, model, last, past, due, moved, listens))
+    errors = g(
+        "Mul", _errors(g, model, last, past, due, moved, listens), g("Where", long, np.float64(1), np.float64(UNSURE))
+    )
+    shares = _evidence(g, detection.detector_, errors)
     _surprise(g, shares, _repetitions(g, detection.repeating, model.spec.sensory), detection.repeating[2], model.spec)
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple, Self
+
+import numpy as np
 
 from asm_gym.detection import Blocks, check_per_hour, conformal_episodes, conformal_threshold, hourly_threshold
 from asm_gym.detection.base import Array
@@ -46,3 +49,18 @@ class Asked(NamedTuple):
             return conformal_threshold(maxima, self.rate)
         assert blocks is not None
         return hourly_threshold(blocks, self.rate)
+
+    def threshold_of(self, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> float:
+        """The same from the values (T,) of nominal episodes; with ``each``, the greatest that one of its groups needs.
+
+        Raises:
+            ValueError: there are too few episodes, or too few hours, in all of them or in a group.
+        """
+        threshold = self.threshold(np.array([v.max() for v in values]), Blocks.of(values, dt, each))
+        for name in dict.fromkeys(each):
+            own = [v for v, of in zip(values, each, strict=True) if of == name]
+            try:
+                threshold = max(threshold, self.threshold_of(own, dt))
+            except ValueError as error:
+                raise ValueError(f"{name} by itself: {error}") from None
+        return threshold

@@ -75,19 +75,11 @@ class Calibrated:
 
     def _set_threshold(self, scores: Sequence[Surprise], asked: Asked, each: Sequence[str]) -> None:
         """By what was made of nominal episodes. Raises ValueError, and changes nothing, where they are too few."""
-        maxima = np.array([s.value.max() for s in scores])
-        blocks = Blocks.of([s.value for s in scores], self.spec.dt, each)
-        threshold = asked.threshold(maxima, blocks)
-        for name in dict.fromkeys(each):
-            own = [s.value for s, of in zip(scores, each, strict=True) if of == name]
-            try:
-                needed = asked.threshold(np.array([v.max() for v in own]), Blocks.of(own, self.spec.dt))
-            except ValueError as error:
-                raise ValueError(f"{name} by itself: {error}") from None
-            threshold = max(threshold, needed)
+        values = [s.value for s in scores]
+        threshold = asked.threshold_of(values, self.spec.dt, each)
         self._check_threshold(threshold)
-        self.threshold_ = threshold
-        self.maxima_, self.blocks_, self.promised_ = maxima, blocks, asked.per
+        self.threshold_, self.promised_ = threshold, asked.per
+        self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
 
     def _check_threshold(self, threshold: float) -> None:
         """Raises ValueError where it is none that will do."""

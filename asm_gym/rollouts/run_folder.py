@@ -21,6 +21,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 import asm_gym
+from asm_gym.crashes import CRASH
 from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.comparison import LeftOut
 from asm_gym.files import named, written_whole
@@ -31,8 +32,6 @@ Item = TypeVar("Item")
 LOCK, HOLDER = ".lock", ".lock_holder"
 NOMINAL_ROLES = ("fit", "calibration", "nominal")
 """Roles of the episodes that nothing is done to."""
-CRASH = 2.0
-"""How many times what the robot usually presses at most in nominal episodes of a task is a crash."""
 
 
 def versions(*more: str) -> dict[str, str]:

@@ -1,7 +1,8 @@
-"""How often the scripted experts succeed, by task and robot: ``asm-gym benchmark experts``."""
+"""How often the scripted experts succeed, hit something or meet a stop: ``asm-gym benchmark experts``."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.console import Console
 
+from asm_gym.detection.events import NEAR_STOP
+from asm_gym.envs.simulation import Simulation
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.policies import make_policy, rollout
@@ -22,6 +25,9 @@ from asm_gym.validation import check_choice
 
 _QUICK = 5
 
+HIT = 60.0
+"""Contact [N] above which nobody does it on purpose."""
+
 
 class Attempt(NamedTuple):
     """What became of one episode."""
@@ -30,26 +36,38 @@ class Attempt(NamedTuple):
     held: bool  # at the last step, too
     steps: int  # until it was solved, or all of them
     force: float  # the largest contact force on an arm [N]
+    room: float  # what was left of an arm's joint to its nearest stop, at least [rad]
+
+
+def room_to_the_stops(simulation: Simulation) -> float:
+    """How far the arms' joint that is nearest to one of its stops is from it [rad]."""
+    joints = [simulation.model.joint(i) for i in range(simulation.model.njnt)]
+    arms = [joint for joint in joints if re.fullmatch(r"robot\d_joint\d", joint.name)]
+    angles = np.array([simulation.data.joint(joint.name).qpos[0] for joint in arms])
+    low, high = np.array([joint.range for joint in arms]).T
+    return float(np.minimum(angles - low, high - angles).min())
 
 
 def attempt(seed: int, task: str, robot: str) -> Attempt:
     """The scripted expert's episode of ``seed``, which also is the expert's own seed."""
-    env = environment(f"asm_gym/{task}-v0", (("robot", robot), ("stream", ())))
+    env: Any = environment(f"asm_gym/{task}-v0", (("robot", robot), ("stream", ())))
     success: list[bool] = []
     force: list[float] = []
+    room: list[float] = []
 
     def note(info: dict[str, Any]) -> None:
         success.append(bool(info["success"]))
         force.append(float(info["contact_force"]))
+        room.append(room_to_the_stops(env.unwrapped.simulation))
 
     solved = rollout(env, make_policy("scripted", env, seed=seed), seed, note)
     steps = success.index(True) + 1 if solved else len(success)
-    return Attempt(solved, success[-1], steps, float(np.nanmax(force)))
+    return Attempt(solved, success[-1], steps, float(np.nanmax(force)), min(room))
 
 
 @dataclass
 class Experts:
-    """How often each scripted expert succeeds, whether it leaves the task solved, and how long it takes."""
+    """How often each scripted expert succeeds, leaves the task solved, hits something or meets a stop, and how fast."""
 
     tasks: tuple[str, ...] = tuple(EXPERTS)
     """Names of tasks."""
@@ -82,9 +100,12 @@ class Experts:
                 with stage(f"{name}, {robot}", console, {}) as progress:
                     attempts = parallel_map(partial(attempt, task=name, robot=robot), seeds, self.workers, progress)
                 rows.append((name, robot, *_row(attempts)))
-        headings = ("task", "robot", "solved", "95 %", "held", "steps", "force")
+        headings = ("task", "robot", "solved", "95 %", "held", "steps", "force", "hit", "stop")
         console.print(ConsoleTable(Table(f"scripted experts, seeds of {self.seed}", headings, rows), left=2))
-        console.print("held: also at the last step; steps: mean until solved; force: median largest [N]")
+        console.print(
+            "held: also at the last step; steps: mean until solved; force: median largest [N]; hit: solved with a "
+            f"contact above {HIT:g} N; stop: solved with a joint within {NEAR_STOP:g} rad of its stop"
+        )
         return 0
 
 
@@ -98,4 +119,6 @@ def _row(attempts: list[Attempt]) -> tuple[str, ...]:
         str(sum(a.held for a in attempts)),
         f"{np.mean(steps):.0f}" if steps else "",
         f"{np.median([a.force for a in attempts]):.0f}",
+        str(sum(a.solved and a.force > HIT for a in attempts)),
+        str(sum(a.solved and a.room < NEAR_STOP for a in attempts)),
     )

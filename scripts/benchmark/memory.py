@@ -20,6 +20,7 @@ from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.episode import Episode
 from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.extras import require
+from asm_gym.memory.state import UNSURE
 from asm_gym.memory.traces import DECAYS
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.onnx_export import STATE, initial_state, write_onnx
@@ -81,6 +82,8 @@ class PlainTorch:
         again = x[self.sensory] == before[self.sensory]
         if self.before is None:
             error, again = torch.zeros_like(error), torch.zeros_like(again)
+        elif self.t == 1:
+            error = float(UNSURE) * error
         changed, same = torch.where(self.again, self.steps[1], self.steps[0])
         self.unlikely, self.again = (self.unlikely + torch.where(again, same, changed)).clamp(min=0.0), again
         self.t += 1

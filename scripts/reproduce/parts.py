@@ -18,12 +18,16 @@ from matplotlib.figure import Figure
 from asm_gym.detection import EvidenceDetection, conformal_episodes
 from asm_gym.episode import Episode
 from asm_gym.evaluation import defaults
-from asm_gym.evaluation.comparison import BenchmarkResult, MonitorResult
+from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
+from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE
 from asm_gym.evaluation.detection_tables import monitors_table
 from asm_gym.evaluation.figures import figure
+from asm_gym.evaluation.metrics import DetectionMetrics, detected, false_alarms, in_words
 from asm_gym.evaluation.resampling import interval
 from asm_gym.evaluation.standing import lead_table
-from asm_gym.evaluation.tables import Table
+from asm_gym.evaluation.statistics import Share
+from asm_gym.evaluation.tables import Table, percent
+from asm_gym.faults.suite import SEVERITIES
 from asm_gym.memory.dynamics import TRACES
 from asm_gym.memory.feedback import FEEDBACK, LEARNED
 from asm_gym.memory.precision import unbounded
@@ -31,6 +35,7 @@ from asm_gym.monitors import CalibratedMonitor, NeuralASM
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.memory_parts import AssociationPart, TemporalPart
 from asm_gym.monitors.memory_model import MemoryModel
+from asm_gym.rollouts.corpus import SKILLS
 from asm_gym.rollouts.run_folder import Recordings
 from asm_gym.rollouts.scoring import detectability_of, fitted, judged, read
 from asm_gym.scripts.evaluate import Args, labels
@@ -53,6 +58,10 @@ class Config(kit.Config):
     """What asm-gym corpus has recorded: learned from, calibrated on and judged by."""
     ways: tuple[str, ...] = option(WAYS, least=1, known=WAYS)
     """How association is taught, and the dynamics; or linear, for no hidden units."""
+    tasks: tuple[str, ...] = option(SKILLS, least=1, known=SKILLS)
+    """Skills of the corpus, which one memory learns together."""
+    whole: bool = False
+    """The memory alone, not its parts; and each kind of fault, the hardest first."""
     false_alarm_rate: float = option(defaults.REPORTED_RATE, quick=0.5, check=conformal_episodes)
     """Share of nominal episodes that may raise an alarm."""
     epochs: int = fixed(40, quick=1, least=1)
@@ -61,7 +70,12 @@ class Config(kit.Config):
     @property
     def recordings(self) -> Recordings:
         """Of the skills in the corpus; raises as ``Corpus.open``."""
-        return read(self.corpus / "scripted", tuple(labels(Args(corpus=self.corpus))))
+        own = (label for label in labels(Args(corpus=self.corpus)) if label.task in self.tasks)
+        return read(self.corpus / "scripted", tuple(own))
+
+
+KINDS_AT = REPORTED_RATE, FALSE_ALARM_RATE
+"""False-alarm rates at which kinds, and faults that are surely seen, are counted."""
 
 
 class Learned(MemoryModel):
@@ -110,7 +124,7 @@ def monitors_of(job: Job, fit: Sequence[Episode], config: Config) -> Iterator[tu
     assert isinstance(memory, NeuralASM)
     said = "".join(f", {name}" for name in (feedback, dynamics) if name not in (LEARNED, TRACES))
     yield f"all{said}", memory
-    if feedback != LEARNED:
+    if config.whole or feedback != LEARNED:
         return
 
     def alone(model: object) -> CalibratedMonitor:
@@ -146,22 +160,60 @@ def run(config: Config) -> Findings:
     for seed in config.repetitions:
         own = {name: m for job, made in zip(jobs, found, strict=True) if job.seed == seed for name, m in made.items()}
         results.append(BenchmarkResult(own, seen, *how))
-        for m in results[-1].on_visible:
-            hourly = {f"found_{rate:g}_an_hour": 100 * share.value for rate, share in m.found_hourly.items()}
-            at = {"found": 100 * m.found[config.false_alarm_rate].value, **hourly}
-            records.append({"part": m.name, "seed": seed, "auroc": m.auroc, **at})
+        records += [{"part": m.name, "seed": seed, **measured(m, seen)} for m in results[-1].on_visible]
     made = [over(records, config), monitors_table(results[0]), lead_table(results[0])]
+    if config.whole:
+        made = [*made[:2], hardest(results)]
     return Findings(records, made, bars(results[0]), {"parts": list(results[0].monitors)})
+
+
+def measured(m: DetectionMetrics, seen: Sequence[Detectability]) -> Record:
+    """AUROC, and shares of the faults that were found [%]: of all, and of those that the ideal observer is sure of."""
+    sure = {(d.task, d.kind, d.severity, d.seed) for d in seen if d.earliest is not None}
+    told = [t for t in m.faulty if (t.task, t.kind, t.severity, t.seed) in sure]
+    found = {f"at {100 * r:g} %": share.value for r, share in m.found.items()}
+    hourly = {f"at {r:g} an hour": share.value for r, share in m.found_hourly.items()}
+    surely = {
+        f"of {len(told)} surely seen, at {100 * r:g} %": detected([t.at(q) for t in told], m.window_s).value
+        for r, q in m.thresholds.items()
+        if r in KINDS_AT
+    }
+    alarms = {"nominal alarms": false_alarms(m.nominal).value}
+    return {"auroc": m.auroc} | {name: 100 * share for name, share in (found | hourly | surely | alarms).items()}
 
 
 def over(records: Sequence[Record], config: Config) -> Table:
     """Mean and deviation over the seeds."""
-    heads = {"auroc": "AUROC", "found": f"found at {100 * config.false_alarm_rate:g} % [%]"}
-    heads |= {name: name.replace("_", " ") + " [%]" for name in records[0] if name.startswith("found_")}
+    heads = [name for name in records[0] if name not in ("part", "seed")]
     parts = dict.fromkeys(str(r["part"]) for r in records)
     rows = [(p, *(shown(records, name, 3 if name == "auroc" else 0, part=p) for name in heads)) for p in parts]
-    seeds = ", ".join(map(str, config.repetitions))
-    return Table(f"Each part; mean ± SD over these seeds of the weights: {seeds}", ("", *heads.values()), rows)
+    return Table(
+        f"Each part: AUROC over the same steps, and faults found [%]; mean ± SD over these seeds of the weights: "
+        f"{', '.join(map(str, config.repetitions))}. Surely seen: by the ideal observer. Nominal alarms: at "
+        f"{100 * config.false_alarm_rate:g} % [% of episodes].",
+        ("", "AUROC", *heads[1:]),
+        rows,
+    )
+
+
+def hardest(results: Sequence[BenchmarkResult]) -> Table:
+    """Each kind of fault, and what the first monitor finds of it with all seeds together; the hardest first."""
+    own = [next(iter(result.on_visible)).kinds for result in results]
+    kinds = list(dict.fromkeys(kind for kind, _ in own[0]))
+
+    def found(kind: str, severity: str, rate: float) -> Share:
+        shares = [k[kind, severity].found[rate] for k in own if (kind, severity) in k]
+        return Share(sum(s.k for s in shares), sum(s.n for s in shares))
+
+    rates = (r for r in KINDS_AT if r in results[0].on_visible[0].thresholds)
+    columns = [(r, severity) for r in rates for severity in SEVERITIES]
+    rows = [(kind, [found(kind, severity, r) for r, severity in columns]) for kind in kinds]
+    rows.sort(key=lambda row: float(np.nanmean([share.value for share in row[1]])))
+    return Table(
+        "Faults found of each kind that the ideal observer can see, all seeds together, the hardest first.",
+        ("", *(f"{severity}, at {100 * r:g} %" for r, severity in columns)),
+        [(in_words((kind, "")), *map(percent, shares)) for kind, shares in rows],
+    )
 
 
 def bars(result: BenchmarkResult) -> Figure:

@@ -9,17 +9,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from asm_gym.contact_limits import healthy_forces
+from asm_gym.crashes import CRASH, peak_torques
 from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import Progress
-from asm_gym.rollouts.training.exploration import SHORTEST, Gentle, peak_torques
+from asm_gym.rollouts.training.exploration import SHORTEST, Gentle
 from asm_gym.spec import StreamSpec
 
 EXPERT = "scripted"
 """The guide that says what is usual."""
 HELD_OUT = 3
 """One in so many lessons of a task is not learned from: the threshold is set on those."""
-LEARNED_UP_TO, DISTURBED_UP_TO = 2.0, 1.0
+LEARNED_UP_TO, DISTURBED_UP_TO = CRASH, 1.0
 """How many times what an undisturbed expert usually feels at most may be felt in what is learned from, of a guide's own
 course and of a disturbed one. In the latter contact is an accident: a memory that knows it feels no push."""
 AROUND_S = 0.2

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from asm_gym.crashes import CRASH
 from asm_gym.detection.events import KNOCK, STOP
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.comparison import visible_kinds
@@ -18,7 +19,6 @@ from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.statistics import Rate, Share
 from asm_gym.evaluation.tables import Column, Table, count, percent, tabulate
 from asm_gym.monitors import CalibratedMonitor
-from asm_gym.rollouts.run_folder import CRASH
 from asm_gym.rollouts.scoring import detectability_of, traces_of
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.tasks import task as task_spec

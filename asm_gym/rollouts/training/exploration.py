@@ -17,8 +17,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.crashes import peak_torques
 from asm_gym.episode import Episode, load_episode, save_episode
-from asm_gym.monitors.baselines.limits import columns
 from asm_gym.policies import make_policy
 from asm_gym.policies.base import Policy
 from asm_gym.rollouts.staging import play, staged
@@ -94,13 +94,6 @@ def until_contact(episode: Episode, forces: NDArray[np.floating[Any]], gentle: G
     end = int(np.argmax(over)) if over.any() else len(forces)
     kept = {name: getattr(episode, name)[:end] for name in ("stream", "actions", "rewards", "faults")}
     return replace(episode, observations=episode.observations[: end + 1], **kept)
-
-
-def peak_torques(episode: Episode) -> NDArray[np.floating[Any]]:
-    """(T,) the largest external torque on a joint in each row of the stream [N m]."""
-    torques = episode.stream[:, columns(episode.spec, "external_torque_peak")]
-    peaks: NDArray[np.floating[Any]] = np.abs(torques).max(axis=1)
-    return peaks
 
 
 def explore(seed: int, env_id: str, gentle: Gentle, folder: Path) -> Path:
