@@ -13,6 +13,7 @@ from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
 
 _WALL = 0.09  # how high above the bins' floor the fingertips stay clear of the walls' tops with the palm [m]
 _REACH = 0.8  # further from its base than this a Panda's hand comes down with its elbow at its stop [m]
+_CLEAR = 0.04  # how much room a box needs beside it, for half a wall and for how far from its place it is lowered [m]
 
 
 class PickPlaceExpert(CarryExpert):
@@ -55,7 +56,7 @@ class PickPlaceExpert(CarryExpert):
         at, turned = self.pose(observation, name)
         half = self._half_extents(name)
         grip = max(0.0, half[2] - 0.02)
-        place = self._place(env, nearest, half[2], grip, self._careful)
+        place = self._place(env, nearest, half, grip, self._careful)
         if self._careful:  # let go over the walls: stretched out, the arm may stand nearer to one than it should
             place[2] += 0.04
         closing = self._closing(half, at, turned, env.bin1_pos, env.bin_size, self._careful and name == "Can")
@@ -93,7 +94,7 @@ class PickPlaceExpert(CarryExpert):
         return max(axes, key=room)
 
     @staticmethod
-    def _place(env: Any, compartment: int, half_height: float, grip: float, careful: bool) -> Vector:
+    def _place(env: Any, compartment: int, half: Vector, grip: float, careful: bool) -> Vector:
         """(3,) where to let go: nearer to the arm, because it is stretched out at the far side of the bins."""
         place = np.array(env.target_bin_placements[compartment], np.float64)
         away = place[:2] - env.robots[0].base_pos[:2]
@@ -103,9 +104,13 @@ class PickPlaceExpert(CarryExpert):
             place[:2] += 0.08 * inwards / np.linalg.norm(inwards)
             place[2] += 0.02
         else:
-            place[:2] -= (0.07 if careful else 0.04) * away / np.linalg.norm(away)
+            nearer = (0.07 if careful else 0.04) * away / np.linalg.norm(away)
+            if careful and np.linalg.norm(away) <= _REACH:  # a tall box would stand on a wall
+                room = np.maximum(np.asarray(env.bin_size[:2]) / 4 - _CLEAR - np.linalg.norm(half[:2]), 0.0)
+                nearer = np.clip(nearer, -room, room)
+            place[:2] -= nearer
         # Lower, and the palm would stand on a wall.
-        place[2] += max(half_height + 0.015, _WALL - grip)
+        place[2] += max(half[2] + 0.015, _WALL - grip)
         return place
 
     def _half_extents(self, name: str) -> Vector:
