@@ -53,7 +53,7 @@ class Informed:
     def _informed(self, episode: Episode) -> Episode:
         values = self._values(episode)
         steps = np.diff(values, axis=0, prepend=values[:1]) / self._change
-        inputs = self._derived(values, steps, self._spread)
+        inputs = self._derived(values, steps, self._spread, self._change / self.spec.dt)
         if not inputs.shape[1]:
             return episode
         before = np.concatenate([inputs[:1], inputs[:-1]])
