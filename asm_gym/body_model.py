@@ -2,49 +2,57 @@ r"""What an arm's links weigh on its joints, by the body model that came with it
 
     τ = g(q) + [M(q) q̈ + c(q, q̇)]      each joint's torque by recursive Newton-Euler, links from the base outwards
 
-    ω_i = Rᵢᵀ ω_p + q̇ z,   ω̇_i = Rᵢᵀ ω̇_p + q̈ z + Rᵢᵀ ω_p × q̇ z       where joint i turns about z
-    a_i = Rᵢᵀ (a_p + ω̇_p × p + ω_p × (ω_p × p)),   a_base = -gravity
-    f_i = m (a_i + ω̇_i × c + ω_i × (ω_i × c)),   n_i = I ω̇_i + ω_i × I ω_i + c × f_i
+    ω_i = ω_p + q̇ z,   ω̇_i = ω̇_p + q̈ z + ω_p × q̇ z              where joint i of parent p turns about z
+    a_i = a_p + ω̇_p × r + ω_p × (ω_p × r),   a_base = -gravity     r: from joint p to joint i
+    f_i = m (a_i + ω̇_i × c + ω_i × (ω_i × c)) + Σ f_child          c: from the joint to the centre of mass
+    n_i = I ω̇_i + ω_i × I ω_i + c × m (…) + Σ (n_child + r × f_child),   τ_i = z · n_i
 
-Frames are those of the links, p is where a joint stands in its parent's, c the centre of mass. What does not move against
-a link is a part of it; joints that no column tells stand at 0.
+All in the frame of the base. What does not move against a link is a part of it; so is what moves by a joint that nobody
+senses, which stands at 0.
 
 Source: Luh, Walker and Paul 1980 (Journal of Dynamic Systems, Measurement, and Control 102).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, Self
+from collections.abc import Container, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, Self
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.compilation import compiled
+
 Floats = NDArray[np.float64]
 
 GRAVITY = 9.81
 """Downwards along the base's z [m/s²]."""
 
+LARGEST, MOST_JOINTS = 10_000_000, 200
+"""Characters of a file, and joints: no arm has more."""
+
 TURNS, SLIDES = ("revolute", "continuous"), ("prismatic",)
 
 
 class BodyModel(NamedTuple):
-    """Links that move, from the base outwards, of which the last J are what it was asked about.
+    """The links of an arm that move, from the base outwards.
 
     Attributes:
-        names: (L,) of the joint that moves each.
-        parents: (L,) which link each stands on; -1 is the base.
-        turns, places: (L, 3, 3) and (L, 3) where a joint stands in its parent's frame [m].
-        axes: (L, 3) of the joints, in their own frames.
-        slides: (L,) whether a joint slides and does not turn.
-        mass, centre, inertia: (L,) [kg], (L, 3) [m], (L, 3, 3) about the centre [kg m²].
-        asked: (J,) which links stand in the columns of what it is told.
+        names: (J,) of the joint that moves each.
+        parents: (J,) which link each stands on; -1 is the base.
+        turns, places: (J, 3, 3) and (J, 3) where a joint stands in its parent's frame [m].
+        axes: (J, 3) of the joints, in their own frames.
+        slides: (J,) whether a joint slides and does not turn.
+        mass, centre, inertia: (J,) [kg], (J, 3) [m], (J, 3, 3) about the centre [kg m²].
+        columns: (J,) which column of what it is told is of each link.
     """
 
     names: tuple[str, ...]
-    parents: tuple[int, ...]
+    parents: NDArray[np.intp]
     turns: Floats
     places: Floats
     axes: Floats
@@ -52,101 +60,168 @@ class BodyModel(NamedTuple):
     mass: Floats
     centre: Floats
     inertia: Floats
-    asked: NDArray[np.intp]
+    columns: NDArray[np.intp]
 
     @classmethod
-    def of(cls, urdf: str, columns: Sequence[str]) -> Self:
-        """By a URDF's text, for a column a joint: by joints' names, or else the first of the longest chain of joints.
+    def of(cls, urdf: str, labels: Sequence[str]) -> Self:
+        """By a URDF's text, of the joints that labels name, or else the first of the longest chain of joints.
 
         Raises:
-            ValueError: it is no URDF, its joints are no tree, or it has fewer joints than there are columns.
+            ValueError: it is no URDF, its joints are no tree, or it has fewer joints than there are labels.
         """
         root = _root(urdf)
-        joints = {_text(j, "name"): j for j in root.findall("joint")}
-        below: dict[str, list[str]] = {}
-        for name, joint in joints.items():
-            below.setdefault(_end(joint, "parent"), []).append(name)
-        ends = {_end(joint, "child") for joint in joints.values()}
-        links = {_text(link, "name"): link for link in root.findall("link")}
-        bases = [name for name in links if name not in ends]
-        if len(bases) != 1 or len(ends) != len(joints) or not ends <= set(links):
-            raise ValueError(f"the joints of the body are no tree with one base: bases are {', '.join(bases) or 'none'}")
-        found = _Links([], [], [], [], [], [], [], [], [])
-        _gather(found, bases[0], -1, np.eye(3), np.zeros(3), links, joints, below)
-        asked = _by_name(found.names, columns) or _longest(found.parents)[: len(columns)]
-        if len(asked) < len(columns):
-            raise ValueError(f"{len(columns)} joints are sensed, and the body's longest chain has {len(asked)} that move")
+        every = _moving(root, None)
+        names = [link.name for link in every]
+        asked = _by_name(names, labels) or _longest([link.parent for link in every])[: len(labels)]
+        if len(asked) < len(labels):
+            raise ValueError(
+                f"{len(labels)} joints are sensed, and the body's longest chain has {len(asked)} that move"
+            )
+        told = [names[i] for i in asked]
+        links = _moving(root, told)
         return cls(
-            *(tuple(found.names), tuple(found.parents), np.array(found.turns), np.array(found.places), np.array(found.axes)),
-            *(np.array(found.slides), np.array(found.mass), np.array(found.centre), np.array(found.inertia)),
-            np.array(asked, np.intp),
+            tuple(link.name for link in links),
+            np.array([link.parent for link in links], np.intp),
+            *(np.array([getattr(link, n) for link in links]) for n in ("turn", "place", "axis", "slides")),
+            *(np.array([getattr(link, n) for link in links]) for n in ("mass", "centre", "inertia")),
+            np.array([told.index(link.name) for link in links], np.intp),
         )
 
     def torques(self, q: Floats, speed: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
-        """By gravity and by motion, (N, J) each, for what J joints do (N, J)."""
-        still = np.zeros_like(q)
-        weight = self._torques(q, still, still, GRAVITY)
-        return weight, self._torques(q, speed, acceleration, 0.0)
+        """By weight and by motion, (N, J) each, for what the J joints do (N, J)."""
+        told = [np.ascontiguousarray(part[:, self.columns], np.float64) for part in (q, speed, acceleration)]
+        still = np.zeros_like(told[0])
+        found = np.zeros((2, *q.shape))
+        found[0][:, self.columns] = newton_euler(told[0], still, still, GRAVITY, *self[1:9])
+        found[1][:, self.columns] = newton_euler(*told, 0.0, *self[1:9])
+        return found[0], found[1]
 
-    def _torques(self, q: Floats, speed: Floats, acceleration: Floats, gravity: float) -> Floats:
-        N, L = len(q), len(self.names)
-        told = np.zeros((3, N, L))
-        told[:, :, self.asked] = q, speed, acceleration
-        turns = []  # (N, 3, 3) from each link's frame to its parent's
-        places, spin, spun, moved = [], [], [], []  # (N, 3) ω, ω̇ and a of each, in its own frame
-        forces, moments = [], []
-        for i, parent in enumerate(self.parents):
-            x, v, a = told[..., i, None]
-            axis, slides = self.axes[i], self.slides[i]
-            turn = self.turns[i] @ (np.broadcast_to(np.eye(3), (N, 3, 3)) if slides else _about(axis, x[:, 0]))
-            place = self.places[i] + (x * (self.turns[i] @ axis) if slides else np.zeros((N, 3)))
-            w0, dw0 = (spin[parent], spun[parent]) if parent >= 0 else (np.zeros((N, 3)), np.zeros((N, 3)))
-            a0 = moved[parent] if parent >= 0 else np.tile([0.0, 0.0, gravity], (N, 1))
-            w, dw = _back(turn, w0), _back(turn, dw0)
-            linear = _back(turn, a0 + np.cross(dw0, place) + np.cross(w0, np.cross(w0, place)))
-            if slides:
-                linear = linear + a * axis + 2 * np.cross(w, v * axis)
+
+@compiled
+def newton_euler(
+    q: Any,
+    speed: Any,
+    acceleration: Any,
+    gravity: float,
+    parents: Any,
+    turns: Any,
+    places: Any,
+    axes: Any,
+    slides: Any,
+    mass: Any,
+    centre: Any,
+    inertia: Any,
+) -> Any:
+    """(N, J) torques and forces of the joints; see the top of this file."""
+    N, J = q.shape
+    found, R = np.zeros((N, J)), np.zeros((J, 3, 3))
+    at, z, spin, spun, moved, force, moment = [np.zeros((J, 3)) for _ in range(7)]
+    for n in range(N):
+        for i in range(J):
+            p = parents[i]
+            base = p < 0
+            stand = turns[i] if base else _product(R[p], turns[i])
+            r = places[i] if base else _times(R[p], places[i])
+            z[i] = _times(stand, axes[i])
+            x, v, a = q[n, i], speed[n, i], acceleration[n, i]
+            if slides[i]:
+                R[i], r = stand, r + x * z[i]
             else:
-                dw = dw + a * axis + np.cross(w, v * axis)
-                w = w + v * axis
-            centre, inertia = self.centre[i], self.inertia[i]
-            force = self.mass[i] * (linear + np.cross(dw, centre) + np.cross(w, np.cross(w, centre)))
-            moment = dw @ inertia + np.cross(w, w @ inertia) + np.cross(centre, force)
-            for kept, new in zip(
-                (turns, places, spin, spun, moved, forces, moments),
-                (turn, place, w, dw, linear, force, moment),
-                strict=True,
-            ):
-                kept.append(new)
-        found = np.zeros((N, L))
-        for i in range(L - 1, -1, -1):
-            found[:, i] = (forces[i] if self.slides[i] else moments[i]) @ self.axes[i]
-            parent = self.parents[i]
-            if parent >= 0:
-                force = (turns[i] @ forces[i][..., None])[..., 0]
-                moments[parent] = (
-                    moments[parent] + (turns[i] @ moments[i][..., None])[..., 0] + np.cross(places[i], force)
-                )
-                forces[parent] = forces[parent] + force
-        return found[:, self.asked]
+                R[i] = _product(stand, _turn(axes[i], x))
+            if base:
+                at[i], moved[i], spin[i], spun[i] = r, np.array([0.0, 0.0, gravity]), 0.0, 0.0
+            else:
+                at[i] = at[p] + r
+                moved[i] = moved[p] + _cross(spun[p], r) + _cross(spin[p], _cross(spin[p], r))
+                spin[i], spun[i] = spin[p], spun[p]
+            if slides[i]:
+                moved[i] += a * z[i] + 2.0 * v * _cross(spin[i], z[i])
+            else:
+                spun[i] += a * z[i] + v * _cross(spin[i], z[i])
+                spin[i] += v * z[i]
+            c = _times(R[i], centre[i])
+            force[i] = mass[i] * (moved[i] + _cross(spun[i], c) + _cross(spin[i], _cross(spin[i], c)))
+            turned = _product(_product(R[i], inertia[i]), R[i].T)
+            moment[i] = _times(turned, spun[i]) + _cross(spin[i], _times(turned, spin[i])) + _cross(c, force[i])
+        for i in range(J - 1, -1, -1):
+            found[n, i] = (z[i] * (force[i] if slides[i] else moment[i])).sum()
+            p = parents[i]
+            if p >= 0:
+                force[p] += force[i]
+                moment[p] += moment[i] + _cross(at[i] - at[p], force[i])
+    return found
 
 
-class _Links(NamedTuple):
-    """The same as of a BodyModel, while it is made."""
+@compiled
+def _cross(a: Any, b: Any) -> Any:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
-    names: list[str]
-    parents: list[int]
-    turns: list[Floats]
-    places: list[Floats]
-    axes: list[Floats]
-    slides: list[bool]
-    mass: list[float]
-    centre: list[Floats]
-    inertia: list[Floats]
+
+@compiled
+def _times(matrix: Any, v: Any) -> Any:
+    found = np.zeros(3)
+    for i in range(3):
+        found[i] = matrix[i, 0] * v[0] + matrix[i, 1] * v[1] + matrix[i, 2] * v[2]
+    return found
+
+
+@compiled
+def _product(a: Any, b: Any) -> Any:
+    found = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            found[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+    return found
+
+
+@compiled
+def _turn(axis: Any, angle: float) -> Any:
+    """(3, 3) about an axis."""
+    s, c = np.sin(angle), np.cos(angle)
+    found = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            found[i, j] = (1.0 - c) * axis[i] * axis[j] + (c if i == j else 0.0)
+    found[0, 1] -= s * axis[2]
+    found[1, 0] += s * axis[2]
+    found[0, 2] += s * axis[1]
+    found[2, 0] -= s * axis[1]
+    found[1, 2] -= s * axis[0]
+    found[2, 1] += s * axis[0]
+    return found
+
+
+def read_urdf(model: str | Path) -> str:
+    """The text of a body model, or of the file at a path, pared to its joints and to what the links weigh.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no URDF.
+    """
+    if isinstance(model, Path) or not model.lstrip().startswith("<"):
+        with Path(model).open(encoding="utf-8", errors="replace") as file:
+            model = file.read(LARGEST)
+    root = _root(model)
+    pared = Element("robot", name=root.get("name", ""))
+    for joint in root.findall("joint"):
+        _copied(joint, pared, ("origin", "parent", "child", "axis", "mimic"), ("name", "type"))
+    for link in root.findall("link"):
+        made = _copied(link, pared, (), ("name",))
+        for inertial in link.findall("inertial"):
+            _copied(inertial, made, ("origin", "mass", "inertia"), ())
+    return ElementTree.tostring(pared, encoding="unicode")
+
+
+def _copied(element: Element, under: Element, parts: Sequence[str], attributes: Sequence[str]) -> Element:
+    """The same element under another, with those attributes and parts alone."""
+    made = ElementTree.SubElement(under, element.tag, {n: v for n in attributes if (v := element.get(n)) is not None})
+    for part in (p for p in element if p.tag in parts):
+        ElementTree.SubElement(made, part.tag, dict(part.attrib))
+    return made
 
 
 def _by_name(names: Sequence[str], columns: Sequence[str]) -> list[int]:
-    """Which joint each column names, the longest name that is a part of it; none where not each names one of its own."""
+    """Which joint each column names, by the longest name in it; none unless each names one of its own."""
     named = [max((n for n in names if n in column), key=len, default="") for column in columns]
     return [names.index(n) for n in named] if all(named) and len(set(named)) == len(named) else []
 
@@ -159,82 +234,84 @@ def _longest(parents: Sequence[int]) -> list[int]:
     return max(chains, key=len, default=[])
 
 
-def _gather(
-    found: _Links,
-    link: str,
-    at: int,
-    turn: Floats,
-    place: Floats,
-    links: dict[str, Element],
-    joints: dict[str, Element],
-    below: dict[str, list[str]],
-) -> None:
-    """Adds a link, that stands so in the frame of the moving link ``at``, and all that stands on it."""
-    if at >= 0:
-        _weigh(found, at, links[link], turn, place)
-    for name in below.get(link, ()):
-        joint = joints[name]
-        offset, own = _origin(joint)
-        there, turned = place + turn @ offset, turn @ own
-        kind = joint.get("type")
-        if kind in (*TURNS, *SLIDES) and joint.find("mimic") is None:
+@dataclass
+class _Link:
+    """One that moves, and all that it carries."""
+
+    name: str
+    parent: int
+    turn: Floats
+    place: Floats
+    axis: Floats
+    slides: bool
+    mass: float = 0.0
+    centre: Floats = field(default_factory=lambda: np.zeros(3))
+    inertia: Floats = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def carry(self, link: Element, turn: Floats, place: Floats) -> None:
+        """Adds what a link weighs that stands so in its frame."""
+        inertial = link.find("inertial")
+        if inertial is None:
+            return
+        offset, own = _origin(inertial)
+        mass = float(_numbers(inertial.find("mass"), "value", (0.0,))[0])
+        xx, xy, xz, yy, yz, zz = (
+            float(_numbers(inertial.find("inertia"), f"i{ij}", (0.0,))[0])
+            for ij in ("xx", "xy", "xz", "yy", "yz", "zz")
+        )
+        turned, centre, together = turn @ own, place + turn @ offset, self.mass + mass
+        if not together > 0:
+            return
+        middle = (self.mass * self.centre + mass * centre) / together
+        own_inertia = turned @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turned.T
+        self.inertia = (
+            self.inertia + own_inertia + _point(self.mass, self.centre - middle) + _point(mass, centre - middle)
+        )
+        self.mass, self.centre = together, middle
+
+
+def _moving(root: Element, told: Container[str] | None) -> list[_Link]:
+    """The links that move by those joints, or by any, each after the one that it stands on."""
+    links = {_text(link, "name"): link for link in root.findall("link")}
+    below: dict[str, list[Element]] = {}
+    joints = root.findall("joint")
+    for joint in joints:
+        below.setdefault(_end(joint, "parent"), []).append(joint)
+    ends = {_end(joint, "child") for joint in joints}
+    bases = [name for name in links if name not in ends]
+    if len(bases) != 1 or len(ends) != len(joints) or not ends <= set(links) or len(joints) > MOST_JOINTS:
+        raise ValueError(
+            f"the joints of the body are no tree of at most {MOST_JOINTS} with one base: {len(joints)} joints, "
+            f"{len(links)} links, of which no joint moves {', '.join(bases[:5]) or 'none'}"
+        )
+    found = list[_Link]()
+    waiting = [(bases[0], -1, np.eye(3), np.zeros(3))]  # a link, on which moving one it stands, and how
+    while waiting:
+        name, on, turn, place = waiting.pop(0)
+        if on >= 0:
+            found[on].carry(links[name], turn, place)
+        for joint in below.get(name, ()):
+            offset, own = _origin(joint)
+            there, turned, moved = place + turn @ offset, turn @ own, _end(joint, "child")
+            if not _moves(joint) or (told is not None and joint.get("name") not in told):
+                waiting.append((moved, on, turned, there))
+                continue
             axis = _numbers(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
-            length = np.linalg.norm(axis)
-            if not length > 0:
-                raise ValueError(f"the axis of joint {name} has no direction")
-            found.names.append(name)
-            found.parents.append(at)
-            for kept, new in ((found.turns, turned), (found.places, there), (found.axes, axis / length)):
-                kept.append(new)
-            found.slides.append(kind in SLIDES)
-            found.mass.append(0.0)
-            found.centre.append(np.zeros(3))
-            found.inertia.append(np.zeros((3, 3)))
-            _gather(found, _end(joint, "child"), len(found.names) - 1, np.eye(3), np.zeros(3), links, joints, below)
-        else:
-            _gather(found, _end(joint, "child"), at, turned, there, links, joints, below)
+            if not (length := np.linalg.norm(axis)) > 0:
+                raise ValueError(f"the axis of joint {joint.get('name')} has no direction")
+            found.append(_Link(_text(joint, "name"), on, turned, there, axis / length, joint.get("type") in SLIDES))
+            waiting.append((moved, len(found) - 1, np.eye(3), np.zeros(3)))
+    return found
 
 
-def _weigh(found: _Links, at: int, link: Element, turn: Floats, place: Floats) -> None:
-    """Adds what a link weighs to the moving one that it is a part of."""
-    inertial = link.find("inertial")
-    if inertial is None:
-        return
-    offset, own = _origin(inertial)
-    mass = float(_numbers(inertial.find("mass"), "value", (0.0,))[0])
-    tag = inertial.find("inertia")
-    xx, xy, xz, yy, yz, zz = (float(_numbers(tag, f"i{ij}", (0.0,))[0]) for ij in ("xx", "xy", "xz", "yy", "yz", "zz"))
-    turned = turn @ own
-    inertia = turned @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turned.T
-    centre = place + turn @ offset
-    before, together = found.mass[at], found.mass[at] + mass
-    if not together > 0:
-        return
-    middle = (before * found.centre[at] + mass * centre) / together
-    found.inertia[at] = (
-        found.inertia[at] + inertia + _point(before, found.centre[at] - middle) + _point(mass, centre - middle)
-    )
-    found.mass[at], found.centre[at] = together, middle
+def _moves(joint: Element) -> bool:
+    """Whether it does so by itself."""
+    return joint.get("type") in (*TURNS, *SLIDES) and joint.find("mimic") is None
 
 
 def _point(mass: float, r: Floats) -> Floats:
     """(3, 3) inertia of a point at r [m]."""
     found: Floats = mass * (r @ r * np.eye(3) - np.outer(r, r))
-    return found
-
-
-def _about(axis: Floats, angle: Floats) -> Floats:
-    """(N, 3, 3) turns about an axis (3,) by angles (N,)."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    found: Floats = np.eye(3) + s * cross + (1 - c) * (cross @ cross)
-    return found
-
-
-def _back(turn: Floats, v: Floats) -> Floats:
-    """Rᵀ v of each row (N, 3)."""
-    found: Floats = (v[:, None, :] @ turn)[:, 0, :]
     return found
 
 
@@ -268,8 +345,8 @@ def _origin(element: Element) -> tuple[Floats, Floats]:
     """Offset (3,) and turn (3, 3) from roll, pitch and yaw."""
     origin = element.find("origin")
     offset, (roll, pitch, yaw) = (_numbers(origin, name, (0.0, 0.0, 0.0)) for name in ("xyz", "rpy"))
-    x, y, z = (_about(np.eye(3)[k], np.array([angle]))[0] for k, angle in enumerate((roll, pitch, yaw)))
-    return offset, z @ y @ x
+    about_x, about_y, about_z = (_turn(axis, angle) for axis, angle in zip(np.eye(3), (roll, pitch, yaw), strict=True))
+    return offset, about_z @ about_y @ about_x
 
 
 def _numbers(element: Element | None, name: str, default: tuple[float, ...]) -> Floats:

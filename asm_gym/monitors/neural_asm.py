@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from asm_gym.body_model import read_urdf
 from asm_gym.checkpoint import Checkpoint, read_checkpoint
 from asm_gym.detection import Detector, EvidenceDetection
 from asm_gym.detection.detector import BOUND, GAINS
@@ -25,6 +26,7 @@ from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
 from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.base import Progress, Surprise, Told
+from asm_gym.monitors.baselines.arm_inputs import Derived
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.fused import CompiledRow
 from asm_gym.monitors.hub import fetched
@@ -77,6 +79,7 @@ class NeuralASM(CalibratedMonitor):
             for a memory that is to watch any policy, of which some strike things.
         values: torques, and other values that the rest of a row tells, are judged beside changes (``monitors.values``):
             for a push that is held, in logs of real arms.
+        urdf: text of the arm's body model, or its path: torques are then told by weight and inertia (``body_model``).
         seed: of the initial weights and of the order of the episodes.
         feedback: how errors come back to the hidden units of association, one of ``memory.feedback.FEEDBACK``.
         dynamics: how the temporal network carries on what was: ``"traces"`` of what was sensed and done, or
@@ -126,8 +129,14 @@ class NeuralASM(CalibratedMonitor):
         dynamics: str = TRACES,
         excuses: bool = False,
         values: bool = False,
+        urdf: str | Path = "",
     ) -> None:
         self.values = check_flag("values", values)
+        self.urdf = read_urdf(urdf) if urdf else ""
+        if self.urdf:
+            if not values:
+                raise ValueError("a body model tells torques, which values=True judges")
+            Derived.of(spec, friction=True, body=False, urdf=self.urdf)  # refuses one that does not fit
         self._excuses = Excuses(spec) if check_flag("excuses", excuses) else None
         self.excuses = excuses
         check_choice("dynamics", dynamics, DYNAMICS)
@@ -211,7 +220,7 @@ class NeuralASM(CalibratedMonitor):
         schedule = {name: getattr(self, name) for name in Schedule._fields}
         sizes = {"hidden_size": self.hidden_size, "association_size": self.association_size}
         detections = {n: getattr(d, n) for d in self.detections.values() for n in parameter_names(type(d))}
-        how = {n: getattr(self, n) for n in ("seed", "feedback", "dynamics", "excuses", "values")}
+        how = {n: getattr(self, n) for n in ("seed", "feedback", "dynamics", "excuses", "values", "urdf")}
         return schedule | sizes | detections | how
 
     @classmethod
@@ -293,7 +302,7 @@ class NeuralASM(CalibratedMonitor):
         own, values = apart(own, VALUES)
         super().restore(own)
         self.skill_ = SkillSurprise.found(self.spec, skill, self.seed) if skill else None
-        self.values_ = Values.found(self.spec, values, self.seed)
+        self.values_ = Values.found(self.spec, values, self.seed, self.urdf)
         if self.alarm_on != "body" and self.skill_ is None:
             raise ValueError(f"the checkpoint alarms on {shown(self.alarm_on)} surprise, and holds no skills")
         check_choice("alarm_on", self.alarm_on, ALARMS_ON)
@@ -302,7 +311,7 @@ class NeuralASM(CalibratedMonitor):
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
         self.skill_ = None  # it was weighed against the memory as it was
         super()._learn(episodes, progress, warm_start)
-        self.values_ = Values.learned(episodes, self.seed) if self.values else Values()
+        self.values_ = Values.learned(episodes, self.seed, self.urdf) if self.values else Values()
 
     def _set_threshold(self, scores: Sequence[Surprise], asked: Asked, each: Sequence[str]) -> None:
         super()._set_threshold(scores, asked, each)

@@ -19,11 +19,13 @@ Sources: Hoerl and Kennard 1970; for h, the leverage: Hoaglin and Welsch 1978 (T
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.body_model import read_urdf
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
@@ -69,22 +71,22 @@ class ValueAssociation(StreamModel):
         friction: whether smooth signs of the speeds are among the inputs.
         body: whether sines of the angles are; angles are taken to stand in the order of the chain.
         changes: whether changes are judged too.
-        urdf: text of a body model; torques by weight and inertia are then inputs, in place of sines.
+        urdf: text of a body model, or its path: torques by weight and inertia are inputs then, in place of sines.
     """
 
     kind = "association_values"
 
     @typed
     def __init__(
-        self, spec: StreamSpec, friction: bool = True, body: bool = True, changes: bool = True, urdf: str = ""
+        self, spec: StreamSpec, friction: bool = True, body: bool = True, changes: bool = True, urdf: str | Path = ""
     ) -> None:
         super().__init__(spec)
         self.friction, self.body = check_flag("friction", friction), check_flag("body", body)
         self.changes = check_flag("changes", changes)
         self.lag = rows_apart(spec.dt)
         self.shortest = 1 + self.lag
-        self.urdf = urdf
-        self._derived = Derived.of(spec, friction, body, urdf)
+        self.urdf = read_urdf(urdf) if urdf else ""
+        self._derived = Derived.of(spec, friction, body, self.urdf)
 
     @property
     def error_columns(self) -> NDArray[np.intp]:
@@ -157,7 +159,9 @@ class ValueAssociation(StreamModel):
         steps = np.asarray(read.inputs[:, senses.changes], np.float64)
         before = np.asarray(read.inputs[:, sensory], np.float64)
         physical = values * senses.spread[sensory] + senses.mean[sensory]
-        derived = self._derived(physical, steps, senses.spread[sensory], senses.change[sensory] / (self.lag * self.spec.dt))
+        derived = self._derived(
+            physical, steps, senses.spread[sensory], senses.change[sensory] / (self.lag * self.spec.dt)
+        )
         return values, steps, before, derived, np.asarray(read.commands, np.float64)
 
     def _judged(self, told: Floats) -> NDArray[np.intp]:
