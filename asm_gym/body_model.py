@@ -38,29 +38,33 @@ LARGEST, MOST_JOINTS = 10_000_000, 200
 TURNS, SLIDES = ("revolute", "continuous"), ("prismatic",)
 
 
+KEPT = ("parent", "turn", "place", "axis", "slides", "mass", "centre", "inertia")
+"""What is known of a link that moves."""
+
+
 class BodyModel(NamedTuple):
     """The links of an arm that move, from the base outwards.
 
     Attributes:
         names: (J,) of the joint that moves each.
-        parents: (J,) which link each stands on; -1 is the base.
-        turns, places: (J, 3, 3) and (J, 3) where a joint stands in its parent's frame [m].
-        axes: (J, 3) of the joints, in their own frames.
+        columns: (J,) which column of what it is told is of each.
+        parent: (J,) which link each stands on; -1 is the base.
+        turn, place: (J, 3, 3) and (J, 3) where a joint stands in its parent's frame [m].
+        axis: (J, 3) of the joint, in its own frame.
         slides: (J,) whether a joint slides and does not turn.
         mass, centre, inertia: (J,) [kg], (J, 3) [m], (J, 3, 3) about the centre [kg m²].
-        columns: (J,) which column of what it is told is of each link.
     """
 
     names: tuple[str, ...]
-    parents: NDArray[np.intp]
-    turns: Floats
-    places: Floats
-    axes: Floats
+    columns: NDArray[np.intp]
+    parent: NDArray[np.intp]
+    turn: Floats
+    place: Floats
+    axis: Floats
     slides: NDArray[np.bool_]
     mass: Floats
     centre: Floats
     inertia: Floats
-    columns: NDArray[np.intp]
 
     @classmethod
     def of(cls, urdf: str, labels: Sequence[str]) -> Self:
@@ -79,55 +83,39 @@ class BodyModel(NamedTuple):
             )
         told = [names[i] for i in asked]
         links = _moving(root, told)
-        return cls(
-            tuple(link.name for link in links),
-            np.array([link.parent for link in links], np.intp),
-            *(np.array([getattr(link, n) for link in links]) for n in ("turn", "place", "axis", "slides")),
-            *(np.array([getattr(link, n) for link in links]) for n in ("mass", "centre", "inertia")),
-            np.array([told.index(link.name) for link in links], np.intp),
-        )
+        parts = {n: np.array([getattr(link, n) for link in links]) for n in KEPT}
+        columns = np.array([told.index(link.name) for link in links], np.intp)
+        return cls(tuple(link.name for link in links), columns, **parts)
 
     def torques(self, q: Floats, speed: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
         """By weight and by motion, (N, J) each, for what the J joints do (N, J)."""
-        told = [np.ascontiguousarray(part[:, self.columns], np.float64) for part in (q, speed, acceleration)]
-        still = np.zeros_like(told[0])
-        found = np.zeros((2, *q.shape))
-        found[0][:, self.columns] = newton_euler(told[0], still, still, GRAVITY, *self[1:9])
-        found[1][:, self.columns] = newton_euler(*told, 0.0, *self[1:9])
-        return found[0], found[1]
+        x, v, a = (np.ascontiguousarray(part[:, self.columns], np.float64) for part in (q, speed, acceleration))
+        still, links = np.zeros_like(x), self[2:]
+        weight, motion = np.zeros(q.shape), np.zeros(q.shape)
+        weight[:, self.columns] = newton_euler(x, still, still, GRAVITY, links)
+        motion[:, self.columns] = newton_euler(x, v, a, 0.0, links)
+        return weight, motion
 
 
 @compiled
-def newton_euler(
-    q: Any,
-    speed: Any,
-    acceleration: Any,
-    gravity: float,
-    parents: Any,
-    turns: Any,
-    places: Any,
-    axes: Any,
-    slides: Any,
-    mass: Any,
-    centre: Any,
-    inertia: Any,
-) -> Any:
-    """(N, J) torques and forces of the joints; see the top of this file."""
+def newton_euler(q: Any, speed: Any, acceleration: Any, gravity: float, links: Any) -> Any:
+    """(N, J) torques and forces of the joints; see the top of this file. ``links`` are what ``KEPT`` names."""
+    parent, turn, place, axis, slides, mass, centre, inertia = links
     N, J = q.shape
     found, R = np.zeros((N, J)), np.zeros((J, 3, 3))
     at, z, spin, spun, moved, force, moment = [np.zeros((J, 3)) for _ in range(7)]
     for n in range(N):
         for i in range(J):
-            p = parents[i]
+            p = parent[i]
             base = p < 0
-            stand = turns[i] if base else _product(R[p], turns[i])
-            r = places[i] if base else _times(R[p], places[i])
-            z[i] = _times(stand, axes[i])
+            stand = turn[i] if base else _product(R[p], turn[i])
+            r = place[i] if base else _times(R[p], place[i])
+            z[i] = _times(stand, axis[i])
             x, v, a = q[n, i], speed[n, i], acceleration[n, i]
             if slides[i]:
                 R[i], r = stand, r + x * z[i]
             else:
-                R[i] = _product(stand, _turn(axes[i], x))
+                R[i] = _product(stand, _turn(axis[i], x))
             if base:
                 at[i], moved[i], spin[i], spun[i] = r, np.array([0.0, 0.0, gravity]), 0.0, 0.0
             else:
@@ -145,7 +133,7 @@ def newton_euler(
             moment[i] = _times(turned, spun[i]) + _cross(spin[i], _times(turned, spin[i])) + _cross(c, force[i])
         for i in range(J - 1, -1, -1):
             found[n, i] = (z[i] * (force[i] if slides[i] else moment[i])).sum()
-            p = parents[i]
+            p = parent[i]
             if p >= 0:
                 force[p] += force[i]
                 moment[p] += moment[i] + _cross(at[i] - at[p], force[i])
@@ -191,17 +179,19 @@ def _turn(axis: Any, angle: float) -> Any:
     return found
 
 
-def read_urdf(model: str | Path) -> str:
-    """The text of a body model, or of the file at a path, pared to its joints and to what the links weigh.
+def read_urdf(path: str | Path) -> str:
+    """The text of a body model, pared to its joints and to what the links weigh.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: it is no URDF.
     """
-    if isinstance(model, Path) or not model.lstrip().startswith("<"):
-        with Path(model).open(encoding="utf-8", errors="replace") as file:
-            model = file.read(LARGEST)
-    root = _root(model)
+    with Path(path).open(encoding="utf-8", errors="replace") as file:
+        text = file.read(LARGEST)
+    try:
+        root = _root(text)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     pared = Element("robot", name=root.get("name", ""))
     for joint in root.findall("joint"):
         _copied(joint, pared, ("origin", "parent", "child", "axis", "mimic"), ("name", "type"))

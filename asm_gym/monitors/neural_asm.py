@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from asm_gym.body_model import read_urdf
 from asm_gym.checkpoint import Checkpoint, read_checkpoint
 from asm_gym.detection import Detector, EvidenceDetection
 from asm_gym.detection.detector import BOUND, GAINS
@@ -79,7 +78,8 @@ class NeuralASM(CalibratedMonitor):
             for a memory that is to watch any policy, of which some strike things.
         values: torques, and other values that the rest of a row tells, are judged beside changes (``monitors.values``):
             for a push that is held, in logs of real arms.
-        urdf: text of the arm's body model, or its path: torques are then told by weight and inertia (``body_model``).
+        urdf: text of the arm's body model, as ``body_model.read_urdf`` reads it: torques are then expected from what
+            its links weigh, and from their inertia.
         seed: of the initial weights and of the order of the episodes.
         feedback: how errors come back to the hidden units of association, one of ``memory.feedback.FEEDBACK``.
         dynamics: how the temporal network carries on what was: ``"traces"`` of what was sensed and done, or
@@ -129,14 +129,13 @@ class NeuralASM(CalibratedMonitor):
         dynamics: str = TRACES,
         excuses: bool = False,
         values: bool = False,
-        urdf: str | Path = "",
+        urdf: str = "",
     ) -> None:
         self.values = check_flag("values", values)
-        self.urdf = read_urdf(urdf) if urdf else ""
-        if self.urdf:
-            if not values:
-                raise ValueError("a body model tells torques, which values=True judges")
-            Derived.of(spec, friction=True, body=False, urdf=self.urdf)  # refuses one that does not fit
+        self.urdf = urdf
+        if urdf and not values:
+            raise ValueError("a body model tells torques, which only values=True judges")
+        Derived.of(spec, friction=True, body=False, urdf=urdf)  # refuses one that does not fit
         self._excuses = Excuses(spec) if check_flag("excuses", excuses) else None
         self.excuses = excuses
         check_choice("dynamics", dynamics, DYNAMICS)

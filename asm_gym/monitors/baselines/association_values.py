@@ -19,13 +19,11 @@ Sources: Hoerl and Kennard 1970; for h, the leverage: Hoaglin and Welsch 1978 (T
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.body_model import read_urdf
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
@@ -71,22 +69,22 @@ class ValueAssociation(StreamModel):
         friction: whether smooth signs of the speeds are among the inputs.
         body: whether sines of the angles are; angles are taken to stand in the order of the chain.
         changes: whether changes are judged too.
-        urdf: text of a body model, or its path: torques by weight and inertia are inputs then, in place of sines.
+        urdf: text of a body model, as ``read_urdf`` reads it: what links weigh, and their inertia, in place of sines.
     """
 
     kind = "association_values"
 
     @typed
     def __init__(
-        self, spec: StreamSpec, friction: bool = True, body: bool = True, changes: bool = True, urdf: str | Path = ""
+        self, spec: StreamSpec, friction: bool = True, body: bool = True, changes: bool = True, urdf: str = ""
     ) -> None:
         super().__init__(spec)
         self.friction, self.body = check_flag("friction", friction), check_flag("body", body)
         self.changes = check_flag("changes", changes)
         self.lag = rows_apart(spec.dt)
         self.shortest = 1 + self.lag
-        self.urdf = read_urdf(urdf) if urdf else ""
-        self._derived = Derived.of(spec, friction, body, self.urdf)
+        self.urdf = urdf
+        self._derived = Derived.of(spec, friction, body, urdf)
 
     @property
     def error_columns(self) -> NDArray[np.intp]:

@@ -28,10 +28,11 @@ class Informed:
     Args:
         spec: of the streams without.
         make: the monitor of a spec.
+        urdf: text of a body model; empty where sines of angles say weight.
     """
 
-    def __init__(self, spec: StreamSpec, make: Callable[[StreamSpec], Any]) -> None:
-        self.spec, self.make, self._derived = spec, make, Derived.of(spec, friction=True, body=True)
+    def __init__(self, spec: StreamSpec, make: Callable[[StreamSpec], Any], urdf: str = "") -> None:
+        self.spec, self.make, self._derived = spec, make, Derived.of(spec, friction=True, body=True, urdf=urdf)
 
     def fit(self, episodes: Sequence[Episode]) -> Self:
         """The spreads of what was sensed, and the monitor."""
