@@ -269,15 +269,17 @@ def _moving(root: Element, told: Container[str] | None) -> list[_Link]:
         below.setdefault(_end(joint, "parent"), []).append(joint)
     ends = {_end(joint, "child") for joint in joints}
     bases = [name for name in links if name not in ends]
+    no_tree = ValueError(
+        f"the joints of the body are no tree of at most {MOST_JOINTS} with one base: {len(joints)} joints, "
+        f"{len(links)} links, of which no joint moves {', '.join(bases[:5]) or 'none'}"
+    )
     if len(bases) != 1 or len(ends) != len(joints) or not ends <= set(links) or len(joints) > MOST_JOINTS:
-        raise ValueError(
-            f"the joints of the body are no tree of at most {MOST_JOINTS} with one base: {len(joints)} joints, "
-            f"{len(links)} links, of which no joint moves {', '.join(bases[:5]) or 'none'}"
-        )
-    found = list[_Link]()
+        raise no_tree
+    found, seen = list[_Link](), 0
     waiting = [(bases[0], -1, np.eye(3), np.zeros(3))]  # a link, on which moving one it stands, and how
     while waiting:
         name, on, turn, place = waiting.pop(0)
+        seen += 1
         if on >= 0:
             found[on].carry(links[name], turn, place)
         for joint in below.get(name, ()):
@@ -291,6 +293,8 @@ def _moving(root: Element, told: Container[str] | None) -> list[_Link]:
                 raise ValueError(f"the axis of joint {joint.get('name')} has no direction")
             found.append(_Link(_text(joint, "name"), on, turned, there, axis / length, joint.get("type") in SLIDES))
             waiting.append((moved, len(found) - 1, np.eye(3), np.zeros(3)))
+    if seen != len(links):
+        raise no_tree
     return found
 
 
