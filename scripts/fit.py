@@ -35,6 +35,7 @@ from asm_gym.data.selection import (
 )
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE, HOUR
+from asm_gym.detection.hourly import least_per_hour
 from asm_gym.episode import Episode
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
@@ -198,7 +199,18 @@ def promised(args: Args, calibration: list[Episode]) -> str:
         return f"at most {args.asked.rate:g} alarms an hour of normal ones, from {hours_of(calibration):.3g} of them"
     hourly = args.false_alarm_rate * len(calibration) / hours_of(calibration)
     at_their_length = f"{hourly:.{0 if hourly >= 10 else 1}f} an hour at their length"
-    return f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones, {at_their_length}"
+    return f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones, {at_their_length}{too_little(calibration)}"
+
+
+def too_little(calibration: list[Episode]) -> str:
+    """How many alarms an hour could be promised at best, where that is more than one, and what one would take."""
+    hours = hours_of(calibration)
+    if hours >= 1.0:
+        return ""
+    return (
+        f"; from {60 * hours:.3g} min nothing under {least_per_hour(hours):.3g} an hour can be promised, "
+        f"and one an hour takes {60 * (1.0 - hours):.0f} min more"
+    )
 
 
 def about_commands(args: Args, episodes: list[Episode]) -> list[str]:

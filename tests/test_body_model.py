@@ -74,7 +74,8 @@ def test_torques_are_those_of_mujoco():
 
 def test_a_pendulum_weighs_what_a_pendulum_weighs():
     urdf = (
-        '<robot name="p"><link name="base"/><link name="bob"><inertial><origin xyz="0.5 0 0" rpy="1.5707963267948966 0 0"/>'
+        '<robot name="p"><link name="base"/><link name="bob"><inertial><origin xyz="0.5 0 0" '
+        'rpy="1.5707963267948966 0 0"/>'
         '<mass value="2"/><inertia ixx="9" ixy="0" ixz="0" iyy="7" iyz="0" izz="0.1"/></inertial></link>'
         '<joint name="j" type="continuous"><parent link="base"/><child link="bob"/><axis xyz="0 -1 0"/></joint></robot>'
     )
