@@ -295,7 +295,8 @@ def test_the_study_runs_on_files_of_the_same_shape_and_names_what_is_missing(tmp
 
 
 PENDULUMS = """<robot name="two"><link name="base"/><link name="upper"><inertial><origin xyz="0.4 0 0"/>
-<mass value="1"/></inertial></link><link name="lower"><inertial><origin xyz="0.4 0 0"/><mass value="1"/></inertial></link>
+<mass value="1"/></inertial></link>
+<link name="lower"><inertial><origin xyz="0.4 0 0"/><mass value="1"/></inertial></link>
 <joint name="a" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/></joint>
 <joint name="b" type="continuous"><parent link="upper"/><child link="lower"/><origin xyz="0.4 0 0"/><axis xyz="0 1 0"/>
 </joint></robot>"""
