@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from asm_gym.body_model import read_urdf
 from asm_gym.data.commands import feedback
 from asm_gym.data.gaps import filled
 from asm_gym.data.live import is_live, lines_from
@@ -34,9 +35,11 @@ from asm_gym.data.selection import (
 )
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE, HOUR
+from asm_gym.detection.hourly import least_per_hour
 from asm_gym.episode import Episode
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
+from asm_gym.monitors.baselines.arm_inputs import Derived
 from asm_gym.monitors.promise import Asked
 from asm_gym.monitors.registry import check_monitor
 from asm_gym.rollouts.parallel import Progress
@@ -45,7 +48,7 @@ from asm_gym.scripts.command import run
 from asm_gym.scripts.live_recording import listen, rtde_source
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.scripts.unlike_pieces import Part, about_pieces, left_out
-from asm_gym.spec import MOTOR
+from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import check_number
 
 SILENCE_S = 2.0
@@ -88,6 +91,8 @@ class Args:
     """The files of a folder are parts of one recording: join them by their clocks."""
     bridge: float = option(0.0, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
     """Gaps up to so long are filled, on the line between their ends, such as 0.05; a log is cut at others."""
+    urdf: Path | None = option(None, metavar="FILE")
+    """Body model of the arm: what its links weigh then tells torques, and pushes are found by less."""
     split: float | None = option(None, check=partial(check_number, "split", above=0), metavar="SECONDS")
     """Length of the pieces that long logs are cut into; each then counts as an episode."""
     minutes: float = option(10.0, check=partial(check_number, "minutes", above=0))
@@ -129,6 +134,10 @@ def learned(
         settings["epochs"] = args.epochs
     if fitting[0].spec.source == "table" and "values" in monitor_class(args.monitor).hyperparameters:
         settings["values"] = True  # an arm's log holds pushes that last, and torques
+    if args.urdf is not None:
+        if "urdf" not in monitor_class(args.monitor).hyperparameters:
+            raise ValueError(f"{args.monitor} takes no body model: leave --urdf out")
+        settings["urdf"] = read_urdf(args.urdf)
     monitor: Any = make_monitor(args.monitor, fitting[0].spec, **settings)
     monitor.fit(fitting, progress)
     try:
@@ -190,7 +199,18 @@ def promised(args: Args, calibration: list[Episode]) -> str:
         return f"at most {args.asked.rate:g} alarms an hour of normal ones, from {hours_of(calibration):.3g} of them"
     hourly = args.false_alarm_rate * len(calibration) / hours_of(calibration)
     at_their_length = f"{hourly:.{0 if hourly >= 10 else 1}f} an hour at their length"
-    return f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones, {at_their_length}"
+    return f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones, {at_their_length}{too_little(calibration)}"
+
+
+def too_little(calibration: list[Episode]) -> str:
+    """How many alarms an hour could be promised at best, where that is more than one, and what one would take."""
+    hours = hours_of(calibration)
+    if hours >= 1.0:
+        return ""
+    return (
+        f"; from {60 * hours:.3g} min nothing under {least_per_hour(hours):.3g} an hour can be promised, "
+        f"and one an hour takes {60 * (1.0 - hours):.0f} min more"
+    )
 
 
 def about_commands(args: Args, episodes: list[Episode]) -> list[str]:
@@ -210,6 +230,16 @@ def about_commands(args: Args, episodes: list[Episode]) -> list[str]:
         "leave it out by --channels, or take what the controller was asked for"
         for label, share in feedback(episodes).items()
     ]
+
+
+def about_body(args: Args, spec: StreamSpec) -> list[str]:
+    """Which joints of the body model the log's angles were taken for, a line; none without one."""
+    if args.urdf is None:
+        return []
+    links = Derived.of(spec, friction=True, body=False, urdf=read_urdf(args.urdf)).links
+    assert links is not None
+    joints = ", ".join(links.names[i] for i in np.argsort(links.columns))
+    return [f"the angles are taken for these joints of {args.urdf}, in this order: {joints}"]
 
 
 def origins(logs: list[str], whole: list[list[Episode]]) -> dict[int, Part]:
@@ -264,7 +294,7 @@ def fit(args: Args, console: Console) -> None:
     rows = sum(map(len, fitting))
     say = partial(console.print, soft_wrap=True, highlight=False)
     odd = about_pieces([origin[id(e)] for e in calibration], monitor.maxima_)
-    for line in [*notes, *about_commands(args, kept.episodes), *odd]:
+    for line in [*notes, *about_commands(args, kept.episodes), *about_body(args, spec), *odd]:
         say(f"Note: {line}.", markup=False)
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
     if gone:

@@ -36,10 +36,6 @@ class Args:
     """Folder of the pictures."""
     rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
     """Rows a second, where the log has no clock."""
-    action: tuple[str, ...] = option((), metavar="COLUMN")
-    """Columns that were commanded and not sensed: names, or patterns such as 'cmd*'."""
-    label: tuple[str, ...] = fixed(())
-    """Columns that say what is wrong, beside those called so."""
     columns: tuple[str, ...] = option((), metavar="NAME")
     """Names of the columns of files without a header."""
     join: bool = False
@@ -54,12 +50,11 @@ class Args:
 def inspect(args: Args, console: Console) -> int:
     """Reads, prints a table a log, and draws a picture of each."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-    layout = LogLayout(None, args.rate, args.action, (), args.label, args.columns, args.join)
+    layout = LogLayout(None, args.rate, columns=args.columns, join=args.join)
     code = DONE
     with noted() as notes:
         shown = [
-            inspected(name, columns, args.rate, args.action, args.label)
-            for name, columns in islice(read_tables(args.log, layout), args.logs)
+            inspected(name, columns, args.rate) for name, columns in islice(read_tables(args.log, layout), args.logs)
         ]
     for found in shown:
         for line in table(found):

@@ -97,6 +97,7 @@ def test_a_memory_is_fitted_from_a_pipe(tmp_path, monkeypatch, capsys):
     said = capsys.readouterr().out
     assert "Learned from 30 episodes: 3000 rows" in said
     assert "from 29 other episodes" in said
+    assert "from 0.483 min nothing under 125 an hour can be promised, and one an hour takes 60 min more" in said
     assert out.exists()
     assert out.with_suffix(".jsonl").exists()
 

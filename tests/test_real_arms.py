@@ -294,6 +294,28 @@ def test_the_study_runs_on_files_of_the_same_shape_and_names_what_is_missing(tmp
     assert "is missing: it is unisa-acg/inverse-dynamics-solver" in capsys.readouterr().err
 
 
+PENDULUMS = """<robot name="two"><link name="base"/><link name="upper"><inertial><origin xyz="0.4 0 0"/>
+<mass value="1"/></inertial></link>
+<link name="lower"><inertial><origin xyz="0.4 0 0"/><mass value="1"/></inertial></link>
+<joint name="a" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/></joint>
+<joint name="b" type="continuous"><parent link="upper"/><child link="lower"/><origin xyz="0.4 0 0"/><axis xyz="0 1 0"/>
+</joint></robot>"""
+
+
+def test_the_study_gives_monitors_a_body_model_or_names_the_file_that_is_missing(tmp_path, capsys):
+    folder = tiago(tmp_path / "arms")
+    out = ["--out", str(tmp_path / "out"), "--experiments", "tiago", "tx40", "--monitors", "ridge, body"]
+    command = ["reproduce", "real_arms", str(folder), *out, "association_values, body"]
+    assert main(command) == 2
+    assert "tiago.urdf is missing: it is in example-robot-data" in capsys.readouterr().err
+    (folder / "urdf").mkdir()
+    (folder / "urdf" / "tiago.urdf").write_text(PENDULUMS)
+    assert main(command) == 0
+    text = (tmp_path / "out" / "real_arms.md").read_text()
+    assert "| association_values, body |" in text
+    assert "| ridge, body |" in text
+
+
 def test_every_monitor_meets_the_same_faults(tmp_path):
     folder = tiago(tmp_path / "arms")
     config = Config(folder=folder)

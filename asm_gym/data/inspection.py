@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -141,7 +140,9 @@ class Inspection:
             )
         roles = [c.role for c in self.channels]
         if "command" not in roles:
-            said.append("no command by name: the memory learns without what was asked of the arm, unless --action says")
+            said.append(
+                "no command by name: the memory learns without what was asked of the arm, unless fit --action says"
+            )
         still = [c.name for c in self.channels if c.constant and c.role == "sense"]
         if still:
             said.append(f"{len(still)} channels never move: {', '.join(still[:6])}{', …' if len(still) > 6 else ''}")
@@ -158,20 +159,12 @@ def in_time(seconds: float) -> str:
     return f"{seconds:.3g} s"
 
 
-def inspected(
-    name: str,
-    columns: Mapping[str, NDArray[Any]],
-    rate: float | None = None,
-    action: Sequence[str] = (),
-    labels: Sequence[str] = (),
-) -> Inspection:
+def inspected(name: str, columns: Mapping[str, NDArray[Any]], rate: float | None = None) -> Inspection:
     """What a table holds.
 
     Args:
         columns: (T,) or (T, k) each, as read from a file.
         rate: rows a second [Hz], where its clock does not say.
-        action: patterns of what was commanded.
-        labels: patterns of what says that something is wrong.
     """
     flat: dict[str, NDArray[Any]] = {}
     for column, values in columns.items():
@@ -181,10 +174,10 @@ def inspected(
             flat[column] = values
     rows = max(map(len, flat.values()), default=0)
     clock, times = _clock(flat, rows, rate)
-    words = [n for n, v in flat.items() if v.dtype.kind not in "biuf" and not is_clock(n) and not is_label(n, labels)]
+    words = [n for n, v in flat.items() if v.dtype.kind not in "biuf" and not is_clock(n) and not is_label(n)]
     numbers = {n: v for n, v in flat.items() if v.dtype.kind in "biuf"}
-    found = [_channel(n, v, action, labels) for n, v in numbers.items()]
-    found += [_channel(n, np.zeros(0), action, labels) for n, v in flat.items() if n not in numbers and n not in words]
+    found = [_channel(n, v) for n, v in numbers.items()]
+    found += [_channel(n, np.zeros(0)) for n, v in flat.items() if n not in numbers and n not in words]
     return Inspection(name, clock, found, words, times, numbers)
 
 
@@ -211,9 +204,9 @@ def _clock(
     return ClockFound(clock.column, 1 / dt, jitter, gaps, rows, float(kept[-1] - kept[0])), times
 
 
-def _channel(column: str, values: NDArray[Any], action: Sequence[str], labels: Sequence[str]) -> ChannelFound:
+def _channel(column: str, values: NDArray[Any]) -> ChannelFound:
     name, known = bare_name(column), values[np.isfinite(values)]
-    role = _role(column, values, action, labels)
+    role = _role(column, values)
     return ChannelFound(
         name,
         unit_of(column),
@@ -229,13 +222,12 @@ def _channel(column: str, values: NDArray[Any], action: Sequence[str], labels: S
     )
 
 
-def _role(column: str, values: NDArray[Any], action: Sequence[str], labels: Sequence[str]) -> str:
+def _role(column: str, values: NDArray[Any]) -> str:
     name = bare_name(column)
     if is_clock(column):
         return "clock"
-    if is_label(name, labels):
+    if is_label(name):
         return "label"
     if counts_rows(name, values):
         return "counter"
-    asked = any(fnmatchcase(name, pattern) for pattern in action)
-    return "command" if asked or is_command(name) else "sense"
+    return "command" if is_command(name) else "sense"

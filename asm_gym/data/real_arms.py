@@ -14,10 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.body_model import read_urdf
 from asm_gym.data.bags import read_bag
 from asm_gym.data.joining import joined
 from asm_gym.data.text import read_table
 from asm_gym.episode import Episode
+
+BODIES = "urdf"
+BODIES_SOURCE = "it is in example-robot-data 6.0.0 (PyPI)"
 
 Columns = dict[str, NDArray[Any]]
 
@@ -35,6 +39,7 @@ class RealArm:
         rate: that it is read at [Hz]; None for its own.
         unit: of a position, 1 in radians.
         model: whose kinematics it has, its effort being in N m; empty where a push is a step in one joint.
+        urdf: file of its body model, in the folder ``urdf`` of that of all recordings; empty where there is none.
     """
 
     robot: str
@@ -45,6 +50,14 @@ class RealArm:
     rate: float | None = None
     unit: float = 1.0
     model: str = ""
+    urdf: str = ""
+
+    def body(self, folder: Path) -> str:
+        """The text of its body model. Raises FileNotFoundError that says where it is published."""
+        path = folder / BODIES / self.urdf
+        if not self.urdf or not path.is_file():
+            raise FileNotFoundError(f"{path} is missing: {BODIES_SOURCE}")
+        return read_urdf(path)
 
     def episode(self, folder: Path) -> Episode:
         """The recording. Raises FileNotFoundError that says where it is published."""
@@ -102,6 +115,7 @@ ARMS = {
         "BSD-3-Clause",
         _bag,
         model="panda",
+        urdf="panda.urdf",
     ),
     "ur10": RealArm(
         "UR10",
@@ -110,6 +124,7 @@ ARMS = {
         "BSD-3-Clause",
         _bag,
         model="ur10",
+        urdf="ur10_robot.urdf",
     ),
     "panda_gaz2019": RealArm(
         "Franka Panda",
@@ -119,6 +134,7 @@ ARMS = {
         _flattened,
         rate=100.0,
         model="panda",
+        urdf="panda.urdf",
     ),
     "tiago": RealArm(
         "PAL TIAGo",
@@ -126,6 +142,7 @@ ARMS = {
         "thanhndv212/figaroh-examples @ c0b5c7f0",
         "Apache-2.0 by reference",
         _three_files,
+        urdf="tiago.urdf",
     ),
     "tx40": RealArm(
         "Staubli TX40",

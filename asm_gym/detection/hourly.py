@@ -95,7 +95,8 @@ def check_hours(rate: float, hours: float) -> None:
     if math.floor(rate * hours + ROUNDING) < 1:
         raise ValueError(
             f"{rate:g} false alarms an hour need at least {1.0 / rate:.4g} hours of nominal episodes, got {hours:.3g}: "
-            f"record {math.ceil(100 * (1.0 / rate - hours)) / 100:.4g} hours more, or promise {_least(hours):.4g}"
+            f"record {math.ceil(100 * (1.0 / rate - hours)) / 100:.4g} hours more, "
+            f"or promise {least_per_hour(hours):.4g}"
         )
 
 
@@ -116,7 +117,7 @@ def hourly_threshold(blocks: Blocks, rate: float) -> float:
     return float(maxima[max(len(maxima) - 1 - allowed, 0)])
 
 
-def _least(hours: float) -> float:
+def least_per_hour(hours: float) -> float:
     """The least rate that so many hours can promise, rounded up to three digits."""
     unit = 10.0 ** (math.floor(math.log10(1.0 / hours)) - 2)
     return math.ceil(1.0 / hours / unit) * unit

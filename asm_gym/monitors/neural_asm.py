@@ -25,6 +25,7 @@ from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor
 from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.base import Progress, Surprise, Told
+from asm_gym.monitors.baselines.arm_inputs import Derived
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.fused import CompiledRow
 from asm_gym.monitors.hub import fetched
@@ -77,6 +78,8 @@ class NeuralASM(CalibratedMonitor):
             for a memory that is to watch any policy, of which some strike things.
         values: torques, and other values that the rest of a row tells, are judged beside changes (``monitors.values``):
             for a push that is held, in logs of real arms.
+        urdf: text of the arm's body model, as ``body_model.read_urdf`` reads it: torques are then expected from what
+            its links weigh, and from their inertia.
         seed: of the initial weights and of the order of the episodes.
         feedback: how errors come back to the hidden units of association, one of ``memory.feedback.FEEDBACK``.
         dynamics: how the temporal network carries on what was: ``"traces"`` of what was sensed and done, or
@@ -126,8 +129,13 @@ class NeuralASM(CalibratedMonitor):
         dynamics: str = TRACES,
         excuses: bool = False,
         values: bool = False,
+        urdf: str = "",
     ) -> None:
         self.values = check_flag("values", values)
+        self.urdf = urdf
+        if urdf and not values:
+            raise ValueError("a body model tells torques, which only values=True judges")
+        Derived.of(spec, friction=True, body=False, urdf=urdf)  # refuses one that does not fit
         self._excuses = Excuses(spec) if check_flag("excuses", excuses) else None
         self.excuses = excuses
         check_choice("dynamics", dynamics, DYNAMICS)
@@ -211,7 +219,7 @@ class NeuralASM(CalibratedMonitor):
         schedule = {name: getattr(self, name) for name in Schedule._fields}
         sizes = {"hidden_size": self.hidden_size, "association_size": self.association_size}
         detections = {n: getattr(d, n) for d in self.detections.values() for n in parameter_names(type(d))}
-        how = {n: getattr(self, n) for n in ("seed", "feedback", "dynamics", "excuses", "values")}
+        how = {n: getattr(self, n) for n in ("seed", "feedback", "dynamics", "excuses", "values", "urdf")}
         return schedule | sizes | detections | how
 
     @classmethod
@@ -293,7 +301,7 @@ class NeuralASM(CalibratedMonitor):
         own, values = apart(own, VALUES)
         super().restore(own)
         self.skill_ = SkillSurprise.found(self.spec, skill, self.seed) if skill else None
-        self.values_ = Values.found(self.spec, values, self.seed)
+        self.values_ = Values.found(self.spec, values, self.seed, self.urdf)
         if self.alarm_on != "body" and self.skill_ is None:
             raise ValueError(f"the checkpoint alarms on {shown(self.alarm_on)} surprise, and holds no skills")
         check_choice("alarm_on", self.alarm_on, ALARMS_ON)
@@ -302,7 +310,7 @@ class NeuralASM(CalibratedMonitor):
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
         self.skill_ = None  # it was weighed against the memory as it was
         super()._learn(episodes, progress, warm_start)
-        self.values_ = Values.learned(episodes, self.seed) if self.values else Values()
+        self.values_ = Values.learned(episodes, self.seed, self.urdf) if self.values else Values()
 
     def _set_threshold(self, scores: Sequence[Surprise], asked: Asked, each: Sequence[str]) -> None:
         super()._set_threshold(scores, asked, each)

@@ -50,9 +50,9 @@ class Values(NamedTuple):
     usual: float = 1.0
 
     @classmethod
-    def learned(cls, episodes: Sequence[Episode], seed: int) -> Self:
-        """Fitted to nominal episodes."""
-        monitor = _monitor(episodes[0].spec, seed).fit(episodes)
+    def learned(cls, episodes: Sequence[Episode], seed: int, urdf: str = "") -> Self:
+        """Fitted to nominal episodes; ``urdf`` is the text of a body model, or empty."""
+        monitor = _monitor(episodes[0].spec, seed, urdf).fit(episodes)
         if not len(monitor.learned_["judged_values"]):
             return cls()
         senses = _senses(monitor)
@@ -65,12 +65,12 @@ class Values(NamedTuple):
         return cls(monitor, usual * leverage, usual)
 
     @classmethod
-    def found(cls, spec: StreamSpec, arrays: Arrays, seed: int) -> Self:
+    def found(cls, spec: StreamSpec, arrays: Arrays, seed: int, urdf: str = "") -> Self:
         """As arrays by their names without the prefix say. Raises ValueError or KeyError where they do not fit."""
         if not arrays:
             return cls()
         own = {n: a for n, a in arrays.items() if n not in ("leverage", "usual")}
-        monitor = taken_up(_monitor(spec, seed), own)
+        monitor = taken_up(_monitor(spec, seed, urdf), own)
         if "leverage" not in arrays:
             return cls(monitor)
         size, far = _senses(monitor).inputs + 1, arrays["leverage"]
@@ -117,10 +117,10 @@ class Values(NamedTuple):
         return root
 
 
-def _monitor(spec: StreamSpec, seed: int) -> CalibratedMonitor:
+def _monitor(spec: StreamSpec, seed: int, urdf: str) -> CalibratedMonitor:
     """Not yet fitted."""
     detection = EvidenceDetection(spec, shrinkage=1.0, habituates=False)
-    return CalibratedMonitor(ValueAssociation(spec, changes=False), detection, seed=seed)
+    return CalibratedMonitor(ValueAssociation(spec, changes=False, urdf=urdf), detection, seed=seed)
 
 
 def _senses(monitor: CalibratedMonitor) -> StreamScaler:

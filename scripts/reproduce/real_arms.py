@@ -50,6 +50,13 @@ SETTINGS: dict[str, dict[str, Any]] = {
 """The first as ``asm-gym fit`` has it of a log, the other without whitening, as the first has it beside."""
 INFORMED = {"kalman, told": "kalman+evidence", "ridge, told": "association_linear+evidence"}
 """Rivals that are told what arms are made of."""
+WITH_BODY = {
+    "neural_asm, body": "neural_asm",
+    "association_values, body": "association_values+evidence",
+    "kalman, body": "kalman+evidence",
+    "ridge, body": "association_linear+evidence",
+}
+"""With a body model in place of sines of angles."""
 EXPERIMENTS = (*ARMS, "cobot", "executions")
 AROUND_S = 5.0
 """An alarm so long before or after an event of the cobot belongs to it."""
@@ -74,9 +81,9 @@ class Config(kit.Config):
         ),
         quick=("association_values+evidence", RULE),
         least=1,
-        known=(*MONITORS, *INFORMED, RULE),
+        known=(*MONITORS, *INFORMED, *WITH_BODY, RULE),
     )
-    """Names of monitors, friction_rule, and rivals that are told of friction and weight."""
+    """Names of monitors, friction_rule, and rivals that are told of friction and weight; or by a body model."""
     piece: float = fixed(1.0)
     """Length of a piece [s]."""
     folds: int = fixed(4, least=2)
@@ -102,7 +109,9 @@ def run(config: Config) -> Findings:
         Job(name, monitor, seed, fold)
         for name in there
         for monitor in config.monitors
-        if not (monitor == RULE and name == "executions") and not (monitor in INFORMED and name not in ARMS)
+        if not (monitor == RULE and name == "executions")
+        and (monitor not in INFORMED or name in ARMS)
+        and (monitor not in WITH_BODY or (name in ARMS and ARMS[name].urdf))
         for seed in config.repetitions
         for fold in range(config.folds)
     ]
@@ -149,7 +158,8 @@ def on_an_arm(job: Job, arm: RealArm, config: Config) -> list[Record]:
     ranges = (np.quantile(effort, 0.95, axis=0) - np.quantile(effort, 0.05, axis=0)).tolist()
     cut = [replace(p, info={"effort_range": ranges}) for part in unbroken(whole) for p in pieces(part, config.piece)]
     tested, learned, calibration = parted(len(cut), job, config)
-    monitor = fitted(job, [cut[i] for i in learned])
+    urdf = arm.body(config.folder) if job.monitor in WITH_BODY else ""
+    monitor = fitted(job, [cut[i] for i in learned], urdf)
     threshold = greatest(monitor, [cut[i] for i in calibration])
     rng = np.random.default_rng([job.seed, job.fold])  # the same faults for every monitor
     quiet = [cut[i] for i in tested]
@@ -189,19 +199,22 @@ def parted(count: int, job: Job, config: Config) -> tuple[list[int], list[int], 
     return sorted(tested.tolist()), [i for n, i in enumerate(others) if n % 3], others[::3]
 
 
-def fitted(job: Job, episodes: Sequence[Episode]) -> Any:
+def fitted(job: Job, episodes: Sequence[Episode], urdf: str = "") -> Any:
     """The monitor, fitted; its threshold is set here, for so few pieces that none could be promised."""
     spec = episodes[0].spec
+    name = (INFORMED | WITH_BODY).get(job.monitor, job.monitor)
+    told = name != job.monitor and name in INFORMED.values()
     made: Any
     if job.monitor == RULE:
         made = CalibratedMonitor(FrictionRule(spec), Largest(spec), seed=job.seed)
     else:
 
         def make(spec: StreamSpec) -> Any:
-            name = INFORMED.get(job.monitor, job.monitor)
-            return make_monitor(name, spec, seed=job.seed, **SETTINGS.get(job.monitor, {}))
+            settings = SETTINGS.get(name, {})
+            body = {"urdf": urdf} if urdf and not told else {}
+            return make_monitor(name, spec, seed=job.seed, **settings, **body)
 
-        made = Informed(spec, make) if job.monitor in INFORMED else make(spec)
+        made = Informed(spec, make, urdf) if told else make(spec)
     return made.fit(list(episodes))
 
 

@@ -2,6 +2,7 @@
 
     tanh(v/w s)       w ∈ {0.01, 0.1, 1}, of each speed v of spread s
     sin, cos          of angles q, of q_2 + q_3, …, and products of two of them
+    g, M q̈ + c        what the links weigh on each joint, by a body model in place of the sines; see ``body_model``
 
 Motor current is torque plus what the sign of the speed says, and weight is a sum of products of sines of angles along
 the chain: a linear model can say neither without. Source: Stribeck friction smoothed by tanh: Makkar et al. 2005.
@@ -15,6 +16,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.body_model import BodyModel
 from asm_gym.data.coverage import POSITION, SPEED
 from asm_gym.data.units import ratio
 from asm_gym.spec import StreamSpec
@@ -44,6 +46,7 @@ class Derived(NamedTuple):
         radians: (J,) in one of their units.
         pairs: (2, P) of sines and cosines of single angles, that are multiplied.
         sources: (M, X) which senses each is made of.
+        links: what the joints carry, where a body model says it; the sines are not there then.
     """
 
     speeds: NDArray[np.intp]
@@ -52,44 +55,76 @@ class Derived(NamedTuple):
     radians: Floats
     pairs: NDArray[np.intp]
     sources: NDArray[np.bool_]
+    links: BodyModel | None = None
 
     @classmethod
-    def of(cls, spec: StreamSpec, friction: bool, body: bool) -> Self:
-        """What a stream has by the names of its channels."""
+    def of(cls, spec: StreamSpec, friction: bool, body: bool, urdf: str = "") -> Self:
+        """What a stream has by the names of its channels. Raises ValueError where a body model does not fit it."""
         place = {int(column): k for k, column in enumerate(spec.sensory)}
         moving, from_steps = speeds(spec) if friction else (np.zeros(0, np.intp), False)
-        columns = _named(spec, POSITION) if body else np.zeros(0, np.intp)
+        columns = _named(spec, POSITION) if body or urdf else np.zeros(0, np.intp)
         columns = columns if len(columns) <= MOST_ANGLES else columns[:0]
         units = {
             i: c.unit for c, s in zip(spec.channels, spec.slices.values(), strict=True) for i in range(s.start, s.stop)
         }
         radians = np.array([ratio(units[int(i)], "rad") or 1.0 for i in columns])
+        links = _links(spec, columns, urdf)
         S, J = len(moving), len(columns)
-        pairs = np.array(np.triu_indices(2 * J), np.intp) if J else np.zeros((2, 0), np.intp)
-        own = np.eye(J, dtype=np.bool_)
-        ends = range(2, min(J, CHAIN + 1))
-        sums = np.array([[1 <= k <= n for k in range(J)] for n in ends], np.bool_).reshape(len(ends), J)
-        single = np.vstack([own, own])
-        of_angles = np.vstack([single, sums, sums, single[pairs[0]] | single[pairs[1]]])
+        at = np.array([place[int(i)] for i in moving], np.intp)
+        angles = np.array([place[int(i)] for i in columns], np.intp)
+        pairs = np.array(np.triu_indices(2 * J), np.intp) if J and links is None else np.zeros((2, 0), np.intp)
+        if links is None:
+            own = np.eye(J, dtype=np.bool_)
+            ends = range(2, min(J, CHAIN + 1))
+            sums = np.array([[1 <= k <= n for k in range(J)] for n in ends], np.bool_).reshape(len(ends), J)
+            single = np.vstack([own, own])
+            of_angles = np.vstack([single, sums, sums, single[pairs[0]] | single[pairs[1]]])
+        else:
+            of_angles = np.ones((2 * J, J), np.bool_)
         sources = np.zeros((S * len(WIDTHS) + len(of_angles), len(spec.sensory)), np.bool_)
-        at = [place[int(i)] for i in moving]
         for w in range(len(WIDTHS)):
             sources[w * S + np.arange(S), at] = True
-        angles = np.array([place[int(i)] for i in columns], np.intp)
         sources[S * len(WIDTHS) :, angles] = of_angles
-        return cls(np.array(at, np.intp), from_steps, angles, radians, pairs, sources)
+        if links is not None:
+            sources[S * len(WIDTHS) + J :, at] = True
+        return cls(at, from_steps, angles, radians, pairs, sources, links)
 
-    def __call__(self, values: Floats, steps: Floats, spread: Floats) -> Floats:
-        """(N, M) of values (N, X) in their units, standardised changes (N, X), and the values' spread (X,)."""
+    def __call__(self, values: Floats, steps: Floats, spread: Floats, rate: Floats) -> Floats:
+        """(N, M) of values (N, X) in their units, standardised changes (N, X), and the values' spread (X,).
+
+        A standardised change of 1 is ``rate`` (X,) in a second.
+        """
         speed = steps[:, self.speeds] if self.from_steps else values[:, self.speeds] / spread[self.speeds]
         parts = [np.tanh(speed / width) for width in WIDTHS]
-        if len(self.angles):
+        if self.links is not None:
+            parts += self._carried(self.links, values, steps, rate)
+        elif len(self.angles):
             q = values[:, self.angles] * self.radians
             single = np.hstack([np.sin(q), np.cos(q)])
             sums = np.cumsum(q[:, 1 : CHAIN + 1], axis=1)[:, 1:]
             products = single[:, self.pairs[0]] * single[:, self.pairs[1]]
             parts += [single, np.sin(sums), np.cos(sums), products]
         return np.hstack(parts)
+
+    def _carried(self, links: BodyModel, values: Floats, steps: Floats, rate: Floats) -> tuple[Floats, Floats]:
+        """Torques (N, J) by weight, and by motion."""
+        q, pace = values[:, self.angles] * self.radians, (steps * rate)[:, self.speeds]
+        if self.from_steps:
+            return links.torques(q, pace * self.radians, np.zeros_like(q))
+        return links.torques(q, values[:, self.speeds] * self.radians, pace * self.radians)
+
+
+def _links(spec: StreamSpec, columns: NDArray[np.intp], urdf: str) -> BodyModel | None:
+    """The body model for columns of angles. Raises ValueError where it does not fit them."""
+    if not urdf:
+        return None
+    moving = speeds(spec)[0]
+    if not len(columns) or len(moving) != len(columns):
+        raise ValueError(
+            f"a body model needs an angle and a speed of each joint, among {MOST_ANGLES} at most; by their names "
+            f"{len(columns)} numbers are angles and {len(moving)} are speeds"
+        )
+    return BodyModel.of(urdf, [spec.labels[int(i)] for i in columns])
 
 
 def _named(spec: StreamSpec, pattern: re.Pattern[str]) -> NDArray[np.intp]:

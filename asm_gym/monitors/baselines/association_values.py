@@ -69,18 +69,22 @@ class ValueAssociation(StreamModel):
         friction: whether smooth signs of the speeds are among the inputs.
         body: whether sines of the angles are; angles are taken to stand in the order of the chain.
         changes: whether changes are judged too.
+        urdf: text of a body model, as ``read_urdf`` reads it: what links weigh, and their inertia, in place of sines.
     """
 
     kind = "association_values"
 
     @typed
-    def __init__(self, spec: StreamSpec, friction: bool = True, body: bool = True, changes: bool = True) -> None:
+    def __init__(
+        self, spec: StreamSpec, friction: bool = True, body: bool = True, changes: bool = True, urdf: str = ""
+    ) -> None:
         super().__init__(spec)
         self.friction, self.body = check_flag("friction", friction), check_flag("body", body)
         self.changes = check_flag("changes", changes)
         self.lag = rows_apart(spec.dt)
         self.shortest = 1 + self.lag
-        self._derived = Derived.of(spec, friction, body)
+        self.urdf = urdf
+        self._derived = Derived.of(spec, friction, body, urdf)
 
     @property
     def error_columns(self) -> NDArray[np.intp]:
@@ -153,7 +157,9 @@ class ValueAssociation(StreamModel):
         steps = np.asarray(read.inputs[:, senses.changes], np.float64)
         before = np.asarray(read.inputs[:, sensory], np.float64)
         physical = values * senses.spread[sensory] + senses.mean[sensory]
-        derived = self._derived(physical, steps, senses.spread[sensory])
+        derived = self._derived(
+            physical, steps, senses.spread[sensory], senses.change[sensory] / (self.lag * self.spec.dt)
+        )
         return values, steps, before, derived, np.asarray(read.commands, np.float64)
 
     def _judged(self, told: Floats) -> NDArray[np.intp]:

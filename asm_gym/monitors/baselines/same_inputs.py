@@ -28,10 +28,11 @@ class Informed:
     Args:
         spec: of the streams without.
         make: the monitor of a spec.
+        urdf: text of a body model; empty where sines of angles say weight.
     """
 
-    def __init__(self, spec: StreamSpec, make: Callable[[StreamSpec], Any]) -> None:
-        self.spec, self.make, self._derived = spec, make, Derived.of(spec, friction=True, body=True)
+    def __init__(self, spec: StreamSpec, make: Callable[[StreamSpec], Any], urdf: str = "") -> None:
+        self.spec, self.make, self._derived = spec, make, Derived.of(spec, friction=True, body=True, urdf=urdf)
 
     def fit(self, episodes: Sequence[Episode]) -> Self:
         """The spreads of what was sensed, and the monitor."""
@@ -53,7 +54,7 @@ class Informed:
     def _informed(self, episode: Episode) -> Episode:
         values = self._values(episode)
         steps = np.diff(values, axis=0, prepend=values[:1]) / self._change
-        inputs = self._derived(values, steps, self._spread)
+        inputs = self._derived(values, steps, self._spread, self._change / self.spec.dt)
         if not inputs.shape[1]:
             return episode
         before = np.concatenate([inputs[:1], inputs[:-1]])

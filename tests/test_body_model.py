@@ -1,0 +1,178 @@
+"""Torques by a body model: against MuJoCo and closed forms; and what a memory makes of them."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from asm_gym.body_model import GRAVITY, BodyModel, read_urdf
+from asm_gym.data.selection import pieces
+from asm_gym.episode import Episode
+from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
+from asm_gym.monitors.baselines.association_values import ValueAssociation
+from asm_gym.scripts.cli import main
+
+
+def link(name: str, mass: float, centre: str, inertia: tuple[float, ...]) -> str:
+    tensor = " ".join(f'i{ij}="{v}"' for ij, v in zip(("xx", "yy", "zz", "xy", "xz", "yz"), inertia, strict=True))
+    return (
+        f'<link name="{name}"><visual><geometry><box size="1 1 1"/></geometry></visual><inertial>'
+        f'<origin xyz="{centre}"/><mass value="{mass}"/><inertia {tensor}/></inertial></link>'
+    )
+
+
+def joint(name: str, kind: str, parent: str, child: str, origin: str, axis: str) -> str:
+    limit = "" if kind in ("fixed", "continuous") else '<limit lower="-3" upper="3" effort="99" velocity="9"/>'
+    return (
+        f'<joint name="{name}" type="{kind}"><origin {origin}/><parent link="{parent}"/><child link="{child}"/>'
+        f'<axis xyz="{axis}"/>{limit}</joint>'
+    )
+
+
+def arm() -> str:
+    """A lift that slides, a shoulder, an elbow askew and a tool that is fixed to it; a head beside them."""
+    return "".join(
+        (
+            '<robot name="arm"><link name="base"/>',
+            link("torso", 4.0, "0.01 0 0.2", (0.2, 0.21, 0.1, 0.0, 0.01, 0.0)),
+            link("upper", 3.0, "0.1 0.02 -0.01", (0.02, 0.05, 0.05, 0.001, 0.0, 0.002)),
+            link("lower", 2.0, "0.15 0 0.03", (0.01, 0.03, 0.03, 0.0, 0.001, 0.0)),
+            link("tool", 0.7, "0 0 0.05", (0.001, 0.0015, 0.002, 0.0, 0.0, 0.0)),
+            link("head", 1.0, "0 0.1 0", (0.01, 0.01, 0.01, 0.0, 0.0, 0.0)),
+            joint("lift", "prismatic", "base", "torso", 'xyz="0 0 0.5" rpy="0.1 0.2 0"', "0 0 1"),
+            joint("look", "revolute", "torso", "head", 'xyz="0 0 0.6"', "0 0 1"),
+            joint("shoulder", "revolute", "torso", "upper", 'xyz="0.1 0 0.4" rpy="1.2 0 0.3"', "0 1 0"),
+            joint("elbow", "continuous", "upper", "lower", 'xyz="0.3 0 0" rpy="0 0.4 0"', "0 0.6 0.8"),
+            joint("grip", "fixed", "lower", "tool", 'xyz="0.3 0 0.1" rpy="0 0 0.5"', "1 0 0"),
+            "</robot>",
+        )
+    )
+
+
+SENSED = ("position[elbow]", "position[lift]", "position[shoulder]")
+
+
+def test_torques_are_those_of_mujoco():
+    body = BodyModel.of(arm(), SENSED)
+    apart = '<mujoco><compiler fusestatic="false"/></mujoco></robot>'  # fused, it puts the tool elsewhere
+    model = mujoco.MjModel.from_xml_string(arm().replace("</robot>", apart))
+    data = mujoco.MjData(model)
+    told = np.random.default_rng(0).uniform(-1, 1, (3, 6, 3))
+    found = np.add(*body.torques(*told))
+    for n in range(6):
+        for k, name in enumerate(("elbow", "lift", "shoulder")):
+            there = model.joint(name)
+            data.qpos[there.qposadr], data.qvel[there.dofadr], data.qacc[there.dofadr] = told[:, n, k]
+        mujoco.mj_inverse(model, data)
+        expected = [data.qfrc_inverse[model.joint(name).dofadr[0]] for name in ("elbow", "lift", "shoulder")]
+        np.testing.assert_allclose(found[n], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_pendulum_weighs_what_a_pendulum_weighs():
+    urdf = (
+        '<robot name="p"><link name="base"/><link name="bob"><inertial><origin xyz="0.5 0 0" '
+        'rpy="1.5707963267948966 0 0"/>'
+        '<mass value="2"/><inertia ixx="9" ixy="0" ixz="0" iyy="7" iyz="0" izz="0.1"/></inertial></link>'
+        '<joint name="j" type="continuous"><parent link="base"/><child link="bob"/><axis xyz="0 -1 0"/></joint></robot>'
+    )
+    q = np.linspace(-3, 3, 9)[:, None]  # about y, which is the inertia's z
+    weight, motion = BodyModel.of(urdf, ["q"]).torques(q, np.ones_like(q), np.full_like(q, 3.0))
+    np.testing.assert_allclose(weight, 2 * GRAVITY * 0.5 * np.cos(q), atol=1e-12)
+    np.testing.assert_allclose(motion, (0.1 + 2 * 0.5**2) * 3.0, atol=1e-12)
+
+
+def test_joints_are_those_that_columns_name_or_the_longest_chain():
+    assert BodyModel.of(arm(), SENSED).columns.tolist() == [1, 2, 0]
+    by_order = BodyModel.of(arm(), ["q[0]", "q[1]", "q[2]"])
+    assert (by_order.names, by_order.columns.tolist()) == (("lift", "shoulder", "elbow"), [0, 1, 2])
+    assert BodyModel.of(arm(), SENSED[1:2]).mass == pytest.approx([4 + 3 + 2 + 0.7 + 1])
+
+
+@pytest.mark.parametrize(
+    ("urdf", "said"),
+    [
+        ("position", "the body is no URDF: syntax error"),
+        ("<mujoco/>", "its root is <mujoco>, not <robot>"),
+        ('<!DOCTYPE r [<!ENTITY a "aa">]><robot/>', "declares a document type"),
+        ("<robot/>", "are no tree"),
+        (arm().replace('child link="tool"', 'child link="base"'), "are no tree"),
+        (arm().replace('child link="tool"', 'child link="gone"'), "are no tree"),
+        (arm().replace('xyz="0 0.6 0.8"', 'xyz="0 0 0"'), "the axis of joint elbow has no direction"),
+        (arm().replace('value="3.0"', 'value="nan"'), "value='nan' of the body should be 1 numbers"),
+        (arm().replace('<parent link="base"/>', ""), "joint lift of the body has no <parent>"),
+        (arm().replace('"elbow" type="continuous"', '"elbow" type="fixed"'), "3 joints are sensed, and .* 2 that move"),
+    ],
+)
+def test_what_is_no_body_of_the_arm_is_refused_in_a_line(urdf, said):
+    with pytest.raises(ValueError, match=said) as refused:
+        BodyModel.of(urdf, ["q[0]", "q[1]", "q[2]"])
+    assert "\n" not in str(refused.value)
+
+
+def recorded(seconds: float, seed: int = 0, rate: float = 100.0) -> dict[str, np.ndarray]:
+    """The arm, as it moves by its own model, with friction and noise."""
+    rng, t = np.random.default_rng(seed), np.arange(round(seconds * rate)) / rate
+    w = rng.uniform(0.5, 2.5, size=(2, 3))
+    phase = rng.uniform(0, 6, size=(2, 3))
+    size = np.array([0.15, 0.8, 1.2])
+    q = sum(size * np.sin(np.outer(t, w[k]) + phase[k]) for k in range(2))
+    v = sum(size * w[k] * np.cos(np.outer(t, w[k]) + phase[k]) for k in range(2))
+    a = -sum(size * w[k] ** 2 * np.sin(np.outer(t, w[k]) + phase[k]) for k in range(2))
+    load = np.add(*BodyModel.of(arm(), ["q"] * 3).torques(q, v, a))
+    said = {"position": q, "velocity": v, "effort": load + 0.5 * np.tanh(v / 0.02) + 0.2 * v}
+    return {"time": t} | {n: x + s * rng.normal(size=q.shape) for (n, x), s in zip(said.items(), NOISE, strict=True)}
+
+
+NOISE = (1e-4, 1e-3, 0.05)
+
+
+def test_a_memory_expects_torques_by_it_and_needs_the_file_no_more(tmp_path):
+    (tmp_path / "arm.urdf").write_text(arm())
+    urdf = read_urdf(tmp_path / "arm.urdf")
+    assert "visual" not in urdf
+    cut = pieces(Episode.from_table(recorded(30)), 1.0)
+    told = {}
+    for model in ("", urdf):
+        monitor = make_monitor("association_values+evidence", cut[0].spec, urdf=model).fit(cut)
+        told[model] = 1 - monitor.learned_["R2_values"][6:]
+    assert (told[urdf] < 0.5 * told[""]).all()
+    asm = NeuralASM(cut[0].spec, hidden_size=8, association_size=16, epochs=1, values=True, urdf=urdf)
+    asm.fit(cut[:20]).calibrate(cut[20:], 0.1).save(tmp_path / "x.asm")
+    assert isinstance(asm.values_.monitor.model, ValueAssociation)
+    assert asm.values_.monitor.model._derived.links is not None
+    (tmp_path / "arm.urdf").unlink()
+    again = load_monitor(tmp_path / "x.asm")
+    np.testing.assert_array_equal(again.score(cut[25]).value, asm.score(cut[25]).value)
+    with pytest.raises(ValueError, match="only values=True judges"):
+        NeuralASM(cut[0].spec, urdf=urdf)
+    bare = Episode.from_table({"position": np.zeros((9, 3)), "velocity": np.zeros(9)}, rate=10.0)
+    with pytest.raises(ValueError, match="by their names 3 numbers are angles and 1 are speeds"):
+        NeuralASM(bare.spec, values=True, urdf=urdf)
+
+
+def test_fit_takes_a_body_model_and_says_which_joints_it_saw(tmp_path, capsys):
+    write(tmp_path / "log.csv", recorded(60))
+    (tmp_path / "arm.urdf").write_text(arm())
+    command = ["fit", str(tmp_path / "log.csv"), "--out", str(tmp_path / "x.asm"), "--split", "1", "--quick"]
+    command += ["--urdf", str(tmp_path / "arm.urdf")]
+    assert main([*command, "--monitor", "association_values+evidence", "--false-alarm-rate", "0.1"]) == 0
+    assert "are taken for these joints" in (said := capsys.readouterr().out)
+    assert "in this order: lift, shoulder, elbow." in said
+    assert load_monitor(tmp_path / "x.asm").get_params()["urdf"].startswith("<robot")
+    assert main([*command, "--monitor", "kalman"]) == 2
+    assert capsys.readouterr().err.strip().endswith("kalman takes no body model: leave --urdf out")
+    (tmp_path / "arm.urdf").write_text("<robot")
+    assert main([*command, "--monitor", "association_values+evidence"]) == 2
+    assert "arm.urdf: the body is no URDF" in capsys.readouterr().err
+
+
+def write(path: Path, columns: dict[str, np.ndarray]) -> None:
+    names = [f"{n}_{k}" for n, c in columns.items() for k in range(c.shape[1] if c.ndim > 1 else 1)]
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["time", *names[1:]])
+        rows.writerows(np.column_stack(list(columns.values())).tolist())
