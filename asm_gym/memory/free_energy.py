@@ -76,7 +76,7 @@ class Before(NamedTuple):
 
 
 Carried = tuple[Floats, ...]
-"""What the network through time makes of c: by traces μ (H,), and (S + A,) of what it expects; by settling W_H f(c) (H,)."""
+"""What the network through time makes of c: by traces μ (H,) and its part of what is expected (S + A,), by settling W_H f(c)."""
 
 
 class _Given(NamedTuple):
