@@ -75,6 +75,18 @@ class Before(NamedTuple):
     last: Floats  # (1, D) the row before it
 
 
+Carried = tuple[Floats, ...]
+"""What the network through time makes of c: by traces μ (H,) and its part of what is expected (S + A,), by settling W_H f(c)."""
+
+
+class _Given(NamedTuple):
+    """What of F follows from what was there before a row, whatever the row is."""
+
+    moment: Before
+    carried: Carried
+    command: Floats  # (A,) the one that the motor association expects, in spreads of the stream
+
+
 class _Read(NamedTuple):
     """A row as the memory reads it."""
 
@@ -117,7 +129,8 @@ class FreeEnergy:
             for moment, row in raw.moments(stream):
                 z = raw.inferred(moment, row)
                 time += raw.terms(moment, row, z).time
-                commands += raw._unexpected(moment, raw._read(moment, row).u[:-1]) ** 2
+                given = raw._given(moment)
+                commands += raw._unexpected(given, raw._read(moment, row).u[:-1]) ** 2
                 rows += 1
         if not rows:
             raise ValueError("no healthy row is long enough to learn the spreads of")
@@ -143,11 +156,11 @@ class FreeEnergy:
 
     def terms(self, moment: Before, row: Floats, z: Floats) -> Terms:
         """F of a row (D,) and a state (H,), by its parts."""
-        return self._of(moment, row, z)[0]
+        return self._of(self._given(moment), row, z)[0]
 
     def slope(self, moment: Before, row: Floats, z: Floats) -> Slope:
         """∂F of a row (D,) and a state (H,)."""
-        return self._of(moment, row, z)[1]
+        return self._of(self._given(moment), row, z)[1]
 
     def settled(self, moment: Before, row: Floats, free: NDArray[np.bool_]) -> tuple[Floats, Terms]:
         """The row (D,) in which F is lowest over its ``free`` (D,) numbers and the state; and F there.
@@ -157,18 +170,18 @@ class FreeEnergy:
         from scipy.optimize import minimize  # a third of a second, that nobody else should wait for
 
         spread, count = self.senses.spread, int(free.sum())
-        start = np.concatenate([np.zeros(count), self.inferred(moment, row)])
+        start, given = np.concatenate([np.zeros(count), self.inferred(moment, row)]), self._given(moment)
 
         def at(offset: Floats) -> tuple[float, Floats]:
             tried = row.copy()
             tried[free] += spread[free] * offset[:count]
-            terms, slope = self._of(moment, tried, offset[count:])
+            terms, slope = self._of(given, tried, offset[count:])
             return terms.total, np.concatenate([slope.row[free], slope.z])
 
         found = minimize(at, start, jac=True, method="L-BFGS-B", options={"maxiter": STEPS, "maxcor": 20})
         settled = row.copy()
         settled[free] += spread[free] * found.x[:count]
-        return settled, self.terms(moment, settled, found.x[count:])
+        return settled, self._of(given, settled, found.x[count:])[0]
 
     def reaction(self, moment: Before) -> Floats:
         """(A,) the command that lets F be lowest over itself and the row that it leads to.
@@ -217,23 +230,28 @@ class FreeEnergy:
         inputs = np.concatenate([(before - senses.mean) / senses.spread, changes, past, u])
         return _Read(x, u, np.where(np.abs(inputs) < FARTHEST, inputs, 0.0), changes)
 
-    def _unexpected(self, moment: Before, u: Floats) -> Floats:
-        """u - û (A,) in spreads of the stream; 0 where there is no motor association."""
-        if self.motor is None:
-            return np.zeros(len(u))
-        spec, senses = self.senses.spec, self.senses
-        found: Floats = u - (self.expected(moment) - senses.mean[spec.motor]) / senses.spread[spec.motor]
-        return found
+    def _given(self, moment: Before) -> _Given:
+        senses, motor, (w, _) = self.senses, self.senses.spec.motor, self._weights
+        c = moment.c[0].astype(np.float64)
+        if isinstance(w, SettlingWeights):
+            carried: Carried = (w.W_H @ np.tanh(c),)
+        else:
+            carried = w.W_C @ c, w.W_D[:, : len(c)] @ c
+        return _Given(moment, carried, (self.expected(moment) - senses.mean[motor]) / senses.spread[motor])
 
-    def _of(self, moment: Before, row: Floats, z: Floats) -> tuple[Terms, Slope]:
+    def _unexpected(self, given: _Given, u: Floats) -> Floats:
+        """u - û (A,) in spreads of the stream; 0 where there is no motor association."""
+        return np.zeros(len(u)) if self.motor is None else u - given.command
+
+    def _of(self, given: _Given, row: Floats, z: Floats) -> tuple[Terms, Slope]:
         senses, spec, (w, association) = self.senses, self.senses.spec, self._weights
-        x, u, a, changes = self._read(moment, row)
+        x, u, a, changes = self._read(given.moment, row)
         how = float(self.network.prior_precision), float(self.network.sensory_precision)
         through = _by_settling if isinstance(w, SettlingWeights) else _by_traces
-        raw, of_x, of_u, of_z = through(w, moment.c[0].astype(np.float64), u, x, z, *how)
+        raw, of_x, of_u, of_z = through(w, given.carried, u, x, z, *how)
         time, scale = raw / self.tau**2 + self._numbers * np.log(self.tau), 1.0 / self.tau**2
         between, of_a, of_changes = _between(association, a, changes)
-        off = self._unexpected(moment, u[:-1])
+        off = self._unexpected(given, u[:-1])
         motor = float(np.sum(0.5 * (off / self.tau_motor) ** 2 + np.log(self.tau_motor))) if self.motor else 0.0
         D, X, L, A = len(row), len(spec.sensory), len(senses.slow), len(spec.motor)
         slope = np.zeros(D)
@@ -267,23 +285,25 @@ Through = tuple[float, Floats, Floats, Floats]
 """The sum through time, and how it rises with x (S,), u (A,) and z (H,)."""
 
 
-def _by_traces(w: Weights, c: Floats, u: Floats, x: Floats, z: Floats, pi_z: float, pi_x: float) -> Through:
-    """½ Π_z ‖z - W_C c‖² + ½ Π_x ‖[x, u] - W_F f(z) - W_D [c, u, 1]‖²."""
-    W_C, W_F, W_D, _ = w
-    f, off = np.tanh(z), z - W_C @ c
-    error = np.concatenate([x, u[:-1]]) - W_F @ f - W_D @ np.concatenate([c, u])
-    S, past, A = len(x), len(c), len(u) - 1
-    of_u = pi_x * (error[S:] - W_D[:, past : past + A].T @ error)
+def _by_traces(w: Weights, carried: Carried, u: Floats, x: Floats, z: Floats, pi_z: float, pi_x: float) -> Through:
+    """½ Π_z ‖z - μ‖² + ½ Π_x ‖[x, u] - W_F f(z) - W_D [c, u, 1]‖²; carried are μ = W_C c, and what W_D makes of c."""
+    mu, past = carried
+    W_F, of_action = w.W_F, w.W_D[:, -len(u) :]
+    f, off, S = np.tanh(z), z - mu, len(x)
+    error = np.concatenate([x, u[:-1]]) - W_F @ f - past - of_action @ u
+    of_u = pi_x * (error[S:] - of_action[:, :-1].T @ error)
     of_z = pi_z * off - pi_x * (1.0 - f**2) * (W_F.T @ error)
     return float(0.5 * pi_z * off @ off + 0.5 * pi_x * error @ error), pi_x * error[:S], of_u, of_z
 
 
-def _by_settling(w: SettlingWeights, c: Floats, u: Floats, x: Floats, z: Floats, pi_z: float, pi_x: float) -> Through:
-    """½ Π_z ‖z - μ‖² + ½ Π_x ‖x - W_F f(z) - b_F‖² + ½ ‖u - W_A f(h)‖²."""
-    W_H, W_U, W_F, b_F, W_A = w
-    carried, f = W_H @ np.tanh(c), np.tanh(z)
-    off, error = z - carried - W_U @ u, x - b_F - W_F @ f
-    action = u[:-1] - W_A @ np.tanh(carried + W_U[:, -1])
+def _by_settling(
+    w: SettlingWeights, carried: Carried, u: Floats, x: Floats, z: Floats, pi_z: float, pi_x: float
+) -> Through:
+    """½ Π_z ‖z - μ‖² + ½ Π_x ‖x - W_F f(z) - b_F‖² + ½ ‖u - W_A f(h)‖²; carried is W_H f(c)."""
+    _, W_U, W_F, b_F, W_A = w
+    known, f = carried[0], np.tanh(z)
+    off, error = z - known - W_U @ u, x - b_F - W_F @ f
+    action = u[:-1] - W_A @ np.tanh(known + W_U[:, -1])
     of_z = pi_z * off - pi_x * (1.0 - f**2) * (W_F.T @ error)
     of_u = action - pi_z * W_U[:, :-1].T @ off
     whole = 0.5 * pi_z * off @ off + 0.5 * pi_x * error @ error + 0.5 * action @ action

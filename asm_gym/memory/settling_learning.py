@@ -27,8 +27,8 @@ from asm_gym.memory.scheduled_sampling import LONGEST_CUE, Moment, practise
 from asm_gym.memory.settling import SettlingNetwork, SettlingWeights, settling_shapes
 from asm_gym.memory.temporal import Trained, unassociated
 
-SUSTAINED, FAINT = (0.9, 1.0), 0.1
-"""What units begin with of their own last state, the least and the most; and the gain from all the others."""
+FAINT = 0.1
+"""The gain from state to state to begin with, beside the whole of its own last state that each unit has."""
 
 
 def initial_settling_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> SettlingWeights:
@@ -37,7 +37,7 @@ def initial_settling_weights(hidden: int, sensory: int, motor: int, rng: np.rand
     for name in ("W_H", "W_U", "W_F", "W_A"):
         W = weights[name]
         W[:] = rng.standard_normal(W.shape) / np.sqrt(W.shape[1])
-    weights["W_H"][:] = FAINT * weights["W_H"] + np.diag(np.linspace(*SUSTAINED, hidden, dtype=np.float32))
+    weights["W_H"][:] = FAINT * weights["W_H"] + np.eye(hidden, dtype=np.float32)
     return SettlingWeights(**weights)
 
 

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.tables import Table
+from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.closed_loop import CUE, EVENT, WAYS, Course
 from asm_gym.scripts.reproduce.handwriting import STEPS
 from asm_gym.scripts.reproduce.kit import Record, shown
@@ -42,30 +43,51 @@ def tables(records: Sequence[Record], skills: int) -> list[Table]:
     asked_for = f"{skills} letters, cue of {CUE} rows; mean ± SD over seeds"
     return [
         Table(f"Expected, and written in closed loop: {asked_for}", head, lines),
+        behind(records),
         Table("What is noticed", head[:3], told),
         Table("Share of letters that the state names rightly", head[:3], named),
     ]
 
 
+def behind(records: Sequence[Record]) -> Table:
+    """How much further off each dynamics is than the GRU, over the same repertoires."""
+
+    def cell(model: str, measure: str) -> str:
+        found = kit.paired(records, "cm", {"model": model}, {"model": "gru"}, measure=measure)
+        verdict = "ahead" if found.high < 0 else "behind" if found.low > 0 else "within chance"
+        return f"{found.value:+.2f} ({found.low:+.2f} to {found.high:+.2f}), {verdict}"
+
+    names = [name for name in TITLES if name != "gru"]
+    count = len({r["seed"] for r in records})
+    lines = [(f"{m} [cm]", *(cell(name, m) for name in names)) for m in ("next row", "recalled", WAYS[0])]
+    said = f"Further off than the GRU, in the same {count} repertoires; 95 % intervals of the paired difference"
+    return Table(said, ("", *(TITLES[name] for name in names)), lines)
+
+
 def drawn(courses: Mapping[str, Mapping[str, Course]], truth: Floats) -> Figure:
     """A letter (T, 2) by each dynamics: where the hand went, and what was felt of it."""
     n, names = 0, [name for name in courses if name != "gru"]
-    with figure(height=5.0, width=11) as fig:
-        rows = fig.subplots(2, 4)
+    looks = {way: look(i)[:2] for i, way in enumerate(WAYS)}
+    with figure(height=5.6, width=11) as fig:
+        rows = fig.subplots(2, 4, squeeze=False)
         for axes, name in zip(rows, names, strict=True):
             own = courses[name]
             for ax, ways in zip(axes[:2], (WAYS[:3], (WAYS[0], *WAYS[3:5])), strict=True):
-                ax.plot(*truth.T, color="#bbbbbb", linewidth=4, label="as it was written")
-                for i, way in enumerate(ways):
-                    colour, line, _ = look(i)
+                ax.plot(*truth.T, color="#cccccc", linewidth=4, label="as it was written")
+                for way in ways:
+                    colour, line = looks[way]
                     ax.plot(*own[way].path[CUE:, n].T, color=colour, linestyle=line, label=way)
-                ax.plot(*own[WAYS[0]].path[EVENT, n], "k.", markersize=5)
-                ax.set(title=name, xlabel="x [cm]", ylabel="y [cm]", aspect="equal")
-            for i, way in enumerate((WAYS[0], WAYS[1], WAYS[3])):
+                ax.plot(*own[WAYS[0]].path[EVENT, n], "k.", markersize=6, label="where it happens")
+                ax.set(title=name, xlabel="x [cm]", ylabel="y [cm]", aspect="equal", adjustable="datalim")
+            for way in (WAYS[0], WAYS[1], WAYS[3]):
                 for ax, what in zip(axes[2:], ("surprise", "energy"), strict=True):
-                    ax.plot(DT * np.arange(STEPS), getattr(own[way], what)[:, n], color=look(i)[0], label=way)
-            axes[2].set(title=name, xlabel="time [s]", ylabel="surprise", yscale="symlog")
-            axes[3].set(title=name, xlabel="time [s]", ylabel="F [nats]")
-        for ax in rows[0][:3]:
-            ax.legend(fontsize=6)
+                    colour, line = looks[way]
+                    ax.plot(DT * np.arange(STEPS), getattr(own[way], what)[:, n], color=colour, linestyle=line)
+            axes[2].axhline(own[WAYS[0]].threshold, color="#888888", linewidth=1)
+            axes[2].set(title=f"{name}; line: threshold", xlabel="time [s]", ylabel="surprise", yscale="symlog", ylim=(-0.5, None))
+            axes[3].set(title=name, xlabel="time [s]", ylabel="F [nats]", yscale="symlog")
+        labelled: dict[str, Any] = {}
+        for ax in rows[0][:2]:
+            labelled |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+        fig.legend(list(labelled.values()), list(labelled), loc="outside lower center", ncols=7, fontsize=8)
     return fig

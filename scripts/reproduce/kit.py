@@ -33,10 +33,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
+from scipy.stats import t as student
 from threadpoolctl import threadpool_limits
 
 from asm_gym.evaluation.figures import save
-from asm_gym.evaluation.statistics import Spread
+from asm_gym.evaluation.statistics import Estimate, Spread
 from asm_gym.evaluation.tables import ConsoleTable, Table, markdown
 from asm_gym.rollouts import progress
 from asm_gym.rollouts.parallel import Progress, parallel_map
@@ -181,6 +182,21 @@ def over_seeds(records: Sequence[Record], value: str, **where: Any) -> Spread:
     chosen = [r for r in records if all(r.get(k) == v for k, v in where.items()) and r.get(value) is not None]
     means = [np.mean([r[value] for r in chosen if r["seed"] == s]) for s in dict.fromkeys(r["seed"] for r in chosen)]
     return Spread.of([float(mean) for mean in means]) if means else Spread(float("nan"), float("nan"))
+
+
+def paired(records: Sequence[Record], value: str, one: Record, other: Record, **where: Any) -> Estimate:
+    """How much larger a value is of ``one`` than of ``other``, seed by seed, with Student's 95 % interval."""
+
+    def of(chosen: Record) -> dict[int, float]:
+        own = {r["seed"] for r in records if all(r.get(k) == v for k, v in (where | chosen).items())}
+        return {seed: over_seeds(records, value, seed=seed, **where | chosen).mean for seed in own}
+
+    first, second = of(one), of(other)
+    apart = np.array([first[seed] - second[seed] for seed in sorted(first.keys() & second.keys())])
+    if len(apart) < 2:
+        return Estimate(float(apart.mean()) if len(apart) else float("nan"), float("-inf"), float("inf"))
+    half = float(student.ppf(0.975, len(apart) - 1) * apart.std(ddof=1) / np.sqrt(len(apart)))
+    return Estimate(float(apart.mean()), float(apart.mean()) - half, float(apart.mean()) + half)
 
 
 def by(name: str, values: Iterable[Any]) -> dict[str, Record]:
