@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import ctypes
 import socket
 import time
 from dataclasses import dataclass
@@ -77,21 +76,8 @@ def _put(state: Any, streams: NDArray[np.int64], new: Any) -> None:
         state[streams] = new
 
 
-HEADER = np.dtype(
-    {
-        "names": ["parts", "count", "size"],
-        "formats": ["<u8", "<u8", "<u4"],
-        "offsets": [16, 24, 56],
-        "itemsize": 64,
-    }
-)
-"""A ``struct mmsghdr`` of Linux with 64 bits, as far as anything of it is told or read."""
-
-
 class Inbox:
     """Rows as they come: datagrams of a stream's number, when it was sent [s], and the row.
-
-    All that have come are read by one call of the system, ``recvmmsg``: one by one they take Python 2 µs each.
 
     Args:
         size: D.
@@ -102,23 +88,22 @@ class Inbox:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 24)
         self.socket.bind(("127.0.0.1", 0))
-        self._rows, self._headers, self._came = np.zeros(ROOM, self.kind), np.zeros(ROOM, HEADER), 0
-        places = self._rows.ctypes.data + self.kind.itemsize * np.arange(ROOM, dtype=np.uint64)
-        self._parts = np.stack([places, np.full(ROOM, self.kind.itemsize, np.uint64)], axis=1)  # a struct iovec each
-        self._headers["parts"] = self._parts.ctypes.data + self._parts.strides[0] * np.arange(ROOM, dtype=np.uint64)
-        self._headers["count"] = 1
-        self._receive = ctypes.CDLL(None).recvmmsg
+        self.socket.setblocking(False)
+        self._buffers = [bytearray(self.kind.itemsize) for _ in range(ROOM)]
+        self._came = 0
 
     def drain(self) -> None:
         """Takes in what has come, as far as there is room; the socket keeps the rest."""
-        place, room = self._headers.ctypes.data + HEADER.itemsize * self._came, ROOM - self._came
-        came = self._receive(self.socket.fileno(), ctypes.c_void_p(place), room, socket.MSG_DONTWAIT, None)
-        self._came += max(0, came)  # -1 where nothing has
+        try:
+            while self._came < ROOM:
+                self.socket.recv_into(self._buffers[self._came])
+                self._came += 1
+        except BlockingIOError:
+            return
 
     def taken(self) -> NDArray[Any]:
-        """What has come, which is forgotten here; what is no row is left out."""
-        whole = self._headers["size"][: self._came] == self.kind.itemsize
-        rows: NDArray[Any] = self._rows[: self._came][whole]
+        """What has come, which is forgotten here."""
+        rows = np.frombuffer(b"".join(self._buffers[: self._came]), self.kind)
         self._came = 0
         return rows
 
