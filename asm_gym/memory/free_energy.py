@@ -76,7 +76,7 @@ class Before(NamedTuple):
 
 
 Carried = tuple[Floats, ...]
-"""What the network through time makes of c: by traces μ (H,) and its part of what is expected (S + A,), by settling W_H f(c)."""
+"""What the network through time makes of c: μ and its part of what is expected by traces, W_H f(c) by settling."""
 
 
 class _Given(NamedTuple):

@@ -27,17 +27,25 @@ from asm_gym.memory.scheduled_sampling import LONGEST_CUE, Moment, practise
 from asm_gym.memory.settling import SettlingNetwork, SettlingWeights, settling_shapes
 from asm_gym.memory.temporal import Trained, unassociated
 
-FAINT = 0.1
-"""The gain from state to state to begin with, beside the whole of its own last state that each unit has."""
+LEAST, FAINT = 0.9, 0.1
+"""What units begin with of their own last state, from this to the whole; and the gain from all the others."""
 
 
-def initial_settling_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> SettlingWeights:
-    """Random weights of about unit gain, but from state to state, where each unit sustains itself; no biases."""
+def initial_settling_weights(
+    hidden: int, sensory: int, motor: int, rng: np.random.Generator, least: float = LEAST
+) -> SettlingWeights:
+    """Random weights of about unit gain, but from state to state, where each unit sustains itself; no biases.
+
+    Args:
+        hidden, sensory, motor: H, S, A.
+        rng: what draws them.
+        least: what of its own last state a unit has at least.
+    """
     weights = {n: np.zeros(shape, np.float32) for n, shape in settling_shapes(hidden, sensory, motor).items()}
     for name in ("W_H", "W_U", "W_F", "W_A"):
         W = weights[name]
         W[:] = rng.standard_normal(W.shape) / np.sqrt(W.shape[1])
-    weights["W_H"][:] = FAINT * weights["W_H"] + np.eye(hidden, dtype=np.float32)
+    weights["W_H"][:] = FAINT * weights["W_H"] + np.diag(np.linspace(least, 1.0, hidden, dtype=np.float32))
     return SettlingWeights(**weights)
 
 
@@ -171,7 +179,9 @@ def learn_settling(
 ) -> Trained:
     """Learns the synapses through time; see ``temporal.Learn``."""
     sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
-    weights = initial_settling_weights(hidden, sensory, commands - 1, rng)
+    # What runs on alone must keep what it was shown; over hundreds of rows that are read, what keeps everything drifts.
+    least = 1.0 if schedule.free_running_probability > 0 else LEAST
+    weights = initial_settling_weights(hidden, sensory, commands - 1, rng, least)
     streams = SettlingStreams(SettlingLearner(weights, schedule, rng), schedule.batch_size)
     energy = practise(streams, hidden, trajectories, schedule, rng, tick)
     how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision

@@ -84,7 +84,8 @@ def drawn(courses: Mapping[str, Mapping[str, Course]], truth: Floats) -> Figure:
                     colour, line = looks[way]
                     ax.plot(DT * np.arange(STEPS), getattr(own[way], what)[:, n], color=colour, linestyle=line)
             axes[2].axhline(own[WAYS[0]].threshold, color="#888888", linewidth=1)
-            axes[2].set(title=f"{name}; line: threshold", xlabel="time [s]", ylabel="surprise", yscale="symlog", ylim=(-0.5, None))
+            axes[2].set(title=f"{name}; line: threshold", xlabel="time [s]", ylabel="surprise", yscale="symlog")
+            axes[2].set_ylim(bottom=-0.5)
             axes[3].set(title=name, xlabel="time [s]", ylabel="F [nats]", yscale="symlog")
         labelled: dict[str, Any] = {}
         for ax in rows[0][:2]:
