@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import shlex
 import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -95,6 +97,8 @@ def check(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
         targets = re.findall(r"^([a-z-]+):", (documents.ROOT / "Makefile").read_text(), re.M)
         assert argv[0] in targets
         return
+    if program == "python" and argv == ["-"]:
+        return  # of what it reads from standard input the names are asked for
     if program == "python":
         assert argv[:2] == ["-m", "tests.soak"], command
         called: Callable[[], int] = partial(run, "soak", soak.Args, soak.soak, argv[2:])
@@ -128,11 +132,15 @@ def test_the_commands_of_a_page_exist_and_take_their_arguments(page: Path, monke
 
 @pytest.mark.parametrize("page", RESULTS, ids=documents.name)
 def test_the_command_of_a_page_of_results_can_be_given_again(page: Path, monkeypatch: pytest.MonkeyPatch):
-    pages = documents.tool("pages")
-    given = commands(pages.Page.read(page).meta["command"])
+    script = documents.tool("pages").Page.read(page).meta["command"]
+    given = commands(script)
     assert given
     for command in given:
         check(command, monkeypatch)
+    for program in re.findall(r"^python - <<'END'\n(.*?)^END$", script, re.M | re.S):
+        for each in ast.walk(ast.parse(program)):
+            if isinstance(each, ast.ImportFrom) and each.module and all(map(is_there, [each.module])):
+                assert not [n.name for n in each.names if not hasattr(import_module(each.module), n.name)], each.module
 
 
 def test_a_command_with_a_wrong_argument_is_found(monkeypatch: pytest.MonkeyPatch):
