@@ -153,7 +153,7 @@ def learned(
         return Hopfield.learned(train, **how)
     if name == "library":
         return Library.learned(train, [str(e.info["skill"]) for e in tests], **how)
-    cell, _, truncated = name.partition("_one_step")
+    cell, truncated, _ = name.partition("_one_step")
     return Backpropagated.learned(train, cell, units, rng, practice.updates, truncated=bool(truncated), **how)
 
 
