@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,7 +10,6 @@ import numpy as np
 from rich.console import Console
 
 from asm_gym.detection.events import NEAR_STOP
-from asm_gym.envs.simulation import Simulation
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.policies import make_policy, rollout
@@ -39,10 +37,11 @@ class Attempt(NamedTuple):
     room: float  # what was left of an arm's joint to its nearest stop, at least [rad]
 
 
-def room_to_the_stops(simulation: Simulation) -> float:
-    """How far the arms' joint that is nearest to one of its stops is from it [rad]."""
-    joints = [simulation.model.joint(i) for i in range(simulation.model.njnt)]
-    arms = [joint for joint in joints if re.fullmatch(r"robot\d_joint\d", joint.name)]
+def room_to_the_stops(env: Any) -> float:
+    """How far the arms' joint that is nearest to one of its stops is from it [rad]; joints without stops do not count."""
+    simulation = env.unwrapped.simulation
+    names = [name for robot in env.unwrapped.robosuite_env.robots for name in robot.robot_joints]
+    arms = [joint for joint in map(simulation.model.joint, names) if simulation.model.jnt_limited[joint.id]]
     angles = np.array([simulation.data.joint(joint.name).qpos[0] for joint in arms])
     low, high = np.array([joint.range for joint in arms]).T
     return float(np.minimum(angles - low, high - angles).min())
@@ -58,7 +57,7 @@ def attempt(seed: int, task: str, robot: str) -> Attempt:
     def note(info: dict[str, Any]) -> None:
         success.append(bool(info["success"]))
         force.append(float(info["contact_force"]))
-        room.append(room_to_the_stops(env.unwrapped.simulation))
+        room.append(room_to_the_stops(env))
 
     solved = rollout(env, make_policy("scripted", env, seed=seed), seed, note)
     steps = success.index(True) + 1 if solved else len(success)
