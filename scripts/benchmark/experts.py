@@ -38,7 +38,7 @@ class Attempt(NamedTuple):
 
 
 def room_to_the_stops(env: Any) -> float:
-    """How far the arms' joint that is nearest to one of its stops is from it [rad]; joints without stops do not count."""
+    """How far the arms' joint nearest to one of its stops is from it [rad]; joints without stops are left out."""
     simulation = env.unwrapped.simulation
     names = [name for robot in env.unwrapped.robosuite_env.robots for name in robot.robot_joints]
     arms = [joint for joint in map(simulation.model.joint, names) if simulation.model.jnt_limited[joint.id]]
