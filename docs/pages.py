@@ -50,7 +50,6 @@ ROOT = ran.ROOT
 RESULTS = ROOT / "docs" / "results"
 ARCHIVE = RESULTS / "archive"
 BEGIN, END = "<!-- printed by the command above: edits are lost -->", "<!-- end of what was printed -->"
-RAN = "<!-- what ran: edits are lost\n"  # at the end of pages that were printed before it had a file of its own
 REQUIRED = ("command", "version", "date", "commit")
 MOST = 20  # live pages
 ALLOWED = 30.0  # for a check [s of a core]
@@ -80,11 +79,10 @@ class Page:
             raise ValueError(f"{path}: the front matter lacks {', '.join(missing)}")
         if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
             raise ValueError(f"{path}: what was printed must stand once between {BEGIN} and {END}")
-        text, _, old = text.partition(RAN)
         meta["commit"] = str(meta["commit"])  # one of digits alone is a number in YAML
         beside = _beside(path)
-        kept = json.loads(beside.read_text()) if beside.is_file() else yaml.safe_load(old.removesuffix("-->\n"))
-        return cls(path, meta, text, kept or {})
+        kept = json.loads(beside.read_text()) if beside.is_file() else {}
+        return cls(path, meta, text, kept)
 
     def write(self) -> None:
         """Replaces each file at once, or not at all."""
