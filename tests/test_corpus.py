@@ -184,7 +184,7 @@ def test_monitors_are_judged_by_it_and_have_cards(asked, tmp_path):
     ("change", "message"),
     [
         (lambda text: text[:-20], "is damaged or cut off"),
-        (lambda text: text.replace(f'"version": {VERSION}', '"version": 99'), "version 99 of the corpus.*reads 1"),
+        (lambda text: text.replace(f'"version": {VERSION}', '"version": 99'), "version 99 of the corpus.*reads 2"),
         (lambda text: json.dumps({"version": VERSION}), "is damaged or cut off: 'files'"),
     ],
 )
