@@ -226,7 +226,7 @@ def drawn(records: Sequence[Record], config: Config) -> Figure:
     """Angles, errors, costs."""
     epochs = checkpoints(config.epochs)
     where = {"array": "all", "iterations": usual(config)}
-    with figure(height=3.0, width=11) as fig:
+    with figure(height=3.3, width=11) as fig:
         axes = fig.subplots(1, 4)
         targets = {label: {"target": t} for t, label in TARGETS.items()}
         curves(axes[0], records, "degrees", ("epoch", epochs), targets, **where)
@@ -245,8 +245,10 @@ def drawn(records: Sequence[Record], config: Config) -> Figure:
             ax.axhline(90, color="#999999", linewidth=1)
         for ax in (axes[0], axes[2]):
             ax.set_xlim(0, 1.2 * config.epochs)
-        for ax, place in ((axes[0], "lower right"), (axes[2], "upper right"), (axes[3], "center right")):
-            ax.legend(fontsize=7, loc=place)
+        handles, labels = (
+            sum(parts, []) for parts in zip(*(ax.get_legend_handles_labels() for ax in (axes[0], axes[2])))
+        )
+        fig.legend(handles, labels, loc="outside upper center", ncols=5, fontsize=8)
     return fig
 
 

@@ -238,8 +238,8 @@ def example(config: Config) -> dict[str, Floats]:
         max(config.iterations),
     )
     found = {"true": run.states, "Kalman filter": kalman(run)[0]}
-    found[f"{few} steps"] = tracked(informed(few, config.lengths[0]), run)
-    found[f"{many} steps"] = tracked(informed(many, config.lengths[-1]), run)
+    found[f"steps of inference: {few}"] = tracked(informed(few, config.lengths[0]), run)
+    found[f"steps of inference: {many}"] = tracked(informed(many, config.lengths[-1]), run)
     return {name: states[:, 2] for name, states in found.items()}
 
 
