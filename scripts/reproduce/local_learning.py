@@ -245,9 +245,8 @@ def drawn(records: Sequence[Record], config: Config) -> Figure:
             ax.axhline(90, color="#999999", linewidth=1)
         for ax in (axes[0], axes[2]):
             ax.set_xlim(0, 1.2 * config.epochs)
-        handles, labels = (
-            sum(parts, []) for parts in zip(*(ax.get_legend_handles_labels() for ax in (axes[0], axes[2])))
-        )
+        ways = [ax.get_legend_handles_labels() for ax in (axes[0], axes[2])]
+        handles, labels = ([*first, *second] for first, second in zip(*ways, strict=True))
         fig.legend(handles, labels, loc="outside upper center", ncols=5, fontsize=8)
     return fig
 
