@@ -6,7 +6,8 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 
 from asm_gym import Episode, NeuralASM
-from asm_gym.detection.events import EVENTS, EXCUSED, KNOCKED_S, SLIPPED, Excuses, event_of
+from asm_gym.detection.detector import GAINS
+from asm_gym.detection.events import EVENTS, EXCUSED, FADING, KNOCKED_S, SLIPPED, Excuses, event_of
 from asm_gym.monitors import Surprise
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
@@ -60,12 +61,32 @@ def test_what_the_senses_say_of_a_row(row, event, divisor):
     assert excused([row]) == [(event, divisor)]
 
 
-def test_a_knock_is_felt_for_a_second_at_any_rate():
+def test_a_knock_is_felt_for_a_second_at_any_rate_and_fades_as_what_it_has_left_in_the_slowest_evidence():
     for dt in (0.05, 0.01):
         spec = StreamSpec(ARM.channels, dt)
         found = excused([changed(5, 80.0)] + [CALM] * 200, spec)
-        assert [e for e, _ in found].count("knock") == round(KNOCKED_S / dt)
-        assert found[round(KNOCKED_S / dt)] == ("", 1.0)
+        second = round(KNOCKED_S / dt)
+        assert found[:second] == [("knock", EXCUSED)] * second
+        fading = np.array([by for _, by in found[second:]])
+        assert [event for event, _ in found[second:]] == ["knock"] * FADING + [""] * (201 - second - FADING)
+        left = EXCUSED * (1 - min(GAINS)) ** (2 * np.arange(1, len(fading) + 1))  # of evidence to which nothing is added
+        assert (np.diff(fading) <= 0).all()
+        np.testing.assert_allclose(fading, np.maximum(left, 1.0))
+
+
+def test_the_end_of_a_knocks_second_is_no_fault_and_a_fault_that_comes_then_is():
+    memory = NeuralASM(ARM, hidden_size=8, association_size=8, epochs=1, excuses=True).fit(wild(20))
+    calm = wild(1, seed=2)[0].stream
+    knocked = calm.copy()
+    knocked[40, 5:8] += 1000.0
+    surprise, over = memory.score(Episode.from_stream(knocked, ARM)), 40 + round(KNOCKED_S / ARM.dt)
+    later = slice(over, over + FADING)
+    fading, second = surprise.value[later], surprise.value[over - 5 : over].max()
+    assert surprise.raw[over] > 3 * second  # a tenth of it would be excused no more
+    usual = memory.score(Episode.from_stream(calm, ARM)).value[later].max()
+    assert fading.max() < 1.5 * max(second, usual)
+    knocked[over + 3, 0] += 0.5
+    assert memory.score(Episode.from_stream(knocked, ARM)).value[over + 3] > 3 * fading.max()
 
 
 def test_a_finger_has_moved_for_a_tenth_of_a_second():

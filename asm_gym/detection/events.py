@@ -3,6 +3,7 @@
     knock    a wrist has felt more than 50 N on an axis within the last second; its peaks count, where they are sensed
     stop     a joint is within 0.03 rad of one of its stops
     s'       s / 10 where either is so, s / 3 where a finger has just slid by 1 cm/s, else s
+    after    k rows after the second is over  s / (10 (1 - a)^{2k}), as long as that is less than s
 
 A hand that strikes a table surprises, and so does a joint that comes to its stop or a finger that slips: none is a
 fault of the body, and most alarms of healthy robots are such. They are not forgiven: what is still over the threshold
@@ -12,6 +13,7 @@ counted. A number that is missing excuses nothing.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
+from asm_gym.detection.detector import GAINS
 from asm_gym.spec import Channel, StreamSpec
 
 NO_EVENT, KNOCK, STOP, FAULT = "", "knock", "stop", "fault"
@@ -33,6 +36,9 @@ NEAR_STOP = 0.03
 """[rad]"""
 EXCUSED, SLIPPED = 10.0, 3.0
 """What surprise is divided by, at a knock or a stop, and where fingers move."""
+FADE = (1.0 - min(GAINS)) ** 2
+FADING = math.ceil(-math.log(EXCUSED) / math.log(FADE))
+"""What is left of the slowest evidence after a row; in how many it comes down to a tenth, the excuse of a knock too."""
 MOVING, MOVED_S = 0.01, 0.1
 """At which a finger moves that slides [m/s], and for how long it has just moved [s]. Those that turn never rest."""
 
@@ -62,11 +68,11 @@ class Excuses:
         self._joints = _columns(spec, lambda c: bool(c.stops))
         self._ends = np.array([pair for c in spec.channels for pair in c.stops], np.float64).reshape(-1, 2)
         self._fingers = _columns(spec, lambda c: c.name.endswith("gripper_velocity") and c.unit == "m/s")
-        self._rows = np.array([max(1, round(seconds / spec.dt)) for seconds in (KNOCKED_S, MOVED_S)])
+        self._rows = np.array([*(max(1, round(seconds / spec.dt)) for seconds in (KNOCKED_S, MOVED_S)), FADING])
 
     @property
     def arrays(self) -> tuple[list[NDArray[Any]], NDArray[np.float64]]:
-        """Columns of wrists, joints and fingers, and how many rows things last; (J, 2) the stops."""
+        """Columns of wrists, joints and fingers, and how many rows things last and fade; (J, 2) the stops."""
         return [self._wrist, self._joints, self._fingers, self._rows], self._ends
 
     def start(self, batch: int) -> NDArray[np.int64]:
@@ -100,7 +106,7 @@ def _step(left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any
     for n in range(B):
         for i in wrist:
             if abs(rows[n, i]) > KNOCKING and np.isfinite(rows[n, i]):
-                after[n, 0] = lasting[0]
+                after[n, 0] = lasting[0] + lasting[2]
         for i in fingers:
             if abs(rows[n, i]) > MOVING and np.isfinite(rows[n, i]):
                 after[n, 1] = lasting[1]
@@ -110,8 +116,9 @@ def _step(left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any
             q = rows[n, joints[j]]
             if q < ends[j, 0] + NEAR_STOP or q > ends[j, 1] - NEAR_STOP:
                 kind[n] = 2
-        if after[n, 0] > 0:
-            kind[n] = 1
         if kind[n] > 0:
             divisor[n] = EXCUSED
+        if after[n, 0] > 0:
+            kind[n] = 1
+            divisor[n] = max(divisor[n], EXCUSED * FADE ** max(lasting[2] - after[n, 0] + 1, 0))
     return after, kind, divisor

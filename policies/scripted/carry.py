@@ -43,6 +43,7 @@ class CarryTask(NamedTuple):
         headings: those of its x axis that fit the place [rad]; empty where every one does.
         heading_fit: how exactly it must have one of them before it is lowered [rad].
         fit: how exactly it must stand over its place before it is lowered [m].
+        haste: with which share of the usual speed the hand comes down.
     """
 
     name: str
@@ -55,6 +56,7 @@ class CarryTask(NamedTuple):
     headings: tuple[float, ...] = ()
     heading_fit: float = 0.06
     fit: float = 0.02
+    haste: float = 1.0
 
 
 class CarryState(NamedTuple):
@@ -165,7 +167,8 @@ class CarryExpert(PhasedExpert):
             # From afar, first high: the way may lead over a wall or another object.
             if phase == REACH and np.linalg.norm((grip - hand_at)[:2]) > 0.1:
                 target = np.array([target[0], target[1], max(target[2], min(hand_at[2], target[2] + 0.1))])
-            return np.append(move(hand_at, target, hand, aligned, state.speed, self._gain), OPEN)
+            speed = state.speed * (task.haste if phase == DESCEND else 1.0)
+            return np.append(move(hand_at, target, hand, aligned, speed, self._gain), OPEN)
         if phase == GRASP:
             gain = self._gain if self._careful else 1.0
             return np.append(move(hand_at, state.anchor, hand, gripping(hand, None), state.speed, gain), CLOSE)
@@ -208,7 +211,7 @@ class CarryExpert(PhasedExpert):
         def strain(choice: tuple[Vector, float]) -> tuple[float, float]:
             """How far the last joint comes beyond where it has room, and how far it turns in all [rad]."""
             closing, wanted = choice
-            fitting = _about_vertical(wanted - heading) @ turned
+            fitting = about_vertical(wanted - heading) @ turned
             grasp = _wrapped(along - _yaw(turned @ closing) + _yaw(at + turned @ task.grip - base))
             place = _wrapped(along - _yaw(fitting @ closing) + _yaw(task.place + fitting @ task.grip - base))
             return max(abs(grasp) - most, abs(place) - most, 0.0), abs(grasp - now) + abs(place - grasp)
@@ -228,7 +231,7 @@ class CarryExpert(PhasedExpert):
             return target
         wrist = self._wrist(observation)
         left = wrist - _wrapped(wrist - left)
-        first: Vector = _about_vertical(float(np.clip(left, -_AHEAD, _AHEAD))) @ down
+        first: Vector = about_vertical(float(np.clip(left, -_AHEAD, _AHEAD))) @ down
         return first
 
     def _wrist(self, observation: Any) -> float:
@@ -242,7 +245,7 @@ class CarryExpert(PhasedExpert):
 
     def _held(self, task: CarryTask, hand: Vector, turned: Vector) -> Vector:
         """(3, 3) how to hold the hand so that the object in it comes to fit its place."""
-        return _about_vertical(_to_fit(task.headings, turned)) @ gripping(hand, None)
+        return about_vertical(_to_fit(task.headings, turned)) @ gripping(hand, None)
 
 
 def _to_fit(headings: tuple[float, ...], turned: Vector) -> float:
@@ -262,7 +265,7 @@ def _wrapped(angle: float) -> float:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def _about_vertical(angle: float) -> Vector:
+def about_vertical(angle: float) -> Vector:
     """(3, 3) rotation about the vertical [rad]."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -9,10 +9,16 @@ import gymnasium as gym
 import numpy as np
 
 from asm_gym.policies.scripted.base import Style, Vector
-from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
+from asm_gym.policies.scripted.carry import CarryExpert, CarryTask, about_vertical
 
 _WALL = 0.09  # how high above the bins' floor the fingertips stay clear of the walls' tops with the palm [m]
 _REACH = 0.8  # further from its base than this a Panda's hand comes down with its elbow at its stop [m]
+_PALM = 0.103, 0.035  # half of a Panda's palm, along which its fingers close and across [m]
+_ABOVE = 0.03  # of the fingertips its palm is [m]
+_WALLS = 0.1  # how high the walls of the bins are above the bins' origin [m]
+_SPARE = 0.01  # so much room beside a wall is enough [m]
+_ASKEW = 0.0, 0.2, -0.2, 0.4, -0.4  # how far from square to an object its fingers may close [rad]
+_SLOWLY = 0.3  # with which share of its speed a palm comes down that will meet a wall
 _CLEAR = 0.04  # how much room a box needs beside it, for half a wall and for how far from its place it is lowered [m]
 
 
@@ -59,7 +65,12 @@ class PickPlaceExpert(CarryExpert):
         place = self._place(env, nearest, half, grip, self._careful)
         if self._careful:  # let go over the walls: stretched out, the arm may stand nearer to one than it should
             place[2] += 0.04
-        closing = self._closing(half, at, turned, env.bin1_pos, env.bin_size, self._careful and name == "Can")
+        closing, room = (
+            self._closing(half, at, turned, env.bin1_pos, env.bin_size, self._careful and name == "Can"),
+            _SPARE,
+        )
+        if not self._careful and at[2] + grip + _ABOVE < env.bin1_pos[2] + _WALLS:
+            closing, room = self._beside_walls(half, at, turned, env.bin1_pos, env.bin_size)
         task = CarryTask(
             name=name,
             grip=np.array([0.0, 0.0, grip]),
@@ -71,6 +82,7 @@ class PickPlaceExpert(CarryExpert):
             headings=self._headings(closing, place - env.robots[0].base_pos) if self._careful else (),
             heading_fit=0.3,
             fit=0.03,
+            haste=1.0 if room >= _SPARE else _SLOWLY,
         )
         return self._at_ease(task, observation)
 
@@ -92,6 +104,26 @@ class PickPlaceExpert(CarryExpert):
             return float(np.min((bin_size[:2] / 2 - np.abs(at[:2] - bin_at[:2])) / np.maximum(along, 1e-6)))
 
         return max(axes, key=room)
+
+    @staticmethod
+    def _beside_walls(
+        half: Vector, at: Vector, turned: Vector, bin_at: Vector, bin_size: Vector
+    ) -> tuple[Vector, float]:
+        """Along which direction (3,) to close, in the object's frame, and what room the palm then has by the walls [m].
+
+        Square to the object where there is room, else as far askew as it takes; square in corners, where nothing helps.
+        """
+        left = bin_size[:2] / 2 - np.abs(at[:2] - bin_at[:2])
+        narrow = [np.eye(3)[i] for i in (0, 1) if half[i] < 0.035]
+
+        def room(closing: Vector) -> float:
+            along = np.abs((turned @ closing)[:2])
+            return float(np.min(left - _PALM[0] * along - _PALM[1] * along[::-1]))
+
+        ways = [about_vertical(askew) @ axis for askew in _ASKEW for axis in narrow]
+        fitting = [closing for closing in ways if room(closing) >= _SPARE]
+        best = fitting[0] if fitting else max(narrow, key=room)
+        return best, room(best)
 
     @staticmethod
     def _place(env: Any, compartment: int, half: Vector, grip: float, careful: bool) -> Vector:
