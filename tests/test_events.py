@@ -69,9 +69,18 @@ def test_a_knock_is_felt_for_a_second_at_any_rate_and_fades_as_what_it_has_left_
         assert found[:second] == [("knock", EXCUSED)] * second
         fading = np.array([by for _, by in found[second:]])
         assert [event for event, _ in found[second:]] == ["knock"] * FADING + [""] * (201 - second - FADING)
-        left = EXCUSED * (1 - min(GAINS)) ** (2 * np.arange(1, len(fading) + 1))  # of evidence to which nothing is added
+        left = EXCUSED * (1 - min(GAINS)) ** (
+            2 * np.arange(1, len(fading) + 1)
+        )  # of evidence
         assert (np.diff(fading) <= 0).all()
         np.testing.assert_allclose(fading, np.maximum(left, 1.0))
+
+
+def test_a_stop_fades_once_the_joint_has_left_it():
+    found = excused([changed(0, 0.98), *[CALM] * (FADING + 1)])
+    assert [event for event, _ in found] == ["stop"] * (FADING + 1) + [""]
+    assert found[0][1] == EXCUSED
+    assert found[1][1] == pytest.approx(EXCUSED * (1 - min(GAINS)) ** 2)
 
 
 def test_the_end_of_a_knocks_second_is_no_fault_and_a_fault_that_comes_then_is():
@@ -99,7 +108,7 @@ def test_streams_without_such_senses_excuse_nothing():
 
 def test_what_is_left_of_an_excused_surprise_adds_up_and_hides_nothing():
     raw = Surprise(np.array([60.0]), np.array([[20.0, 40.0]]))
-    _, by = Excuses(ARM).step(np.zeros((1, 2), np.int64), changed(5, 80.0)[None])
+    _, by = Excuses(ARM).step(np.zeros((1, 3), np.int64), changed(5, 80.0)[None])
     left = raw.excused(by)
     assert left.value == pytest.approx(60.0 / EXCUSED)
     assert left.attribution.sum() == pytest.approx(left.value)

@@ -112,7 +112,7 @@ class QuietRows:
         doubles, and_where = _side_by_side(np.float64, *chain, ends, numbers)
         self._fixed = ints, doubles, np.array([*where, *and_where]), *learned
         # Of each kind of number the state now and the next one, in turns.
-        sizes = T + H + K, 2 * lag * D + G * X + H + 2 * X + HAND + 2, 4, X
+        sizes = T + H + K, 2 * lag * D + G * X + H + 2 * X + HAND + 2, 5, X
         kinds = np.float32, np.float64, np.int64, np.bool_
         self._state = tuple(np.zeros((2, n), kind) for n, kind in zip(sizes, kinds, strict=True))
         self._table = table((*self._state, *self._fixed))

@@ -3,7 +3,7 @@
     knock    a wrist has felt more than 50 N on an axis within the last second; its peaks count, where they are sensed
     stop     a joint is within 0.03 rad of one of its stops
     s'       s / 10 where either is so, s / 3 where a finger has just slid by 1 cm/s, else s
-    after    k rows after the second is over  s / (10 (1 - a)^{2k}), as long as that is less than s
+    after    k rows after either is over  s / (10 (1 - a)^{2k}), as long as that is less than s
 
 A hand that strikes a table surprises, and so does a joint that comes to its stop or a finger that slips: none is a
 fault of the body, and most alarms of healthy robots are such. They are not forgiven: what is still over the threshold
@@ -38,7 +38,7 @@ EXCUSED, SLIPPED = 10.0, 3.0
 """What surprise is divided by, at a knock or a stop, and where fingers move."""
 FADE = (1.0 - min(GAINS)) ** 2
 FADING = math.ceil(-math.log(EXCUSED) / math.log(FADE))
-"""What is left of the slowest evidence after a row; in how many it comes down to a tenth, the excuse of a knock too."""
+"""What is left of the slowest evidence after a row; in how many it comes down to a tenth, and the excuse too."""
 MOVING, MOVED_S = 0.01, 0.1
 """At which a finger moves that slides [m/s], and for how long it has just moved [s]. Those that turn never rest."""
 
@@ -76,8 +76,8 @@ class Excuses:
         return [self._wrist, self._joints, self._fingers, self._rows], self._ends
 
     def start(self, batch: int) -> NDArray[np.int64]:
-        """(B, 2) for how many rows a knock is still felt, and fingers have just moved: none."""
-        return np.zeros((batch, 2), np.int64)
+        """(B, 3) for how many rows a knock and a stop are still felt, and fingers have just moved: none."""
+        return np.zeros((batch, 3), np.int64)
 
     def step(self, left: NDArray[np.int64], rows: NDArray[np.float64]) -> tuple[NDArray[np.int64], Excused]:
         """What the next rows (B, D) excuse, some of whose numbers may not be finite."""
@@ -109,16 +109,15 @@ def _step(left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any
                 after[n, 0] = lasting[0] + lasting[2]
         for i in fingers:
             if abs(rows[n, i]) > MOVING and np.isfinite(rows[n, i]):
-                after[n, 1] = lasting[1]
-        if after[n, 1] > 0:
+                after[n, 2] = lasting[1]
+        if after[n, 2] > 0:
             divisor[n] = SLIPPED
         for j in range(len(joints)):
             q = rows[n, joints[j]]
             if q < ends[j, 0] + NEAR_STOP or q > ends[j, 1] - NEAR_STOP:
-                kind[n] = 2
-        if kind[n] > 0:
-            divisor[n] = EXCUSED
-        if after[n, 0] > 0:
-            kind[n] = 1
-            divisor[n] = max(divisor[n], EXCUSED * FADE ** max(lasting[2] - after[n, 0] + 1, 0))
+                after[n, 1] = lasting[2] + 1
+        for k in (1, 0):
+            if after[n, k] > 0:
+                kind[n] = k + 1
+                divisor[n] = max(divisor[n], EXCUSED * FADE ** max(lasting[2] - after[n, k] + 1, 0))
     return after, kind, divisor
