@@ -69,9 +69,7 @@ def test_a_knock_is_felt_for_a_second_at_any_rate_and_fades_as_what_it_has_left_
         assert found[:second] == [("knock", EXCUSED)] * second
         fading = np.array([by for _, by in found[second:]])
         assert [event for event, _ in found[second:]] == ["knock"] * FADING + [""] * (201 - second - FADING)
-        left = EXCUSED * (1 - min(GAINS)) ** (
-            2 * np.arange(1, len(fading) + 1)
-        )  # of evidence
+        left = EXCUSED * (1 - min(GAINS)) ** (2 * np.arange(1, len(fading) + 1))  # of evidence
         assert (np.diff(fading) <= 0).all()
         np.testing.assert_allclose(fading, np.maximum(left, 1.0))
 
