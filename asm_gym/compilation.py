@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.registry import cpu_target
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -56,7 +57,10 @@ def _index_of(load: Callable[[], dict[Any, str]]) -> dict[Any, str]:
 def must_compile(function: Any) -> bool:
     """Whether the next call of a compiled function will take seconds, as far as can be told."""
     cache = _cache_of(function)
-    return cache is not None and not function.signatures and not cache._load_index()
+    if cache is None or function.signatures:
+        return False
+    processor = cpu_target.target_context.codegen().magic_tuple()  # code that another one compiled is none
+    return not any(processor in key for key in cache._load_index())
 
 
 def kept_in(function: Any) -> Path | None:

@@ -103,6 +103,16 @@ def test_code_that_was_kept_for_a_type_that_is_gone_is_compiled_anew(tmp_path):
     assert said == ["True 4.0\n", "True 4.0\n", "False 4.0\n"]
 
 
+def test_code_that_another_processor_compiled_is_none(tmp_path):
+    (tmp_path / "arm.py").write_text(OF_A_TYPE.replace("TYPE", "Arm"))
+    said, env = [], os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    generic = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+    for processor in ({}, generic, generic, {}):
+        run, own = [sys.executable, "-c", "import arm"], env | processor
+        said.append(subprocess.run(run, capture_output=True, text=True, env=own, check=True, cwd=tmp_path).stdout)
+    assert said == ["True 4.0\n", "True 4.0\n", "False 4.0\n", "False 4.0\n"]
+
+
 ROW = """
 import numpy as np
 from asm_gym.memory.energy import outward
