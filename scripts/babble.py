@@ -30,7 +30,7 @@ from asm_gym.policies.registry import EXPERTS, agents, trained_in
 from asm_gym.rollouts.corpus import Corpus
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
-from asm_gym.rollouts.pretraining.healthy import apart, calibrate_body, healthy, held_out, learn_body
+from asm_gym.rollouts.pretraining.healthy import Lessons, apart, calibrate_body, healthy, held_out, learn_body
 from asm_gym.rollouts.pretraining.model_card import Exam, Marks, at_rates, card, examine, usual_force
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.record import record
@@ -184,11 +184,7 @@ def check(args: Args) -> None:
 
 def learn(args: Args, console: Console) -> NeuralASM:
     """Records what is missing, and fits, calibrates and saves the memory, unless this code has learned it already."""
-    wanted = curriculum(args.shown, args.episodes, args.seed, args.guides, args.reaching)
-    with stage("babbling", console, {}) as progress:
-        make = partial(record_lesson, config=args.config, folder=args.out.resolve())
-        files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, args.parallel, progress)
-    lessons = healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
+    lessons = healthy_lessons(args, console)
     hours = [e for e in healthy_hours(args, console) if e.success]
     inner: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
     whole = [*lessons.whole, *hours]
@@ -199,9 +195,7 @@ def learn(args: Args, console: Console) -> NeuralASM:
         **{n: getattr(args, n) for n in ("guides", "reaching", "episodes", "seed", "false_alarms_per_hour")},
         "lessons": len(lessons.fit),
         "rows": sum(map(len, lessons.fit)),
-        "calibrated_on": len(whole),
-        "hours": sum(len(e) * e.spec.dt for e in whole) / 3600,
-        "each": bool(apart(whole, args.false_alarms_per_hour)),
+        **calibrated(whole, args.false_alarms_per_hour),
         "code": code_digest(names=LEARNING),
         **versions(),
     }
@@ -216,6 +210,21 @@ def learn(args: Args, console: Console) -> NeuralASM:
     memory.about = about
     memory.save(path)
     return memory
+
+
+def healthy_lessons(args: Args, console: Console) -> Lessons:
+    """What is healthy of the lessons; those that are missing are recorded."""
+    wanted = curriculum(args.shown, args.episodes, args.seed, args.guides, args.reaching)
+    with stage("babbling", console, {}) as progress:
+        make = partial(record_lesson, config=args.config, folder=args.out.resolve())
+        files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, args.parallel, progress)
+    return healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
+
+
+def calibrated(whole: Sequence[Episode], per_hour: float) -> dict[str, Any]:
+    """What a memory says of the episodes that its threshold was set on."""
+    hours = sum(len(e) * e.spec.dt for e in whole) / 3600
+    return {"calibrated_on": len(whole), "hours": hours, "each": bool(apart(whole, per_hour))}
 
 
 def healthy_hours(args: Args, console: Console) -> list[Episode]:

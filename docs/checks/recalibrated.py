@@ -1,0 +1,50 @@
+"""Sets the threshold of a shipped memory anew, on recordings of its body, and examines it; its weights stay.
+
+    python docs/checks/recalibrated.py panda_100hz
+
+What is missing in the run's folder is recorded. It leaves recalibrated.asm and card.md there.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from asm_gym import NeuralASM
+from asm_gym.evaluation.tables import markdown
+from asm_gym.rollouts.pretraining.healthy import calibrate_body
+from asm_gym.rollouts.pretraining.model_card import at_rates, card
+from asm_gym.scripts.babble import RATES, Args, calibrated, examined, healthy_hours, healthy_lessons
+
+YOUNG = tuple(f"runs/{task}_young/agent.npz" for task in ("lift", "stack", "door"))
+RUNS = {
+    "panda": Args(guides=YOUNG, healthy_episodes=390, corpus=Path("runs/corpus"), workers="1", out=Path("runs/babble")),
+    "panda_100hz": Args(
+        guides=YOUNG,
+        stream_freq=100,
+        episodes=30,
+        exam_episodes=12,
+        exam_policies=("lift_sac", "stack_sac"),
+        exam_tasks=("PickPlaceMilk",),
+        workers="1",
+        out=Path("runs/babble_panda_100hz"),
+    ),
+}
+
+
+def main(name: str) -> None:
+    args, console = RUNS[name], Console()
+    lessons = healthy_lessons(args, console)
+    hours = [episode for episode in healthy_hours(args, console) if episode.success]
+    memory = NeuralASM.pretrained(name)
+    memory.about |= calibrated([*lessons.whole, *hours], args.false_alarms_per_hour)
+    calibrate_body(memory, lessons, hours, args.false_alarms_per_hour).save(args.out / "recalibrated.asm")
+    marks = examined(args, memory, console)
+    text = f"{markdown(card(marks, memory, args.window))}\n\n{at_rates(marks, memory, RATES)}\n"
+    (args.out / "card.md").write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
