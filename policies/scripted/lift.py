@@ -47,7 +47,7 @@ class LiftExpert(PhasedExpert):
         target, grip = self._target(state, cube_at)
         if self._careful and state.phase == DESCEND:  # over the cube first, lest a finger comes down on it
             astray = float(np.linalg.norm((hand_at - cube_at)[:2]))
-            target = target + np.array([0.0, 0.0, np.clip(4 * (astray - 0.012), 0.0, 0.06)])
+            target = target + np.array([0.0, 0.0, np.clip(4 * (astray - 0.006), 0.0, 0.06)])
         aligned = pointing_down(hand, cube if state.phase <= DESCEND else None)
         command = np.append(move(hand_at, target, hand, aligned, state.speed), grip)
         command[:6] += noise[:6]
@@ -55,13 +55,14 @@ class LiftExpert(PhasedExpert):
 
     def _begin(self, observation: Any) -> _State:
         style, rng = self.style, self.np_random
+        deep = 0.0 if self._careful else 0.005  # fingers of other arms are longer, and come down on the table
         return _State(
             phase=REACH,
             since=0,
             speed=style.pace(0.45, rng),
             hover=np.array([0.0, 0.0, 0.07]) + style.spread * rng.standard_normal(3),
             goal=np.array([0.0, 0.0, 0.13]) + style.spread * rng.standard_normal(3),
-            depth=float(np.clip(0.005 + 0.3 * style.spread * rng.standard_normal(), 0.0, 0.01)),
+            depth=float(np.clip(deep + 0.3 * style.spread * rng.standard_normal(), 0.0, 2 * deep)),
             grasped_at=np.zeros(3),
             drift=np.zeros(7),
         )

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from asm_gym.detection.hourly import Blocks, hourly_threshold
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
 from asm_gym.evaluation.scored_episode import ScoredEpisode
@@ -68,7 +69,7 @@ def run(config: Config) -> Findings:
     return Findings(
         records(marks, settings),
         [
-            kept(marks, settings),
+            kept(marks, [*settings, at_last(marks)]),
             *(each(marks, setting) for setting in settings if setting.thresholds),
             missed(marks, shipped),
         ],
@@ -88,6 +89,14 @@ def examined(corpus: Corpus, memory: NeuralASM, known: Sequence[str]) -> list[Ma
             usual = usual_force(list(corpus.episodes("nominal", policies=(EXPERT,), tasks=(task,))[:100]))
             marks.append(examine(memory, Exam(task, policy, known=False).name, own, WINDOW_S, usual))
     return marks
+
+
+def at_last(marks: Sequence[Marks]) -> Setting:
+    """What these hours themselves would set: how much is found where so many alarms come, whatever was promised."""
+    solved = [t for m in marks for t in m.solved]
+    blocks = Blocks.of([t.surprise for t in solved], solved[0].dt)
+    rates = {r: hourly_threshold(blocks, r) for r in PROMISES if r * blocks.total >= 1.0}
+    return Setting("from these very hours, which promises nothing", rates)
 
 
 def together(marks: Sequence[Marks], threshold: float) -> tuple[Alarms, Rate, list[Share]]:
