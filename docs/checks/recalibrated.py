@@ -22,7 +22,16 @@ YOUNG = tuple(f"runs/{task}_young/agent.npz" for task in ("lift", "stack", "door
 RUNS = {
     "panda": Args(guides=YOUNG, healthy_episodes=390, corpus=Path("runs/corpus"), workers="1", out=Path("runs/babble")),
     "sawyer": Args(robot="Sawyer", reaching=True, healthy_episodes=240, workers="1", out=Path("runs/babble_sawyer")),
-    "iiwa": Args(robot="IIWA", reaching=True, healthy_episodes=240, workers="1", out=Path("runs/babble_iiwa")),
+    "iiwa": Args(robot="IIWA", reaching=True, healthy_episodes=150, workers="1", out=Path("runs/babble_iiwa")),
+    "sawyer_100hz": Args(
+        robot="Sawyer",
+        reaching=True,
+        stream_freq=100,
+        episodes=30,
+        exam_episodes=12,
+        workers="1",
+        out=Path("runs/babble_sawyer_100hz"),
+    ),
     "panda_100hz": Args(
         guides=YOUNG,
         stream_freq=100,
@@ -41,7 +50,9 @@ def main(name: str) -> None:
     lessons = healthy_lessons(args, console)
     hours = [episode for episode in healthy_hours(args, console) if episode.success]
     memory = NeuralASM.pretrained(name)
+    memory.about.pop("false_alarm_rate", None)  # of a promise by the episode, before there were others
     memory.about |= calibrated([*lessons.whole, *hours], args.false_alarms_per_hour)
+    memory.about["false_alarms_per_hour"] = args.false_alarms_per_hour
     calibrate_body(memory, lessons, hours, args.false_alarms_per_hour).save(args.out / "recalibrated.asm")
     marks = examined(args, memory, console)
     text = f"{markdown(card(marks, memory, args.window))}\n\n{at_rates(marks, memory, RATES)}\n"
