@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -99,6 +100,9 @@ def check(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
         return
     if program == "python" and argv == ["-"]:
         return  # of what it reads from standard input the names are asked for
+    if program == "python" and argv[0].startswith("docs/checks/"):
+        assert argv[1] in runpy.run_path(str(documents.ROOT / argv[0]))["RUNS"], command
+        return
     if program == "python":
         assert argv[:2] == ["-m", "tests.soak"], command
         called: Callable[[], int] = partial(run, "soak", soak.Args, soak.soak, argv[2:])
@@ -148,6 +152,8 @@ def test_a_command_with_a_wrong_argument_is_found(monkeypatch: pytest.MonkeyPatc
         check("asm-gym demo --no-such-thing", monkeypatch)
     with pytest.raises(AssertionError):
         check("make no-such-thing", monkeypatch)
+    with pytest.raises(AssertionError):
+        check("python docs/checks/recalibrated.py no_such_robot", monkeypatch)
 
 
 def test_a_block_that_needs_a_library_says_so(tmp_path: Path):
