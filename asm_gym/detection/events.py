@@ -9,6 +9,9 @@ A hand that strikes a table surprises, and so does a joint that comes to its sto
 fault of the body, and most alarms of healthy robots are such. They are not forgiven: what is still over the threshold
 is a fault, as a pair of swapped joints is by far. What is over it but for the excuse has a name of its own, and is
 counted. A number that is missing excuses nothing.
+
+Evidence outlives what it is of: the slowest fades by (1 - a)² with each row, a the least of the usual gains. So does
+the excuse, or what is left of a knock would be a fault once its second is over, and of a stop once the joint leaves it.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ Vector = NDArray[np.float64]
 # What one unit of action moves the hand's set-point by, in robosuite's OSC_POSE: 5 cm, 0.5 rad.
 _METRES, _RADIANS = 0.05, 0.5
 OPEN, CLOSE = -1.0, 1.0
+_OVER = 0.006  # how far aside of its target a careful hand goes straight down [m]
 _STILL = 0.1  # below this a gripper's joints have come to rest [rad/s]
 
 
@@ -203,6 +204,16 @@ def move(
         step *= speed / norm
     turn = 0.5 * np.cross(hand, target_rotation, axis=0).sum(axis=1) / _RADIANS
     return np.concatenate([step, np.clip(turn, -0.5, 0.5)])
+
+
+def over_first(position: Vector, target: Vector) -> Vector:
+    """(3,) how much higher than its target a careful hand goes while it is not over it, lest a finger comes down on it.
+
+    Args:
+        position, target: (3,) of the hand [m].
+    """
+    astray = float(np.linalg.norm((position - target)[:2]))
+    return np.array([0.0, 0.0, np.clip(4 * (astray - _OVER), 0.0, 0.06)])
 
 
 def turn_left(hand: Vector, target: Vector) -> float:

@@ -18,6 +18,7 @@ from asm_gym.policies.scripted.base import (
     has_settled,
     matrix,
     move,
+    over_first,
     rotation,
     turn_left,
 )
@@ -26,7 +27,6 @@ REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT = range(8)
 
 _AHEAD = 1.0  # how far to turn the hand at once [rad]
 _ROOM = 0.9  # how far from its stops the last joint is to stay [rad]
-_OVER = 0.006  # how far aside of its grip a careful hand goes straight down [m]
 _EXACT = 0.005  # what has to fit as exactly as this is not lowered beside its place [m]
 
 
@@ -168,9 +168,8 @@ class CarryExpert(PhasedExpert):
             # From afar, first high: the way may lead over a wall or another object.
             if phase == REACH and np.linalg.norm((grip - hand_at)[:2]) > 0.1:
                 target = np.array([target[0], target[1], max(target[2], min(hand_at[2], target[2] + 0.1))])
-            if phase == DESCEND and self._careful:  # over it first, lest a finger comes down on it
-                astray = float(np.linalg.norm((hand_at - grip)[:2]))
-                target = target + np.array([0.0, 0.0, np.clip(4 * (astray - _OVER), 0.0, 0.06)])
+            if phase == DESCEND and self._careful:
+                target = target + over_first(hand_at, grip)
             speed = state.speed * (task.haste if phase == DESCEND else 1.0)
             return np.append(move(hand_at, target, hand, aligned, speed, self._gain), OPEN)
         if phase == GRASP:

@@ -14,6 +14,7 @@ from asm_gym.policies.scripted.base import (
     has_settled,
     matrix,
     move,
+    over_first,
     pointing_down,
     rotation,
 )
@@ -45,9 +46,8 @@ class LiftExpert(PhasedExpert):
 
         state = self._advance(state, hand_at, cube_at, self._read(observation, "gripper_velocity"))
         target, grip = self._target(state, cube_at)
-        if self._careful and state.phase == DESCEND:  # over the cube first, lest a finger comes down on it
-            astray = float(np.linalg.norm((hand_at - cube_at)[:2]))
-            target = target + np.array([0.0, 0.0, np.clip(4 * (astray - 0.006), 0.0, 0.06)])
+        if self._careful and state.phase == DESCEND:
+            target = target + over_first(hand_at, cube_at)
         aligned = pointing_down(hand, cube if state.phase <= DESCEND else None)
         command = np.append(move(hand_at, target, hand, aligned, state.speed), grip)
         command[:6] += noise[:6]

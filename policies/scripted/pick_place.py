@@ -65,12 +65,11 @@ class PickPlaceExpert(CarryExpert):
         place = self._place(env, nearest, half, grip, self._careful)
         if self._careful:  # let go over the walls: stretched out, the arm may stand nearer to one than it should
             place[2] += 0.04
-        closing, room = (
-            self._closing(half, at, turned, env.bin1_pos, env.bin_size, self._careful and name == "Can"),
-            _SPARE,
-        )
         if not self._careful and at[2] + grip + _ABOVE < env.bin1_pos[2] + _WALLS:
             closing, room = self._beside_walls(half, at, turned, env.bin1_pos, env.bin_size)
+        else:
+            closing = self._closing(half, at, turned, env.bin1_pos, env.bin_size, self._careful and name == "Can")
+            room = _SPARE
         task = CarryTask(
             name=name,
             grip=np.array([0.0, 0.0, grip]),
@@ -95,7 +94,7 @@ class PickPlaceExpert(CarryExpert):
     @staticmethod
     def _closing(half: Vector, at: Vector, turned: Vector, bin_at: Vector, bin_size: Vector, round_: bool) -> Vector:
         """(3,) along which of the object's axes to close: of those it is narrow enough along, away from the walls."""
-        axes = [np.eye(3)[i] for i in (0, 1) if half[i] < 0.035]
+        axes = _narrow(half)
         if round_:
             axes += [np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.array([1.0, -1.0, 0.0]) / np.sqrt(2)]
 
@@ -114,7 +113,7 @@ class PickPlaceExpert(CarryExpert):
         Square to the object where there is room, else as far askew as it takes; square in corners, where nothing helps.
         """
         left = bin_size[:2] / 2 - np.abs(at[:2] - bin_at[:2])
-        narrow = [np.eye(3)[i] for i in (0, 1) if half[i] < 0.035]
+        narrow = _narrow(half)
 
         def room(closing: Vector) -> float:
             along = np.abs((turned @ closing)[:2])
@@ -160,3 +159,8 @@ class PickPlaceExpert(CarryExpert):
         )
         half: Vector = np.abs(turn) @ model.geom_aabb[geom, 3:]
         return half
+
+
+def _narrow(half: Vector) -> list[Vector]:
+    """Which of its own horizontal axes (3,) an object of half this size (3,) can be gripped along [m]."""
+    return [np.eye(3)[i] for i in (0, 1) if half[i] < 0.035]
