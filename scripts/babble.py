@@ -30,7 +30,15 @@ from asm_gym.policies.registry import EXPERTS, agents, trained_in
 from asm_gym.rollouts.corpus import Corpus
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
-from asm_gym.rollouts.pretraining.healthy import Lessons, apart, calibrate_body, healthy, held_out, learn_body
+from asm_gym.rollouts.pretraining.healthy import (
+    Lessons,
+    apart,
+    calibrate_body,
+    for_threshold,
+    healthy,
+    held_out,
+    learn_body,
+)
 from asm_gym.rollouts.pretraining.model_card import Exam, Marks, at_rates, card, examine, usual_force
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.record import record
@@ -222,9 +230,14 @@ def healthy_lessons(args: Args, console: Console) -> Lessons:
 
 
 def calibrated(whole: Sequence[Episode], per_hour: float) -> dict[str, Any]:
-    """What a memory says of the episodes that its threshold was set on."""
-    hours = sum(len(e) * e.spec.dt for e in whole) / 3600
-    return {"calibrated_on": len(whole), "hours": hours, "each": bool(apart(whole, per_hour))}
+    """What a memory says of the episodes that its threshold was set on, and of those that told ceilings."""
+    whole, told = for_threshold(whole)
+    found = {"calibrated_on": len(whole), "hours": _hours(whole), "each": bool(apart(whole, per_hour))}
+    return found | ({"ceilings_on": len(told), "ceilings_hours": _hours(told)} if told else {})
+
+
+def _hours(episodes: Sequence[Episode]) -> float:
+    return sum(len(e) * e.spec.dt for e in episodes) / 3600
 
 
 def healthy_hours(args: Args, console: Console) -> list[Episode]:

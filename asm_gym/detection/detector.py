@@ -31,7 +31,7 @@ from asm_gym.detection.repetition import (
     repeated,
     unrepeated,
 )
-from asm_gym.detection.tails import worst_case
+from asm_gym.detection.tails import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, ceilings, worst_case
 from asm_gym.detection.whitening import bounded, whitening
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, check_number, shown, typed
@@ -135,6 +135,7 @@ class Detector:
         shrinkage: float,
         rng: np.random.Generator,
         habituates: bool = True,
+        tail_index: float = TAIL_INDEX,
     ) -> Self:
         """From nominal episodes that the model has learned, and others that it has not."""
         matrix = whitening(bounded(np.concatenate([r.errors for r in learned]), bound), shrinkage)
@@ -142,14 +143,14 @@ class Detector:
         ones = np.ones((len(a), len(matrix)))
         plain = cls(matrix, ones, ones, np.zeros(1), ANYTHING, a, bound)
         everything = [*learned, *held_out]
-        ceiling, tail = worst_case(np.array([plain._strengths(r)[0].max(axis=0) for r in everything]))
+        ceiling, tail = worst_case(np.array([plain.strengths(r)[0].max(axis=0) for r in everything]), tail_index)
         steps, numbers = sum(len(r.errors) for r in everything), 2 * everything[0].contexts.shape[1]
         if not habituates or steps < STEPS_PER_NUMBER * numbers:
             return cls(matrix, ceiling, tail, np.zeros(numbers + 1), np.zeros(2), a, bound)
         apart = -(-steps // MOST_ROWS)
         contexts, levels = [], []
         for r in everything:
-            strengths, lately = plain._strengths(r)
+            strengths, lately = plain.strengths(r)
             contexts.append(np.hstack([r.contexts, lately])[::apart].astype(np.float32))
             ratios = ((strengths / ceiling) ** tail).reshape(len(lately), -1)
             levels.append(np.log(np.maximum(pool(ratios)[0], FAINTEST))[::apart])
@@ -205,7 +206,7 @@ class Detector:
         )
         return Evidence(*new), value, shares
 
-    def _strengths(self, run: ModelOutput) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def strengths(self, run: ModelOutput) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """v (T, G, X) and the running mean of the contexts (T, C) of a whole episode."""
         whitened = bounded(run.errors, self.bound) @ self.whitening
         vectors, lately = accumulated(whitened, np.asarray(run.contexts, np.float64), self.gains)
@@ -232,6 +233,7 @@ class EvidenceDetection:
         shrinkage: λ in [0, 1] of the whitening, towards no correlation between errors.
         habituates: surprise is measured against what is usual in a context. A context knows the policy, so a memory
             that is to watch any policy leaves it out.
+        tail_index: ξ_0 in (0, 1]: a ratio falls off as probability to this power. The smaller, the more senses add up.
 
     Attributes:
         detector_: what turns errors into surprise; None before ``fit``.
@@ -248,6 +250,7 @@ class EvidenceDetection:
         bound: float = BOUND,
         shrinkage: float = 1e-3,
         habituates: bool = True,
+        tail_index: float = TAIL_INDEX,
     ) -> None:
         try:
             self.spec, self.gains = spec, tuple(check_number("gains", a, above=0.0, high=1.0) for a in gains)
@@ -258,13 +261,15 @@ class EvidenceDetection:
         self.bound = check_number("bound", bound, above=0.0)
         self.shrinkage = check_number("shrinkage", shrinkage, low=0.0, high=1.0)
         self.habituates = check_flag("habituates", habituates)
+        self.tail_index = check_number("tail_index", tail_index, above=0.0, high=1.0)
         self.learned_: Arrays = {}
         self.detector_: Detector | None = None
 
     def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
         """Whitening from what the model has learned; its ceilings, and what is usual in a context, from all."""
         learned, fresh = nominal.outputs(nominal.learned), nominal.outputs(nominal.held_out)
-        detector = Detector.fit(learned, fresh, self.gains, self.bound, self.shrinkage, rng, self.habituates)
+        how = self.gains, self.bound, self.shrinkage, rng, self.habituates, self.tail_index
+        detector = Detector.fit(learned, fresh, *how)
         senses = self.spec.sensory
         counted = count_repetitions([e.stream[:, senses] for e in nominal.episodes], self.spec.noise[senses] > 0)
         return self.restore({name: getattr(detector, name) for name in self.arrays[:-1]} | {"repetition": counted})
@@ -279,9 +284,16 @@ class EvidenceDetection:
         kept = {name: old[name][:, left] for name in ("ceiling", "tail", "repetition")}
         usual = {name: old[name] for name in ("context_quantile", "context_range")}
         matrix = (vectors / np.sqrt(values)) @ vectors.T
-        return EvidenceDetection(spec, self.gains, self.bound, self.shrinkage, self.habituates).restore(
-            {"whitening": matrix, **usual, **kept}
-        )
+        return self._anew(spec, self.tail_index).restore({"whitening": matrix, **usual, **kept})
+
+    def with_ceilings(self, maxima: Array) -> EvidenceDetection:
+        """The same, with q from the largest v in each of N healthy episodes (N, G, X); κ goes by a smaller ξ_0."""
+        tail = np.minimum(self.learned_["tail"] * (HOURS_TAIL_INDEX / self.tail_index), 1.0)
+        told = {"ceiling": ceilings(maxima, HOURS_QUANTILE), "tail": tail}
+        return self._anew(self.spec, HOURS_TAIL_INDEX).restore({**self.learned_, **told})
+
+    def _anew(self, spec: StreamSpec, tail_index: float) -> EvidenceDetection:
+        return EvidenceDetection(spec, self.gains, self.bound, self.shrinkage, self.habituates, tail_index)
 
     def restore(self, learned: Arrays) -> Self:
         found = {name: learned[name] for name in self.arrays[:-1]}

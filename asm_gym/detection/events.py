@@ -87,6 +87,14 @@ class Excuses:
         after, kind, divisor = _step(left, rows, self._wrist, self._joints, self._ends, self._fingers, self._rows)
         return after, Excused(kind, divisor)
 
+    def divisors(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+        """(T,) what surprise is divided by in each row of a whole stream (T, D)."""
+        left, found = self.start(1), np.ones(len(stream))
+        for t, row in enumerate(np.asarray(stream, np.float64)):
+            left, excused = self.step(left, row[None])
+            found[t] = excused.divisor[0]
+        return found
+
 
 def event_of(value: float, raw: float, kind: int, threshold: float) -> str:
     """What a row is: its surprise as far as it is not excused, all of it, and what excuses it."""

@@ -13,12 +13,15 @@ from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint, write_checkpoint
 from asm_gym.contact_limits import healthy_forces
-from asm_gym.detection import Detection, ModelOutput, Nominal
+from asm_gym.detection import Detection, EvidenceDetection, ModelOutput, Nominal
 from asm_gym.detection.conformal import HOUR
+from asm_gym.detection.events import Excuses
+from asm_gym.detection.tails import FEWEST_EPISODES
 from asm_gym.episode import Episode
 from asm_gym.familiar_speed import FamiliarSpeed
 from asm_gym.monitors.base import Model, Progress, Specialises, State, Surprise, Told
 from asm_gym.monitors.blindness import require_sight
+from asm_gym.monitors.ceilings import worst_of
 from asm_gym.monitors.doubt import LOG, doubt_crashes
 from asm_gym.monitors.monitor_file import SavedMonitor, calibration_arrays
 from asm_gym.monitors.overlap import Marks, check_fresh, sketch
@@ -60,6 +63,7 @@ class CalibratedMonitor(Calibrated):
     """
 
     model: Model
+    _excuses: Excuses | None = None
 
     def __init__(self, model: Model, *detections: Detection, seed: int = 0) -> None:
         if not detections:
@@ -168,6 +172,35 @@ class CalibratedMonitor(Calibrated):
                 if taken:
                     raise ValueError(f"{self.model.kind} and {detection.name} both learn {', '.join(sorted(taken))}")
                 detection.fit(nominal, rng)
+
+    @typed
+    def learn_ceilings(self, episodes: Sequence[Episode]) -> Self:
+        """Learns from healthy hours how far each sense goes at its worst, so that rare alarms are as rare in each.
+
+        What it was fitted to, babbling say, tells less of hours than hours do. It has no threshold then: ``calibrate``
+        it on other hours of the same policies and tasks.
+
+        Args:
+            episodes: healthy ones that ``fit`` has not seen, 100 at least, and one hit or so in each 50 at most.
+
+        Raises:
+            ValueError: too few, or bad ones.
+            TypeError: its detection is not that of evidence.
+        """
+        self._fitted()
+        if not isinstance(self.detection, EvidenceDetection):
+            raise TypeError(f"the detection {self.detection.name} has no ceilings: learn those of evidence")
+        check_nominal(episodes, self.spec, self.model.shortest)
+        if len(episodes) < FEWEST_EPISODES:
+            raise ValueError(f"ceilings take {FEWEST_EPISODES} healthy episodes or more, got {len(episodes)}")
+        with threadpool_limits(1):
+            maxima = worst_of(self.model, self.detection, self._excuses, episodes)
+        new = self._copy()
+        new.detection = new.detections["evidence"] = self.detection.with_ceilings(maxima)
+        new._uncalibrate()
+        new._remember(episodes)
+        vars(self).update(vars(new))
+        return self
 
     @typed
     def calibrate(

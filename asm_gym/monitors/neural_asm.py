@@ -17,6 +17,7 @@ from asm_gym.checkpoint import Checkpoint, read_checkpoint
 from asm_gym.detection import Detector, EvidenceDetection
 from asm_gym.detection.detector import BOUND, GAINS
 from asm_gym.detection.events import Excuses
+from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.episode import Episode
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.feedback import FEEDBACK, LEARNED
@@ -74,6 +75,7 @@ class NeuralASM(CalibratedMonitor):
         shrinkage: λ in [0, 1] of the whitening, towards no correlation between errors.
         habituates: surprise is measured against what is usual in a context. A context knows the policy, so a memory
             that is to watch any policy leaves it out.
+        tail_index: ξ_0 in (0, 1]: surprise falls off as probability to this power. The smaller, the more senses add up.
         excuses: knocks, joints at their stops and fingers that move are told apart from faults (``detection.events``):
             for a memory that is to watch any policy, of which some strike things.
         values: torques, and other values that the rest of a row tells, are judged beside changes (``monitors.values``):
@@ -130,6 +132,7 @@ class NeuralASM(CalibratedMonitor):
         excuses: bool = False,
         values: bool = False,
         urdf: str = "",
+        tail_index: float = TAIL_INDEX,
     ) -> None:
         self.values = check_flag("values", values)
         self.urdf = urdf
@@ -157,7 +160,8 @@ class NeuralASM(CalibratedMonitor):
         self.feedback = feedback
         schedule = Schedule(**{name: getattr(self, name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, feedback, dynamics)
-        super().__init__(model, EvidenceDetection(spec, gains, bound, shrinkage, habituates), seed=seed)
+        evidence = EvidenceDetection(spec, gains, bound, shrinkage, habituates, tail_index)
+        super().__init__(model, evidence, seed=seed)
         self._diagnosis: Diagnosis | None = None
         self._row: CompiledRow | None = None
         self._row_of: tuple[Any, ...] | None = None
@@ -311,6 +315,13 @@ class NeuralASM(CalibratedMonitor):
         self.skill_ = None  # it was weighed against the memory as it was
         super()._learn(episodes, progress, warm_start)
         self.values_ = Values.learned(episodes, self.seed, self.urdf) if self.values else Values()
+
+    def learn_ceilings(self, episodes: Sequence[Episode]) -> Self:
+        """As every monitor of evidence does; skills are then to be learned anew."""
+        super().learn_ceilings(episodes)
+        self.skill_ = None  # it was weighed against the memory as it was
+        self.about = {name: value for name, value in self.about.items() if name != "alarm_on"}
+        return self
 
     def _set_threshold(self, scores: Sequence[Surprise], asked: Asked, each: Sequence[str]) -> None:
         super()._set_threshold(scores, asked, each)

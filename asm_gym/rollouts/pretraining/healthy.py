@@ -10,6 +10,7 @@ import numpy as np
 
 from asm_gym.contact_limits import healthy_forces
 from asm_gym.crashes import CRASH, peak_torques
+from asm_gym.detection.tails import FEWEST_EPISODES
 from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import Progress
@@ -23,6 +24,8 @@ HELD_OUT = 3
 LEARNED_UP_TO, DISTURBED_UP_TO = CRASH, 1.0
 """How many times what an undisturbed expert usually feels at most may be felt in what is learned from, of a guide's own
 course and of a disturbed one. In the latter contact is an accident: a memory that knows it feels no push."""
+FOR_CEILINGS = 4
+"""One in so many healthy episodes of a task tells how far each sense goes at its worst, where that makes enough."""
 AROUND_S = 0.2
 """What is left out before and after a hit [s]."""
 PASSES, HIDDEN = 4, 32
@@ -152,7 +155,8 @@ def learn_body(lessons: Lessons, spec: StreamSpec, seed: int, progress: Progress
 def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode], per_hour: float) -> NeuralASM:
     """Calibrated so that so many faults are said in an hour of healthy episodes, hits and all.
 
-    In an hour of each task, where all have so many hours that it can be promised.
+    In an hour of each task, where all have so many hours that it can be promised. Where there are episodes enough, one
+    in ``FOR_CEILINGS`` of each task tells before how far each sense goes, and the threshold is set on the others.
 
     How hard healthy motion presses is told by what presses no harder than is usual: a limit that a hit has raised would
     be none.
@@ -160,10 +164,22 @@ def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode]
     Args:
         hours: of healthy episodes beside the lessons that are left out.
     """
-    whole = [*lessons.whole, *hours]
+    whole, told = for_threshold([*lessons.whole, *hours])
+    if told:
+        memory.learn_ceilings(told)
     memory.calibrate(whole, false_alarms_per_hour=per_hour, each=apart(whole, per_hour))
     memory.healthy_ = healthy_forces([episode.stream for episode in lessons.calibration], memory.spec)
     return memory
+
+
+def for_threshold(whole: Sequence[Episode]) -> tuple[list[Episode], list[Episode]]:
+    """Those that set the threshold, and those that tell ceilings, none where these were too few."""
+    number: defaultdict[str, int] = defaultdict(int)
+    parts: tuple[list[Episode], list[Episode]] = [], []
+    for episode in whole:
+        number[episode.labelled.task] += 1
+        parts[number[episode.labelled.task] % FOR_CEILINGS == 0].append(episode)
+    return parts if len(parts[1]) >= FEWEST_EPISODES else (list(whole), [])
 
 
 def apart(episodes: Sequence[Episode], per_hour: float) -> list[str]:

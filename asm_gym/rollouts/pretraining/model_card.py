@@ -165,6 +165,11 @@ def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Ta
         f"threshold {memory.threshold:.3g} for {about['false_alarms_per_hour']:g} {where}, from "
         f"{about['calibrated_on']} others of {about['hours']:.2f} hours"
     )
+    if "ceilings_on" in about:
+        limit += (
+            f"; how far each sense goes at its worst from {about['ceilings_on']} more of "
+            f"{about['ceilings_hours']:.2f} hours"
+        )
     return tabulate(
         f"{about['name']}: {learned}, {limit}. Alarms an hour of healthy episodes that solved the task: of faults that "
         "are none, with a 95 % Poisson interval, of knocks, of joints at their stops, and all; one that comes back "

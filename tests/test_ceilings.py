@@ -1,0 +1,147 @@
+"""Ceilings from healthy hours: how far each sense goes at its worst, so that rare alarms are as rare in each."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+
+from asm_gym import Episode, NeuralASM
+from asm_gym.detection.detector import EvidenceDetection
+from asm_gym.detection.events import EXCUSED, Excuses
+from asm_gym.detection.tails import FEWEST_EPISODES, HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX
+from asm_gym.episode import EpisodeLabel
+from asm_gym.monitors import make_monitor
+from asm_gym.monitors.ceilings import worst_of
+from asm_gym.monitors.stream_model import model_outputs
+from asm_gym.rollouts.pretraining.healthy import FOR_CEILINGS, for_threshold
+from tests.memories import SMALL, sine_memory
+from tests.streams import sine_episodes, sine_spec
+from tests.test_events import ARM, CALM
+
+
+@pytest.fixture
+def asm() -> NeuralASM:
+    return deepcopy(sine_memory())  # ceilings are learned in place
+
+
+def shaken(episodes, column=3, by=4.0):
+    """One sense makes a jump now and then: that of these hours is not that of what was learned."""
+    rng = np.random.default_rng(1)
+    for episode in episodes:
+        stream = np.array(episode.stream)
+        if rng.random() < 0.3:
+            stream[rng.integers(10, len(stream)) :, column] += by * rng.pareto(2.0)
+        yield Episode.from_stream(stream, episode.spec)
+
+
+def test_a_share_of_the_hours_stays_below_each_ceiling_and_tails_are_those_that_were_learned(asm):
+    hours = list(shaken(sine_episodes(150, seed=20)))
+    before, detection = asm.detection.detector_, asm.detection
+    maxima = worst_of(asm.model, detection, None, hours)
+    asm.learn_ceilings(hours)
+    np.testing.assert_allclose((maxima <= asm.detector_.ceiling).mean(axis=0), HOURS_QUANTILE, atol=0.01)
+    np.testing.assert_allclose(asm.detector_.tail, before.tail * HOURS_TAIL_INDEX / TAIL_INDEX)
+    np.testing.assert_array_equal(asm.detector_.whitening, before.whitening)
+    assert asm.threshold_ is None
+    assert asm.get_params()["tail_index"] == HOURS_TAIL_INDEX
+
+
+def test_the_largest_evidence_is_that_of_the_detector_row_by_row(asm):
+    episode = sine_episodes(1, seed=21)[0]
+    output = model_outputs(asm.model, [episode])[0]
+    detector, gains = asm.detector_, asm.detector_.gains
+    vector, most = np.zeros((len(gains), output.errors.shape[1])), 0.0
+    for t, error in enumerate(output.errors.astype(np.float64), 1):
+        whitened = (error / np.sqrt(1 + (error / detector.bound) ** 2)) @ detector.whitening
+        vector += gains[:, None] * (whitened - vector)
+        variance = gains / (2 - gains) * (1 - (1 - gains) ** (2 * t))
+        most = np.maximum(most, vector**2 / variance[:, None])
+    np.testing.assert_allclose(worst_of(asm.model, asm.detection, None, [episode])[0], most, rtol=1e-5)
+
+
+def test_a_sense_that_jumps_in_healthy_hours_sets_no_threshold_for_the_others(asm):
+    hours = list(shaken(sine_episodes(700, seed=22)))
+    faults = [
+        Episode.from_stream(e.stream + np.r_[np.zeros(7), 2.0, np.zeros(6)] * (np.arange(len(e))[:, None] > 20), e.spec)
+        for e in sine_episodes(60, seed=23)
+    ]
+
+    def found():
+        asm.calibrate(hours[350:], false_alarm_rate=0.02)
+        return np.mean([(s.value > asm.threshold).any() for s in asm.score_episodes(faults)])
+
+    as_it_was = found()
+    asm.learn_ceilings(hours[:350])
+    assert found() > as_it_was + 0.5
+
+
+def test_learning_them_again_is_as_learning_them_once_and_a_file_keeps_them(asm, tmp_path):
+    first, second = list(shaken(sine_episodes(120, seed=24))), sine_episodes(120, seed=25)
+    twice = deepcopy(asm).learn_ceilings(first).learn_ceilings(second)
+    once = asm.learn_ceilings(second)
+    for name in ("ceiling", "tail"):
+        np.testing.assert_allclose(getattr(twice.detector_, name), getattr(once.detector_, name))
+    once.calibrate(sine_episodes(99, seed=26), 0.05).save(tmp_path / "m.asm")
+    again, episode = NeuralASM.load(tmp_path / "m.asm"), sine_episodes(1, seed=27)[0]
+    np.testing.assert_allclose(again.score(episode).value, once.score(episode).value, rtol=1e-6)
+    assert again.get_params() == once.get_params()
+
+
+def test_what_ceilings_are_of_is_not_calibrated_on_by_the_hour(asm):
+    hours = sine_episodes(120, seed=28)
+    with pytest.raises(ValueError, match="was learned from"):
+        asm.learn_ceilings(hours).calibrate(hours, false_alarms_per_hour=60.0)
+
+
+def test_rows_that_the_senses_excuse_tell_little():
+    quiet = Excuses(ARM).divisors(np.tile(CALM, (5, 1)))
+    np.testing.assert_array_equal(quiet, 1.0)
+    knocked = np.tile(CALM, (5, 1))
+    knocked[2, 6] = 60.0
+    np.testing.assert_array_equal(Excuses(ARM).divisors(knocked), [1, 1, EXCUSED, EXCUSED, EXCUSED])
+
+
+def test_bad_input_is_named(asm):
+    with pytest.raises(ValueError, match=f"{FEWEST_EPISODES} healthy episodes or more, got 3"):
+        asm.learn_ceilings(sine_episodes(3, seed=0))
+    with pytest.raises(RuntimeError, match="call fit"):
+        NeuralASM(sine_spec(), **SMALL).learn_ceilings(sine_episodes(120, seed=0))
+    other = make_monitor("kalman", sine_spec()).fit(sine_episodes(30, seed=0))
+    with pytest.raises(TypeError, match="mahalanobis has no ceilings"):
+        other.learn_ceilings(sine_episodes(120, seed=0))
+    with pytest.raises(ValueError, match="tail_index must be"):
+        EvidenceDetection(sine_spec(), tail_index=0.0)
+
+
+def test_a_rival_under_the_same_detection_learns_them_too():
+    ridge = make_monitor("association_linear+evidence", sine_spec()).fit(sine_episodes(30, seed=0))
+    before = ridge.detection.detector_.ceiling
+    ridge.learn_ceilings(list(shaken(sine_episodes(120, seed=29))))
+    assert (ridge.detection.detector_.ceiling != before).all()
+
+
+def test_skills_that_were_weighed_against_it_are_to_be_learned_anew(asm):
+    asm.learn_skills(sine_episodes(20, seed=0))
+    asm.about["alarm_on"] = "skill"
+    asm.learn_ceilings(sine_episodes(120, seed=30))
+    assert asm.skill_ is None
+    assert asm.alarm_on == "body"
+
+
+@pytest.mark.parametrize(("each", "told"), [(200, 100), (199, 0)])
+def test_one_healthy_episode_in_four_of_each_task_tells_ceilings_where_that_makes_enough(each, told):
+    stream = np.zeros((2, sine_spec().size))
+    whole = [
+        Episode.from_stream(stream, sine_spec(), label=EpisodeLabel(task, "nominal", seed=n))
+        for n in range(each)
+        for task in ("Lift", "Door")
+    ]
+    rest, chosen = for_threshold(whole)
+    assert len(chosen) == told
+    assert len(rest) + len(chosen) == len(whole)
+    if told:
+        assert [e.label.seed for e in chosen if e.label.task == "Door"] == list(
+            range(FOR_CEILINGS - 1, each, FOR_CEILINGS)
+        )
