@@ -13,7 +13,7 @@ from asm_gym.rollouts import harmless
 from asm_gym.rollouts.pretraining.babbling import (
     Lesson,
 )
-from asm_gym.rollouts.pretraining.healthy import healthy
+from asm_gym.rollouts.pretraining.healthy import KNOWN, healthy
 from asm_gym.scripts.babble import Args, check, main
 from asm_gym.spec import Channel, StreamSpec
 
@@ -42,13 +42,20 @@ def test_the_expert_alone_says_what_is_usual():
     assert [e.labelled.seed for e in kept.whole] == [5, 8, 11, 2]
 
 
-@pytest.mark.parametrize(("noise", "force", "torque"), [(0.0, 18, 6), (0.1, 9, 3)])
+@pytest.mark.parametrize(("noise", "force", "torque"), [(0.0, 80, 40), (0.1, 40, 20)])
 def test_what_presses_harder_than_is_learned_is_cut_out_with_what_is_near(noise, force, torque):
-    calm = [lesson_of([5, 9, 0] * 20, [1, 2, 3] * 20, number=n) for n in (0, 4)]
+    calm = [lesson_of([5, 40, 0] * 20, [1, 20, 3] * 20, number=n) for n in (0, 4)]
     about = {"noise": noise, "guide": "lift_sac"}  # what is usual is not asked of an agent
     hits = lesson_of([force] * 27 + [force + 0.1] + [0] * 32, [torque] * 60, number=1, **about)
     at_stop = lesson_of([0] * 60, [torque] * 22 + [torque + 0.1] + [0] * 37, number=3, **about)
     assert [len(e) for e in healthy([*calm, hits, at_stop, undisturbed()]).fit] == [60, 60, 23, 28, 33]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_some_contact_is_learned_however_careful_the_expert(noise):
+    careful = lesson_of([5, 9, 0] * 20, [1, 2, 3] * 20)
+    firm = lesson_of([KNOWN.force] * 27 + [KNOWN.force + 1] + [0] * 32, [KNOWN.torque] * 60, noise, number=1)
+    assert [len(e) for e in healthy([careful, firm, undisturbed()]).fit] == [60, 23, 28]
 
 
 def undisturbed(**about):
@@ -68,8 +75,8 @@ def test_a_threshold_is_set_on_solved_lessons_that_nothing_disturbed_but_where_t
 
 def test_forces_of_steps_cut_streams_of_many_rows_a_step():
     calm = [lesson_of([5] * 30, [1] * 90, number=n, rows=3) for n in (0, 2)]
-    hits = lesson_of([0] * 25 + [11] * 5, [1] * 90, noise=0.5, number=1, rows=3)
-    turned = lesson_of([0] * 30, [1] * 81 + [3] * 9, noise=0.5, number=4, rows=3)
+    hits = lesson_of([0] * 25 + [31] * 5, [1] * 90, noise=0.5, number=1, rows=3)
+    turned = lesson_of([0] * 30, [1] * 81 + [16] * 9, noise=0.5, number=4, rows=3)
     assert [len(e) for e in healthy([*calm, hits, turned]).fit] == [90, 72, 78]
 
 

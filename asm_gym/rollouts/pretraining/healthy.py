@@ -24,6 +24,8 @@ HELD_OUT = 3
 LEARNED_UP_TO, DISTURBED_UP_TO = CRASH, 1.0
 """How many times what an undisturbed expert usually feels at most may be felt in what is learned from, of a guide's own
 course and of a disturbed one. In the latter contact is an accident: a memory that knows it feels no push."""
+KNOWN = Gentle(30.0, 15.0)
+"""[N], [N m] What is learned whatever is usual: an arm whose experts hardly touch a thing meets contact all the same."""
 FOR_CEILINGS = 4
 """One in so many healthy episodes of a task tells how far each sense goes at its worst, where that makes enough."""
 AROUND_S = 0.2
@@ -57,8 +59,8 @@ def healthy(recordings: Sequence[Episode]) -> Lessons:
 
     Noise drives arms into tables and joints into their stops, and so do agents that are half trained. That is no fault
     of the body, but a memory that takes it for usual would be blind to every collision. So learning goes up to twice
-    what the expert usually feels at most in that task, and up to once that where a guide was disturbed. The threshold
-    is set on what stays below twice that: beyond is a crash.
+    what the expert usually feels at most in that task, and up to once that where a guide was disturbed; but to
+    ``KNOWN`` in any case. The threshold is set on what stays below twice that: beyond is a crash.
 
     Raises:
         ValueError: a task has no undisturbed lesson that was solved, to measure by, or too little is left.
@@ -78,7 +80,7 @@ def healthy(recordings: Sequence[Episode]) -> Lessons:
         usual = np.median(felt[episode.labelled.task], axis=0)
         if not held_out(_lesson(episode)["number"]):
             share = DISTURBED_UP_TO if _lesson(episode)["noise"] else LEARNED_UP_TO
-            found.fit.extend(gentle_pieces(episode, Gentle(*(share * usual))))
+            found.fit.extend(gentle_pieces(episode, Gentle(*np.maximum(share * usual, KNOWN))))
         elif _undisturbed(episode):
             found.whole.append(episode)
             found.calibration.extend(gentle_pieces(episode, Gentle(*(LEARNED_UP_TO * usual))))
