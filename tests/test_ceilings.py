@@ -97,6 +97,8 @@ def test_what_ceilings_are_of_is_not_calibrated_on_by_the_hour(asm):
     hours = sine_episodes(120, seed=28)
     with pytest.raises(ValueError, match="was learned from"):
         asm.learn_ceilings(hours).calibrate(hours, false_alarms_per_hour=60.0)
+    assert all(asm.knows(episode) for episode in hours)
+    assert not any(asm.knows(episode) for episode in sine_episodes(20, seed=31))
 
 
 def test_rows_that_the_senses_excuse_tell_little():

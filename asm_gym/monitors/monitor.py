@@ -24,7 +24,7 @@ from asm_gym.monitors.blindness import require_sight
 from asm_gym.monitors.ceilings import worst_of
 from asm_gym.monitors.doubt import LOG, doubt_crashes
 from asm_gym.monitors.monitor_file import SavedMonitor, calibration_arrays
-from asm_gym.monitors.overlap import Marks, check_fresh, sketch
+from asm_gym.monitors.overlap import Marks, check_fresh, marks, shares, sketch
 from asm_gym.monitors.promise import Asked
 from asm_gym.monitors.stream_model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.threshold import Calibrated
@@ -251,6 +251,11 @@ class CalibratedMonitor(Calibrated):
         self.healthy_ = healthy_forces(streams, self.spec)
         self.familiar_ = FamiliarSpeed.learned(streams, self.spec)
         return self
+
+    @typed
+    def knows(self, episode: Episode) -> bool:
+        """Whether a stretch of it was learned from, by ``fit`` or ``learn_ceilings``: no promise is made of it."""
+        return shares(marks(episode), self._learned_from)
 
     def _check_threshold(self, threshold: float) -> None:
         """Raises ValueError where no fault of some channel could pass it."""

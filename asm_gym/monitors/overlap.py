@@ -52,6 +52,11 @@ def sketch(episodes: Sequence[Episode]) -> Marks:
     return kept
 
 
+def shares(found: Marks, learned: Marks | None) -> bool:
+    """Whether one of these marks is of what was learned from; no, where that is not known."""
+    return learned is not None and bool(np.isin(found, learned).any())
+
+
 def check_fresh(episodes: Sequence[Episode], learned: Marks | None = None) -> None:
     """Raises ValueError where two episodes share a stretch of rows, or one was learned from.
 
@@ -60,7 +65,7 @@ def check_fresh(episodes: Sequence[Episode], learned: Marks | None = None) -> No
     """
     own = [np.unique(marks(e)) for e in episodes]
     for n, found in enumerate(own):
-        if learned is not None and np.isin(found, learned).any():
+        if shares(found, learned):
             raise ValueError(
                 f"episode {n} was learned from: such episodes surprise too little to promise by; give others"
             )

@@ -20,9 +20,18 @@ from asm_gym.scripts.babble import RATES, Args, calibrated, examined, healthy_ho
 
 YOUNG = tuple(f"runs/{task}_young/agent.npz" for task in ("lift", "stack", "door"))
 RUNS = {
-    "panda": Args(guides=YOUNG, healthy_episodes=390, corpus=Path("runs/corpus"), workers="1", out=Path("runs/babble")),
-    "sawyer": Args(robot="Sawyer", reaching=True, healthy_episodes=240, workers="1", out=Path("runs/babble_sawyer")),
-    "iiwa": Args(robot="IIWA", reaching=True, healthy_episodes=150, workers="1", out=Path("runs/babble_iiwa")),
+    "panda": Args(guides=YOUNG, healthy_episodes=520, corpus=Path("runs/corpus"), workers="1", out=Path("runs/babble")),
+    "sawyer": Args(
+        robot="Sawyer",
+        reaching=True,
+        healthy_episodes=1230,
+        exam_episodes=480,
+        workers="1",
+        out=Path("runs/babble_sawyer"),
+    ),
+    "iiwa": Args(
+        robot="IIWA", reaching=True, healthy_episodes=1230, exam_episodes=240, workers="1", out=Path("runs/babble_iiwa")
+    ),
     "sawyer_100hz": Args(
         robot="Sawyer",
         reaching=True,
