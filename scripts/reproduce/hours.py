@@ -1,8 +1,8 @@
 """Alarms an hour of a shipped memory: set on healthy hours of the corpus, and counted in others.
 
 The threshold is set on the experts' episodes of those tasks that the memory babbled in, but for those that told its
-ceilings. It is examined under agents, and in tasks, that it never met. Only episodes that solved the task count as healthy, hits
-and all: what the senses excuse is a knock or a stop, and counted apart.
+ceilings. It is examined under agents, and in tasks, that it never met. Only episodes that solved the task count as
+healthy, hits and all: what the senses excuse is a knock or a stop, and counted apart.
 """
 
 from __future__ import annotations
