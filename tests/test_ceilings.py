@@ -10,7 +10,7 @@ import pytest
 from asm_gym import Episode, NeuralASM
 from asm_gym.detection.detector import EvidenceDetection
 from asm_gym.detection.events import EXCUSED, Excuses
-from asm_gym.detection.tails import FEWEST_EPISODES, HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, worst_case
+from asm_gym.detection.tails import FEWEST_EPISODES, HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX
 from asm_gym.episode import EpisodeLabel
 from asm_gym.monitors import make_monitor
 from asm_gym.monitors.ceilings import worst_of
@@ -45,10 +45,6 @@ def test_a_share_of_the_hours_stays_below_each_ceiling_and_tails_are_those_that_
     np.testing.assert_allclose(asm.detector_.tail, before.tail * HOURS_TAIL_INDEX / TAIL_INDEX)
     np.testing.assert_array_equal(asm.detector_.whitening, before.whitening)
     assert asm.threshold_ is None
-    index = HOURS_TAIL_INDEX
-    np.testing.assert_allclose(
-        deepcopy(asm).learn_ceilings(hours, tails=True).detector_.tail, worst_case(maxima, index, HOURS_QUANTILE)[1]
-    )
     assert asm.get_params()["tail_index"] == HOURS_TAIL_INDEX
 
 
@@ -117,8 +113,6 @@ def test_bad_input_is_named(asm):
     other = make_monitor("kalman", sine_spec()).fit(sine_episodes(30, seed=0))
     with pytest.raises(TypeError, match="mahalanobis has no ceilings"):
         other.learn_ceilings(sine_episodes(120, seed=0))
-    with pytest.raises(ValueError, match="tails must be"):
-        asm.learn_ceilings(sine_episodes(120, seed=0), tails="yes")
     with pytest.raises(ValueError, match="tail_index must be"):
         EvidenceDetection(sine_spec(), tail_index=0.0)
 
@@ -138,8 +132,8 @@ def test_skills_that_were_weighed_against_it_are_to_be_learned_anew(asm):
     assert asm.alarm_on == "body"
 
 
-@pytest.mark.parametrize(("each", "told"), [(200, 100), (199, 0)])
-def test_one_healthy_episode_in_four_of_each_task_tells_ceilings_where_that_makes_enough(each, told):
+@pytest.mark.parametrize(("each", "told"), [(500, 100), (499, 0)])
+def test_one_healthy_episode_in_ten_of_each_task_tells_ceilings_where_that_makes_enough(each, told):
     stream = np.zeros((2, sine_spec().size))
     whole = [
         Episode.from_stream(stream, sine_spec(), label=EpisodeLabel(task, "nominal", seed=n))

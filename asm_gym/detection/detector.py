@@ -31,7 +31,7 @@ from asm_gym.detection.repetition import (
     repeated,
     unrepeated,
 )
-from asm_gym.detection.tails import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, worst_case
+from asm_gym.detection.tails import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, ceilings, worst_case
 from asm_gym.detection.whitening import bounded, whitening
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, check_number, shown, typed
@@ -286,12 +286,10 @@ class EvidenceDetection:
         matrix = (vectors / np.sqrt(values)) @ vectors.T
         return self._anew(spec, self.tail_index).restore({"whitening": matrix, **usual, **kept})
 
-    def with_ceilings(self, maxima: Array, tails: bool = False) -> EvidenceDetection:
-        """The same with q, and ξ if asked, from the largest v in each of N episodes (N, G, X), by a smaller ξ_0."""
-        ceiling, tail = worst_case(maxima, HOURS_TAIL_INDEX, HOURS_QUANTILE)
-        if not tails:
-            tail = np.minimum(self.learned_["tail"] * (HOURS_TAIL_INDEX / self.tail_index), 1.0)
-        told = {"ceiling": ceiling, "tail": tail}
+    def with_ceilings(self, maxima: Array) -> EvidenceDetection:
+        """The same, with q from the largest v in each of N healthy episodes (N, G, X); κ goes by a smaller ξ_0."""
+        tail = np.minimum(self.learned_["tail"] * (HOURS_TAIL_INDEX / self.tail_index), 1.0)
+        told = {"ceiling": ceilings(maxima, HOURS_QUANTILE), "tail": tail}
         return self._anew(self.spec, HOURS_TAIL_INDEX).restore({**self.learned_, **told})
 
     def _anew(self, spec: StreamSpec, tail_index: float) -> EvidenceDetection:

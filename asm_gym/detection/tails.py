@@ -44,11 +44,9 @@ LEAST_SHARE = 1e-3
 and its first small error is not a thousand million times what is usual."""
 
 
-def worst_case(
-    maxima: Array, tail_index: float = TAIL_INDEX, quantile: float = NOMINAL_QUANTILE
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """q, below which that share stays, and κ by ξ_0, of the shape of one episode's maxima, of N nominal ones (N, …)."""
-    ceiling = ceilings(maxima, quantile)
+def worst_case(maxima: Array, tail_index: float = TAIL_INDEX) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """q and κ by ξ_0, of the shape of one episode's maxima, from those of N nominal episodes (N, …)."""
+    ceiling = ceilings(maxima, NOMINAL_QUANTILE)
     beyond = np.log(np.maximum(maxima / ceiling, 1.0))
     total, count = beyond.sum(axis=0), (beyond > 0).sum(axis=0)
     common = np.median(total / np.maximum(count, 1))  # Hill's estimate of ξ is total / count

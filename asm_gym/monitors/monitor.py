@@ -174,7 +174,7 @@ class CalibratedMonitor(Calibrated):
                 detection.fit(nominal, rng)
 
     @typed
-    def learn_ceilings(self, episodes: Sequence[Episode], *, tails: bool = False) -> Self:
+    def learn_ceilings(self, episodes: Sequence[Episode]) -> Self:
         """Learns from healthy hours how far each sense goes at its worst, so that rare alarms are as rare in each.
 
         What it was fitted to, babbling say, tells less of hours than hours do. It has no threshold then: ``calibrate``
@@ -182,15 +182,12 @@ class CalibratedMonitor(Calibrated):
 
         Args:
             episodes: healthy ones that ``fit`` has not seen, 100 at least, and one hit or so in each 50 at most.
-            tails: whether they also tell how much further a sense may go now and then. More is found so under the
-                policies that they are of, and any other raises many false alarms.
 
         Raises:
             ValueError: too few, or bad ones.
             TypeError: its detection is not that of evidence.
         """
         self._fitted()
-        check_flag("tails", tails)
         if not isinstance(self.detection, EvidenceDetection):
             raise TypeError(f"the detection {self.detection.name} has no ceilings: learn those of evidence")
         check_nominal(episodes, self.spec, self.model.shortest)
@@ -199,7 +196,7 @@ class CalibratedMonitor(Calibrated):
         with threadpool_limits(1):
             maxima = worst_of(self.model, self.detection, self._excuses, episodes)
         new = self._copy()
-        new.detection = new.detections["evidence"] = self.detection.with_ceilings(maxima, tails)
+        new.detection = new.detections["evidence"] = self.detection.with_ceilings(maxima)
         new._uncalibrate()
         new._remember(episodes)
         vars(self).update(vars(new))

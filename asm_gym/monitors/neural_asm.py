@@ -316,9 +316,9 @@ class NeuralASM(CalibratedMonitor):
         super()._learn(episodes, progress, warm_start)
         self.values_ = Values.learned(episodes, self.seed, self.urdf) if self.values else Values()
 
-    def learn_ceilings(self, episodes: Sequence[Episode], *, tails: bool = False) -> Self:
+    def learn_ceilings(self, episodes: Sequence[Episode]) -> Self:
         """As every monitor of evidence does; skills are then to be learned anew."""
-        super().learn_ceilings(episodes, tails=tails)
+        super().learn_ceilings(episodes)
         self.skill_ = None  # it was weighed against the memory as it was
         self.about = {name: value for name, value in self.about.items() if name != "alarm_on"}
         return self

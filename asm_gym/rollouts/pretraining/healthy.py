@@ -26,7 +26,7 @@ LEARNED_UP_TO, DISTURBED_UP_TO = CRASH, 1.0
 course and of a disturbed one. In the latter contact is an accident: a memory that knows it feels no push."""
 KNOWN = Gentle(30.0, 15.0)
 """[N], [N m] What is learned whatever is usual: an arm whose experts touch little meets contact all the same."""
-FOR_CEILINGS = 4
+FOR_CEILINGS = 10
 """One in so many healthy episodes of a task tells how far each sense goes at its worst, where that makes enough."""
 AROUND_S = 0.2
 """What is left out before and after a hit [s]."""
