@@ -42,6 +42,16 @@ RUNS = {
         workers="1",
         out=Path("runs/babble_sawyer_100hz"),
     ),
+    "iiwa_100hz": Args(
+        robot="IIWA",
+        reaching=True,
+        stream_freq=100,
+        episodes=15,
+        healthy_episodes=66,
+        exam_episodes=12,
+        workers="1",
+        out=Path("runs/babble_iiwa_100hz"),
+    ),
     "panda_100hz": Args(
         guides=YOUNG,
         stream_freq=100,
