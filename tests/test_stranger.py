@@ -156,8 +156,8 @@ def test_robosuites_own_gym_wrapper_is_recorded():
 
 
 def test_a_class_of_robosuite_becomes_a_task_with_named_channels(registries):
-    register_task("Pour", own_class(), horizon=6, robots="Sawyer", control_freq=10)
-    first, again = (collect("asm_gym/Pour-v0", "hold", episodes=1, seed=3, workers=1)[0] for _ in range(2))
+    register_task("Decant", own_class(), horizon=6, robots="Sawyer", control_freq=10)
+    first, again = (collect("asm_gym/Decant-v0", "hold", episodes=1, seed=3, workers=1)[0] for _ in range(2))
     np.testing.assert_array_equal(first.stream, again.stream)
     units = {c.name: c.unit for c in first.spec.channels}
     assert (first.spec.source, first.spec.dt, len(first)) == ("Sawyer", 0.1, 6)
