@@ -196,7 +196,7 @@ class CalibratedMonitor(Calibrated):
         with threadpool_limits(1):
             maxima = worst_of(self.model, self.detection, self._excuses, episodes)
         new = self._copy()
-        new.detection = new.detections["evidence"] = self.detection.with_ceilings(maxima)
+        new.detection = new.detections[self.detection.name] = self.detection.with_ceilings(maxima)
         new._uncalibrate()
         new._remember(episodes)
         vars(self).update(vars(new))

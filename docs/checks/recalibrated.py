@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -19,49 +20,30 @@ from asm_gym.rollouts.pretraining.model_card import at_rates, card
 from asm_gym.scripts.babble import RATES, Args, calibrated, examined, healthy_hours, healthy_lessons
 
 YOUNG = tuple(f"runs/{task}_young/agent.npz" for task in ("lift", "stack", "door"))
+
+
+def _body(robot: str = "Panda", hz: int | None = None, **settings: Any) -> Args:
+    """The Panda's lessons are led by agents, those of others reach for places."""
+    folder = "_".join(
+        ["runs/babble", *([robot.lower()] if robot != "Panda" or hz else []), *([f"{hz}hz"] if hz else [])]
+    )
+    lessons: dict[str, Any] = {"guides": YOUNG} if robot == "Panda" else {"reaching": True}
+    return Args(robot=robot, stream_freq=hz, workers="1", out=Path(folder), **lessons, **settings)
+
+
 RUNS = {
-    "panda": Args(guides=YOUNG, healthy_episodes=520, corpus=Path("runs/corpus"), workers="1", out=Path("runs/babble")),
-    "sawyer": Args(
-        robot="Sawyer",
-        reaching=True,
-        healthy_episodes=1230,
-        exam_episodes=480,
-        workers="1",
-        out=Path("runs/babble_sawyer"),
-    ),
-    "iiwa": Args(
-        robot="IIWA", reaching=True, healthy_episodes=1230, exam_episodes=240, workers="1", out=Path("runs/babble_iiwa")
-    ),
-    "sawyer_100hz": Args(
-        robot="Sawyer",
-        reaching=True,
-        stream_freq=100,
-        episodes=30,
-        healthy_episodes=200,
-        exam_episodes=12,
-        workers="1",
-        out=Path("runs/babble_sawyer_100hz"),
-    ),
-    "iiwa_100hz": Args(
-        robot="IIWA",
-        reaching=True,
-        stream_freq=100,
-        episodes=15,
-        healthy_episodes=66,
-        exam_episodes=12,
-        workers="1",
-        out=Path("runs/babble_iiwa_100hz"),
-    ),
-    "panda_100hz": Args(
-        guides=YOUNG,
-        stream_freq=100,
+    "panda": _body(healthy_episodes=520, corpus=Path("runs/corpus")),
+    "sawyer": _body("Sawyer", healthy_episodes=1230, exam_episodes=480),
+    "iiwa": _body("IIWA", healthy_episodes=1230, exam_episodes=240),
+    "sawyer_100hz": _body("Sawyer", 100, episodes=30, healthy_episodes=200, exam_episodes=12),
+    "iiwa_100hz": _body("IIWA", 100, episodes=15, healthy_episodes=66, exam_episodes=12),
+    "panda_100hz": _body(
+        hz=100,
         episodes=30,
         healthy_episodes=140,
         exam_episodes=12,
         exam_policies=("lift_sac", "stack_sac"),
         exam_tasks=("PickPlaceMilk",),
-        workers="1",
-        out=Path("runs/babble_panda_100hz"),
     ),
 }
 
