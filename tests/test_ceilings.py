@@ -36,6 +36,12 @@ def shaken(episodes, column=3, by=4.0):
         yield Episode.from_stream(stream, episode.spec)
 
 
+def arm_episodes(count):
+    """An arm that stirs a little, of the channels that excuse."""
+    rng = np.random.default_rng(2)
+    return [Episode.from_stream(CALM + 0.01 * rng.normal(size=(40, len(CALM))), ARM) for _ in range(count)]
+
+
 def test_a_share_of_the_hours_stays_below_each_ceiling_and_tails_are_those_that_were_learned(asm):
     hours = list(shaken(sine_episodes(150, seed=20)))
     before, detection = asm.detection.detector_, asm.detection
@@ -102,7 +108,18 @@ def test_rows_that_the_senses_excuse_tell_little():
     np.testing.assert_array_equal(quiet, 1.0)
     knocked = np.tile(CALM, (5, 1))
     knocked[2, 6] = 60.0
-    np.testing.assert_array_equal(Excuses(ARM).divisors(knocked), [1, 1, EXCUSED, EXCUSED, EXCUSED])
+    for index in (TAIL_INDEX, HOURS_TAIL_INDEX):
+        np.testing.assert_allclose(Excuses(ARM, index).divisors(knocked), [1, 1, EXCUSED, EXCUSED, EXCUSED])
+
+
+def test_an_excuse_is_scaled_as_the_surprise_that_it_excuses():
+    knocked, index = CALM.copy(), HOURS_TAIL_INDEX
+    knocked[6] = 60.0
+    _, by = Excuses(ARM, index).step(np.zeros((1, 3), np.int64), knocked[None])
+    assert by.divisor[0] == pytest.approx(EXCUSED ** (index / TAIL_INDEX))
+    memory = NeuralASM(ARM, 8, 8, epochs=1, excuses=True).fit(still := arm_episodes(130))
+    assert memory.events.power == 1.0
+    assert memory.learn_ceilings(still).events.power == pytest.approx(index / TAIL_INDEX)
 
 
 def test_bad_input_is_named(asm):

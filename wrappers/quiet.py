@@ -107,7 +107,8 @@ class QuietRows:
         senses, ends = ([none] * 4, none.reshape(0, 2)) if excuses is None else excuses.arrays
         *learned, pi_z, pi_x, curvature, iterations, looks = monitor.compiled_row.learned
         spans = np.array([T, H, K, lag, D, G, X, iterations, looks, hand is not None, excuses is not None])
-        numbers = np.array([*numbers, monitor.spec.dt, pi_z, pi_x, curvature])
+        power = 1.0 if excuses is None else excuses.power
+        numbers = np.array([*numbers, monitor.spec.dt, pi_z, pi_x, curvature, power])
         ints, where = _side_by_side(np.int64, spans, at, *senses, *guard.columns)
         doubles, and_where = _side_by_side(np.float64, *chain, ends, numbers)
         self._fixed = ints, doubles, np.array([*where, *and_where]), *learned

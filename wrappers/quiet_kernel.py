@@ -143,7 +143,7 @@ def quiet(
     if ints[EXCUSES]:
         senses = _vector(ints, where, WRIST), _vector(ints, where, JOINTS), _matrix(fixed, where, ENDS)
         lasting = _vector(ints, where, FINGERS), _vector(ints, where, LASTING)
-        knocks, kind, divisor = _step(old[12], rows, *senses, *lasting)
+        knocks, kind, divisor = _step(old[12], rows, *senses, *lasting, numbers[7])
         new[12][:] = knocks
         found[KIND] = kind[0]
         if divisor[0] != 1.0:

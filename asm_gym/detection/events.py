@@ -4,6 +4,7 @@
     stop     a joint is within 0.03 rad of one of its stops
     s'       s / 10 where either is so, s / 3 where a finger has just slid by 1 cm/s, else s
     after    k rows after either is over  s / (10 (1 - a)^{2k}), as long as that is less than s
+    scaled   all that s is divided by to the power ξ_0 / 0.3, as s itself is: see ``tails``
 
 A hand that strikes a table surprises, and so does a joint that comes to its stop or a finger that slips: none is a
 fault of the body, and most alarms of healthy robots are such. They are not forgiven: what is still over the threshold
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.detection.detector import GAINS
+from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.spec import Channel, StreamSpec
 
 NO_EVENT, KNOCK, STOP, FAULT = "", "knock", "stop", "fault"
@@ -63,9 +65,14 @@ class Excuses:
 
     Args:
         spec: of the stream; without forces at a wrist no knock is known, and without ``Channel.stops`` no stop.
+        tail_index: ξ_0 of the surprise that is excused.
+
+    Attributes:
+        power: that what surprise is divided by is raised to: the smaller ξ_0, the closer surprise keeps to 1.
     """
 
-    def __init__(self, spec: StreamSpec) -> None:
+    def __init__(self, spec: StreamSpec, tail_index: float = TAIL_INDEX) -> None:
+        self.power = tail_index / TAIL_INDEX
         peaks = _columns(spec, lambda c: c.name.endswith("wrist_force_peak"))
         self._wrist = peaks if peaks.size else _columns(spec, lambda c: c.name.endswith("wrist_force"))
         self._joints = _columns(spec, lambda c: bool(c.stops))
@@ -84,15 +91,16 @@ class Excuses:
 
     def step(self, left: NDArray[np.int64], rows: NDArray[np.float64]) -> tuple[NDArray[np.int64], Excused]:
         """What the next rows (B, D) excuse, some of whose numbers may not be finite."""
-        after, kind, divisor = _step(left, rows, self._wrist, self._joints, self._ends, self._fingers, self._rows)
+        senses = self._wrist, self._joints, self._ends, self._fingers
+        after, kind, divisor = _step(left, rows, *senses, self._rows, self.power)
         return after, Excused(kind, divisor)
 
     def divisors(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-        """(T,) what surprise is divided by in each row of a whole stream (T, D)."""
+        """(T,) what surprise of the usual ξ_0 is divided by in each row of a whole stream (T, D)."""
         left, found = self.start(1), np.ones(len(stream))
         for t, row in enumerate(np.asarray(stream, np.float64)):
             left, excused = self.step(left, row[None])
-            found[t] = excused.divisor[0]
+            found[t] = excused.divisor[0] ** (1.0 / self.power)
         return found
 
 
@@ -111,7 +119,7 @@ def _columns(spec: StreamSpec, which: Callable[[Channel], bool]) -> NDArray[np.i
 
 
 @compiled
-def _step(left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any, lasting: Any) -> Any:
+def _step(left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any, lasting: Any, power: float) -> Any:
     B = len(rows)
     after, kind, divisor = np.maximum(left - 1, 0), np.zeros(B, np.int8), np.ones(B)
     for n in range(B):
@@ -131,4 +139,6 @@ def _step(left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any
             if after[n, k] > 0:
                 kind[n] = k + 1
                 divisor[n] = max(divisor[n], EXCUSED * FADE ** max(lasting[2] - after[n, k] + 1, 0))
+        if divisor[n] != 1.0 and power != 1.0:
+            divisor[n] **= power
     return after, kind, divisor

@@ -196,7 +196,8 @@ class CalibratedMonitor(Calibrated):
         with threadpool_limits(1):
             maxima = worst_of(self.model, self.detection, self._excuses, episodes)
         new = self._copy()
-        new.detection = new.detections[self.detection.name] = self.detection.with_ceilings(maxima)
+        new.detection = new.detections[self.detection.name] = evidence = self.detection.with_ceilings(maxima)
+        new._excuses = self._excuses and Excuses(self.spec, evidence.tail_index)
         new._uncalibrate()
         new._remember(episodes)
         vars(self).update(vars(new))
