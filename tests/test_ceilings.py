@@ -51,7 +51,9 @@ def test_a_share_of_the_hours_stays_below_each_ceiling_and_tails_are_those_that_
     np.testing.assert_allclose(asm.detector_.tail, before.tail * HOURS_TAIL_INDEX / TAIL_INDEX)
     np.testing.assert_array_equal(asm.detector_.whitening, before.whitening)
     assert asm.threshold_ is None
-    assert asm.get_params()["tail_index"] == HOURS_TAIL_INDEX
+    again = asm.fit(sine_episodes(50)).detector_  # anew: nothing is left of hours
+    for name in ("ceiling", "tail"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(before, name))
 
 
 def test_the_largest_evidence_is_that_of_the_detector_row_by_row(asm):
@@ -108,23 +110,16 @@ def test_rows_that_the_senses_excuse_tell_little():
     np.testing.assert_array_equal(quiet, 1.0)
     knocked = np.tile(CALM, (5, 1))
     knocked[2, 6] = 60.0
-    for index in (TAIL_INDEX, HOURS_TAIL_INDEX):
-        np.testing.assert_allclose(Excuses(ARM, index).divisors(knocked), [1, 1, EXCUSED, EXCUSED, EXCUSED])
-
-
-def test_an_excuse_is_scaled_as_the_surprise_that_it_excuses():
-    knocked, index = CALM.copy(), HOURS_TAIL_INDEX
-    knocked[6] = 60.0
-    _, by = Excuses(ARM, index).step(np.zeros((1, 3), np.int64), knocked[None])
-    assert by.divisor[0] == pytest.approx(EXCUSED ** (index / TAIL_INDEX))
-    memory = NeuralASM(ARM, 8, 8, epochs=1, excuses=True).fit(still := arm_episodes(130))
-    assert memory.events.power == 1.0
-    assert memory.learn_ceilings(still).events.power == pytest.approx(index / TAIL_INDEX)
+    np.testing.assert_allclose(Excuses(ARM).divisors(knocked), [1, 1, EXCUSED, EXCUSED, EXCUSED])
 
 
 def test_bad_input_is_named(asm):
     with pytest.raises(ValueError, match=f"{FEWEST_EPISODES} healthy episodes or more, got 3"):
         asm.learn_ceilings(sine_episodes(3, seed=0))
+    with pytest.raises(ValueError, match="episode 119 was learned from"):
+        asm.learn_ceilings([*sine_episodes(119, seed=3), sine_episodes(50)[0]])
+    with pytest.raises(ValueError, match="episodes 0 and 120 overlap"):
+        asm.learn_ceilings([*(hours := sine_episodes(120, seed=3)), hours[0]])
     with pytest.raises(RuntimeError, match="call fit"):
         NeuralASM(sine_spec(), **SMALL).learn_ceilings(sine_episodes(120, seed=0))
     other = make_monitor("kalman", sine_spec()).fit(sine_episodes(30, seed=0))

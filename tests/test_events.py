@@ -7,7 +7,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from asm_gym import Episode, NeuralASM
 from asm_gym.detection.detector import GAINS
-from asm_gym.detection.events import EVENTS, EXCUSED, FADING, KNOCKED_S, SLIPPED, Excuses, event_of
+from asm_gym.detection.events import EVENTS, EXCUSED, FADING, FASTEST, KNOCKED_S, NEAR_STOP, SLIPPED, Excuses, event_of
 from asm_gym.monitors import Surprise
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
@@ -52,6 +52,11 @@ def changed(column, value):
         (changed(0, 0.98), "stop", EXCUSED),
         (changed(1, -1.98), "stop", EXCUSED),
         (changed(0, 0.96), "", 1.0),
+        (changed(0, 1.09), "stop", EXCUSED),
+        (changed(0, 1.11), "", 1.0),
+        (changed(1, -2.09), "stop", EXCUSED),
+        (changed(1, -2.11), "", 1.0),
+        (changed(1, -np.inf), "", 1.0),
         (changed(0, np.nan), "", 1.0),
         (changed(9, 0.011), "", SLIPPED),
         (changed(9, 0.009), "", 1.0),
@@ -59,6 +64,18 @@ def changed(column, value):
 )
 def test_what_the_senses_say_of_a_row(row, event, divisor):
     assert excused([row]) == [(event, divisor)]
+
+
+def test_a_joint_that_was_seen_on_its_way_is_at_its_stop_and_one_that_jumps_there_is_not():
+    on_its_way = 1.0 - NEAR_STOP - 0.9 * FASTEST * ARM.dt
+    path = [0.5, on_its_way, 0.98, 1.05, 0.98]  # at 20 Hz a joint of 5 rad/s gets from there to its stop in a row
+    assert [event for event, _ in excused([changed(0, q) for q in path])] == ["", "", "stop", "stop", "stop"]
+    for far in (0.5, -1.5, 1.2):  # across its range, or from past either stop
+        assert {event for event, _ in excused([changed(0, far), changed(0, 0.98), changed(0, 0.99)])} == {""}
+    assert excused([changed(0, 0.5), changed(0, np.nan), changed(0, 0.98)])[-1] == ("stop", EXCUSED)  # nobody saw it
+    other = changed(0, 0.98)
+    other[1] = -1.98
+    assert excused([changed(1, -1.9), other])[-1] == ("stop", EXCUSED)  # each joint by itself
 
 
 def test_a_knock_is_felt_for_a_second_at_any_rate_and_fades_as_what_it_has_left_in_the_slowest_evidence():
@@ -106,7 +123,8 @@ def test_streams_without_such_senses_excuse_nothing():
 
 def test_what_is_left_of_an_excused_surprise_adds_up_and_hides_nothing():
     raw = Surprise(np.array([60.0]), np.array([[20.0, 40.0]]))
-    _, by = Excuses(ARM).step(np.zeros((1, 3), np.int64), changed(5, 80.0)[None])
+    excuses = Excuses(ARM)
+    _, by = excuses.step(excuses.start(1), changed(5, 80.0)[None])
     left = raw.excused(by)
     assert left.value == pytest.approx(60.0 / EXCUSED)
     assert left.attribution.sum() == pytest.approx(left.value)

@@ -107,13 +107,13 @@ class QuietRows:
         senses, ends = ([none] * 4, none.reshape(0, 2)) if excuses is None else excuses.arrays
         *learned, pi_z, pi_x, curvature, iterations, looks = monitor.compiled_row.learned
         spans = np.array([T, H, K, lag, D, G, X, iterations, looks, hand is not None, excuses is not None])
-        power = 1.0 if excuses is None else excuses.power
-        numbers = np.array([*numbers, monitor.spec.dt, pi_z, pi_x, curvature, power])
+        joints, on_its_way = (0, 0.0) if excuses is None else (excuses.joints, excuses.on_its_way)
+        numbers = np.array([*numbers, monitor.spec.dt, pi_z, pi_x, curvature, on_its_way])
         ints, where = _side_by_side(np.int64, spans, at, *senses, *guard.columns)
         doubles, and_where = _side_by_side(np.float64, *chain, ends, numbers)
         self._fixed = ints, doubles, np.array([*where, *and_where]), *learned
         # Of each kind of number the state now and the next one, in turns.
-        sizes = T + H + K, 2 * lag * D + G * X + H + 2 * X + HAND + 2, 5, X
+        sizes = T + H + K, 2 * lag * D + G * X + H + 2 * X + HAND + 2, 5 + joints, X
         kinds = np.float32, np.float64, np.int64, np.bool_
         self._state = tuple(np.zeros((2, n), kind) for n, kind in zip(sizes, kinds, strict=True))
         self._table = table((*self._state, *self._fixed))

@@ -47,7 +47,7 @@ def state_in(singles: Any, doubles: Any, whole: Any, flags: Any, ints: Any) -> A
         doubles[c + H : c + H + X].reshape((1, X)),
         flags[:X].reshape((1, X)),
         doubles[c + H + X : c + H + 2 * X].reshape((1, X)),
-        whole[2:5].reshape((1, 3)),
+        whole[2:].reshape((1, len(whole) - 2)),
     )
 
 

@@ -284,16 +284,20 @@ class EvidenceDetection:
         kept = {name: old[name][:, left] for name in ("ceiling", "tail", "repetition")}
         usual = {name: old[name] for name in ("context_quantile", "context_range")}
         matrix = (vectors / np.sqrt(values)) @ vectors.T
-        return self._anew(spec, self.tail_index).restore({"whitening": matrix, **usual, **kept})
+        return self._anew(spec).restore({"whitening": matrix, **usual, **kept})
 
-    def with_ceilings(self, maxima: Array) -> EvidenceDetection:
-        """The same, with q from the largest v in each of N healthy episodes (N, G, X); κ goes by a smaller ξ_0."""
-        tail = np.minimum(self.learned_["tail"] * (HOURS_TAIL_INDEX / self.tail_index), 1.0)
+    def with_ceilings(self, maxima: Array, anew: bool) -> EvidenceDetection:
+        """The same, with q from the largest v in each of N healthy episodes (N, G, X); κ goes by a smaller ξ_0.
+
+        Args:
+            anew: no hours told q before, so that κ does not go by it yet.
+        """
+        tail = np.minimum(self.learned_["tail"] * (HOURS_TAIL_INDEX / self.tail_index if anew else 1.0), 1.0)
         told = {"ceiling": ceilings(maxima, HOURS_QUANTILE), "tail": tail}
-        return self._anew(self.spec, HOURS_TAIL_INDEX).restore({**self.learned_, **told})
+        return self._anew(self.spec).restore({**self.learned_, **told})
 
-    def _anew(self, spec: StreamSpec, tail_index: float) -> EvidenceDetection:
-        return EvidenceDetection(spec, self.gains, self.bound, self.shrinkage, self.habituates, tail_index)
+    def _anew(self, spec: StreamSpec) -> EvidenceDetection:
+        return EvidenceDetection(spec, self.gains, self.bound, self.shrinkage, self.habituates, self.tail_index)
 
     def restore(self, learned: Arrays) -> Self:
         found = {name: learned[name] for name in self.arrays[:-1]}

@@ -73,6 +73,7 @@ class CalibratedMonitor(Calibrated):
         self.detections = {d.name: d for d in detections}
         self._uncalibrate()
         self._learned_from: Marks | None = None
+        self._ceilings_from: Marks | None = None
         self.about: dict[str, Any] = {}
 
     def __repr__(self) -> str:
@@ -156,7 +157,7 @@ class CalibratedMonitor(Calibrated):
         held_out, learned = ([episodes[i] for i in part] for part in (order[:kept], order[kept:]))
         self._uncalibrate()
         if not warm_start:
-            self._learned_from = None
+            self._learned_from = self._ceilings_from = None
         self._remember(episodes)
         # One thread: products this small are slowed down by several, and ruined by several that share a core.
         with threadpool_limits(1):
@@ -184,7 +185,7 @@ class CalibratedMonitor(Calibrated):
             episodes: healthy ones that ``fit`` has not seen, 100 at least, and one hit or so in each 50 at most.
 
         Raises:
-            ValueError: too few, or bad ones.
+            ValueError: too few, or bad ones; such as overlap, or as ``fit`` has learned from.
             TypeError: its detection is not that of evidence.
         """
         self._fitted()
@@ -193,13 +194,14 @@ class CalibratedMonitor(Calibrated):
         check_nominal(episodes, self.spec, self.model.shortest)
         if len(episodes) < FEWEST_EPISODES:
             raise ValueError(f"ceilings take {FEWEST_EPISODES} healthy episodes or more, got {len(episodes)}")
+        check_fresh(episodes, self._learned_from)
         with threadpool_limits(1):
             maxima = worst_of(self.model, self.detection, self._excuses, episodes)
         new = self._copy()
-        new.detection = new.detections[self.detection.name] = evidence = self.detection.with_ceilings(maxima)
-        new._excuses = self._excuses and Excuses(self.spec, evidence.tail_index)
+        told = self.detection.with_ceilings(maxima, anew=self._ceilings_from is None)
+        new.detection = new.detections[told.name] = told
+        new._ceilings_from = sketch(episodes)
         new._uncalibrate()
-        new._remember(episodes)
         vars(self).update(vars(new))
         return self
 
@@ -237,7 +239,7 @@ class CalibratedMonitor(Calibrated):
             raise ValueError(f"each must name one group an episode, got {len(each)} for {len(episodes)} episodes")
         asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
         try:
-            check_fresh(episodes, self._learned_from)
+            check_fresh(episodes, self._learned_from, self._ceilings_from)
         except ValueError as error:
             if asked.per == HOUR:
                 raise
@@ -253,7 +255,7 @@ class CalibratedMonitor(Calibrated):
     @typed
     def knows(self, episode: Episode) -> bool:
         """Whether a stretch of it was learned from, by ``fit`` or ``learn_ceilings``: no promise is made of it."""
-        return shares(marks(episode), self._learned_from)
+        return shares(marks(episode), self._learned_from, self._ceilings_from)
 
     def _check_threshold(self, threshold: float) -> None:
         """Raises ValueError where no fault of some channel could pass it."""
@@ -326,7 +328,7 @@ class CalibratedMonitor(Calibrated):
         """Writes everything learned to one file: arrays and JSON."""
         self._fitted()
         learned = {n: a if a.dtype.kind == "f" else np.asarray(a, np.float64) for n, a in self.learned_.items()}
-        arrays = {**learned, **calibration_arrays(self.maxima_, self.blocks_, self._learned_from)}
+        arrays = {**learned, **calibration_arrays(self.maxima_, self.blocks_, self._learned_from, self._ceilings_from)}
         header = {
             "spec": self.spec.to_json(),
             "hyperparameters": self.get_params(),
@@ -359,7 +361,7 @@ class CalibratedMonitor(Calibrated):
         for detection in self.detections.values():
             if found.arrays.keys() >= set(detection.arrays):
                 detection.restore({n: found.arrays[n] for n in detection.arrays})
-        self.about, self._learned_from = found.about, found.learned_from
+        self.about, self._learned_from, self._ceilings_from = found.about, found.learned_from, found.ceilings_from
         self.familiar_ = FamiliarSpeed.restored(saved.header.get("familiar", []))
         self.healthy_ = tuple(check_number("healthy", value, low=0.0) for value in saved.header.get("healthy", ()))
         if found.detection == self.detection.name:

@@ -16,9 +16,9 @@ from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_number
 
-MAXIMA, BLOCKS, LEARNED_FROM = "nominal_maxima", "nominal_blocks", "learned_from"
+MAXIMA, BLOCKS, LEARNED_FROM, CEILINGS_FROM = "nominal_maxima", "nominal_blocks", "learned_from", "ceilings_from"
 """Under which names a checkpoint keeps what ``calibrate`` has found, by the episode and by the hour, and the marks of
-what ``fit`` was given."""
+what ``fit`` and ``learn_ceilings`` were given."""
 
 
 class SavedMonitor(NamedTuple):
@@ -28,7 +28,9 @@ class SavedMonitor(NamedTuple):
         arrays: what its model and its detections have learned, by name.
         maxima: (n,) largest surprise in each episode of the calibration; None before it.
         blocks: the same by the hour; None before it, and in files that were written before it was kept.
-        learned_from: marks of the episodes that were learned from, as ``fresh.sketch`` keeps them; None in such files.
+        learned_from: marks of the episodes that were learned from, as ``overlap.sketch`` keeps them; None in such
+            files.
+        ceilings_from: the same of the hours that told ceilings; None where none did.
         promised: what the threshold's promise counts by.
         threshold: as it was written.
         detection: which the threshold is of.
@@ -40,6 +42,7 @@ class SavedMonitor(NamedTuple):
     maxima: NDArray[np.float64] | None
     blocks: Blocks | None
     learned_from: NDArray[np.float64] | None
+    ceilings_from: NDArray[np.float64] | None
     promised: str
     threshold: object
     detection: str
@@ -54,11 +57,12 @@ class SavedMonitor(NamedTuple):
         if undeclared:
             raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
         arrays = {name: saved.array(name, *shape) for name, shape in header["shapes"].items()}
-        maxima, blocks, learned_from = (arrays.pop(name, None) for name in (MAXIMA, BLOCKS, LEARNED_FROM))
+        maxima, blocks = (arrays.pop(name, None) for name in (MAXIMA, BLOCKS))
+        learned, ceilings = (arrays.pop(name, None) for name in (LEARNED_FROM, CEILINGS_FROM))
         promised = header.get("promised", EPISODE)
         check_choice("promise", promised, (EPISODE, HOUR))
         by_hour = None if blocks is None else Blocks.restored(blocks)
-        kept = maxima, by_hour, learned_from, promised, header["threshold"]
+        kept = maxima, by_hour, learned, ceilings, promised, header["threshold"]
         return cls(arrays, *kept, header["detection"], tuple(header["skills"]), dict(header["about"]))
 
     def threshold_below(self, reach: float) -> float | None:
@@ -72,11 +76,11 @@ class SavedMonitor(NamedTuple):
 
 
 def calibration_arrays(
-    maxima: NDArray[np.float64] | None, blocks: Blocks | None, learned_from: NDArray[np.float64] | None
+    maxima: NDArray[np.float64] | None, blocks: Blocks | None, *marks: NDArray[np.float64] | None
 ) -> Arrays:
     """What a checkpoint keeps of them, by name; of what there is."""
     by_hour = None if blocks is None else blocks.array
-    found = {MAXIMA: maxima, BLOCKS: by_hour, LEARNED_FROM: learned_from}
+    found = dict(zip((MAXIMA, BLOCKS, LEARNED_FROM, CEILINGS_FROM), (maxima, by_hour, *marks), strict=True))
     return {name: array for name, array in found.items() if array is not None}
 
 

@@ -139,7 +139,7 @@ class NeuralASM(CalibratedMonitor):
         if urdf and not values:
             raise ValueError("a body model tells torques, which only values=True judges")
         Derived.of(spec, friction=True, body=False, urdf=urdf)  # refuses one that does not fit
-        self._excuses = Excuses(spec, tail_index) if check_flag("excuses", excuses) else None
+        self._excuses = Excuses(spec) if check_flag("excuses", excuses) else None
         self.excuses = excuses
         check_choice("dynamics", dynamics, DYNAMICS)
         self.dynamics, usual = dynamics, DYNAMICS[dynamics]

@@ -52,20 +52,20 @@ def sketch(episodes: Sequence[Episode]) -> Marks:
     return kept
 
 
-def shares(found: Marks, learned: Marks | None) -> bool:
+def shares(found: Marks, *learned: Marks | None) -> bool:
     """Whether one of these marks is of what was learned from; no, where that is not known."""
-    return learned is not None and bool(np.isin(found, learned).any())
+    return any(some is not None and np.isin(found, some).any() for some in learned)
 
 
-def check_fresh(episodes: Sequence[Episode], learned: Marks | None = None) -> None:
+def check_fresh(episodes: Sequence[Episode], *learned: Marks | None) -> None:
     """Raises ValueError where two episodes share a stretch of rows, or one was learned from.
 
     Args:
-        learned: as ``sketch`` kept it; None where that is not known.
+        *learned: as ``sketch`` kept it; None where that is not known.
     """
     own = [np.unique(marks(e)) for e in episodes]
     for n, found in enumerate(own):
-        if shares(found, learned):
+        if shares(found, *learned):
             raise ValueError(
                 f"episode {n} was learned from: such episodes surprise too little to promise by; give others"
             )

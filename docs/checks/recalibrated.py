@@ -34,7 +34,7 @@ def _body(robot: str = "Panda", hz: int | None = None, **settings: Any) -> Args:
 RUNS = {
     "panda": _body(healthy_episodes=520, corpus=Path("runs/corpus")),
     "sawyer": _body("Sawyer", healthy_episodes=1230, exam_episodes=480),
-    "iiwa": _body("IIWA", healthy_episodes=1230, exam_episodes=240),
+    "iiwa": _body("IIWA", healthy_episodes=1230, exam_episodes=480),
     "sawyer_100hz": _body("Sawyer", 100, episodes=30, healthy_episodes=200, exam_episodes=12),
     "iiwa_100hz": _body("IIWA", 100, episodes=15, healthy_episodes=66, exam_episodes=12),
     "panda_100hz": _body(
