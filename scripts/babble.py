@@ -81,7 +81,7 @@ class Args:
     episodes: int = option(60, quick=18, least=1)
     """Lessons in each task; a second call with more of them goes on."""
     reaching: bool = False
-    """Whether the hand reaches for places where noise alone would move it."""
+    """Whether hands reach for places where noise alone would move them; one lesson more for each three presses."""
     stream_freq: int | None = option(None, least=1, metavar="HZ")
     """Rows of the stream a second; one each control step by default."""
     exam_policies: tuple[str, ...] | None = fixed(None, quick=())
@@ -284,7 +284,7 @@ def babble(args: Args, console: Console) -> None:
     """Records, learns, examines, and says what came of it."""
     check(args)
     claim = {n: getattr(args, n) for n in ("robot", "guides", "stream_freq", "seed")}
-    claim |= {"reaching": True} if args.reaching else {}  # folders of before there was any are of other lessons
+    claim |= {"reaching": "and pressing"} if args.reaching else {}  # folders of before are of other lessons
     with claimed(args.out, "babble.json", claim):
         memory = learn(args, console)
         marks = examined(args, memory, console) if args.exam_episodes else []

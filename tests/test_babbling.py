@@ -15,8 +15,12 @@ from asm_gym.rollouts.pretraining import babbling
 from asm_gym.rollouts.pretraining.babbling import (
     ALONE,
     DRIVEN,
+    HELD,
     LEADING,
     LED,
+    NOISE,
+    PRESS,
+    PRESSING,
     REACHING,
     Babbler,
     Lesson,
@@ -53,10 +57,21 @@ def test_each_task_has_the_experts_own_course_disturbed_courses_and_noise_alone(
 
 
 def test_hands_reach_where_noise_alone_would_lead():
-    usual, reaching = (curriculum(["Lift"], 60, seed=0, reaching=r) for r in (False, True))
+    usual, reaching = (curriculum(["Lift"], 60, seed=0, reaching=r)[:60] for r in (False, True))
     kinds = [REACHING if n.guide == REACHING else LED if n.noise == 0 else DRIVEN for n in reaching]
     assert [kinds.count(kind) for kind in (LED, DRIVEN, REACHING)] == [36, 16, 8]
     assert reaching == [n._replace(guide=n.guide or REACHING) for n in usual]  # all else stays
+
+
+def test_where_the_hand_reaches_one_lesson_more_for_each_three_presses_and_none_of_them_is_held_out():
+    usual, reaching = (curriculum(["Lift", "Stack"], 20, seed=0, reaching=r) for r in (False, True))
+    pressing = [n for n in reaching if n.press]
+    assert reaching[len(usual) :] == pressing
+    assert [n.number for n in pressing if n.task == "Stack"] == list(range(0, 20, 3))
+    assert not any(held_out(n.number) for n in pressing)
+    assert len({n.seed for n in reaching}) == len(reaching)
+    assert {(n.guide, n.noise, n.drift) for n in pressing} == {("scripted", NOISE[0], 0.0)}
+    assert set(curriculum(["Lift"], 8, seed=0, reaching=True)) <= set(reaching)
 
 
 def test_agents_take_turns_with_the_expert_of_their_own_task():
@@ -126,6 +141,34 @@ def test_an_arm_that_pauses_keeps_its_grip():
     resting = (actions[:, :2] == 0).all(axis=1)
     assert 0.8 < resting.mean() < 1.0  # between two pauses it moves
     assert (actions[:, 2] != 0).all()  # the gripper of a FakeEnv
+
+
+class Holding:
+    """Grips from its tenth step on."""
+
+    steps = 0
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        self.steps += 1
+        return np.array([0.01, 0.01, 0.01, 1.0 if self.steps > 10 else -1.0]), state
+
+
+def test_what_is_held_is_pressed_down_or_aside_for_a_while_and_the_grip_is_kept():
+    env = FakeEnv()
+    env.action_space, env.gripper_actions = gym.spaces.Box(-1.0, 1.0, (4,), np.float32), (3,)
+    babbler = Babbler(env, Lesson("Lift", 0, seed=2, guide="", noise=1e-6, press=PRESS))
+    babbler._guide = Holding()
+    actions = np.array([babbler.predict(None)[0] for _ in range(3000)])
+    pressed = np.abs(actions[:, :3]).max(axis=1) > 0.05
+    assert not pressed[: 10 + HELD].any()  # nothing was held for long
+    assert 0.3 < pressed.mean() < 0.7
+    assert PRESSING[1] >= np.abs(actions[pressed, :3]).max() > 0.4
+    starts = actions[1:][pressed[1:] & ~pressed[:-1]]
+    down = (starts[:, 2] < 0) & (starts[:, :2] == 0).all(axis=1)
+    assert 0.35 < down.mean() < 0.65
+    assert ((starts[:, 2] == 0) & (starts[:, 0] != 0)).any()
+    assert (starts[:, 2] > 0).any()
+    assert (actions[11:, 3] > 0).all()
 
 
 def test_an_arm_that_drifts_goes_on_in_one_direction_and_keeps_its_grip():

@@ -6,9 +6,10 @@ Each lesson is one episode. One in three is the expert's own and not learned fro
 others two in five are the expert's own too, at many speeds; in two of five noise drives the expert off its course, in
 jerks or slowly; in one noise alone moves the arm, or the hand reaches for one place after another, for nothing there.
 Where there is noise, the arm also drifts now and then, turning and with what it holds, as agents do once they have done
-their task. In half of all lessons the arm stops now and then, whatever it holds or leans on, and in half a thing weighs
-more or less. No noise is so strong that most of a lesson would be hits: those taught the memory to expect them, and
-cost more faults than they spared alarms.
+their task. Where the hand reaches, no agent leads, and careful experts teach nothing of contact: so there is one lesson
+more for each three, in which the expert presses what it holds against what is around. In half of all lessons the arm
+stops now and then, whatever it holds or leans on, and in half a thing weighs more or less. No noise is so strong that
+most of a lesson would be hits: those taught the memory to expect them, and cost more faults than they spared alarms.
 
 Sources: Laskey et al. 2017 (CoRL, DART) for noise on an expert's commands; Saegusa et al. 2009 (ROBIO) for babbling.
 """
@@ -31,7 +32,7 @@ from asm_gym.faults.object import movable
 from asm_gym.policies import Policy, make_policy
 from asm_gym.policies.registry import trained_in
 from asm_gym.policies.scripted.base import Style
-from asm_gym.rollouts.pretraining.healthy import held_out
+from asm_gym.rollouts.pretraining.healthy import HELD_OUT, held_out
 from asm_gym.rollouts.pretraining.reaching import Reaching
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.staging import environment, play, staged
@@ -56,6 +57,10 @@ DRIFT, DRIFTED, DRIFTING = 0.01, (5, 60), (0.05, 0.5)
 """Probability in a step of a disturbed lesson that the arm drifts, for how many steps, and by which commands [action
 units]."""
 
+PRESS, PRESSED, PRESSING, HELD = 0.04, (8, 40), (0.1, 0.6), 10
+"""Probability in a step that what has been gripped for so many steps is pressed against what is around, for how many,
+and by which commands [action units]."""
+
 LOOSENED, LOOSE = 0.05, 0.05
 """Probability in a step of a disturbed lesson that the grip is commanded more or less firmly from then on, and the
 least share of what the guide would: agents seldom command it all, and a gripper may go by the sign alone."""
@@ -66,7 +71,7 @@ class Lesson(NamedTuple):
 
     Attributes:
         task: its name.
-        number: among the lessons of its task.
+        number: among the lessons of its task; of one that presses, that of the one it comes beside.
         seed: of the environment, of the guide and of the noise.
         guide: what leads, ``"reaching"``, a policy's name or its file; noise alone where empty.
         noise: s, standard deviation of the noise [action units].
@@ -75,6 +80,7 @@ class Lesson(NamedTuple):
         pause: probability in a step that the arm stops for a while.
         weight: what the mass of the task's thing is multiplied by.
         drift: probability in a step that the arm drifts for a while, in one direction that is drawn.
+        press: probability in a step that it presses what it holds for a while, down or in a direction that is drawn.
     """
 
     task: str
@@ -87,6 +93,7 @@ class Lesson(NamedTuple):
     pause: float = 0.0
     weight: float = 1.0
     drift: float = 0.0
+    press: float = 0.0
 
     @property
     def path(self) -> Path:
@@ -109,7 +116,8 @@ def curriculum(
         episodes: of each task.
         guides: agents that take turns with the experts, in the tasks that each was trained in; by name, or the files
             of ``asm-gym train``.
-        reaching: the hand reaches for places where noise alone would lead, as ``leads`` says.
+        reaching: the hand reaches for places where noise alone would lead, as ``leads`` says, and there is one lesson
+            more for each three, which presses. For arms that no agent leads.
 
     Raises:
         ValueError: fewer than one episode.
@@ -118,7 +126,7 @@ def curriculum(
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     homes = {guide: trained_in(guide) for guide in guides}
-    return [
+    usual = [
         _lesson(
             task,
             number,
@@ -128,6 +136,12 @@ def curriculum(
         )
         for task in tasks
         for number, drawn in enumerate(role_seeds(seed, task, "babble", episodes))
+    ]
+    beside = range(0, episodes if reaching else 0, HELD_OUT)
+    return usual + [
+        _pressing(task, number, drawn)
+        for task in tasks
+        for number, drawn in zip(beside, role_seeds(seed, task, "press", len(beside)), strict=True)
     ]
 
 
@@ -153,6 +167,12 @@ def _lesson(task: str, number: int, seed: int, lead: str, guides: Sequence[str])
     )
 
 
+def _pressing(task: str, number: int, seed: int) -> Lesson:
+    """It is hardly disturbed else."""
+    lesson = _lesson(task, number, seed, DRIVEN, ["scripted"])
+    return lesson._replace(noise=NOISE[0], pause=0.0, drift=0.0, press=PRESS)
+
+
 class Babbler:
     """Acts as a lesson says.
 
@@ -166,7 +186,7 @@ class Babbler:
         self._noise = self._rng.standard_normal(env.action_space.shape or ())
         self._grip = np.isin(np.arange(len(self._noise)), list(getattr(env.unwrapped, "gripper_actions", ())))
         self._fumbles = bool(self._rng.random() < 0.5)
-        self._left, self._course, self._grasp = 0, np.zeros_like(self._noise), 1.0
+        self._left, self._course, self._grasp, self._held = 0, np.zeros_like(self._noise), 1.0, 0
 
     def predict(
         self,
@@ -185,6 +205,7 @@ class Babbler:
             # A hand that never keeps hold would never learn what holding feels like.
             if lesson.noise and rng.random() < LOOSENED:
                 self._grasp = rng.uniform(LOOSE, 1.0)
+            self._held = self._held + 1 if (meant[self._grip] > 0.0).any() else 0
             meant = np.where(self._grip, self._grasp, 1.0) * meant
             action = np.where(self._grip & (not self._fumbles), 0.0, action) + meant
         self._left = self._left - 1 if self._left else self._leaves()
@@ -193,7 +214,7 @@ class Babbler:
         return np.clip(action, -1.0, 1.0).astype(np.float32), state
 
     def _leaves(self) -> int:
-        """For how many steps nothing leads from now on: 0, or as long as the arm stops or drifts."""
+        """For how many steps nothing leads from now on: 0, or as long as the arm stops, drifts or presses."""
         rng, lesson = self._rng, self._lesson
         if rng.random() < lesson.pause:
             self._course = np.zeros_like(self._noise)
@@ -202,7 +223,21 @@ class Babbler:
             strength = np.exp(rng.uniform(*np.log(DRIFTING)))
             self._course = strength * rng.standard_normal(self._noise.shape)
             return int(rng.integers(*DRIFTED))
+        if lesson.press and self._held > HELD and rng.random() < lesson.press:
+            strength = np.exp(rng.uniform(*np.log(PRESSING)))
+            self._course = strength * self._against()
+            return int(rng.integers(*PRESSED))
         return 0
+
+    def _against(self) -> NDArray[np.float64]:
+        """(A,) where it presses: down half of the time, else aside or anywhere; its largest entry is 1."""
+        to, kind = np.zeros_like(self._noise), int(self._rng.integers(4))
+        if kind < 2:
+            to[2] = -1.0
+        else:  # 2 aside, 3 anywhere
+            to[:kind] = self._rng.standard_normal(kind)
+            to /= np.abs(to).max()
+        return to
 
 
 def _guide(lesson: Lesson, env: gym.Env[Any, Any]) -> Policy | None:
