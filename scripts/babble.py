@@ -284,7 +284,7 @@ def babble(args: Args, console: Console) -> None:
     """Records, learns, examines, and says what came of it."""
     check(args)
     claim = {n: getattr(args, n) for n in ("robot", "guides", "stream_freq", "seed")}
-    claim |= {"reaching": "and pressing"} if args.reaching else {}  # folders of before are of other lessons
+    claim["reaching"] = "and pressing" if args.reaching else None  # as folders of before there was any say nothing
     with claimed(args.out, "babble.json", claim):
         memory = learn(args, console)
         marks = examined(args, memory, console) if args.exam_episodes else []
