@@ -1,5 +1,6 @@
 """What of motor babbling a memory takes for healthy, and the command that makes one."""
 
+import json
 import re
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from asm_gym.rollouts.pretraining.babbling import (
     Lesson,
 )
 from asm_gym.rollouts.pretraining.healthy import KNOWN, healthy
+from asm_gym.rollouts.run_folder import claimed
 from asm_gym.scripts.babble import Args, check, main
 from asm_gym.spec import Channel, StreamSpec
 
@@ -168,3 +170,14 @@ def test_the_command_makes_a_memory_of_a_body_and_goes_on_where_it_was(tmp_path)
     assert main(["--quick", "--workers", "1", "--out", str(folder)]) == 0
     assert {f: f.stat().st_mtime_ns for f in folder.rglob("*.npz")} == written
     assert main(["--quick", "--workers", "1", "--robot", "Sawyer", "--out", str(folder)]) == 2  # it is another's
+
+
+@pytest.mark.parametrize("there", ["and pressing", True])
+def test_a_folder_of_other_lessons_is_refused(tmp_path, capsys, there):
+    with claimed(tmp_path, "babble.json", {"robot": "Panda", "guides": (), "stream_freq": None, "seed": 0}):
+        pass  # of before any hand reached
+    path = tmp_path / "babble.json"
+    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | {"reaching": there}), encoding="utf-8")
+    assert main(["--quick", "--workers", "1", "--out", str(tmp_path)]) == 2
+    assert f"reaching: {there!r} there, None here" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "episodes").exists()
