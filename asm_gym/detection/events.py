@@ -37,8 +37,8 @@ KNOCKING = 50.0
 KNOCKED_S = 1.0
 """For how long a knock is felt in what comes after it [s]."""
 NEAR_STOP, PAST_STOP = 0.03, 0.1
-"""A joint is at a stop from so far before it to so far past it [rad]; healthy arms went 0.04 rad past theirs at most, in
-4,199 episodes."""
+"""A joint is at a stop from so far before it to so far past it [rad]; healthy arms went 0.04 rad past theirs at most,
+in 4,199 episodes."""
 FASTEST = 5.0
 """At which joints turn [rad/s]: one that was farther from its stop in the row before is not at it now."""
 EXCUSED, SLIPPED = 10.0, 3.0
