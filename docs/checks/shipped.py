@@ -1,6 +1,7 @@
 """How high the surprise of a shipped memory rises in healthy episodes and under two faults: the check of its card.
 
 python docs/checks/shipped.py Panda
+python docs/checks/shipped.py Panda 100   that of 100 Hz
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ CASES = {
 }
 
 
-def main(robot: str) -> None:
+def main(robot: str, hz: str | None = None) -> None:
     for case, faults in CASES.items():
-        base = gym.make("asm_gym/Lift-v0", robot=robot, horizon=HORIZON)
+        base = gym.make("asm_gym/Lift-v0", robot=robot, horizon=HORIZON, stream_freq=int(hz) if hz else None)
         env = NeuralASMSafety(FaultInjection(base, faults), on_alarm="monitor", on_overrun="ignore")
         infos: list[Any] = []
         rollout(env, make_policy("scripted", env, seed=2), 2, infos.append)
@@ -34,4 +35,4 @@ def main(robot: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])
