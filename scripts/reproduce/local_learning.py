@@ -233,10 +233,10 @@ def drawn(records: Sequence[Record], config: Config) -> Figure:
         curves(
             axes[1], records, "degrees", ("iterations", config.iterations), targets, array="all", epoch=config.epochs
         )
-        for i, how in enumerate(RATES):
-            curve(axes[2], epochs, [over_seeds(records, "mse", learned_by=how, epoch=e) for e in epochs], i + 2, how)
+        for i, how in enumerate(RATES, len(TARGETS)):
+            curve(axes[2], epochs, [over_seeds(records, "mse", learned_by=how, epoch=e) for e in epochs], i, how)
             own = [r for r in records if r.get("cost_of") == how]
-            curve(axes[3], [r["steps"] for r in own], [(r["bytes"] / 1024, 0.0) for r in own], i + 2, how)
+            curve(axes[3], [r["steps"] for r in own], [(r["bytes"] / 1024, 0.0) for r in own], i, how)
         axes[0].set(xlabel="epochs", ylabel="angle to the local change [°]", ylim=(0, 95), xscale="symlog")
         axes[1].set(xlabel="iterations of inference", ylim=(0, 95), xscale="log")
         axes[2].set(xlabel="epochs", ylabel="error of the next row [variance]", yscale="log", xscale="symlog")
