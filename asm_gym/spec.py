@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from numbers import Real
 from typing import Any
 
 import gymnasium as gym
@@ -62,6 +63,10 @@ class Channel:
             raise TypeError(f"channel {self.name!r}: elements must be a tuple of names, got {shown(self.elements)}")
         if self.elements and len(self.elements) != self.size:
             raise ValueError(f"channel {self.name!r} has size {self.size} but {len(self.elements)} element names")
+        if not isinstance(self.stops, tuple) or not all(map(_is_pair, self.stops)):
+            raise TypeError(
+                f"channel {self.name!r}: stops must be a tuple of pairs (least, most), got {shown(self.stops)}"
+            )
         if self.stops and len(self.stops) != self.size:
             raise ValueError(f"channel {self.name!r} has size {self.size} but {len(self.stops)} pairs of stops")
 
@@ -71,6 +76,12 @@ class Channel:
         if self.size == 1 and not self.elements:
             return (self.name,)
         return tuple(f"{self.name}[{e}]" for e in (self.elements or range(self.size)))
+
+
+def _is_pair(stops: object) -> bool:
+    """Whether these are the least and the most of a number; a joint may have no stop to one side."""
+    numbers = isinstance(stops, tuple) and len(stops) == 2 and all(isinstance(x, Real) for x in stops)
+    return numbers and float(stops[0]) < float(stops[1])  # type: ignore[index]
 
 
 @dataclass(frozen=True)

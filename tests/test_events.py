@@ -284,3 +284,9 @@ def test_arms_of_the_package_know_their_stops():
 def test_stops_of_another_number_of_joints_are_refused():
     with pytest.raises(ValueError, match="channel 'q' has size 2 but 1 pairs of stops"):
         Channel("q", 2, "rad", stops=((0.0, 1.0),))
+
+
+@pytest.mark.parametrize("stops", [1, np.inf, ((0.0,),), ((1.0, 0.0),), ((0.0, np.nan),), [(0.0, 1.0)], "ab"])
+def test_what_is_no_pair_of_stops_is_refused(stops):
+    with pytest.raises(TypeError, match="channel 'q': stops must be a tuple of pairs"):
+        Channel("q", 1, "rad", stops=stops)

@@ -126,7 +126,7 @@ class Files:
         rows = good.episodes[0].stream
         pq.write_table(pa.table({label: rows[:, k] for k, label in enumerate(good.spec.labels)}), table)
         PPO("MlpPolicy", FakeEnv(), device="cpu").save("good.zip")
-        layout, env = logs.Layout(spec=good.spec), FakeEnv()
+        layout, env = logs.LogLayout(spec=good.spec), FakeEnv()
         self.formats = {
             "memory": Format(good.memory_file, lambda p: _arrays(load_monitor(p).learned_)),
             "episode": Format(good.episode_file, lambda p: _content(one_episode.load_episode(p))),

@@ -33,6 +33,7 @@ from asm_gym.wrappers import (
     NeuralASMSafety,
     SafetyLog,
     SixValues,
+    StreamFeatures,
     StreamRecorder,
     SurpriseOverlay,
     VectorNeuralASMSafety,
@@ -203,7 +204,7 @@ def public(good: Good) -> dict[str, Target]:
         ),
         "read_logs": (
             lambda path, layout: list(logs.read_logs(path, layout)),
-            lambda: {"path": good.log_file, "layout": logs.Layout(spec=good.spec)},
+            lambda: {"path": good.log_file, "layout": logs.LogLayout(spec=good.spec)},
         ),
         "Channel": (Channel, lambda: {"name": "a", "size": 2}),
         "StreamSpec": (StreamSpec, lambda: {"channels": (Channel("a", 2),), "dt": 0.05}),
@@ -247,6 +248,10 @@ def public(good: Good) -> dict[str, Target]:
         "FaultInjection": (FaultInjection, lambda: {"env": FakeEnv(), "faults": []}),
         "StreamRecorder": (StreamRecorder, lambda: {"env": FakeEnv()}),
         "SurpriseOverlay": (SurpriseOverlay, lambda: {"env": guarded()}),
+        "StreamFeatures": (
+            StreamFeatures,
+            lambda: {"env": FakeEnv(), "channel": Channel("felt", 1), "features": lambda observation, info: [0.0]},
+        ),
         "FlatInfo": (FlatInfo, lambda: {"env": guarded()}),
         "SafetyLog": (SafetyLog, lambda: {"env": guarded(), "writer": Nowhere()}),
         "SixValues": (SixValues, lambda: {"env": guarded()}),
