@@ -78,10 +78,10 @@ class Channel:
         return tuple(f"{self.name}[{e}]" for e in (self.elements or range(self.size)))
 
 
-def _is_pair(stops: object) -> bool:
+def _is_pair(stops: Any) -> bool:
     """Whether these are the least and the most of a number; a joint may have no stop to one side."""
     numbers = isinstance(stops, tuple) and len(stops) == 2 and all(isinstance(x, Real) for x in stops)
-    return numbers and float(stops[0]) < float(stops[1])  # type: ignore[index]
+    return numbers and bool(stops[0] < stops[1])
 
 
 @dataclass(frozen=True)
