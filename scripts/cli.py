@@ -37,7 +37,7 @@ GROUPS: dict[str, dict[str, Subcommand]] = {
     "Study it": {
         "corpus": Subcommand("asm_gym.scripts.corpus", "the recordings that tables of detection are judged on"),
         "reproduce": Subcommand("asm_gym.scripts.reproduce", "the method's claims, one study each; all runs many"),
-        "benchmark": Subcommand("asm_gym.scripts.benchmark", "speeds as ratios against rivals, and experts"),
+        "benchmark": Subcommand("asm_gym.scripts.benchmark", "speeds as ratios against rivals"),
     },
 }
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}

@@ -8,8 +8,13 @@ rate that holds (the lower tail of the binomial distribution).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
+import numpy as np
 from scipy.stats import binomtest
+
+from asm_gym.policies import make_policy, rollout
+from asm_gym.rollouts.staging import environment
 
 CHANCE = 1e-3
 """With which a test of a rate that holds fails."""
@@ -36,3 +41,28 @@ def failures(trial: Callable[[int], str], seeds: Iterable[int], rate: float, fir
             return []
     wrong = [f"seed {seed}: {what}" for seed, what in zip(seeds, said, strict=True) if what]
     return wrong if too_few(len(said) - len(wrong), len(said), rate) else []
+
+
+class Attempt(NamedTuple):
+    """Outcome of one episode of a scripted expert."""
+
+    solved: bool  # at some step
+    held: bool  # at the last step, too
+
+
+def attempt(seed: int, task: str, robot: str) -> Attempt:
+    """Run the scripted expert's episode of ``seed``, which also seeds the expert."""
+    env = environment(f"asm_gym/{task}-v0", (("robot", robot), ("stream", ())))
+    success: list[bool] = []
+    solved = rollout(env, make_policy("scripted", env, seed=seed), seed, lambda info: success.append(info["success"]))
+    return Attempt(bool(solved), bool(success[-1]))
+
+
+def room_to_the_stops(env: Any) -> float:
+    """Return the distance of the arm joint nearest to one of its stops [rad]; joints without stops are left out."""
+    simulation = env.unwrapped.simulation
+    names = [name for robot in env.unwrapped.robosuite_env.robots for name in robot.robot_joints]
+    arms = [joint for joint in map(simulation.model.joint, names) if simulation.model.jnt_limited[joint.id]]
+    angles = np.array([simulation.data.joint(joint.name).qpos[0] for joint in arms])
+    low, high = np.array([joint.range for joint in arms]).T
+    return float(np.minimum(angles - low, high - angles).min())

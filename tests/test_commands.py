@@ -21,7 +21,7 @@ from asm_gym.scripts.options import rows as options_of
 
 ROOT = Path(__file__).resolve().parents[1]
 STUDIES = [f"reproduce {study}" for study in ("all", *reproduce.STUDIES)]
-MEASURES = [f"benchmark {what}" for what in ("env", "experts", "memory", "fit", "safety", "fleet", "deadline")]
+MEASURES = [f"benchmark {what}" for what in ("env", "memory", "safety")]
 EVERY_COMMAND = [*cli.COMMANDS, *STUDIES, *MEASURES]
 
 

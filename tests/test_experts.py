@@ -16,8 +16,7 @@ from asm_gym.policies.scripted.handover import Hammer, Meeting
 from asm_gym.policies.scripted.two_arms import Hand, move_arm
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.scripts.benchmark.experts import attempt, room_to_the_stops
-from tests.rates import failures, too_few
+from tests.rates import attempt, failures, room_to_the_stops, too_few
 
 QUICK = [
     "Stack",

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from asm_gym.scripts.reproduce import harm, harm_agents, harm_felt, harm_report, harm_speeds
-from asm_gym.spec import Channel, StreamSpec
+from asm_gym.scripts.reproduce import harm, harm_agents, harm_felt, harm_report
 
 
 def test_harm_is_the_impulse_beyond_forty_newtons_and_the_first_blow_is_told_from_later_ones():
@@ -68,21 +67,6 @@ def test_a_run_that_goes_on_measures_no_scene_twice(tmp_path, monkeypatch):
     first = harm.measured(job, config)
     monkeypatch.setattr(harm, "one", None)
     np.testing.assert_equal(harm.measured(job, config), first)
-
-
-def test_speed_is_looked_up_by_place_and_by_direction_and_load_where_a_rule_says_so():
-    names = ("hand_position", 3, "m"), ("hand_velocity", 3, "m/s"), ("gripper_force", 2, "N")
-    spec = StreamSpec(tuple(Channel(*name) for name in names), dt=0.05)
-    down = np.zeros((40, 8))
-    down[:, 5] = -0.1
-    asked = np.zeros((3, 8))
-    asked[:, 5] = -0.1, 0.1, -0.1  # down, up, and down with a load
-    asked[2, 6] = 5.0
-    found = {rule: harm_speeds.limits_by(rule, [down], asked, spec).tolist() for rule in harm_speeds.RULES}
-    assert found["no place"] == [0.15] * 3
-    assert found["place"] == pytest.approx([0.12] * 3)
-    assert found["place and direction"] == pytest.approx([0.12, 0.05, 0.12])
-    assert found["place, direction and load"] == pytest.approx([0.12, 0.05, 0.05])
 
 
 def test_every_cell_is_one_row_and_other_arms_are_asked_for():

@@ -1,4 +1,4 @@
-"""Speeds as ratios against a rival in the same run, and how often experts succeed.
+"""Speeds as ratios against a rival in the same run.
 
 Machines differ and are noisy: rivals take turns, step by step, and the medians of their turns are compared.
 """
@@ -20,10 +20,6 @@ from rich.console import Console
 import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
 from asm_gym.evaluation.tables import ConsoleTable, Table
-from asm_gym.scripts.benchmark.deadline import Deadline
-from asm_gym.scripts.benchmark.experts import Experts
-from asm_gym.scripts.benchmark.fit import FitCost
-from asm_gym.scripts.benchmark.fleet import Robots
 from asm_gym.scripts.benchmark.memory import MemoryCost
 from asm_gym.scripts.benchmark.safety import Safety
 from asm_gym.scripts.benchmark.turns import BusyError, take_turns
@@ -164,12 +160,8 @@ class Env:
 
 BENCHMARKS: dict[str, type[Any]] = {
     "env": Env,
-    "experts": Experts,
     "memory": MemoryCost,
-    "fit": FitCost,
     "safety": Safety,
-    "fleet": Robots,
-    "deadline": Deadline,
 }
 
 

@@ -34,7 +34,6 @@ STUDIES = {
     "parts": Study("who does what in the memory, by what rules", needs_a_run=True),
     "diagnosis": Study("what is wrong, of kinds of faults that were never seen", needs_a_run=True),
     "real_arms": Study("faults in recordings of real arms, once downloaded", needs_a_run=True),
-    "actprobe": Study("will GR00T fail, by logs of others", needs_a_run=True),
 }
 INDEPENDENT = tuple(name for name, study in STUDIES.items() if not study.needs_a_run)
 

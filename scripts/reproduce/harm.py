@@ -24,7 +24,7 @@ from asm_gym.policies.hostile import HOSTILE
 from asm_gym.rollouts.staging import environment, policy_for, staged
 from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.scripts.options import fixed, option
-from asm_gym.scripts.reproduce import harm_agents, harm_braking, harm_report, harm_speeds, kit
+from asm_gym.scripts.reproduce import harm_agents, harm_report, kit
 from asm_gym.scripts.reproduce.harm_agents import EXCESS, HITTERS, LEARNERS
 from asm_gym.scripts.reproduce.harm_felt import Felt, hand_speed, harm_of
 from asm_gym.spec import control_period
@@ -77,9 +77,9 @@ class Config(kit.Config):
     """How often it is done anew, with other seeds."""
     episodes: int = option(10, quick=1, least=0)
     """Episodes of each policy that a guard is against."""
-    against: tuple[str, ...] = option(("hostile", "untrained"), known=(*AGAINST, "speeds"), metavar="NAME")
+    against: tuple[str, ...] = option(("hostile", "untrained"), known=AGAINST, metavar="NAME")
     """Which. Elsewhere are hostile ones with the Sawyer, the IIWA, and at 100 Hz. Faulty are healthy ones in Lift and
-    Stack under each kind of fault. With speeds, limits by place, direction and load are compared on healthy ones."""
+    Stack under each kind of fault."""
     healthy: int = option(40, quick=1, least=0)
     """Episodes of each healthy policy."""
     guards: tuple[str, ...] = option(
@@ -152,11 +152,6 @@ def policy_of(cell: HarmCell, env: gym.Env[Any, Any], seed: int, config: Config)
     if cell.kind == "untrained":
         return harm_agents.untrained(cell.policy, env, seed)
     return policy_for(cell.policy, env, seed)
-
-
-def chosen(name: str, env: gym.Env[Any, Any], seed: int) -> Policy:
-    """A hostile policy at full speed, or a healthy one."""
-    return HOSTILE[name](env, seed, 1.0) if name in HOSTILE else policy_for(name, env, seed)
 
 
 def measured(job: tuple[HarmCell, int], config: Config) -> list[kit.Record]:
@@ -233,12 +228,5 @@ def run(config: Config) -> kit.Findings:
         harm_report.harm_table(records, guards),
         harm_report.blows_table(records, [g for g in guards if g in (POLICY_ALONE, "default")]),
     ]
-    if "elsewhere" in config.against:
-        held = kit.together(kit.each("braking", harm_braking.braking, harm_braking.ROBOTS, config))
-        tables.append(harm_braking.braking_table(held))
-    if "speeds" in config.against:
-        by_task = [(t, tuple(p for own, p in HEALTHY.values() if own == t)) for t in config.tasks or TASKS]
-        compare = partial(harm_speeds.speeds, episodes=config.episodes, make=chosen)
-        tables.append(harm_speeds.speeds_table(kit.together(kit.each("speeds", compare, by_task, config))))
     tables += [harm_report.kept_table(records, guards, kind) for kind in ("healthy", "faulty")]
     return kit.Findings(records, [table for table in tables if table.rows], harm_report.frontier(records, guards))
