@@ -26,7 +26,6 @@ BROUGHT_BY = {
     **dict.fromkeys(("rosbags",), "ros"),
     **dict.fromkeys(("cyclonedds",), "dds"),
     **dict.fromkeys(("rerun",), "rerun"),
-    **dict.fromkeys(("onnx", "onnxruntime"), "onnx"),
 }
 """The extra of asm-gym that installs a package, by the name it is imported under."""
 

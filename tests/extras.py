@@ -46,7 +46,6 @@ CHECKS = {
     ),
     "dds": Check("report,dds", "tests/test_dds.py"),
     "rerun": Check("report,rerun", "tests/test_rerun.py"),
-    "onnx": Check("onnx", "tests/test_export.py"),
     "data": Check("robosuite,data,report", "tests/test_datasets.py"),
     "agents": Check("agents", "tests/test_learners.py tests/test_learners_train.py"),
     "learners": Check("learners", "tests/test_learners.py tests/test_learners_train.py"),
@@ -85,7 +84,7 @@ def check(name: str, wheel: Path) -> str:
 
 EXTRAS = (
     *("robosuite", "report", "data", "agents", "environments", "learners", "hub", "notebooks"),
-    *("cluster", "rerun", "ros", "video", "onnx", "dds"),
+    *("cluster", "rerun", "ros", "video", "dds"),
 )
 BREAKS = {"mujoco": "3.10", "dm-control": "1.0.40", "numpy": "3", "pyarrow": "22"}
 """From which version on a package has not been tried, or breaks environments."""

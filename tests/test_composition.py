@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 import zipfile
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,6 @@ import pytest
 
 from asm_gym.detection import EvidenceDetection, ModelOutput, conformal_threshold
 from asm_gym.detection.scores import WINDOW, Largest, Mahalanobis, MovingMean, Squares
-from asm_gym.episode import Episode
 from asm_gym.monitors import (
     DETECTIONS,
     MONITORS,
@@ -30,7 +28,6 @@ from asm_gym.monitors import (
     register_monitor,
 )
 from asm_gym.monitors.stream_model import StreamModel
-from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.streams import frozen, sine_episodes, sine_spec
 
 """Files that asm-gym saved before models and detections were parts, and what it made of a stream."""
@@ -223,63 +220,6 @@ def test_errors_of_no_channel_are_shared_out_among_the_senses_alone(kalman):
     np.testing.assert_allclose(attribution[:, 1:12], (errors[:, 1:] ** 2).sum(axis=1)[:, None].repeat(11, 1) / 12)
     np.testing.assert_allclose(attribution.sum(axis=1), (errors**2).sum(axis=1))
     assert not attribution[:, 12:].any()
-
-
-def test_a_skill_that_has_to_be_told_is_told_by_the_episode_or_by_the_state():
-    episodes = []
-    for n, e in enumerate(sine_episodes(20)):
-        stream = e.stream.copy()
-        stream[:, :4] += 5.0 * (n % 2)
-        episodes.append(Episode.from_stream(stream, e.spec, info={"skill": ("far", "near")[n % 2]}))
-    library = make_monitor("skill_library", sine_spec()).fit(episodes)
-    assert library.skills_ == ("far", "near")
-    scores = [library.score(episodes[1]).value.mean()]
-    for skill in ("near", "far"):
-        state, values = library.initial_state(1, [{"skill": skill}]), []
-        for row in episodes[1].stream:
-            state, surprise = library.observe(state, row[None])
-            values.append(surprise.value[0])
-        scores.append(np.mean(values))
-    assert scores[0] == pytest.approx(scores[1])
-    assert scores[2] > 3 * scores[1]
-
-
-def reach(goal, rng, told=True):
-    """60 rows of a hand that goes to ``goal`` (3,) from elsewhere, and of a sense that rises with it."""
-    channels = Channel("hand_position", 3, "m", noise=1e-3), Channel("effort", 1), Channel("action", 1, group=MOTOR)
-    course = (1 - np.cos(np.pi * np.linspace(0, 1, 60)))[:, None] / 2
-    hand = course * goal + 1e-3 * rng.normal(size=(60, 3))
-    effort = 3.0 * goal[:1] * course + 0.01 * rng.normal(size=(60, 1))
-    info = {"skill": "reach"} | ({"goal": goal.tolist()} if told else {})
-    return Episode.from_stream(np.hstack([hand, effort, np.zeros((60, 1))]), StreamSpec(channels, 0.05), info=info)
-
-
-def test_a_library_expects_a_skill_to_reach_the_goal_it_is_told(tmp_path):
-    rng = np.random.default_rng(0)
-    goals = rng.uniform(-0.3, 0.3, (40, 3))
-    shown = [reach(g, rng) for g in goals[:20]]
-    library = make_monitor("skill_library", shown[0].spec).fit(shown)
-    library.save(tmp_path / "library.asm")
-    fresh = [reach(g, rng) for g in goals[20:]]
-
-    def surprise(monitor, **changed):
-        asked = [replace(e, info={**e.info, **{k: v(e) for k, v in changed.items()}}) for e in fresh]
-        return np.mean([s.value for s in monitor.score_episodes(asked)])
-
-    right, usual = surprise(library), surprise(library, goal=lambda e: [])
-    assert surprise(load_monitor(tmp_path / "library.asm")) == right
-    assert right < 8  # four senses, each of a variance of 1
-    assert usual > 100 * right
-    assert surprise(library, goal=lambda e: [-g for g in e.info["goal"]]) > 2 * usual
-    assert surprise(library, goal=lambda e: e.info["goal"][:2]) == usual  # one that does not fit is none
-
-    state, _ = library.model.predict(library.model.start(1, [fresh[0].info]), fresh[0].stream[:1].astype(float))
-    for _ in range(59):
-        state, _ = library.model.predict(state, np.full((1, 5), np.nan))  # it runs on its own
-    np.testing.assert_allclose(state.place[0], goals[20], atol=0.02)
-
-    untold = make_monitor("skill_library", shown[0].spec).fit([reach(g, rng, told=False) for g in goals[:20]])
-    assert surprise(untold) == surprise(untold, goal=lambda e: [])
 
 
 def test_optional_abilities_are_protocols():

@@ -19,9 +19,7 @@ from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.baselines.arm_inputs import forces, motion, speeds
 from asm_gym.monitors.baselines.association_values import ValueAssociation
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
-from asm_gym.monitors.baselines.same_inputs import Informed
 from asm_gym.monitors.monitor import MonitorState
-from asm_gym.monitors.onnx_export import write_onnx
 from asm_gym.monitors.values import Values
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.reproduce.pushed import FAULTS, NEWTONS, SLIP, TABLES, _about_x, _about_z, jacobian
@@ -195,8 +193,6 @@ def test_a_memory_judges_values_beside_changes_and_keeps_both(tmp_path):
     assert asm.values_.monitor is not None
     body = asm.values_.monitor.score(faulty[0]).value
     assert (score.value >= body).all()
-    with pytest.raises(ValueError, match="values=False"):
-        write_onnx(asm, tmp_path / "x.onnx")
 
 
 def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_says():
@@ -234,19 +230,6 @@ def test_a_memory_of_what_nothing_tells_judges_changes_alone():
     episodes = [Episode.from_stream(rng.normal(size=(60, 2)), spec) for _ in range(10)]
     asm = NeuralASM(spec, hidden_size=8, association_size=8, epochs=1, values=True).fit(episodes)
     assert asm.values_.monitor is None
-
-
-def test_rivals_are_told_friction_and_weight_of_the_row_before():
-    cut = pieces(Episode.from_table(arm(2000)), 1.0)
-    informed = Informed(cut[0].spec, lambda spec: make_monitor("kalman+evidence", spec)).fit(cut[:15])
-    told = informed._informed(cut[0])
-    inputs = told.stream[:, told.spec.slices["of_arms"]]
-    q, dq = (cut[0].stream[:, cut[0].spec.slices[name]].astype(float) for name in ("position", "velocity"))
-    spread = np.concatenate([p.stream[:, 2:4] for p in cut[:15]]).astype(float).std(axis=0)
-    np.testing.assert_allclose(inputs[1:, :2], np.tanh(dq[:-1] / (0.01 * spread)), atol=1e-5)
-    np.testing.assert_allclose(inputs[1:, 6:8], np.sin(q[:-1]), atol=1e-5)
-    score = informed.score_episodes([cut[16]])[0]
-    assert len(score.value) == len(cut[16])
 
 
 def test_it_is_saved_and_says_the_same_again(tmp_path):

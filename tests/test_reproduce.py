@@ -26,7 +26,6 @@ from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     ExpressionMemory,
     Hopfield,
-    Library,
     mean_demonstrations,
     recalled,
 )
@@ -63,17 +62,6 @@ def test_a_recurrent_rival_offline_reads_its_own_predictions():
     np.testing.assert_array_equal(
         offline, model.express(np.where(np.arange(STEPS)[:, None, None] < 20, streams, 9.0), 20)
     )
-
-
-def test_the_library_is_told_and_expresses_another_skill_when_told_another():
-    train, tests = letters_of(2)
-    skills = [str(e.info["skill"]) for e in tests]
-    means = mean_demonstrations(train, 2)
-    right = recalled(Library.learned(train, skills), tests, means, 20)
-    wrong = recalled(Library.learned(train, skills[::-1]), tests, means, 20)
-    assert right[1] == 1.0
-    assert wrong[1] == 0.0
-    assert right[0] < 0.5 * wrong[0]
 
 
 def test_the_memory_recalls_each_letter_from_its_cue():

@@ -99,20 +99,15 @@ def _row(model: str, own: str) -> MonitorKind:
 
 
 _BASELINES = {
-    "skill_library": _row("skill_library:SkillLibrary", "squares"),
     "logpzo": _row("fail_detect:LogpZO", "moving_mean"),
     "rnd": _row("fail_detect:RND", "moving_mean"),
     "lstm_vae": _row("lstm_vae:LSTMVAE", "latent_threshold"),
     "gru": _row("gru:GRU", "mahalanobis"),
     "rapt": _row("rapt:RAPT", "per_dimension"),
-    "next": _row("external_torque:NEXT", "largest"),
     "kalman": _row("kalman:Kalman", "mahalanobis"),
     "association_linear": _row("association_linear:LinearAssociation", "mahalanobis"),
     "association_values": _row("association_values:ValueAssociation", "mahalanobis"),
-    "association_boosted": _row("association_boosted:BoostedAssociation", "mahalanobis"),
-    "association_mlp": _row("association_mlp:MLPAssociation", "mahalanobis"),
     "window_pca": _row("window_pca:WindowPCA", "squares"),
-    "elapsed_time": _row("elapsed_time:ElapsedTime", "squares"),
 }
 
 PARTS = {

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -19,11 +17,9 @@ from asm_gym.detection.repetition import evidence_steps
 from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.episode import Episode
 from asm_gym.evaluation.tables import ConsoleTable, Table
-from asm_gym.extras import require
 from asm_gym.memory.state import UNSURE
 from asm_gym.memory.traces import DECAYS
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.onnx_export import STATE, initial_state, write_onnx
 from asm_gym.scripts.benchmark.turns import again, take_turns
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
@@ -148,26 +144,6 @@ def watching_plainly(asm: NeuralASM, episode: Episode) -> Callable[[], Any]:
     return call
 
 
-def watching_in_onnx(asm: NeuralASM, episode: Episode) -> Callable[[], Any]:
-    """The same in ONNX Runtime, on one thread, by the graph that ``write_onnx`` makes."""
-    onnxruntime = require("onnxruntime", what="this rival")
-    with TemporaryDirectory() as folder:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        graph = write_onnx(asm, f"{folder}/memory.onnx").read_bytes()
-    session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
-    said = [output.name for output in session.get_outputs()]
-    rows, state, n = [row[None].astype(np.float64) for row in episode.stream], initial_state(asm), 0
-
-    def call() -> None:
-        nonlocal state, n
-        found = dict(zip(said, session.run(said, {"row": rows[n % len(rows)], **state}), strict=True))
-        state = {name: found[f"next_{name}"] for name in STATE}
-        n += 1
-
-    return call
-
-
 def _fitted(hidden: int, channels: int, skills: int = 1) -> tuple[NeuralASM, Episode]:
     """A memory that has learned little: the cost is the same. It names skills where there are several."""
     episodes = synthetic(channels, max(10, skills + 2), skills)
@@ -203,8 +179,6 @@ class MemoryCost:
                 "asm_gym, 64 streams": watching(asm, episode, 64),
                 "plain torch, one stream": watching_plainly(asm, episode),
             }
-            if find_spec("onnxruntime") and find_spec("onnx"):
-                rivals["ONNX Runtime, one stream"] = watching_in_onnx(asm, episode)
             turns = take_turns(rivals, self.steps, console, self.even_if_busy)
         finally:
             torch.set_num_threads(threads)

@@ -21,7 +21,6 @@ from asm_gym.memory.recall import Recalled, follow, run_on, to_rows
 from asm_gym.memory.scheduled_sampling import learn
 from asm_gym.memory.temporal import TemporalNetwork, unassociated
 from asm_gym.memory.traces import fit_gains
-from asm_gym.monitors import CalibratedMonitor, make_monitor
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import recurrent
 
@@ -188,38 +187,6 @@ class Hopfield:
             made[t] = self.retrieve(past.transpose(1, 0, 2).reshape(rows.shape[1], -1)) if t else 0.0
             past = np.concatenate([past[1:], rows[t][None] if t < cue else made[t][None]])
         return np.asarray(self.reader.mean + self.reader.spread * made)
-
-
-@dataclass(frozen=True)
-class Library:
-    """Movement primitives, one a skill, and told which skill to express; only the hand is expressed."""
-
-    library: CalibratedMonitor
-    skills: tuple[str, ...]
-
-    @classmethod
-    def learned(
-        cls, episodes: Sequence[Episode], skills: Sequence[str], bases: int = 40, stiffness: float = 25.0
-    ) -> Library:
-        """From episodes that say their skill.
-
-        Args:
-            skills: those of the streams that ``express`` will be given.
-            bases, stiffness: of a primitive; see ``SkillLibrary``.
-        """
-        library = make_monitor("skill_library", episodes[0].spec, bases=bases, stiffness=stiffness)
-        return cls(library.fit(episodes), tuple(skills))
-
-    def express(self, streams: Rows, cue: int) -> Rows:
-        library, made = self.library.model, np.full(streams.shape, np.nan)
-        state = library.start(streams.shape[1], [{"skill": name} for name in self.skills])
-        hand = [
-            i for n, s in library.spec.slices.items() if n.endswith("hand_position") for i in range(s.start, s.stop)
-        ]
-        for t in range(len(streams)):
-            made[t][:, hand] = state.place if t else streams[0][:, hand]
-            state, _ = library.predict(state, streams[t])
-        return made
 
 
 def mean_demonstrations(train: Sequence[Episode], dims: int) -> NDArray[np.float64]:

@@ -60,8 +60,8 @@ class Config(kit.Config):
     tasks: tuple[str, ...] = option(("Lift", "Stack"), quick=("Lift",), least=1, known=AGENTS)
     """Tasks that have an agent; one monitor learns all of them."""
     monitors: tuple[str, ...] = option(
-        ("memory_skill", "neural_asm", "logpzo", "rnd", "gru+evidence", "elapsed_time"),
-        quick=("memory_skill", "elapsed_time"),
+        ("memory_skill", "neural_asm", "logpzo", "rnd", "gru+evidence"),
+        quick=("memory_skill", "neural_asm"),
         least=1,
         known=(*MONITORS, *NAMES),
     )

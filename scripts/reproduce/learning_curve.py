@@ -38,7 +38,6 @@ class Config(RunConfig):
         (
             "neural_asm",
             "association_linear+evidence",
-            "association_mlp+evidence",
             "window_pca+evidence",
             "gru+evidence",
             "kalman+evidence",

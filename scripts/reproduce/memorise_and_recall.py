@@ -95,7 +95,7 @@ def tables(records: Sequence[Record], config: Config) -> list[Table]:
         Table(f"Offline error [cm] by letters, {units}", sizes, rows("skills", config.repertoires)),
         Table("Online error [cm] by letters", sizes, online),
     ]
-    asked: dict[str, Record] = {CALLED[m]: {"model": m} for m in config.models if m not in ("hopfield", "library")}
+    asked: dict[str, Record] = {CALLED[m]: {"model": m} for m in config.models if m != "hopfield"}
     gaps = {f"{n} letters, 1 in {e}": {"skills": n, "every": e} for n in config.repertoires for e in EVERY}
     own: Record = {"domain": "letters", "dims": 2, "hidden": config.hidden}
     made.append(kit.grid("Error [cm] where one row in so many is sensed", records, "glimpsed_cm", asked, gaps, **own))

@@ -35,12 +35,10 @@ from asm_gym.evaluation.statistics import auroc
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
-from asm_gym.monitors.baselines.same_inputs import Informed
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.scripts.reproduce.pushed import FAULTS
-from asm_gym.spec import StreamSpec
 
 RULE = "friction_rule"
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -48,14 +46,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "association_values+evidence": {"shrinkage": 1.0},
 }
 """The first as ``asm-gym fit`` has it of a log, the other without whitening, as the first has it beside."""
-INFORMED = {"kalman, told": "kalman+evidence", "ridge, told": "association_linear+evidence"}
-"""Rivals that are told what arms are made of."""
-WITH_BODY = {
-    "neural_asm, body": "neural_asm",
-    "association_values, body": "association_values+evidence",
-    "kalman, body": "kalman+evidence",
-    "ridge, body": "association_linear+evidence",
-}
+WITH_BODY = {"neural_asm, body": "neural_asm", "association_values, body": "association_values+evidence"}
 """With a body model in place of sines of angles."""
 EXPERIMENTS = (*ARMS, "cobot", "executions")
 AROUND_S = 5.0
@@ -77,13 +68,13 @@ class Config(kit.Config):
     monitors: tuple[str, ...] = option(
         (
             *("neural_asm", "association_values+evidence", "association_linear+evidence", "kalman+evidence"),
-            *(*INFORMED, "window_pca+evidence", "gru+evidence", RULE, "channel_limit"),
+            *("window_pca+evidence", "gru+evidence", RULE, "channel_limit"),
         ),
         quick=("association_values+evidence", RULE),
         least=1,
-        known=(*MONITORS, *INFORMED, *WITH_BODY, RULE),
+        known=(*MONITORS, *WITH_BODY, RULE),
     )
-    """Names of monitors, friction_rule, and rivals that are told of friction and weight; or by a body model."""
+    """Names of monitors, friction_rule, or monitors with a body model."""
     piece: float = fixed(1.0)
     """Length of a piece [s]."""
     folds: int = fixed(4, least=2)
@@ -110,7 +101,6 @@ def run(config: Config) -> Findings:
         for name in there
         for monitor in config.monitors
         if not (monitor == RULE and name == "executions")
-        and (monitor not in INFORMED or name in ARMS)
         and (monitor not in WITH_BODY or (name in ARMS and ARMS[name].urdf))
         for seed in config.repetitions
         for fold in range(config.folds)
@@ -202,19 +192,12 @@ def parted(count: int, job: Job, config: Config) -> tuple[list[int], list[int], 
 def fitted(job: Job, episodes: Sequence[Episode], urdf: str = "") -> Any:
     """The monitor, fitted; its threshold is set here, for so few pieces that none could be promised."""
     spec = episodes[0].spec
-    name = (INFORMED | WITH_BODY).get(job.monitor, job.monitor)
-    told = name != job.monitor and name in INFORMED.values()
-    made: Any
+    name = WITH_BODY.get(job.monitor, job.monitor)
     if job.monitor == RULE:
         made = CalibratedMonitor(FrictionRule(spec), Largest(spec), seed=job.seed)
     else:
-
-        def make(spec: StreamSpec) -> Any:
-            settings = SETTINGS.get(name, {})
-            body = {"urdf": urdf} if urdf and not told else {}
-            return make_monitor(name, spec, seed=job.seed, **settings, **body)
-
-        made = Informed(spec, make, urdf) if told else make(spec)
+        body = {"urdf": urdf} if urdf else {}
+        made = make_monitor(name, spec, seed=job.seed, **SETTINGS.get(name, {}), **body)
     return made.fit(list(episodes))
 
 

@@ -3,8 +3,7 @@
 The temporal predictive coding network on traces, learned by local rules, with as many units as its rivals, and with
 four times as many; the one whose state is carried on and settles, with as many weights as a GRU; a GRU, an LSTM of as
 many weights and a plain RNN trained by backpropagation through time; the GRU with errors that go back one step, which
-is as local; a modern continuous Hopfield network, which keeps every window; and a library of movement primitives, which
-is told the skill.
+is as local; a modern continuous Hopfield network, which keeps every window.
 
 How each is set was chosen by the same search for all, of nine settings each, on letters of seed 100,
 which is none of those that are reported.
@@ -25,7 +24,6 @@ from asm_gym.scripts.reproduce.expression import (
     Expresser,
     ExpressionMemory,
     Hopfield,
-    Library,
     between_glimpses,
     mean_demonstrations,
     recalled,
@@ -33,7 +31,7 @@ from asm_gym.scripts.reproduce.expression import (
 from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, copybook, repertoire
 from asm_gym.scripts.reproduce.kit import Record
 
-MODELS = ("memory", "memory_wide", "settling", "gru", "lstm", "rnn", "gru_one_step", "hopfield", "library")
+MODELS = ("memory", "memory_wide", "settling", "gru", "lstm", "rnn", "gru_one_step", "hopfield")
 CALLED = {
     "memory": "temporal predictive coding, local",
     "memory_wide": "the same, 4 × the units",
@@ -43,7 +41,6 @@ CALLED = {
     "rnn": "RNN, BPTT",
     "gru_one_step": "GRU, BPTT of one step",
     "hopfield": "modern Hopfield",
-    "library": "primitives, told the skill",
 }
 
 WIDER = 4
@@ -70,7 +67,6 @@ CHOSEN: dict[str, Setting] = {
     "rnn": {"rate": 3e-2, "noise": 0.6},
     "gru_one_step": {"rate": 3e-2, "noise": 0.3},
     "hopfield": {"window": 8, "beta": 100.0},
-    "library": {"bases": 40, "stiffness": 25.0},
 }
 """How each learns; what each number means is said where it is taken."""
 
@@ -115,7 +111,7 @@ def recall(
         if name == "memory_wide" and WIDER * condition.hidden > WIDEST:
             continue
         how = (CHOSEN if condition.hidden < LARGE else CHOSEN_LARGE)[name]
-        model = learned(name, how, train, tests, condition.hidden, practice, rng)
+        model = learned(name, how, train, condition.hidden, practice, rng)
         for cue in (*cues, STEPS):
             error, right = recalled(model, tests, means, cue)
             where = {**condition._asdict(), "model": name, "cue": cue, "online": cue == STEPS}
@@ -130,7 +126,6 @@ def learned(
     name: str,
     setting: Setting,
     train: Sequence[Episode],
-    tests: Sequence[Episode],
     hidden: int,
     practice: Practice,
     rng: np.random.Generator,
@@ -138,7 +133,6 @@ def learned(
     """One of ``MODELS``, as it is set.
 
     Args:
-        tests: whose skills only the library is told.
         hidden: units of a rival.
     """
     how: dict[str, Any] = dict(setting)
@@ -151,8 +145,6 @@ def learned(
         return ExpressionMemory.learned(train, units, rng, practice.steps, dynamics=SETTLING, **how)
     if name == "hopfield":
         return Hopfield.learned(train, **how)
-    if name == "library":
-        return Library.learned(train, [str(e.info["skill"]) for e in tests], **how)
     cell, truncated, _ = name.partition("_one_step")
     return Backpropagated.learned(train, cell, units, rng, practice.updates, truncated=bool(truncated), **how)
 
