@@ -41,8 +41,8 @@ test-floats: $(stamp) ## experts and closed loops, where floating point rounds a
 extras: $(stamp) ## every extra in a fresh environment, with the tests of what needs it; ARGS=learners for one
 	$(one_thread) $(bin)/python -m tests.extras $(ARGS)
 
-soak: $(stamp) ## hours of hostile calls, lines and files, kills, full disks and guarded steps; ARGS=--help for less
-	$(one_thread) $(bin)/python -m tests.soak $(ARGS)
+soak: $(stamp) ## kill commands at random moments, and run the hypothesis machines a hundred times longer
+	$(one_thread) $(bin)/python -m tests.kills $(ARGS)
 	SOAK=100 $(pytest) tests/test_fuzz_machines.py
 
 check: $(stamp) ## formatting, lint and types

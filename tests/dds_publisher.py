@@ -1,6 +1,6 @@
 """Publishes ``/joint_states`` of the synthetic arm over DDS, with types of its own, as a driver of ROS 2 would.
 
-    python -m tests.soak.dds_publisher --seconds 10 --every 5
+    python -m tests.dds_publisher --seconds 10 --every 5
 
 prints stamp and moment of each fault that begins.
 """
@@ -18,7 +18,7 @@ from cyclonedds.idl.types import float64, int32, sequence, uint32
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
-from tests.soak.dds import AT, FAULT_S, NAMES, RATE, SLIP, arm
+from tests.dds_arm import AT, FAULT_S, NAMES, RATE, SLIP, arm
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """A DDS topic watched for as long as asked: rows lost, false alarms, and how many rows after a fault the alarm comes.
 
-    python -m tests.soak.dds --seconds 600 --monitor neural_asm
+    python -m tests.dds_arm --seconds 600 --monitor neural_asm
 
 publishes ``/joint_states`` of a synthetic arm at 500 Hz from another process, with types of its own. Its third joint
 slips by 0.05 rad for a fifth of a second once every ``--every`` seconds.
@@ -52,8 +52,8 @@ def episode(seed: int, seconds: float = 5.0) -> Episode:
 
 
 def publisher(topic: str, *options: str) -> subprocess.Popen[str]:
-    """Publishes from another process, once it is up; see ``tests.soak.dds_publisher``."""
-    command = [sys.executable, "-m", "tests.soak.dds_publisher", "--topic", topic, *options]
+    """Publishes from another process, once it is up; see ``tests.dds_publisher``."""
+    command = [sys.executable, "-m", "tests.dds_publisher", "--topic", topic, *options]
     made = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert made.stdout is not None
     assert made.stdout.readline() == "up\n"
