@@ -116,7 +116,9 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as folder:
             same = survives_kills(work, Path(folder), args.kills, rng)
             disk = survives_a_full_disk(work, Path(folder))
-        print(f"{name}: {args.kills} kills {'survived' if same else 'FAILED'}, full disk {'survived' if disk else 'FAILED'}")
+        print(
+            f"{name}: {args.kills} kills {'survived' if same else 'FAILED'}, full disk {'survived' if disk else 'FAILED'}"
+        )
         failed |= not (same and disk)
     return int(failed)
 

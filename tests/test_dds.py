@@ -12,8 +12,8 @@ from rich.console import Console
 
 from asm_gym.data.live import SourceDied, lines_from
 from asm_gym.scripts.live_watching import follow
-from tests.needs import needs
 from tests import dds_arm as dds
+from tests.needs import needs
 
 needs("cyclonedds")
 

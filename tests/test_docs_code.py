@@ -8,7 +8,6 @@ import runpy
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -22,7 +21,6 @@ from asm_gym.faults import FAULTS
 from asm_gym.monitors import MONITORS
 from asm_gym.scripts import command as command_of
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.command import run
 from asm_gym.tasks import OWN
 from tests import documents
 
@@ -105,8 +103,7 @@ def check(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if program == "python":
         assert argv[0] == "-m", command
         return
-    else:
-        called = partial(main, argv)
+    called = partial(main, argv)
     parse = command_of.parse
 
     def dry(*args: Any, **kwargs: Any) -> Any:
