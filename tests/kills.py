@@ -2,8 +2,8 @@
 
     python -m tests.kills --kills 20
 
-Each command runs once undisturbed and is timed. Then it is started, killed (SIGKILL) after a random part of that time and
-started again, until it has been killed as often as asked. It must leave the same results, bit by bit, and no unfinished
+Each command runs once undisturbed and is timed. Then it is started, killed (SIGKILL) after a random part of that time
+and started again, until it has been killed as often as asked. It must leave the same results, bit by bit, and no unfinished
 file. A run whose disk is full must end in a refusal, after which the same command must reach the same results.
 """
 
@@ -116,9 +116,8 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as folder:
             same = survives_kills(work, Path(folder), args.kills, rng)
             disk = survives_a_full_disk(work, Path(folder))
-        print(
-            f"{name}: {args.kills} kills {'survived' if same else 'FAILED'}, full disk {'survived' if disk else 'FAILED'}"
-        )
+        kills, full = ("survived" if ok else "FAILED" for ok in (same, disk))
+        print(f"{name}: {args.kills} kills {kills}, full disk {full}")
         failed |= not (same and disk)
     return int(failed)
 
