@@ -3,8 +3,8 @@
     python -m tests.kills --kills 20
 
 Each command runs once undisturbed and is timed. Then it is started, killed (SIGKILL) after a random part of that time
-and started again, until it has been killed as often as asked. It must leave the same results, bit by bit, and no unfinished
-file. A run whose disk is full must end in a refusal, after which the same command must reach the same results.
+and started again, until it has been killed as often as asked. It must leave the same results, bit by bit, and no
+unfinished file. A run whose disk is full must end in a refusal, after which the same command must reach the same results.
 """
 
 from __future__ import annotations
