@@ -4,7 +4,7 @@
 
 Each command runs once undisturbed and is timed. Then it is started, killed (SIGKILL) after a random part of that time
 and started again, until it has been killed as often as asked. It must leave the same results, bit by bit, and no
-unfinished file. A run whose disk is full must end in a refusal, after which the same command must reach the same results.
+unfinished file. With a full disk a command must be refused, and then reach the same results once there is room.
 """
 
 from __future__ import annotations
