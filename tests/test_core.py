@@ -10,13 +10,12 @@ import sys
 import tomllib
 import venv
 import zipfile
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from asm_gym.extras import BROUGHT_BY, needed_for, require
+from asm_gym.extras import BROUGHT_BY
 from tests.wheel import LINKS, ROOT, build_wheel
 
 CORE = ("filelock", "gymnasium", "numpy", "numba", "packaging", "rich", "scipy", "threadpoolctl", "tyro")
@@ -158,16 +157,6 @@ def test_every_requirement_of_an_extra_is_known_by_the_name_it_is_imported_under
     assert extras == {e: {n for n in BROUGHT_BY if BROUGHT_BY[n] == e and n != "dask"} for e in BROUGHT_BY.values()}
 
 
-def test_only_a_package_that_is_missing_is_said_to_be_missing(tmp_path, monkeypatch):
-    with pytest.raises(ImportError, match=r"^a chart needs nosuch: pip install 'asm-gym\[report\]'$"):
-        require("nosuch.part", what="a chart", extra="report")
-    (tmp_path / "matplotlib.py").write_text("import nosuch")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "matplotlib", raising=False)
-    with pytest.raises(ModuleNotFoundError, match="No module named 'nosuch'"), needed_for("a chart"):
-        import_module("matplotlib")
-
-
 def test_a_wheel_holds_every_file_of_the_package(tmp_path):
     """An editable install finds them all, whatever pyproject.toml says."""
     folders = {"asm_gym": ROOT / "asm_gym", **{f"asm_gym/{name}": ROOT / name for name in LINKS}}
@@ -203,14 +192,3 @@ def test_a_core_install_is_small_and_works(tmp_path):
 def _size(folder: Path) -> int:
     """[bytes] of all files."""
     return sum(f.lstat().st_size for f in folder.rglob("*") if f.is_file())
-
-
-def test_python_3_13_is_told_why_it_has_no_robosuite(monkeypatch):
-    monkeypatch.setattr(sys, "version_info", (3, 13, 0, "final", 0))
-    with (
-        pytest.raises(
-            ImportError, match=r"^a task needs robosuite: take Python 3.12, for 3.13 there is none: its mink"
-        ),
-        needed_for("a task"),
-    ):
-        raise ModuleNotFoundError(name="robosuite")
