@@ -14,11 +14,11 @@ pytest = $(one_thread) $(bin)/python -m pytest -n $(JOBS) --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo reproduce doctor test test-all test-floats extras soak check format docs page pages verify wheel clean
+.PHONY: help demo reproduce doctor test test-all test-floats extras soak check format docs wheel clean
 
 help: ## list the commands
 	@sed -nE 's/^([a-z-]+):.* ## (.*)/  make \1\t\2/p' Makefile | expand -t 20
-	@echo "Variables: PYTHON=$(PYTHON) makes .venv, JOBS=$(JOBS) test processes, ARGS goes to demo, reproduce and pytest, PAGE to page."
+	@echo "Variables: PYTHON=$(PYTHON) makes .venv, JOBS=$(JOBS) test processes, ARGS goes to demo, reproduce and pytest."
 
 demo: $(stamp) ## a robot that notices when something is wrong; ARGS=--help lists its options
 	@$(bin)/asm-gym demo $(ARGS)
@@ -58,21 +58,12 @@ docs: $(stamp) ## this documentation as a site, in docs/_build/html
 	$(bin)/python -m sphinx -b html -W --keep-going -q docs docs/_build/html
 	@echo "make: open docs/_build/html/index.html"
 
-page: $(stamp) ## runs the command of a page of results, and keeps what it prints: PAGE=docs/results/demo.md
-	$(bin)/python docs/pages.py print $(PAGE)
-
-pages: $(stamp) ## prints every page for which something has changed, and goes on where it was interrupted; hours
-	$(bin)/python docs/pages.py all $(ARGS)
-
-verify: $(stamp) ## runs the checks of the pages of results, and says which print something else
-	$(one_thread) $(bin)/python docs/pages.py verify $(ARGS)
-
 wheel: $(stamp) ## the wheel and the source archive, in dist/
 	$(bin)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
 	$(bin)/python -c "from setuptools.build_meta import build_sdist as b; print('make: dist/' + b('dist'))"
 
 clean: ## removes .venv, builds and caches; runs/ stays
-	rm -rf .venv build dist docs/_build docs/reference/api docs/environments *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist docs/_build docs/reference/api docs/reference/commands.md *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Still there, finished once, and its Python still runs: not interrupted half-way, nor left by a Python since removed.
