@@ -6,7 +6,6 @@ Machines differ and are noisy: rivals take turns, step by step, and the medians 
 from __future__ import annotations
 
 import sys
-import textwrap
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from asm_gym.scripts.benchmark.memory import MemoryCost
 from asm_gym.scripts.benchmark.safety import Safety
 from asm_gym.scripts.benchmark.turns import BusyError, take_turns
 from asm_gym.scripts.benchmark.vector import vector_table
+from asm_gym.scripts.cli import usage
 from asm_gym.scripts.command import BAD_NEWS, DONE, exit_code, run
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_choice, check_number
@@ -165,15 +165,6 @@ BENCHMARKS: dict[str, type[Any]] = {
 }
 
 
-def usage() -> str:
-    """The benchmarks, a line each."""
-    lines = [
-        textwrap.fill(f"  {name:<9} {(kind.__doc__ or '').splitlines()[0]}", 80, subsequent_indent=" " * 12)
-        for name, kind in BENCHMARKS.items()
-    ]
-    return "\n".join(["usage: asm-gym benchmark WHAT [OPTIONS]", "", *lines])
-
-
 def measure(args: Any, console: Console) -> int:
     """Runs the one that was asked for."""
     try:
@@ -188,7 +179,7 @@ def main(argv: list[str] | None = None) -> int:
     """Runs one benchmark, and returns the exit code."""
     name, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if name in ("-h", "--help"):
-        print(usage())
+        print(usage("asm-gym benchmark WHAT", {n: (k.__doc__ or "").partition("\n")[0] for n, k in BENCHMARKS.items()}))
         return DONE
 
     def chosen() -> int:

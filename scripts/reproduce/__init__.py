@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 from asm_gym.scripts import command
+from asm_gym.scripts.cli import usage
 from asm_gym.scripts.command import DONE, REFUSED, exit_code
 from asm_gym.validation import check_choice
 
@@ -38,28 +39,12 @@ STUDIES = {
 INDEPENDENT = tuple(name for name, study in STUDIES.items() if not study.needs_a_run)
 
 
-def usage() -> str:
-    """The studies, a line each."""
-    width = max(map(len, STUDIES))
-
-    def lines(needing: bool) -> list[str]:
-        return [f"  {name:<{width}}  {s.summary}" for name, s in STUDIES.items() if s.needs_a_run is needing]
-
-    return "\n".join(
-        [
-            *("usage: asm-gym reproduce STUDY [OPTIONS]", "       asm-gym reproduce all [OPTIONS]", ""),
-            *("All of these, one after another, with the options they share:", *lines(False), ""),
-            *("One by one, on what asm-gym evaluate recorded, or on a file:", *lines(True), ""),
-            "asm-gym reproduce STUDY --help lists the options of one.",
-        ]
-    )
-
-
 def main(argv: list[str] | None = None) -> int:
     """Runs one study, or all that need no other run's folder, and returns the exit code."""
     name, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if name in ("-h", "--help"):
-        print(usage())
+        notes = f"all runs {', '.join(INDEPENDENT)}.", "The others need recordings: of asm-gym evaluate, or of a file."
+        print(usage("asm-gym reproduce STUDY", {name: study.summary for name, study in STUDIES.items()}, *notes))
         return DONE
 
     def chosen() -> int:
@@ -73,8 +58,7 @@ def everything(argv: list[str]) -> int:
     """Runs the independent studies; the options are checked against each of them before the first begins."""
     from asm_gym.scripts.reproduce.kit import Config
 
-    if command.parse("reproduce all", Config, argv, f"Runs {', '.join(INDEPENDENT)}.") is None:
-        return DONE
+    command.parse("reproduce all", Config, argv, f"Run {', '.join(INDEPENDENT)}.")
     for name in INDEPENDENT:
         command.parse(f"reproduce {name}", options_of(name), argv)
     code = DONE
