@@ -74,7 +74,7 @@ def exit_code(name: str, work: Callable[[], int | None]) -> int:
         with _terminable():
             return work() or DONE
     except SystemExit as end:
-        return end.code if isinstance(end.code, int) else REFUSED
+        return int(end.code or DONE)
     except KeyboardInterrupt as end:
         print(f"{prog}: interrupted", file=sys.stderr)
         return 128 + (signal.SIGTERM if isinstance(end, Terminated) else signal.SIGINT)

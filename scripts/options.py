@@ -1,11 +1,11 @@
 """Options of a command: the fields of a frozen dataclass, read by tyro; the string under a field is its help.
 
-    @dataclass(frozen=True)
-    class Args:
-        '''What the command does.'''
+@dataclass(frozen=True)
+class Args:
+    '''What the command does.'''
 
-        episodes: int = option(100, quick=4, least=1)
-        '''Number of episodes.'''
+    episodes: int = option(100, quick=4, least=1)
+    '''Number of episodes.'''
 """
 
 from __future__ import annotations

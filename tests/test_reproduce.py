@@ -7,18 +7,15 @@ import itertools
 import json
 import math
 import re
-from importlib import import_module
 
 import numpy as np
 import pytest
 
 from asm_gym.scripts.cli import main as cli
-from asm_gym.scripts.options import rows
 from asm_gym.scripts.reproduce import (
     INDEPENDENT,
     STUDIES,
     kit,
-    local_learning,
     memorise_and_recall,
     speed_accuracy,
 )
@@ -177,22 +174,6 @@ def test_arguments_that_all_studies_share_are_checked():
 def test_what_is_set_in_python_only_is_checked_too(wrong, message):
     with pytest.raises(ValueError, match=message):
         memorise_and_recall.Config(**wrong)
-
-
-def test_what_was_asked_for_is_not_shortened_and_what_is_shortened_is_named(capsys, monkeypatch, tmp_path):
-    asked = []
-    monkeypatch.setattr(local_learning, "run", lambda config: asked.append(config) or kit.Findings([], []))
-    where = ["--out", str(tmp_path)]
-    assert cli(["reproduce", "local_learning", "--quick", "--skills", "8", "--epochs", "40", *where]) == 0
-    assert (asked[0].skills, asked[0].epochs, asked[0].writings, asked[0].hidden) == (8, 40, 4, 16)
-    assert "--quick: seeds 2, hidden 16, writings 4, iterations 1 5, lengths 30 60\n" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("study", list(STUDIES))
-def test_a_study_has_at_most_six_options_beside_those_of_all(study):
-    module = import_module(f"asm_gym.scripts.reproduce.{study}")
-    shared = {row.name.split()[0] for row in rows(Config)}
-    assert len([row for row in rows(module.Config) if row.name.split()[0] not in shared]) <= 6
 
 
 def test_a_folder_that_cannot_be_made_is_refused_before_the_study(tmp_path, capsys, monkeypatch):
