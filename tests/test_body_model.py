@@ -1,15 +1,16 @@
-"""Torques by a body model: against MuJoCo and closed forms; and what a memory makes of them."""
+"""Torques by a body model: against the unpared file and closed forms; and what a memory makes of them."""
 
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
-from asm_gym.body_model import GRAVITY, BodyModel, read_urdf
+from asm_gym.body_model import BodyModel, read_urdf
 from asm_gym.data.selection import pieces
 from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
@@ -76,20 +77,29 @@ def test_a_pendulum_weighs_what_a_pendulum_weighs():
     urdf = (
         '<robot name="p"><link name="base"/><link name="bob"><inertial><origin xyz="0.5 0 0" '
         'rpy="1.5707963267948966 0 0"/>'
-        '<mass value="2"/><inertia ixx="9" ixy="0" ixz="0" iyy="7" iyz="0" izz="0.1"/></inertial></link>'
+        '<mass value="2"/><inertia ixx="7" ixy="0" ixz="0" iyy="7" iyz="0" izz="0.1"/></inertial></link>'
         '<joint name="j" type="continuous"><parent link="base"/><child link="bob"/><axis xyz="0 -1 0"/></joint></robot>'
     )
     q = np.linspace(-3, 3, 9)[:, None]  # about y, which is the inertia's z
     weight, motion = BodyModel.of(urdf, ["q"]).torques(q, np.ones_like(q), np.full_like(q, 3.0))
-    np.testing.assert_allclose(weight, 2 * GRAVITY * 0.5 * np.cos(q), atol=1e-12)
-    np.testing.assert_allclose(motion, (0.1 + 2 * 0.5**2) * 3.0, atol=1e-12)
+    np.testing.assert_allclose(weight, 2 * 9.81 * 0.5 * np.cos(q), atol=1e-9)
+    np.testing.assert_allclose(motion, (0.1 + 2 * 0.5**2) * 3.0, atol=1e-9)
 
 
 def test_joints_are_those_that_columns_name_or_the_longest_chain():
     assert BodyModel.of(arm(), SENSED).columns.tolist() == [1, 2, 0]
     by_order = BodyModel.of(arm(), ["q[0]", "q[1]", "q[2]"])
     assert (by_order.names, by_order.columns.tolist()) == (("lift", "shoulder", "elbow"), [0, 1, 2])
-    assert BodyModel.of(arm(), SENSED[1:2]).mass == pytest.approx([4 + 3 + 2 + 0.7 + 1])
+
+
+def test_joints_that_nobody_senses_and_joints_that_mimic_are_fixed_and_links_without_mass_weigh_nothing():
+    carried = BodyModel.of(arm(), SENSED[1:2]).torques(*np.zeros((3, 1, 1)))[0].item()
+    up = np.cos(0.1) * np.cos(0.2)  # of the lift's axis
+    assert carried == pytest.approx((4 + 3 + 2 + 0.7 + 1) * 9.81 * up)
+    mimic = arm().replace('<axis xyz="0 0.6 0.8"/>', '<axis xyz="0 0.6 0.8"/><mimic joint="shoulder"/>')
+    assert BodyModel.of(mimic, SENSED[1:]).names == ("lift", "shoulder")
+    massless = re.sub("<inertial>.*?</inertial>", "", arm())
+    np.testing.assert_allclose(BodyModel.of(massless, SENSED).torques(*np.ones((3, 1, 3))), 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -99,10 +109,10 @@ def test_joints_are_those_that_columns_name_or_the_longest_chain():
         ("<mujoco/>", "its root is <mujoco>, not <robot>"),
         ('<!DOCTYPE r [<!ENTITY a "aa">]><robot/>', "declares a document type"),
         ("<robot/>", "are no tree"),
-        (arm().replace('child link="tool"', 'child link="base"'), "are no tree"),
+        (arm().replace('child link="tool"', 'child link="base"'), "the body cannot be read"),
         (arm().replace('child link="tool"', 'child link="gone"'), "are no tree"),
-        (arm().replace('xyz="0 0.6 0.8"', 'xyz="0 0 0"'), "the axis of joint elbow has no direction"),
-        (arm().replace('value="3.0"', 'value="nan"'), "value='nan' of the body should be 1 numbers"),
+        (arm().replace('xyz="0 0.6 0.8"', 'xyz="0 0 0"'), "cannot be read: .*axis"),
+        (arm().replace('value="3.0"', 'value="nan"'), "value='nan' of the body should be finite"),
         (arm().replace('<parent link="base"/>', ""), "joint lift of the body has no <parent>"),
         (arm().replace('"elbow" type="continuous"', '"elbow" type="fixed"'), "3 joints are sensed, and .* 2 that move"),
     ],
