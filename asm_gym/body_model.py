@@ -18,7 +18,6 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from asm_gym.extras import require
 
@@ -197,6 +196,8 @@ def _align(inertial: Element) -> None:
     origin, tensor = inertial.find("origin"), inertial.find("inertia")
     if origin is None or tensor is None or not (rpy := origin.attrib.pop("rpy", "")):
         return
+    from scipy.spatial.transform import Rotation  # takes a while to import
+
     turn = Rotation.from_euler("xyz", [float(word) for word in rpy.split()]).as_matrix()
     pairs = [(i, j, f"i{'xyz'[i]}{'xyz'[j]}") for i in range(3) for j in range(i, 3)]
     inertia = np.zeros((3, 3))

@@ -20,7 +20,7 @@ from rich.console import Console
 from asm_gym.body_model import read_urdf
 from asm_gym.data.commands import feedback
 from asm_gym.data.gaps import filled
-from asm_gym.data.live import is_live, lines_from
+from asm_gym.data.live import is_live, lines_from, record
 from asm_gym.data.logs import LogLayout, read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.selection import (
@@ -45,7 +45,6 @@ from asm_gym.monitors.registry import check_monitor
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
-from asm_gym.scripts.live_recording import listen, rtde_source
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.scripts.unlike_pieces import Part, about_pieces, left_out
 from asm_gym.spec import MOTOR, StreamSpec
@@ -96,7 +95,7 @@ class Args:
     split: float | None = option(None, check=partial(check_number, "split", above=0), metavar="SECONDS")
     """Length of the pieces that long logs are cut into; each then counts as an episode."""
     minutes: float = option(10.0, check=partial(check_number, "minutes", above=0))
-    """For how long a live source is recorded at most; it ends sooner once enough was heard."""
+    """For how long a live source is recorded at most."""
     seed: int = option(0, least=0)
     """Seed of the memory, and of which episodes it learns from."""
     leave_out: bool = False
@@ -150,12 +149,9 @@ def learned(
 
 def recorded(args: Args, say: Callable[[str], None]) -> Args:
     """Records a live source, and returns how to learn from that: cut into as many pieces as the promise needs."""
-    source, to = str(args.data), args.out.with_suffix(".jsonl")
-    if source.startswith("rtde:"):
-        lines = rtde_source(source.partition(":")[2], args.channels, args.rate, SILENCE_S)
-    else:
-        lines = lines_from(source, sys.stdin, SILENCE_S)
-    seconds = listen(lines, to, args.minutes, say)
+    to = args.out.with_suffix(".jsonl")
+    seconds, ended = record(lines_from(str(args.data), sys.stdin, SILENCE_S), to, args.minutes)
+    say(f"{ended}, kept in {to}")
     needed = (
         conformal_episodes(args.false_alarm_rate) / args.calibration_share + SPARE if args.asked.per == EPISODE else 0
     )

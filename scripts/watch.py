@@ -1,9 +1,9 @@
 """Says when a recording is surprising, where, and how much; or watches rows as they come.
 
 A recording gives a table, figures and a report. A live source is - for standard input, tail:FILE for a file that grows,
-udp:PORT for datagrams from this machine, rtde:HOST for a UR controller, or dds:/joint_states for ROS 2: JSON lines (a
-list of numbers, or an object by channel, one a row), or CSV with a header; every alarm is printed as it is raised, in
-constant memory. Exit code 1: there was an alarm.
+udp:PORT for datagrams from this machine, or dds:/joint_states for ROS 2: JSON lines (a list of numbers, or an object by
+channel, one a row), or CSV with a header; every alarm is printed as it is raised, in constant memory. Exit code 1:
+there was an alarm.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from asm_gym.data.live import RETURNING, is_live, lines_from
 from asm_gym.data.logs import Log, LogLayout, read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, traces_of
+from asm_gym.evaluation.rerun_view import LiveView
 from asm_gym.evaluation.scored_episode import ScoredEpisode, moments_of
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
@@ -34,7 +35,6 @@ from asm_gym.scripts.command import BAD_NEWS, DONE, run
 from asm_gym.scripts.live_watching import follow
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.validation import check_number
-from asm_gym.view.rerun import LiveView
 
 AT_ONCE = 64
 """Episodes scored side by side."""
@@ -51,7 +51,7 @@ class Args:
     """Watches a recording, or rows as they come."""
 
     source: str = option(positional=True, metavar="SOURCE")
-    """What asm-gym fit reads; or what is live: -, tail:FILE, udp:PORT, rtde:HOST or dds:/TOPIC."""
+    """What asm-gym fit reads; or what is live: -, tail:FILE, udp:PORT or dds:/TOPIC."""
     monitor: Path = option(metavar="FILE.asm")
     """A calibrated monitor, such as asm-gym fit writes."""
     out: Path = option(Path("runs/watch"), metavar="FOLDER")
@@ -183,7 +183,7 @@ def watch(args: Args, console: Console) -> int:
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
     if is_live(args.source):
-        opened = partial(lines_from, args.source, sys.stdin, args.silence, monitor.spec)
+        opened = partial(lines_from, args.source, sys.stdin, args.silence)
         again = opened if args.source.startswith(RETURNING) else None
         return follow(opened(), monitor, console, args.bridge, again, args.wait)
     return review(args, monitor, console)

@@ -18,7 +18,7 @@ from asm_gym.monitors import pretrained
 from tests.wheel import LINKS, ROOT, build_wheel
 
 LAYERS = (
-    *("core", "memory", "detection", "data", "envs", "faults", "monitors", "evaluation", "view"),
+    *("core", "memory", "detection", "data", "envs", "faults", "monitors", "evaluation"),
     *("policies", "guard", "wrappers", "rollouts", "scripts"),
 )
 """Rooms in their order: each may import itself and what stands before it, so that nothing enters a room twice."""

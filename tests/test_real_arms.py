@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asm_gym.data.real_arms import ARMS, read_cobot, read_executions
 from asm_gym.data.selection import pieces
 from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.scores import Largest
@@ -22,6 +21,7 @@ from asm_gym.monitors.baselines.friction_rule import FrictionRule
 from asm_gym.monitors.monitor import MonitorState
 from asm_gym.monitors.values import Values
 from asm_gym.scripts.cli import main
+from asm_gym.scripts.reproduce.arm_recordings import ARMS, read_cobot, read_executions
 from asm_gym.scripts.reproduce.pushed import FAULTS, NEWTONS, SLIP, TABLES, _about_x, _about_z, jacobian
 from asm_gym.scripts.reproduce.real_arms import Config, Job, on_an_arm
 from asm_gym.spec import Channel, StreamSpec

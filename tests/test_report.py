@@ -20,12 +20,12 @@ from PIL import Image
 
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.detection_tables import detection_table, headline, outcome_table
+from asm_gym.evaluation.film import write_gif, write_video
 from asm_gym.evaluation.metrics import by_condition, false_alarms, time_matched_auroc
 from asm_gym.evaluation.report import write_json, write_report
 from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode, TraceDetail, moments_of
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Column, Table, tabulate
-from asm_gym.view.film import write_gif, write_video
 
 
 def a_trace(condition: str, seed: int, acting: str = "policy alone") -> ScoredEpisode:

@@ -13,10 +13,10 @@ import pytest
 
 import asm_gym  # noqa: F401
 from asm_gym.episode import save_episode
+from asm_gym.evaluation.rerun_view import LiveView
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR, Channel, StreamSpec
-from asm_gym.view.rerun import LiveView
 from asm_gym.wrappers import NeuralASMSafety, RerunView
 from tests.fakes import SPEC, CueMonitor, FakeEnv
 from tests.needs import needs

@@ -13,8 +13,8 @@ from PIL import ImageColor
 
 from asm_gym import FaultInjection
 from asm_gym.faults import Push
-from asm_gym.view import chart as drawing
-from asm_gym.view.chart import StripChart, arrow, compose, project
+from asm_gym.wrappers import chart as drawing
+from asm_gym.wrappers.chart import StripChart, arrow, compose, project
 from asm_gym.wrappers.overlay import SurpriseOverlay
 
 RED, ORANGE, CURVE = (np.array(ImageColor.getrgb(c)) for c in (drawing._ALARM, drawing._FAULT, drawing._CURVE))

@@ -11,9 +11,9 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from asm_gym.evaluation.rerun_view import LiveView
 from asm_gym.spec import control_period
 from asm_gym.stream_source import StreamSource
-from asm_gym.view.rerun import LiveView
 from asm_gym.wrappers.safety import NeuralASMSafety
 
 

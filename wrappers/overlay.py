@@ -10,7 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from asm_gym.validation import check_number, shown
-from asm_gym.view.chart import StripChart, arrow, compose, project
+from asm_gym.wrappers.chart import StripChart, arrow, compose, project
 
 ARROW_M = 0.01
 """Length of a force's arrow [m/N]."""

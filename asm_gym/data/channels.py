@@ -58,6 +58,11 @@ _LABEL = re.compile(
 )
 
 
+SPEED = re.compile(r"(.*[^a-z])?(vel|velocity|velocities|speeds?|qd|dq|qvel|joint_vel)([^a-z].*)?")
+POSITION = re.compile(r"(.*[^a-z])?(pos|position|positions|angles?|q|qpos|joint_pos)([^a-z].*)?")
+"""What speeds and positions of joints are called."""
+
+
 class Signal(NamedTuple):
     """One number of every row.
 

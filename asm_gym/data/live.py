@@ -23,7 +23,6 @@ from asm_gym.data.channels import bare_name, label_of, unit_of
 from asm_gym.data.clock_column import Clock, clock_among
 from asm_gym.data.resampling import ClockWentBack, Pace
 from asm_gym.data.ros2_dds import dds_lines
-from asm_gym.data.rtde import rtde_lines
 from asm_gym.data.text import Dialect, header_of
 from asm_gym.data.units import ratio
 from asm_gym.files import regular_file
@@ -36,9 +35,9 @@ POLL_S = 0.002
 LARGEST = 65_535
 """Bytes of a datagram, and more than a row of any robot."""
 
-SOURCES = ("-", "tail:FILE", "udp:PORT", "rtde:HOST", "dds:/TOPIC")
+SOURCES = ("-", "tail:FILE", "udp:PORT", "dds:/TOPIC")
 
-RETURNING = ("udp:", "rtde:", "dds:")
+RETURNING = ("udp:", "dds:")
 """Sources that may come back after they have died."""
 
 
@@ -51,15 +50,13 @@ def is_live(source: str) -> bool:
     return source == "-" or source.startswith(("tail:", *RETURNING))
 
 
-def lines_from(source: str, stdin: TextIO, silence: float, spec: StreamSpec | None = None) -> Iterator[str]:
+def lines_from(source: str, stdin: TextIO, silence: float) -> Iterator[str]:
     """The lines of a live source, as they come.
 
     Args:
         source: ``-`` for standard input, ``tail:FILE`` for a file that grows, ``udp:PORT`` for datagrams sent to this
-            machine from itself, of which an empty one is the end, ``rtde:HOST`` for a controller of Universal Robots,
-            ``dds:/joint_states`` for topics of ROS 2.
+            machine from itself, of which an empty one is the end, ``dds:/joint_states`` for topics of ROS 2.
         silence: seconds without a line, after the first one, from which on the source has died.
-        spec: of the memory that is to read them: a controller is asked for its channels, at its rate.
 
     Raises:
         SourceDied: it has.
@@ -73,12 +70,34 @@ def lines_from(source: str, stdin: TextIO, silence: float, spec: StreamSpec | No
         return _growing(Path(place), silence)
     if kind == "udp":
         return _datagrams(place, silence)
-    if kind == "rtde" and spec is not None:
-        rows = rtde_lines(place, [channel.name for channel in spec.channels], 1 / spec.dt, silence)
-        return _dying(rows, f"the controller at {place}")
     if kind == "dds":
         return _dying(dds_lines(place, silence), place)
     raise ValueError(f"unknown source {source!r}; known: {', '.join(SOURCES)}")
+
+
+def record(lines: Iterable[str], to: Path, minutes: float) -> tuple[float, str]:
+    """Write rows to a file until the time is over or the source ends; return how long that took [s], and why it ended.
+
+    Raises:
+        ValueError: no row came.
+    """
+    to.parent.mkdir(parents=True, exist_ok=True)
+    start = time.monotonic()
+    why, seconds, rows = "the source ended", 0.0, 0
+    with to.open("w", encoding="utf-8") as file:
+        try:
+            for line in filter(str.strip, lines):
+                start = time.monotonic() if not rows else start
+                rows, seconds = rows + 1, time.monotonic() - start
+                file.write(line.rstrip("\n") + "\n")
+                if seconds >= 60 * minutes:
+                    why = "the time is over"
+                    break
+        except SourceDied as error:
+            why = f"the source has died, {error}"
+    if not rows:
+        raise ValueError("no row came")
+    return seconds, f"{why}: {rows} rows in {seconds:.0f} s"
 
 
 def _piped(stdin: TextIO, silence: float) -> Iterator[str]:

@@ -37,6 +37,7 @@ from scipy.stats import t as student
 from threadpoolctl import threadpool_limits
 
 from asm_gym.evaluation.figures import save
+from asm_gym.evaluation.film import write_gif
 from asm_gym.evaluation.statistics import Estimate, Spread
 from asm_gym.evaluation.tables import ConsoleTable, Table, markdown
 from asm_gym.rollouts import progress
@@ -44,7 +45,6 @@ from asm_gym.rollouts.parallel import Progress, parallel_map
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.scripts import command
 from asm_gym.scripts.options import check_options, option
-from asm_gym.view.film import write_gif
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.real_arms import RealArm
 from asm_gym.episode import Episode
+from asm_gym.scripts.reproduce.arm_recordings import RealArm
 
 Floats = NDArray[np.float64]
 

@@ -19,15 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.real_arms import (
-    ARMS,
-    COBOT_EVENTS,
-    EXECUTION_ROWS,
-    EXECUTION_S,
-    RealArm,
-    read_cobot,
-    read_executions,
-)
 from asm_gym.data.selection import pieces, unbroken
 from asm_gym.detection.scores import Largest
 from asm_gym.episode import Episode, spans
@@ -37,6 +28,15 @@ from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.arm_recordings import (
+    ARMS,
+    COBOT_EVENTS,
+    EXECUTION_ROWS,
+    EXECUTION_S,
+    RealArm,
+    read_cobot,
+    read_executions,
+)
 from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.scripts.reproduce.pushed import FAULTS
 

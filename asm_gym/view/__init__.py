@@ -1,1 +1,0 @@
-"""Pictures: a strip chart under a frame, films, and recordings for Rerun."""
