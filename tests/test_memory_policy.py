@@ -15,7 +15,7 @@ from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.episode import Episode
 from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, situation
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.weight_packing import unpacked
+from asm_gym.monitors.packing import unpacked
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.grip import ENOUGH, FORGETS, CommandReadout
 from asm_gym.policies.memory_policy import StreamReader

@@ -40,7 +40,7 @@ from asm_gym.monitors.stream_model import parameter_names
 from asm_gym.monitors.training_data import check_nominal
 from asm_gym.monitors.values import PREFIX as VALUES
 from asm_gym.monitors.values import Values
-from asm_gym.monitors.weight_packing import rounded, unpacked
+from asm_gym.monitors.packing import rounded, unpacked
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_flag, check_number, shown, typed

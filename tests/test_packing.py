@@ -1,10 +1,10 @@
-"""Weights of 8 bits, roots of covariances, halves of symmetric matrices: what rounding loses, and packing does not."""
+"""Weights of 8 bits and roots of covariances: what rounding loses, and packing does not."""
 
 import numpy as np
 import pytest
 
 from asm_gym import NeuralASM
-from asm_gym.monitors.weight_packing import packed, rounded, unpacked
+from asm_gym.monitors.packing import packed, rounded, unpacked
 from tests.streams import sine_episodes, sine_spec
 
 
@@ -12,13 +12,12 @@ def weights(seed=0):
     rng = np.random.default_rng(seed)
     W = (rng.normal(size=(40, 30)) * np.exp(3 * rng.normal(size=(40, 1)))).astype(np.float32)
     W[3], W[4, 5:], W[6, 7] = 0, 0, 1e-12
-    half, rows = rng.normal(size=(9, 9)), rng.normal(size=(50, 20)) @ np.diag(10.0 ** rng.uniform(-3, 0, 20))
+    rows = rng.normal(size=(50, 20)) @ np.diag(10.0 ** rng.uniform(-3, 0, 20))
     rows[:, 3] = 0.7 * rows[:, 2]  # nothing else is ever seen of it
-    arrays = {"V": W, "moments": rows.T @ rows / 50, "whitening": half + half.T, "D": W.copy(), "mean": np.arange(3.0)}
-    return arrays | {"ceiling": rng.normal(size=(3, 87))}
+    return {"V": W, "moments": rows.T @ rows / 50, "D": W.copy(), "mean": np.arange(3.0)}
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 def test_rounding_moves_a_weight_by_half_a_step_at_most_and_packing_by_nothing(seed):
     before = weights(seed)
     after = rounded(before)
@@ -26,12 +25,9 @@ def test_rounding_moves_a_weight_by_half_a_step_at_most_and_packing_by_nothing(s
     assert (np.abs(after["V"] - before["V"]) <= np.where(after["V"] == before["V"], 0, step)).all()
     assert np.mean(np.abs(after["V"] - before["V"]) <= step / 2) > 0.98  # but the faintest, which must stay
     np.testing.assert_array_equal(after["V"] == 0, before["V"] == 0)
-    np.testing.assert_allclose(after["D"], before["D"], rtol=2.0**-16)
-    np.testing.assert_allclose(after["whitening"], before["whitening"], rtol=2.0**-15)
-    np.testing.assert_array_equal(after["ceiling"], before["ceiling"])
+    np.testing.assert_array_equal(after["D"], before["D"])
     kept = packed(after)
-    parts = "V.bits", "V.scale", "moments.root", "moments.scale", "whitening.half", "D.planesf4", "mean"
-    assert set(kept) == {*parts, "ceiling.planesf8"}
+    assert set(kept) == {"V.bits", "V.scale", "moments.root", "moments.scale", "mean", "D"}
     back = unpacked(kept)
     assert set(back) == set(after)
     for name, array in after.items():
@@ -53,11 +49,6 @@ def test_what_follows_from_a_rounded_covariance_is_what_followed_from_it():
         assert np.abs(left).max() < 0.01 * about
 
 
-def test_a_covariance_of_what_never_changes_stays_as_it_is():
-    kept = packed(rounded({"moments": np.zeros((3, 3), np.float32)}))
-    np.testing.assert_array_equal(unpacked(kept)["moments"], np.zeros((3, 3)))
-
-
 def test_a_covariance_far_from_one_is_kept_as_well():
     C = weights()["moments"]
     for size in (1e-12, 1e9):
@@ -66,14 +57,8 @@ def test_a_covariance_far_from_one_is_kept_as_well():
         assert "moments.root" in packed({"moments": after})
 
 
-def test_an_array_that_lies_by_columns_comes_back_so():
-    D = np.asfortranarray(weights()["D"])
-    back = unpacked(packed({"D": D}))["D"]
-    assert back.strides == D.strides
-
-
 def test_weights_that_would_be_lost_are_not_packed():
-    assert "V.planesf4" in packed(weights())
+    assert set(packed(weights())) == set(weights())
 
 
 @pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan])
@@ -85,25 +70,16 @@ def test_weights_that_no_integer_stands_for_are_refused_by_name_and_kept_as_they
     np.testing.assert_array_equal(unpacked(packed(arrays))["V"], arrays["V"])
 
 
-@pytest.mark.parametrize("size", [1e-30, 1e30])
-def test_weights_of_any_size_are_rounded_to_a_share_of_the_largest(size):
-    V = (size * weights()["V"].astype(np.float64)).astype(np.float32)
-    after = rounded({"V": V})["V"]
-    largest = np.abs(V).max(axis=1, keepdims=True)
-    assert (np.abs(after - V) <= 1.01 * largest / 127).all()
-    assert unpacked(packed({"V": after}))["V"].tobytes() == after.tobytes()
-
-
 def test_parts_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="V of 8 bits should have a scale for each of its rows, got"):
         unpacked({"V.bits": np.zeros((2, 2), np.int8)})
-    with pytest.raises(ValueError, match="4 numbers are no half of a symmetric moments"):
-        unpacked({"moments.half": np.zeros(4)})
-    with pytest.raises(ValueError, match="the root of moments should be of 16 bits with one scale, got float64"):
-        unpacked({"moments.root": np.zeros(3)})
-    for planes in (np.zeros((3, 2), np.uint8), np.zeros((4, 2)), np.zeros((), np.uint8)):
-        with pytest.raises(ValueError, match="D should lie apart by the bytes of its numbers, got"):
-            unpacked({"D.planesf4": planes})
+    with pytest.raises(ValueError, match="the root of moments"):
+        unpacked({"moments.root": np.zeros(4, np.int16), "moments.scale": np.array(1.0)})
+
+
+def test_a_file_of_an_older_format_is_refused_in_one_line_that_says_how_to_make_it_anew():
+    with pytest.raises(ValueError, match=r"^an older asm-gym wrote it: .*asm-gym fit or asm-gym babble$"):
+        unpacked({"D.planesf4": np.zeros((4, 2), np.uint8)})
 
 
 def test_a_rounded_memory_is_the_same_when_it_is_read_and_smaller(tmp_path):
