@@ -25,11 +25,11 @@ from asm_gym.monitors.ceilings import worst_of
 from asm_gym.monitors.doubt import LOG, doubt_crashes
 from asm_gym.monitors.monitor_file import SavedMonitor, calibration_arrays
 from asm_gym.monitors.overlap import Marks, check_fresh, marks, shares, sketch
+from asm_gym.monitors.packing import packed, unpacked
 from asm_gym.monitors.promise import Asked
 from asm_gym.monitors.stream_model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.threshold import Calibrated
 from asm_gym.monitors.training_data import check_nominal
-from asm_gym.monitors.packing import packed, unpacked
 from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
 
 

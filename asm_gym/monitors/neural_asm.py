@@ -33,6 +33,7 @@ from asm_gym.monitors.hub import fetched
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.monitor import CalibratedMonitor, MonitorState
 from asm_gym.monitors.monitor_file import restored
+from asm_gym.monitors.packing import rounded, unpacked
 from asm_gym.monitors.promise import Asked
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.skill import ALARMS_ON, SkillSurprise, apart
@@ -40,7 +41,6 @@ from asm_gym.monitors.stream_model import parameter_names
 from asm_gym.monitors.training_data import check_nominal
 from asm_gym.monitors.values import PREFIX as VALUES
 from asm_gym.monitors.values import Values
-from asm_gym.monitors.packing import rounded, unpacked
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
