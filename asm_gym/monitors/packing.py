@@ -3,8 +3,8 @@
     W_ij = s_i k_ij,   k_ij in -127 … 127,   s_i no less than max_j |W_ij| / 127, of 10 bits, so that products are exact
     C    = s² K Kᵀ,    K of 16 bits, with zeros above its diagonal; s a power of 2, so that the product is exact, too
 
-A synapse that exists keeps a k of at least 1. ``rounded`` makes arrays such; then ``packed`` loses nothing, and a memory
-that was calibrated so is the same when it is read.
+A synapse that exists keeps a k of at least 1. ``rounded`` makes such arrays, of which ``packed`` loses nothing, so that
+a memory that was calibrated after rounding is the same when it is read.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def packed(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
 
 
 def unpacked(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
-    """Return what ``packed`` was given. Raises ValueError where parts do not fit together, or are of an older format."""
+    """Return what ``packed`` was given. Raises ValueError for parts that do not fit, or of an older format."""
     found: Arrays = {}
     for name, array in arrays.items():
         if any(end in name for end in OLDER):
