@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import field, make_dataclass
+from dataclasses import make_dataclass
 from importlib import import_module
 from typing import Annotated, Any, NamedTuple, Union
 
@@ -75,18 +75,16 @@ def print_completion(argv: list[str]) -> None:
 
 
 def _all_options() -> dict[str, Any]:
-    """Return the options of each command, or a dataclass with a union of those of its parts."""
-    from asm_gym.scripts import benchmark, reproduce
+    """Return the options of each command; of reproduce, a dataclass with a union of those of its studies."""
+    from asm_gym.scripts import reproduce
     from asm_gym.scripts.options import parser
 
     found = {}
     for name, command in COMMANDS.items():
-        if name not in ("reproduce", "benchmark"):
+        if name != "reproduce":
             found[name] = parser(import_module(f"asm_gym.scripts.{command.module}").Args)
     studies = {study: parser(reproduce.options_of(study)) for study in reproduce.STUDIES}
-    measures = {what: parser(kind) for what, kind in benchmark.BENCHMARKS.items()}
-    for name, parts in (("reproduce", studies), ("benchmark", measures)):
-        found[name] = make_dataclass(name, [("part", _union(parts), field())])
+    found["reproduce"] = make_dataclass("reproduce", [("study", _union(studies))])
     return found
 
 

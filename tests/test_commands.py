@@ -14,12 +14,12 @@ from typing import Literal
 
 import pytest
 
-from asm_gym.scripts import benchmark, cli, command, reproduce
+from asm_gym.scripts import cli, command, reproduce
 from asm_gym.scripts.options import check_options, fixed, option
 
 ROOT = Path(__file__).resolve().parents[1]
 STUDIES = [f"reproduce {study}" for study in ("all", *reproduce.STUDIES)]
-EVERY_COMMAND = [*cli.COMMANDS, *STUDIES, *(f"benchmark {what}" for what in benchmark.BENCHMARKS)]
+EVERY_COMMAND = [*cli.COMMANDS, *STUDIES]
 
 
 def even(number: int) -> None:
@@ -64,7 +64,7 @@ def test_every_command_prints_its_help(name, capsys):
 
 @pytest.mark.parametrize("name", EVERY_COMMAND)
 def test_an_unknown_option_is_refused(name, capsys):
-    nonsense = "no_such_part" if name in ("reproduce", "benchmark") else "--no-such-option"
+    nonsense = "no_such_study" if name == "reproduce" else "--no-such-option"
     assert cli.main([*name.split(), nonsense]) == 2
     refused = capsys.readouterr()
     assert nonsense in refused.err or "Missing argument" in refused.err

@@ -7,7 +7,7 @@ from threadpoolctl import threadpool_info
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.fused import _ONE_THREAD, A_THREAD
 from asm_gym.monitors.monitor import CalibratedMonitor
-from asm_gym.scripts.benchmark.memory import synthetic
+from asm_gym.scripts.benchmark import synthetic
 
 
 def memory(dt=0.05, **settings):
