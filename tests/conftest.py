@@ -16,23 +16,6 @@ def lift():
     env.close()
 
 
-@pytest.fixture(scope="module")
-def kept_scene(request):
-    """A scene of the task that ``tests.scenes.of`` names; ``scene`` begins an episode in it."""
-    from tests.scenes import Scene
-
-    scene = Scene(request.param)
-    yield scene
-    scene.env.close()
-
-
-@pytest.fixture
-def scene(kept_scene):
-    """At the beginning of an episode, always the same one."""
-    kept_scene.reset()
-    return kept_scene
-
-
 @pytest.fixture
 def small_disk():
     """Lets no file grow beyond 100 KB: what is written to one fails as on a disk that is full."""

@@ -39,21 +39,21 @@ def test_the_mass_matrix_is_mujocos(somewhere):
     model, data = somewhere.model, somewhere.data
     whole = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, whole, data.qM)
-    dofs = somewhere._arms.dofs[0]
+    dofs = somewhere.arms.dofs[0]
     M = np.zeros((7, 7))
-    control.mass_matrix(data.qM, somewhere._views, dofs, 7, M)
+    control.mass_matrix(data.qM, somewhere.views, dofs, 7, M)
     np.testing.assert_array_equal(M, whole[np.ix_(dofs, dofs)])
 
 
 def test_the_jacobian_and_the_hands_velocity_are_mujocos(somewhere):
-    model, data, arms = somewhere.model, somewhere.data, somewhere._arms
+    model, data, arms = somewhere.model, somewhere.data, somewhere.arms
     mujoco.mj_forward(model, data)
     linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
     mujoco.mj_jacSite(model, data, linear, angular, arms.site[0])
     com, J, v = data.subtree_com[arms.root[0]], np.zeros((6, 7)), np.zeros(6)
-    control.jacobian(somewhere._views, arms.dofs[0], 7, data.site_xpos[arms.site[0]], com, J)
+    control.jacobian(somewhere.views, arms.dofs[0], 7, data.site_xpos[arms.site[0]], com, J)
     np.testing.assert_allclose(J, np.vstack([linear, angular])[:, arms.dofs[0]], atol=1e-12)
-    control.hand_velocity(somewhere._views, arms, 0, com, v)
+    control.hand_velocity(somewhere.views, arms, 0, com, v)
     np.testing.assert_allclose(v, np.concatenate([linear @ data.qvel, angular @ data.qvel]), atol=1e-12)
 
 

@@ -216,7 +216,7 @@ def test_the_force_of_a_push_is_found_where_it_pushes():
     body, force = model.body("robot0_link5").id, np.array([3.0, -8.0, 5.0])
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
-    link, found = inner.force_behind(jacobian[:, inner.simulation._dofs].T @ force)
+    link, found = inner.force_behind(jacobian[:, inner.simulation.dofs].T @ force)
     assert link == "robot0_link5"
     np.testing.assert_allclose(found, force, atol=0.5)
     env.close()

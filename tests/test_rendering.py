@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import subprocess
 import sys
 from typing import Any
 
 import mujoco
+import mujoco.viewer
 import numpy as np
 import pytest
 
-from asm_gym.envs import viewer
-from asm_gym.envs.rendering import OffscreenRenderer
-from asm_gym.envs.viewer import HumanViewer
+from asm_gym.envs.rendering import OffscreenRenderer, Window
 from asm_gym.graphics import rendering_backend
 
 SCENE = """
@@ -118,17 +115,14 @@ def test_an_unknown_camera_is_refused(renderer: OffscreenRenderer) -> None:
         renderer.render(*scene(), "below")
 
 
-class Window:
-    """Stands for MuJoCo's viewer; notes what is shown."""
-
-    opened: list[Window] = []  # noqa: RUF012
+class FakeViewer:
+    """Stands for MuJoCo's viewer; records what is shown."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, **_: Any) -> None:
         self.m: Any = model
         self.data = data
         self.shown: list[float] = []
         self.cam, self.opt = mujoco.MjvCamera(), mujoco.MjvOption()
-        Window.opened.append(self)
 
     def is_running(self) -> bool:
         return self.m is not None
@@ -144,73 +138,49 @@ class Window:
 
 
 @pytest.fixture
-def windows(monkeypatch: pytest.MonkeyPatch) -> list[Window]:
-    monkeypatch.setattr(viewer, "_window_launcher", lambda: Window)
-    monkeypatch.setattr(Window, "opened", [])
-    return Window.opened
+def viewers(monkeypatch: pytest.MonkeyPatch) -> list[FakeViewer]:
+    opened: list[FakeViewer] = []
+
+    def launch(*args: Any, **kwargs: Any) -> FakeViewer:
+        opened.append(FakeViewer(*args, **kwargs))
+        return opened[-1]
+
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(mujoco.viewer, "launch_passive", launch)
+    return opened
 
 
-def test_a_window_shows_every_state_and_follows_another_model(windows: list[Window]) -> None:
-    human = HumanViewer("aslant")
-    assert not human.is_open
+def test_a_window_shows_every_state_and_follows_another_model(viewers: list[FakeViewer]) -> None:
+    window = Window("aslant")
+    assert not window.is_open
     for k in range(2):
         model, data = scene()
         for time in (0.1, 0.2):
             data.time = time
-            human.show(model, data)
-        assert human.is_open
-        assert len(windows) == k + 1
-        assert windows[k].shown == [0.1, 0.2]
-        assert windows[k].data is not data, "what is done in the window must not reach the simulation"
-        assert windows[k].cam.fixedcamid == model.camera("aslant").id
-    assert not windows[0].is_running()
-    human.close()
-    human.close()
-    assert not windows[1].is_running()
+            window.show(model, data)
+        assert window.is_open
+        assert len(viewers) == k + 1
+        assert viewers[k].shown == [0.1, 0.2]
+        assert viewers[k].data is not data, "what is done in the window must not reach the simulation"
+        assert viewers[k].cam.fixedcamid == model.camera("aslant").id
+    assert not viewers[0].is_running()
+    window.close()
+    window.close()
+    assert not viewers[1].is_running()
 
 
-def test_a_window_its_user_closed_stays_closed(windows: list[Window]) -> None:
-    human, (model, data) = HumanViewer(), scene()
-    human.show(model, data)
-    windows[0].close()
-    human.show(model, data)
-    assert not human.is_open
-    assert len(windows) == 1
-
-
-SHOW = """
-from tests.test_rendering import HumanViewer, OffscreenRenderer, rendering_backend, scene
-human = HumanViewer("aslant")
-for model, data in (scene(), scene("0.1 0.9 0.1")):
-    before = data.qacc_warmstart.tobytes() + data.xpos.tobytes()
-    for _ in range(20):
-        human.show(model, data)
-    assert human.is_open
-    if rendering_backend():  # leaves its own context current in this thread
-        OffscreenRenderer("above", 64, 48).render(model, data)
-    assert before == data.qacc_warmstart.tobytes() + data.xpos.tobytes()
-human.close()
-human.close()
-human.show(model, data)  # left open: it closes at exit
-print("shown")
-"""
-
-
-def show(**environment: str) -> subprocess.CompletedProcess[str]:
-    clean = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    command = [sys.executable, "-c", SHOW]
-    return subprocess.run(command, env=clean | environment, capture_output=True, text=True, timeout=120, check=False)
+def test_a_window_its_user_closed_stays_closed(viewers: list[FakeViewer]) -> None:
+    window, (model, data) = Window("above"), scene()
+    window.show(model, data)
+    viewers[0].close()
+    window.show(model, data)
+    assert not window.is_open
+    assert len(viewers) == 1
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
-def test_without_a_display_the_error_says_what_is_missing() -> None:
-    done = show()
-    assert done.returncode == 1
-    assert "RuntimeError: no window for render_mode='human'" in done.stderr
-    assert "DISPLAY" in done.stderr
-
-
-@pytest.mark.skipif(not os.environ.get("DISPLAY"), reason="no display")
-def test_a_real_window_opens_twice_and_closes() -> None:
-    done = show(DISPLAY=os.environ["DISPLAY"])
-    assert (done.returncode, done.stdout) == (0, "shown\n"), done.stderr
+def test_without_a_display_the_error_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(RuntimeError, match="DISPLAY"):
+        Window("above").show(*scene())

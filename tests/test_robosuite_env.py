@@ -257,7 +257,6 @@ def test_success_ends_the_episode_where_asked():
         observation, reward, terminated, truncated, info = env.step(action)
         assert not truncated
         assert reward == info["success"] == terminated
-        assert info["reward_terms"] == {"success": reward}
     env.close()
 
 

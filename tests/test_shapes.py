@@ -67,9 +67,8 @@ def test_what_is_drawn_into_a_model_is_what_loading_draws(name, seeds, monkeypat
 def test_a_model_that_others_edit_is_loaded_anew(lift):
     assert not loads_anew(lift, 0)
     inner = lift.unwrapped
-    edit = inner.edits.edit(inner.simulation.model.geom_friction, 0)
-    assert loads_anew(lift, 0)
-    edit.release()
+    with inner.edits.edit(inner.simulation.model.geom_friction, 0):
+        assert loads_anew(lift, 0)
     assert not loads_anew(lift, 0)
     inner.simulation.model.body_mass[inner.simulation.model.body("robot0_link5").id] += 1.0
     assert loads_anew(lift, 0)

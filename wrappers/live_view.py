@@ -27,7 +27,7 @@ class Simulated(Protocol):
 
 def links_of(env: Simulated) -> NDArray[np.float64]:
     """(n, 2, 3) where each body of the robots is, and its parent [m]."""
-    from asm_gym.envs.arms import bodies
+    from asm_gym.envs.robots import bodies
 
     model, data = env.simulation.model, env.simulation.data
     ids = np.concatenate([bodies(model, robot) for robot in env.robosuite_env.robots])

@@ -1,6 +1,7 @@
 """Robosuite's tasks with Gymnasium's contract."""
 
-from asm_gym.extras import require
+from asm_gym.extras import check_mujoco, require
 
-# Looked for here, so that whoever asks for an environment, or for a fault in one, is told what to install.
+# Checked here, so that the error of a missing or unfit package says what to install.
+check_mujoco()
 require("mujoco", what="a robosuite environment or a fault in one")

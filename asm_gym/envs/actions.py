@@ -1,4 +1,4 @@
-"""What an action is to a robot: its bounds, its grippers, the one that changes nothing and those that turn joints."""
+"""Actions of one environment: their bounds, the action that changes nothing, and those that turn joints."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.envs.robots import gripper_actions
 from asm_gym.envs.simulation import Simulation
 from asm_gym.validation import as_float32
 
 _CHANGES = ("OSC_POSE", "JOINT_POSITION")
-"""Controllers whose actions are changes of where the arm is."""
+"""Controllers whose actions are changes of the arm's pose."""
 
 
 class Actions:
@@ -30,11 +31,11 @@ class Actions:
         self._half = 0.5 * (high - self._low)
         self.space = spaces.Box(-1.0, 1.0, self._low.shape, np.float32)
         self.size = int(self._low.size)
-        self.grippers = _grippers(env.robots)
-        """Which numbers of the action command grippers."""
+        self.grippers = gripper_actions(env.robots)
+        """Indices of the numbers that command grippers."""
 
     def checked(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(A,) in [-1, 1], clipped to it.
+        """Return the action (A,) clipped to [-1, 1].
 
         Raises:
             ValueError: a wrong shape, or an action that is not finite.
@@ -47,50 +48,60 @@ class Actions:
         return np.clip(action, -1.0, 1.0)
 
     def scaled(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
-        """(A,) in the units robosuite's controllers take, which for most are the same."""
+        """Return the action (A,) in the units of robosuite's controllers, which for most are the same."""
         found: NDArray[np.float64] = self._low + self._half * (action.astype(np.float64) + 1.0)
         return found
 
-    def slowed(self, simulation: Simulation, action: NDArray[np.float32], most: float) -> NDArray[np.float32]:
-        """(A,) the action at which no hand is commanded to go faster than ``most`` [m/s]; the same where none is."""
-        shares = simulation.speeds.slowed(self.scaled(action), most)
-        if not shares:
-            return action
-        slow, rest = action.copy(), self.resting(simulation, action)
-        for part, share in shares:
-            slow[part] = rest[part] + np.float32(share) * (action[part] - rest[part])
+    def slowed(self, simulation: Simulation, action: NDArray[np.float32], limit: float) -> NDArray[np.float32]:
+        """Return the action (A,) scaled so that no hand is commanded to go faster than ``limit`` [m/s].
+
+        A controller that is asked for a change Δx of pose again and again comes to the velocity Kp/Kd Δx. Actions of
+        controllers that take anything else are left as they are.
+        """
+        slow, rest = action, None
+        for a, (controller, part) in enumerate(zip(simulation.controllers, simulation.moves, strict=True)):
+            if controller.name not in _CHANGES or controller.input_type != "delta":
+                continue
+            delta = np.asarray(controller.scale_action(self.scaled(action)[part]), np.float64)
+            if controller.name == "JOINT_POSITION":
+                delta = simulation.hand_jacobian(a)[:3] @ delta
+            speed = float(np.mean(controller.kp[:3] / controller.kd[:3])) * float(np.linalg.norm(delta[:3]))
+            if speed > limit:
+                rest = self.resting(simulation, action) if rest is None else rest
+                slow = slow.copy()
+                slow[part] = rest[part] + np.float32(limit / speed) * (action[part] - rest[part])
         return slow
 
     def turning(self, simulation: Simulation, turns: NDArray[np.float64]) -> NDArray[np.float32]:
-        """(A,) the action that turns the arms' joints by ``turns`` (J,) [rad], as nearly as one step can.
+        """Return the action (A,) that turns the arms' joints by ``turns`` (J,) [rad], as nearly as one step can.
 
         Raises:
             ValueError: the controller takes no changes.
         """
         if self._controller not in _CHANGES:
             raise ValueError(f"actions of {' and '.join(_CHANGES)} are changes, those of {self._controller} are not")
+        return self._turning(simulation, turns)
+
+    def _turning(self, simulation: Simulation, turns: NDArray[np.float64]) -> NDArray[np.float32]:
         action = np.zeros(self.size, np.float32)
-        for part, motion in simulation.motions(turns):
-            action[part] = np.clip(motion, -1.0, 1.0)
+        joint = 0
+        for a, (controller, part) in enumerate(zip(simulation.controllers, simulation.moves, strict=True)):
+            n = int(simulation.arms.joints[a])
+            move = turns[joint : joint + n]
+            if controller.name != "JOINT_POSITION":
+                hand = simulation.hand_jacobian(a) @ move
+                base = int(simulation.arms.base[a])
+                frame = np.eye(3) if base < 0 else simulation.data.site_xmat[base].reshape(3, 3)
+                move = np.concatenate([frame.T @ hand[:3], frame.T @ hand[3:]])
+            middle, half = (f(controller.output_max, controller.output_min) / 2 for f in (np.add, np.subtract))
+            action[part] = np.clip((move - middle) / half, -1.0, 1.0)
+            joint += n
         return action
 
     def resting(self, simulation: Simulation, last: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(A,) the action that changes nothing, where there is one, with the grippers as ``last`` told them."""
-        action = np.zeros(self.size, np.float32)
-        if simulation.compiled:
-            for part, motion in simulation.motions(np.zeros(len(simulation.motors))):
-                action[part] = np.clip(motion, -1.0, 1.0)
+        """Return the action (A,) that changes nothing, where there is one, with the grippers as in ``last``."""
+        still = np.zeros(len(simulation.motors))
+        action = self._turning(simulation, still) if simulation.compiled else np.zeros(self.size, np.float32)
         grippers = list(self.grippers)
         action[grippers] = last[grippers]
         return action
-
-
-def _grippers(robots: list[Any]) -> tuple[int, ...]:
-    found: list[int] = []
-    start = 0
-    for robot in robots:
-        for part, (low, high) in robot._action_split_indexes.items():
-            if "gripper" in part:
-                found += range(start + low, start + high)
-        start += robot.action_dim
-    return tuple(found)

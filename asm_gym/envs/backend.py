@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.extras import require
 from asm_gym.spec import Channel
-from asm_gym.tasks import ROBOTS, TaskSpec
-from asm_gym.validation import check_choice, check_text, shown
-
-PHYSICS_FREQ = 500
-"""Robosuite's physics rate [Hz]."""
+from asm_gym.tasks import TaskSpec
+from asm_gym.validation import check_choice, shown
 
 CONTROLLERS = ("OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "JOINT_TORQUE", "IK_POSE")
 """Robosuite's controllers of an arm, less JOINT_VELOCITY, which fails inside robosuite 1.5."""
@@ -50,24 +49,6 @@ def _opencv_or_none() -> Iterator[None]:
             del sys.modules["cv2"]
     else:
         yield
-
-
-def robots_for(task: TaskSpec, robot: str | Sequence[str] | None) -> tuple[str, ...]:
-    """One robot for each of the task's arms; one name stands for as many as the task takes.
-
-    Raises:
-        ValueError: an unknown robot, or the wrong number of them.
-    """
-    if robot is not None and not isinstance(robot, Sequence):
-        raise ValueError(f"robot must be a name or a sequence of names, got {shown(robot)}")
-    names = (
-        ("Panda",) * task.arms if robot is None else (robot,) * task.arms if isinstance(robot, str) else tuple(robot)
-    )
-    for name in names:
-        check_choice("robot", check_text("robot", name), ROBOTS)
-    if len(names) != task.arms:
-        raise ValueError(f"{task.name} takes {task.arms} robot{'s' * (task.arms > 1)}, got {', '.join(names)}")
-    return names
 
 
 def row_substeps(rate: int, control_freq: int) -> int:
@@ -115,7 +96,7 @@ def make(
             has_offscreen_renderer=False,
             use_camera_obs=False,
             control_freq=control_freq,
-            reward_shaping=reward_shaping,
+            reward_shaping=reward_shaping and task.name != "TwoArmTransport",  # which has no dense reward
             ignore_done=True,
         )
     except Exception as error:
@@ -133,19 +114,6 @@ def _configuration(controller: str | dict[str, Any], robot: str) -> dict[str, An
     return configuration
 
 
-def free_first_joints(env: Any) -> None:
-    """Lets every Sawyer turn in its base, once a model is loaded.
-
-    Robosuite's Sawyer touches its own base with its shoulder, to within rounding (1e-16 m): where that makes a contact,
-    which depends on the pose, its friction holds the first joint against 20 N m and more.
-    """
-    model = env.sim.model
-    for robot in env.robots:
-        if robot.name == "Sawyer":
-            shoulder = model.geom_name2id(f"{robot.robot_model.naming_prefix}link0_collision")
-            model.geom_contype[shoulder] = model.geom_conaffinity[shoulder] = 0
-
-
 def reseed(env: Any, rng: np.random.Generator) -> None:
     """Seeds the generator that all of robosuite's randomness comes from."""
     # In place: placement samplers hold the generator itself.
@@ -161,6 +129,36 @@ def choose_object(env: Any, task: TaskSpec) -> None:
         candidates = env.objects if task.name == "PickPlaceSingle" else env.nuts
         env.single_object_mode = 2  # "the object that is named", where 1 is "draw one"
         setattr(env, _CHOSEN[task.name], int(env.rng.integers(len(candidates))))
+
+
+def speed_up_contacts(env: Any) -> None:
+    """Replace robosuite's ``check_contact``, on which its rewards rest, for the loaded model.
+
+    Robosuite looks up two names for each contact and pair of groups; this one compares ids in one pass.
+    """
+    data, count = env.sim.data._data, env.sim.model.ngeom
+    ids = {name: env.sim.model.geom_name2id(name) for name in env.sim.model.geom_names}
+
+    @lru_cache
+    def members(names: tuple[str, ...]) -> NDArray[np.bool_]:
+        mask = np.zeros(count, bool)
+        mask[[ids[name] for name in names if name in ids]] = True
+        return mask
+
+    def group(geoms: Any) -> NDArray[np.bool_]:
+        geoms = getattr(geoms, "contact_geoms", geoms)  # of a model
+        return members((geoms,) if isinstance(geoms, str) else tuple(geoms))
+
+    def check_contact(geoms_1: Any, geoms_2: Any = None) -> bool:
+        """Whether any geom of one group touches any of the other; of anything where there is no other."""
+        first, second = data.contact.geom.T  # (ncon,)
+        one = group(geoms_1)
+        if geoms_2 is None:
+            return bool((one[first] | one[second]).any())
+        other = group(geoms_2)
+        return bool((one[first] & other[second] | one[second] & other[first]).any())
+
+    env.check_contact = check_contact
 
 
 class ObjectSensors:

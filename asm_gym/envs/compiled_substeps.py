@@ -17,8 +17,8 @@ import mujoco
 import numpy as np
 from llvmlite import binding
 from numba import types
+from numpy.typing import NDArray
 
-from asm_gym.addresses import floats1, floats2, floats3, whole1, whole2
 from asm_gym.compilation import compiled
 from asm_gym.envs.control import brake, control, hand_velocity, hold_at, set_goal
 from asm_gym.envs.mujoco_views import (
@@ -26,9 +26,9 @@ from asm_gym.envs.mujoco_views import (
     ARMED,
     FELT,
     JOINTS,
-    LEFT,
-    PASSED,
+    PASSED_IN,
     STAYED,
+    SUBSTEPS,
     Arms,
     Floats,
     Goals,
@@ -36,14 +36,9 @@ from asm_gym.envs.mujoco_views import (
     NominalViews,
     SubstepLimits,
     Views,
-    arms_at,
-    goals_at,
-    limits_at,
-    nominal_at,
-    views_at,
 )
 
-# What one arm's sensors give in a substep, side by side.
+# Parts of one arm's sample in a substep.
 EXTERNAL = slice(0, JOINTS)
 MOTOR = slice(JOINTS, 2 * JOINTS)
 WRENCH = slice(2 * JOINTS, 2 * JOINTS + 6)
@@ -51,11 +46,6 @@ CONTACT = slice(2 * JOINTS + 6, 2 * JOINTS + 9)
 VELOCITY = slice(2 * JOINTS + 9, 2 * JOINTS + 15)
 OUTSIDE = slice(2 * JOINTS + 15, 2 * JOINTS + 18)
 SAMPLE = OUTSIDE.stop
-
-ARMS_AT = len(Views._fields)
-GOALS_AT = ARMS_AT + len(Arms._fields)
-LIMITS_AT = GOALS_AT + len(Goals._fields)
-"""Where these begin in the table of ``run``, after Views."""
 
 # MuJoCo's own functions, linked by name so that the compiled loop can be cached on disk.
 binding.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
@@ -70,8 +60,8 @@ _rne: Any = types.ExternalFunction("mj_rne", types.void(types.intp, types.intp, 
 
 
 @compiled
-def _believe(views: Views, nominal: NominalViews) -> None:
-    """Brings the nominal model's dynamics to the live joint positions and velocities."""
+def _evaluate_nominal(views: Views, nominal: NominalViews) -> None:
+    """Evaluate the nominal model's dynamics at the live joint positions and velocities."""
     nominal.qpos[:] = views.qpos
     nominal.qvel[:] = views.qvel
     _kinematics(nominal.model, nominal.data)
@@ -83,7 +73,7 @@ def _believe(views: Views, nominal: NominalViews) -> None:
 
 @compiled
 def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Floats) -> None:
-    """Writes what the sensors of every arm give after substep ``k`` into samples (A, K, SAMPLE)."""
+    """Write the sensor values of every arm after substep ``k`` into samples (A, K, SAMPLE)."""
     edited = nominal.model != 0
     mass = nominal.mass if edited else views.mass
     bias = nominal.bias if edited else views.bias
@@ -127,7 +117,7 @@ def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Flo
 
 @compiled
 def feel(arms: Arms, limits: SubstepLimits, k: int, samples: Floats) -> None:
-    """Compares what the arms felt in substep ``k`` with the limits; what is not a number passes them."""
+    """Compare the arms' load in substep ``k`` with the limits; NaN passes a limit."""
     state = limits.state
     if state[ARMED]:
         for a in range(len(arms.joints)):
@@ -138,17 +128,17 @@ def feel(arms: Arms, limits: SubstepLimits, k: int, samples: Floats) -> None:
                 load = abs(value) / limits.most[a, i]
                 if not load <= limits.load[0]:
                     limits.load[0] = load if load == load else np.inf
-                if state[LEFT] < 0 and not load <= 1.0:
-                    state[LEFT] = state[PASSED]
-    state[PASSED] += 1
+                if state[PASSED_IN] < 0 and not load <= 1.0:
+                    state[PASSED_IN] = state[SUBSTEPS]
+    state[SUBSTEPS] += 1
 
 
 @compiled
 def brake_held(views: Views, nominal: NominalViews, arms: Arms, goals: Goals) -> None:
-    """Brakes the arms that are held, beneath controllers that are not compiled."""
+    """Brake the arms that are held, where their controllers are not compiled."""
     if goals.held.any():
         if nominal.model != 0:
-            _believe(views, nominal)
+            _evaluate_nominal(views, nominal)
         for a in range(len(arms.joints)):
             if goals.held[a]:
                 brake(views, nominal, arms, goals, a)
@@ -156,34 +146,43 @@ def brake_held(views: Views, nominal: NominalViews, arms: Arms, goals: Goals) ->
 
 @compiled
 def must_stay(limits: SubstepLimits) -> bool:
-    """Whether the arms are to be told now to stay, which they are once."""
+    """Whether the arms must stop now; true once in a control step."""
     state = limits.state
-    now = state[ACTS] and state[LEFT] >= 0 and not state[STAYED]
+    now = state[ACTS] and state[PASSED_IN] >= 0 and not state[STAYED]
     if now:
         state[STAYED] = 1
     return bool(now)
 
 
-@partial(compiled, calls=(".",), nogil=True)
-def run(t: Any, nominal_table: Any, fresh: bool, first: int, count: int) -> None:
-    """Runs ``count`` physics substeps, controllers and sensors included.
+@partial(compiled, nogil=True)
+def run(
+    views: Views,
+    nominal: NominalViews,
+    arms: Arms,
+    goals: Goals,
+    limits: SubstepLimits,
+    deltas: Floats,
+    turns: Floats,
+    samples: Floats,
+    fresh: bool,
+    first: int,
+    count: int,
+) -> None:
+    """Run ``count`` physics substeps, controllers and sensors included.
 
     Args:
-        t: the ``table`` of Views, Arms, Goals, SubstepLimits, the action in metres and radians (A, JOINTS), the
-            rotation it asks for (A, 3, 3), and samples (A, K, SAMPLE), which are written at ``first`` and after. From
-            the substep after a limit is passed, the arms stay where they are, if that is asked for.
-        nominal_table: of NominalViews.
-        fresh: the set-points are to be moved by the action in the first of these substeps.
-        first: which substep of the control step comes next.
+        deltas: (A, JOINTS) the action in metres and radians.
+        turns: (A, 3, 3) the rotation that it asks for.
+        samples: (A, K, SAMPLE), written at ``first`` and after.
+        fresh: the action moves the set-points in the first of these substeps.
+        first: index of the first substep within the row.
+
+    From the substep after a limit is passed, the arms stay where they are, where the limits ask for that.
     """
-    views, nominal, arms = views_at(t), nominal_at(nominal_table), arms_at(t[ARMS_AT:])
-    goals, limits = goals_at(t[GOALS_AT:]), limits_at(t[LIMITS_AT:])
-    last = len(t) - 3
-    deltas, turns, samples = floats2(t, last), floats3(t, last + 1), floats3(t, last + 2)
     for k in range(first, first + count):
         _step1(views.model, views.data)
         if nominal.model != 0:
-            _believe(views, nominal)
+            _evaluate_nominal(views, nominal)
         stay = must_stay(limits)
         for a in range(len(arms.joints)):
             if stay:
@@ -196,41 +195,49 @@ def run(t: Any, nominal_table: Any, fresh: bool, first: int, count: int) -> None
         feel(arms, limits, k, samples)
 
 
-@partial(compiled, calls=(".",))
-def read(t: Any, count: int, beside: Any, row: Any, stream: Any) -> tuple[float, float, float, bool, bool]:
-    """Summarises the first ``count`` samples, if there are any, and writes what the sensors read, and its stream.
+@compiled
+def sense(sources: tuple[Floats, ...], where: Ints, beside: Floats, noise: Floats, row: Floats) -> None:
+    """Turn standard normal draws into noisy readings, in place.
 
     Args:
-        t: the ``table`` of samples, their mean, peak and last, arrays of MuJoCo's, ``where`` (P, 2) of each number that
-            the arms sense its source among mean and those after it, and its place there, the (M,) noise, the (M,) steps
-            of resolution, 0 for none, and (D,) which numbers of a row the stream carries.
-        beside: (M - P,) what comes after what the arms sense.
-        row: (M,) of how many standard deviations each number is off; what is read is written there.
-        stream: (D,) of single precision, written.
-
-    Returns:
-        What ``summarise`` does, and whether the row and the stream are finite, in single precision.
+        sources: arrays that the arms' sensors read.
+        where: (P, 2) of each number of the arms its source and its index there.
+        beside: (M - P,) true values of the other numbers.
+        noise: (M,) standard deviations.
+        row: (M,) standard normal draws; overwritten by the readings.
     """
-    mean, peak, last = floats2(t, 1), floats2(t, 2), floats2(t, 3)
-    contact, external, usual = summarise(floats3(t, 0), count, mean, peak, last) if count else (0.0, 0.0, 0.0)
-    arms = mean.ravel(), peak.ravel(), last.ravel()
-    sources = *arms, floats1(t, 4), floats1(t, 5), floats1(t, 6), floats1(t, 7), floats1(t, 8), floats1(t, 9)
-    where, noise, steps, carried = whole2(t, 10), floats1(t, 11), floats1(t, 12), whole1(t, 13)
-    whole = through = True
     for n in range(len(row)):
         value = sources[where[n, 0]][where[n, 1]] if n < len(where) else beside[n - len(where)]
-        value += noise[n] * row[n]
-        row[n] = np.rint(value / steps[n]) * steps[n] if steps[n] > 0.0 else value
-        whole = whole and np.isfinite(np.float32(row[n]))
+        row[n] = value + noise[n] * row[n]
+
+
+@compiled
+def quantise(row: Floats, steps: Floats, carried: Ints, stream: NDArray[np.float32]) -> tuple[bool, bool]:
+    """Round a row to the sensors' resolution in place, and write its stream.
+
+    Args:
+        row: (M,) readings.
+        steps: (M,) resolutions; 0 for none.
+        carried: (D,) indices of the numbers that the stream carries.
+        stream: (D,) written.
+
+    Returns:
+        Whether the row and the stream are finite in single precision.
+    """
+    row_finite = stream_finite = True
+    for n in range(len(row)):
+        if steps[n] > 0.0:
+            row[n] = np.rint(row[n] / steps[n]) * steps[n]
+        row_finite = row_finite and np.isfinite(np.float32(row[n]))
     for n in range(len(carried)):
         stream[n] = np.float32(row[carried[n]])
-        through = through and np.isfinite(stream[n])
-    return contact, external, usual, whole, through
+        stream_finite = stream_finite and np.isfinite(stream[n])
+    return row_finite, stream_finite
 
 
 @compiled
 def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Floats) -> tuple[float, float, float]:
-    """Writes the mean, signed peak and last of the first ``count`` substeps into mean, peak and last (A, SAMPLE).
+    """Write the mean, signed peak and last of the first ``count`` substeps into mean, peak and last (A, SAMPLE).
 
     Returns:
         The largest contact force on an arm, the largest force on it from anything outside, and the mean of the latter
@@ -256,16 +263,6 @@ def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Flo
             if not outside <= external and external == external:
                 external = outside
     return largest, external, total
-
-
-@compiled
-def mean_felt(samples: Floats, count: int, arms: Ints, columns: Ints, out: Floats) -> None:
-    """Writes the mean of the first ``count`` samples of ``arms`` (N,) at ``columns`` (N,) into out."""
-    for n in range(len(out)):
-        total = samples[arms[n], 0, columns[n]]
-        for k in range(1, count):
-            total += samples[arms[n], k, columns[n]]
-        out[n] = total / count
 
 
 @compiled

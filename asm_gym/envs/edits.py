@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -11,67 +12,56 @@ from numpy.typing import NDArray
 Change = Callable[[Any], Any]
 
 
-class Edit:
-    """One party's change of one entry; made by ``SimulatorEdits.edit``."""
-
-    def __init__(self, entry: _Entry) -> None:
-        self._entry = entry
-        self._change: Change = lambda value: value
-
-    def change(self, change: Change) -> None:
-        """From now on the entry is ``change(value)``, where ``value`` is what those who came before make of it."""
-        self._change = change
-        self._entry.write()
-
-    def release(self) -> None:
-        """Ends this party's change; with the last one the entry is what it was, to the bit."""
-        self._entry.leave(self)
-
-
 class _Entry:
-    """A number, or a row of them, that somebody edits."""
+    """An edited number, or row of numbers: its nominal value, and the changes of it in force."""
 
-    def __init__(self, array: NDArray[Any], index: Any, forget: Callable[[], None]) -> None:
-        self._array, self._index, self._forget = array, index, forget
-        self._nominal = np.copy(array[index])
-        self.edits: list[Edit] = []
+    def __init__(self, array: NDArray[Any], index: Any) -> None:
+        self.array, self.index, self.nominal = array, index, np.copy(array[index])
+        self.changes: dict[object, Change] = {}
 
     def write(self) -> None:
-        value = np.copy(self._nominal)
-        for edit in self.edits:
-            value = edit._change(value)
-        self._array[self._index] = value
-
-    def leave(self, edit: Edit) -> None:
-        self.edits.remove(edit)
-        self.write()
-        if not self.edits:
-            self._forget()
+        value = np.copy(self.nominal)
+        for change in self.changes.values():
+            value = change(value)
+        self.array[self.index] = value
 
 
 class SimulatorEdits:
-    """Knows the nominal value of everything that is edited now.
+    """Nominal values of everything that is edited now.
 
-    Every change recomputes the entry from its nominal value, so that edits of one number compose, whichever begins or
+    Each change recomputes the entry from its nominal value, so that edits of one number compose, whichever begins or
     ends first, and nothing is left of them, not even rounding.
     """
 
     def __init__(self) -> None:
         self._entries: dict[tuple[int, str], _Entry] = {}
 
-    def edit(self, array: NDArray[Any], index: Any) -> Edit:
-        """A place in the queue of those who change ``array[index]``.
+    @contextmanager
+    def edit(self, array: NDArray[Any], *indices: Any) -> Iterator[Callable[[Change], None]]:
+        """Edit entries of an array alike while the block runs; yields a function that sets the change of their values.
 
         Args:
-            index: two parties must name one entry in the same way.
+            indices: two parties must name one entry in the same way.
         """
-        key = (array.__array_interface__["data"][0], repr(index))
-        if key not in self._entries:
-            self._entries[key] = _Entry(array, index, lambda: self._entries.__delitem__(key))
-        entry = self._entries[key]
-        edit = Edit(entry)
-        entry.edits.append(edit)
-        return edit
+        keys = [(array.__array_interface__["data"][0], repr(index)) for index in indices]
+        party = object()
+        for key, index in zip(keys, indices, strict=True):
+            self._entries.setdefault(key, _Entry(array, index)).changes[party] = lambda value: value
+
+        def change(rule: Change) -> None:
+            for key in keys:
+                self._entries[key].changes[party] = rule
+                self._entries[key].write()
+
+        try:
+            yield change
+        finally:
+            for key in keys:
+                entry = self._entries[key]
+                del entry.changes[party]
+                entry.write()
+                if not entry.changes:
+                    del self._entries[key]
 
     def __len__(self) -> int:
         return len(self._entries)

@@ -1,4 +1,4 @@
-"""Which of the measured numbers the stream carries, and which a policy sees."""
+"""The measured numbers that the stream carries, and those that a policy observes."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import as_float32
 
-# What of the robot a policy sees: its configuration and motion, not its torques.
+# Channels of the robot that a policy observes: configuration and motion, no torques.
 _OBSERVED = (
     "joint_position",
     "joint_velocity",
@@ -38,7 +37,7 @@ class Layout:
         chosen = tuple(c for c in measured.channels if c.group in groups)
         self.stream_spec = StreamSpec(chosen, measured.dt, measured.source) if chosen else None
         self.carried = _indices(measured, [c.name for c in chosen])
-        """(D,) which numbers of a row the stream carries."""
+        """(D,) indices of the numbers that the stream carries."""
         names = [c.name for c in measured.channels if c.name.endswith(_OBSERVED) or c.group == "object"]
         self._to_observation = _indices(measured, names)
         self._slices = {name: measured.slices[name] for name in names}
@@ -47,26 +46,22 @@ class Layout:
         """The observation's parts in order, and how many numbers each has."""
 
     def space(self, pictures: dict[str, spaces.Space[Any]]) -> spaces.Space[Any]:
-        """Of observations with ``pictures`` added."""
+        """Return the space of observations with ``pictures`` added."""
         if not self._flat:
             return spaces.Dict({name: _box(size) for name, size in self.sizes.items()} | pictures)
         state = _box(len(self._to_observation))
         return spaces.Dict({"state": state} | pictures) if pictures else state
 
     def observation(self, row: NDArray[np.float64], pictures: dict[str, NDArray[np.uint8]]) -> Any:
-        """What a policy sees of a row; finite whatever the row holds."""
+        """Return the observation of a row (M,); finite whatever the row holds."""
         if not self._flat:
-            row32 = _shown(row)
+            row32 = _clipped(row)
             return {name: row32[s] for name, s in self._slices.items()} | pictures
-        state = _shown(row[self._to_observation])
+        state = _clipped(row[self._to_observation])
         return {"state": state} | pictures if pictures else state
 
-    def stream(self, row: NDArray[np.float64]) -> NDArray[np.float32]:
-        """(D,) what of a row the stream carries."""
-        return as_float32(row[self.carried])  # what is too large becomes infinite, which ends the episode
 
-
-def _shown(row: NDArray[np.float64]) -> NDArray[np.float32]:
+def _clipped(row: NDArray[np.float64]) -> NDArray[np.float32]:
     if not np.isfinite(row).all():
         row = np.nan_to_num(row)
     return row.clip(-_BOUND, _BOUND).astype(np.float32)

@@ -1,15 +1,12 @@
-"""What the compiled code works on: MuJoCo's arrays, and where the arms stand in them."""
+"""The arrays that the compiled loop works on: MuJoCo's own, and the arms' places in them."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-
-from asm_gym.addresses import flags1, floats1, floats2, floats3, shorts1, whole1, whole2
-from asm_gym.compilation import compiled
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -18,7 +15,7 @@ JOINTS = 7
 """The most joints an arm may have; shorter arms leave the rest unused."""
 
 FELT = JOINTS + 3
-"""What an arm feels of its surroundings: external torque of its joints, then force at the wrist."""
+"""Numbers that limits apply to: external torque of the joints, then force at the wrist."""
 
 OSC_POSE, JOINT_POSITION = 0, 1
 
@@ -79,7 +76,7 @@ class Views(NamedTuple):
 
 
 class NominalViews(NamedTuple):
-    """The dynamics that the controllers and the torque estimate believe in, frozen when the model was loaded."""
+    """Dynamics that controllers and torque estimate use, frozen when the model was loaded."""
 
     model: int  # 0 while the live model is the nominal one
     data: int
@@ -91,7 +88,7 @@ class NominalViews(NamedTuple):
 
 
 class Arms(NamedTuple):
-    """Where each arm stands in the arrays, and its controller's settings; one row an arm."""
+    """Each arm's indices in the arrays, and its controller's settings; one row an arm."""
 
     joints: Ints  # (A,) how many
     qpos: Ints  # (A, JOINTS)
@@ -123,75 +120,13 @@ class Goals(NamedTuple):
 
 
 class SubstepLimits(NamedTuple):
-    """The most that arms may feel in every substep of a control step; changed in place."""
+    """Limits of the arms' load in every substep of a control step; changed in place."""
 
     most: Floats  # (A, FELT) [N m], [N]
-    load: Floats  # (1,) the largest share of them that was felt since the control step began
+    load: Floats  # (1,) the largest share of a limit that was reached since the control step began
     state: Ints  # (5,) see below
 
 
-ARMED, ACTS, PASSED, LEFT, STAYED = range(5)
-"""Of ``SubstepLimits.state``: whether they are looked at; whether the arms stay once one is passed; substeps since the
-control step began; in which of them one was first passed, -1 for none; whether they were told to stay."""
-
-
-@compiled
-def views_at(t: Any) -> Any:
-    """``Views`` of its table."""
-    state = (
-        floats1(t, 2),
-        floats1(t, 3),
-        floats1(t, 4),
-        floats1(t, 5),
-        floats1(t, 6),
-        floats1(t, 7),
-        floats1(t, 8),
-        floats1(t, 9),
-    )
-    bodies = floats2(t, 10), floats2(t, 11), floats2(t, 12), floats2(t, 13), floats2(t, 14)
-    rest = (
-        floats1(t, 15),
-        floats2(t, 16),
-        floats2(t, 17),
-        floats2(t, 18),
-        floats1(t, 19),
-        shorts1(t, 20),
-        shorts1(t, 21),
-    )
-    return Views(t[0, 0], t[1, 0], *state, *bodies, *rest)
-
-
-@compiled
-def nominal_at(t: Any) -> Any:
-    """``NominalViews`` of its table."""
-    return NominalViews(t[0, 0], t[1, 0], floats1(t, 2), floats1(t, 3), floats1(t, 4), floats1(t, 5), floats1(t, 6))
-
-
-@compiled
-def arms_at(t: Any) -> Any:
-    """``Arms`` of its table."""
-    joints = whole1(t, 0), whole2(t, 1), whole2(t, 2), whole2(t, 3)
-    places = (
-        whole1(t, 4),
-        whole1(t, 5),
-        whole1(t, 6),
-        whole1(t, 7),
-        whole1(t, 8),
-        whole2(t, 9),
-        whole2(t, 10),
-        whole1(t, 11),
-    )
-    compensate = flags1(t, 14)
-    return Arms(*joints, *places, floats2(t, 12), floats2(t, 13), compensate, floats2(t, 15), floats3(t, 16))
-
-
-@compiled
-def goals_at(t: Any) -> Any:
-    """``Goals`` of its table."""
-    return Goals(floats2(t, 0), floats3(t, 1), floats2(t, 2), floats2(t, 3), whole1(t, 4))
-
-
-@compiled
-def limits_at(t: Any) -> Any:
-    """``SubstepLimits`` of its table."""
-    return SubstepLimits(floats2(t, 0), floats1(t, 1), whole1(t, 2))
+ARMED, ACTS, SUBSTEPS, PASSED_IN, STAYED = range(5)
+"""Of ``SubstepLimits.state``: whether limits are compared; whether the arms stay once one is passed; substeps since the
+control step began; the first of them in which a limit was passed, -1 for none; whether the arms were stopped."""

@@ -5,24 +5,77 @@ from __future__ import annotations
 import atexit
 import os
 import sys
+import time
 import weakref
+from collections.abc import Sequence
 from contextlib import suppress
+from copy import copy
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any
 
+import gymnasium as gym
 import mujoco
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
+RENDER_MODES = ("rgb_array", "depth_array", "human")
 
-class Closeable(Protocol):
-    """What holds a part of OpenGL."""
-
-    def close(self) -> None: ...
+_live: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
-_live: weakref.WeakSet[Closeable] = weakref.WeakSet()
+class Pictures:
+    """Frames for people, and camera images for a policy, of one environment.
+
+    Args:
+        mode: None or one of ``RENDER_MODES``.
+        camera, size: camera of ``frame``, and its (height, width) [pixels].
+        cameras, camera_size: the same for ``images``.
+        dt: real time between two frames of mode ``human`` [s].
+    """
+
+    def __init__(
+        self,
+        mode: str | None,
+        camera: str,
+        size: tuple[int, int],
+        cameras: Sequence[str],
+        camera_size: tuple[int, int],
+        dt: float,
+    ) -> None:
+        self._mode, self._cameras, self._camera_size, self._dt = mode, tuple(cameras), camera_size, dt
+        self._renderer = OffscreenRenderer(camera, size[1], size[0])
+        self._window = Window(camera)
+        self._next = 0.0
+
+    @property
+    def spaces(self) -> dict[str, spaces.Space[Any]]:
+        """The space of each of ``images``."""
+        return {f"{name}_image": spaces.Box(0, 255, (*self._camera_size, 3), np.uint8) for name in self._cameras}
+
+    def images(self, model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, NDArray[np.uint8]]:
+        """Return (height, width, 3) uint8 from each camera, as ``<camera>_image``."""
+        return {f"{n}_image": self._renderer.render(model, data, n, self._camera_size) for n in self._cameras}
+
+    def frame(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[Any] | None:
+        """Return a frame of the render mode; ``human`` shows it in a window instead, in real time."""
+        if self._mode == "rgb_array":
+            return self._renderer.render(model, data)
+        if self._mode == "depth_array":
+            return self._renderer.depth(model, data)
+        if self._mode == "human":
+            self._window.show(model, data)
+            self._next = max(self._next + self._dt, time.perf_counter())
+            time.sleep(max(0.0, self._next - time.perf_counter()))
+        else:
+            gym.logger.warn("render() does nothing without a render_mode: gym.make(…, render_mode='rgb_array')")
+        return None
+
+    def close(self) -> None:
+        """Free renderer and window; may be called more than once."""
+        self._renderer.close()
+        self._window.close()
 
 
 def _close_all() -> None:
@@ -57,7 +110,7 @@ class OffscreenRenderer:
         camera: str | None = None,
         size: tuple[int, int] | None = None,
     ) -> NDArray[np.uint8]:
-        """(height, width, 3) uint8.
+        """Return a picture (height, width, 3) uint8.
 
         Args:
             size: (height, width) [pixels].
@@ -78,7 +131,7 @@ class OffscreenRenderer:
         camera: str | None = None,
         size: tuple[int, int] | None = None,
     ) -> NDArray[np.float32]:
-        """(height, width) float32: distance from the camera along its viewing direction [m], not along each ray.
+        """Return (height, width) float32 distances along the viewing direction [m], not along each ray.
 
         The buffer holds b, which is linear in 1/z from 1 at the near plane to 0 at the far one, so
 
@@ -128,7 +181,7 @@ class OffscreenRenderer:
         self._model = model
 
     def close(self) -> None:
-        """Frees the OpenGL context; may be called more than once."""
+        """Free the OpenGL context; may be called more than once."""
         if self._gl is not None:
             if self._model is not None:
                 self._context.free()
@@ -136,8 +189,70 @@ class OffscreenRenderer:
         self._gl = self._model = None
 
 
-def close_at_exit(renderer: Closeable) -> None:
-    """Closes what uses OpenGL before OpenGL itself is cleaned up, if it still exists then."""
+class Window:
+    """A window that shows a copy of the simulation's state; a model's replacement opens a new one.
+
+    Once its user has closed it, it stays closed.
+
+    Args:
+        camera: where it looks from at first.
+    """
+
+    def __init__(self, camera: str) -> None:
+        self.camera = camera
+        self._model: mujoco.MjModel | None = None
+        self._viewer: Any = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the window is on the screen."""
+        return self._viewer is not None and bool(self._viewer.is_running())
+
+    def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Bring the window up to date.
+
+        Raises:
+            RuntimeError: there is no display to open a window on.
+        """
+        if self._model is not model:
+            self._open(model, data)
+        elif self.is_open:
+            mujoco.mj_copyData(self._data, model, data)
+            self._viewer.sync()
+
+    def _open(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self.close()
+        # MuJoCo waits for ever for a window that cannot be opened.
+        if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise RuntimeError(
+                "no window for render_mode='human': it needs a display with OpenGL, which the environment variable "
+                "DISPLAY or WAYLAND_DISPLAY names; render_mode='rgb_array' needs none."
+            )
+        self._data = copy(data)
+        launch = import_module("mujoco.viewer").launch_passive
+        self._viewer = launch(model, self._data, show_left_ui=False, show_right_ui=False)
+        close_at_exit(self)
+        with self._viewer.lock():
+            self._viewer.opt.geomgroup[0] = 0  # collision shapes
+            self._viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
+            self._viewer.cam.fixedcamid = camera_id(model, self.camera)
+        self._viewer.sync()
+        self._model = model
+
+    def close(self) -> None:
+        """Close the window; may be called more than once."""
+        if self._viewer is not None:
+            self._viewer.close()
+            # Its thread must be done before another window opens: GLFW serves one thread at a time.
+            deadline = time.monotonic() + 5.0
+            with suppress(mujoco.UnexpectedError):
+                while self._viewer.m is not None and time.monotonic() < deadline:
+                    time.sleep(0.01)
+        self._viewer = self._model = None
+
+
+def close_at_exit(renderer: Any) -> None:
+    """Close what uses OpenGL before OpenGL itself is cleaned up, if it still exists then."""
     _live.add(renderer)
     # The last to be registered is the first to run, and OpenGL has registered its own by now.
     atexit.unregister(_close_all)
@@ -145,7 +260,7 @@ def close_at_exit(renderer: Closeable) -> None:
 
 
 def camera_id(model: mujoco.MjModel, name: str) -> int:
-    """The id of a camera.
+    """Return the id of a camera.
 
     Raises:
         ValueError: there is none of this name; the message lists those that exist.
@@ -158,7 +273,7 @@ def camera_id(model: mujoco.MjModel, name: str) -> int:
 
 
 def _gl_context(width: int, height: int) -> Any:
-    """An OpenGL context that needs no display.
+    """Return an OpenGL context that needs no display.
 
     Raises:
         RuntimeError: there is none to be had on this machine.

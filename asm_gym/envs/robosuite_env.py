@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.envs import backend, shapes
+from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.actions import Actions
-from asm_gym.envs.cameras import RENDER_MODES, Pictures
-from asm_gym.envs.chains import chains_of
 from asm_gym.envs.edits import SimulatorEdits
 from asm_gym.envs.layout import Layout
-from asm_gym.envs.rewards import Rewards, RewardTerms
-from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Corruption, SensorErrors
+from asm_gym.envs.rendering import RENDER_MODES, Pictures
+from asm_gym.envs.robots import PHYSICS_FREQ, chains_of, force_behind, free_first_joints, robots_for
+from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Corruption
 from asm_gym.envs.simulation import Simulation
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.tasks import task as task_spec
-from asm_gym.validation import as_float32, check_choice, check_flag, check_number, check_numbers, check_text, shown
+from asm_gym.validation import check_choice, check_flag, check_number, check_numbers, check_text, shown
 
 _BAD = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
@@ -40,7 +40,6 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
     - ``stream`` (D,) float32: one row of the sensorimotor stream that ``stream_spec`` names;
     - ``success``: whether the task is solved now;
-    - ``reward_terms``: the parts of the reward by name, which add up to it (not on reset);
     - ``contact_force``: the largest net contact force on an arm within the step [N];
     - ``external_force``: the same of all that acts on it from outside, faults that push or pull included [N];
     - ``external_impulse``: that force's mean norm times the length of the step [N s];
@@ -96,7 +95,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         render_size: tuple[int, int] = (480, 480),
     ) -> None:
         self.task = task_spec(task)
-        self.robots = backend.robots_for(self.task, robot)
+        self.robots = robots_for(self.task, robot)
         check_choice("render_mode", render_mode, (None, *RENDER_MODES))
         check_choice("observation", observation, ("flat", "dict"))
         for name, names in (("stream", stream), ("cameras", cameras)):
@@ -104,10 +103,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
                 raise ValueError(f"{name} must be a sequence of names, got {shown(names)}")
         for group in stream:
             check_choice("stream group", check_text("stream group", group), (*GROUPS, *EXTRA_GROUPS))
-        if check_number("control_freq", control_freq, low=1, whole=True) and backend.PHYSICS_FREQ % control_freq:
-            raise ValueError(
-                f"control_freq must divide the physics rate of {backend.PHYSICS_FREQ} Hz, got {control_freq}"
-            )
+        if check_number("control_freq", control_freq, low=1, whole=True) and PHYSICS_FREQ % control_freq:
+            raise ValueError(f"control_freq must divide the physics rate of {PHYSICS_FREQ} Hz, got {control_freq}")
         if stream_freq is not None:
             check_number("stream_freq", stream_freq, low=1, whole=True)
         self._row_substeps = backend.row_substeps(control_freq if stream_freq is None else stream_freq, control_freq)
@@ -140,12 +137,12 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """What the arms may feel and how fast they may go in this episode; ``reset`` forgets it. ``info`` then holds
         ``contact_load``, the largest share of a limit that was felt within the step, ``contact_left_s``, when in it a
         limit was passed [s], not a number where none was, and ``contact_felt``, the step's mean of what was felt."""
-        self.substeps = backend.PHYSICS_FREQ // control_freq
+        self.substeps = PHYSICS_FREQ // control_freq
         self._groups = tuple(stream)
         self._flat = observation == "flat"
         self._seeded = False
         self._ended = True
-        self._steps = 0
+        self._steps_taken = 0
 
         self.controller = controller if isinstance(controller, str) else "custom"
         """Of the arms, by name."""
@@ -179,24 +176,25 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
     def _bind(self) -> None:
         """Takes up what belongs to the present model, which a hard reset replaces."""
-        backend.free_first_joints(self.robosuite_env)
+        free_first_joints(self.robosuite_env)
         self.simulation = Simulation(self.robosuite_env, self.substeps)
         """Physics, controllers and sensors of the loaded model."""
         self._warning_counts: Any = self.simulation.data.warning.number  # a view
         self._objects = backend.ObjectSensors(self.robosuite_env, self.task)
-        self._rewards = Rewards(self.task.name, self.robosuite_env)
-        self.simulation.keeps_history = self._rewards.reads_history
+        backend.speed_up_contacts(self.robosuite_env)
+        self.simulation.keeps_history = self.task.name == "Wipe"  # whose reward reads it
 
     def _build_spaces(self) -> None:
         action = Channel("action", self._actions.size, "1", 0.0, MOTOR)
         everything = (*self.simulation.proprioception.channels, *self._objects.channels, action)
-        dt, source = self._row_substeps / backend.PHYSICS_FREQ, "+".join(self.robots)
+        dt, source = self._row_substeps / PHYSICS_FREQ, "+".join(self.robots)
         self.measured_spec = StreamSpec(everything, dt, source)
         """Everything that is measured, whether or not the stream carries it."""
         ends = "external_torque", "wrist_force"
         self.felt_channels = tuple(c for c in everything if c.name.endswith(ends))
         """Of what the arms feel: external torque of the joints and force at the wrist, of one arm after another."""
-        self._errors = SensorErrors(self.measured_spec, self.sensor_noise)
+        self._noise = self.measured_spec.noise * self.sensor_noise
+        self._steps = self.measured_spec.resolution if self.sensor_noise else np.zeros(self.measured_spec.size)
         self._layout = Layout(self.measured_spec, self._groups, self._flat)
         self._overlooked = "object" not in self._groups
         self.observation_layout = self._layout.sizes
@@ -210,11 +208,11 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         Raises:
             ValueError: a rate that does not fit physics or control; the message lists those that do.
         """
-        return backend.PHYSICS_FREQ // self._row_substeps
+        return PHYSICS_FREQ // self._row_substeps
 
     @stream_freq.setter
     def stream_freq(self, rate: int) -> None:
-        self._row_substeps = backend.row_substeps(rate, backend.PHYSICS_FREQ // self.substeps)
+        self._row_substeps = backend.row_substeps(rate, PHYSICS_FREQ // self.substeps)
         self._build_spaces()
 
     def stream_spec_at(self, rate: int) -> StreamSpec:
@@ -223,8 +221,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         Raises:
             ValueError: a rate that does not fit physics or control.
         """
-        substeps = backend.row_substeps(rate, backend.PHYSICS_FREQ // self.substeps)
-        return replace(self.stream_spec, dt=substeps / backend.PHYSICS_FREQ)
+        substeps = backend.row_substeps(rate, PHYSICS_FREQ // self.substeps)
+        return replace(self.stream_spec, dt=substeps / PHYSICS_FREQ)
 
     # ------------------------------------------------------------------ episodes
 
@@ -265,7 +263,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         else:
             self.simulation.begin_episode()
         self._warnings = self._bad_count()
-        self._steps, self.holding = 0, False
+        self._steps_taken, self.holding = 0, False
         self.contact_limits = None
         self._action = np.zeros(self._actions.size, np.float32)
         self._row = self.measure()
@@ -304,25 +302,22 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             # What was done last is what the stream says was commanded.
             self._action = self._actions.resting(self.simulation, self._action)
         env.cur_time += env.control_timestep
-        self._steps += 1
-        reward = self._rewards(self._action)
+        self._steps_taken += 1
+        reward, success = float(env._post_action(self._action)[0]), bool(env._check_success())
         self._row = self.measure()
-        # As float32, for a number that is too large for the stream is infinite there.
-        self._finite &= bool(np.isfinite(as_float32(self._row)).all()) if self.corruptions else self._reading.whole
-        if unstable := self._bad_count() != self._warnings or not self._finite:
-            # What the simulation holds now, MuJoCo's initial state as a rule, is nothing that the robot could sense.
-            self._row[:] = np.nan
-            reward = RewardTerms(dict.fromkeys(reward.terms, 0.0), False)
-        info = self._info(reward.success, unstable)
+        if unstable := self._bad_count() != self._warnings or not (self._finite and self._row_finite):
+            # The simulation then holds MuJoCo's initial state as a rule, which no sensor of the robot could read.
+            self._row[:] = self._stream[:] = np.nan
+            reward, success = 0.0, False
+        info = self._info(success, unstable)
         if self._row_substeps < self.substeps and "stream" in info:
             info["streams"] = np.stack([*self._rows, info["stream"]])
-        info["reward_terms"] = reward.terms
-        terminated = self.terminate_on_success and reward.success
-        truncated = self._steps >= self.horizon or unstable
+        terminated = self.terminate_on_success and success
+        truncated = self._steps_taken >= self.horizon or unstable
         self._ended = terminated or truncated
         if self.render_mode == "human":
             self.render()
-        return self._observation(), float(sum(reward.terms.values())), terminated, truncated, info
+        return self._observation(), reward, terminated, truncated, info
 
     def _advance(self) -> None:
         """The substeps of a control step, and the rows of the stream that come before its end."""
@@ -332,13 +327,12 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             for hook in self.substep_hooks:
                 hook(done - 1)
             if done % self._row_substeps == 0 and done < self.substeps:
-                measured = self._read(within=True)
-                row = self.to_stream(measured) if self.corruptions else self._reading.stream
-                self._finite &= bool(np.isfinite(row).all()) if self.corruptions else self._reading.through
+                self._read(within=True)
+                self._finite &= self._stream_finite
                 self.simulation.begin_row()
-                self._rows.append(row)
-                for feel in self.row_hooks:
-                    feel(row)
+                self._rows.append(self._stream)
+                for hook_of_row in self.row_hooks:
+                    hook_of_row(self._stream)
 
     def command(self, action: NDArray[np.float32]) -> None:
         """From within a hook: another action for the rest of the control step, efference copy included.
@@ -396,26 +390,22 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         return self._read()
 
     def _read(self, within: bool = False) -> NDArray[np.float64]:
-        """As ``measure``; ``within`` a control step objects stay where they were seen last, if nobody looks at them."""
-        faults, rng = self.corruptions, self.np_random
-        if faults or not (within and self._overlooked):
-            self._seen = np.concatenate([*self._objects.read(), np.zeros(0)])
-        beside = np.concatenate([self._seen, self._action])
-        if faults:
-            return self._errors.added(np.concatenate([self.simulation.sense(), beside]), faults, rng)
-        drawn = rng.standard_normal(self.measured_spec.size)
-        self._reading = self.simulation.read(beside, self._errors, drawn, self._layout.carried)
-        return self._reading.row
-
-    def to_stream(self, row: NDArray[np.float64]) -> NDArray[np.float32]:
-        """(D,) what of a measured row the stream carries."""
-        return self._layout.stream(row)
+        """As ``measure``; ``within`` a control step objects keep their last pose, if the stream does not carry them."""
+        if self.corruptions or not (within and self._overlooked):
+            self._object_poses = np.concatenate([*self._objects.read(), np.zeros(0)])
+        beside = np.concatenate([self._object_poses, self._action])
+        row = self.simulation.sense(beside, self._noise, self.np_random)
+        for corrupt in self.corruptions:
+            corrupt(row)
+        self._stream = np.empty(len(self._layout.carried), np.float32)
+        self._row_finite, self._stream_finite = kernels.quantise(row, self._steps, self._layout.carried, self._stream)
+        return row
 
     def _observation(self) -> Any:
         return self._layout.observation(self._row, self._pictures.images(self.simulation.model, self.simulation.data))
 
     def _info(self, success: bool, unstable: bool = False) -> dict[str, Any]:
-        info: dict[str, Any] = {"stream": self.to_stream(self._row)} if self._layout.stream_spec else {}
+        info: dict[str, Any] = {"stream": self._stream} if self._layout.stream_spec else {}
         sim = self.simulation
         felt = sim.contact_force, sim.external_force, sim.mean_external_force / self.metadata["render_fps"]
         names = "contact_force", "external_force", "external_impulse"
@@ -423,7 +413,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         if self.contact_limits is not None:
             passed = sim.passed_limit
             info["contact_load"] = np.inf if unstable else sim.load
-            info["contact_left_s"] = np.nan if passed is None else (passed + 1) / backend.PHYSICS_FREQ
+            info["contact_left_s"] = np.nan if passed is None else (passed + 1) / PHYSICS_FREQ
             info["contact_felt"] = sim.mean_felt
         return info | {"success": success, **forces, "unstable": unstable}
 
@@ -448,8 +438,9 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         return self._row.copy()
 
     def force_behind(self, torques: NDArray[np.floating[Any]]) -> tuple[str, NDArray[np.float64]]:
-        """The link on which a force would explain external torques (J,) [N m] best, and that force (3,) [N]."""
-        return self.simulation.force_behind(np.asarray(torques, np.float64))
+        """Return the link on which a force explains external torques (J,) [N m] best, and that force (3,) [N]."""
+        sim = self.simulation
+        return force_behind(sim.model, sim.data, sim.motors, sim.dofs, np.asarray(torques, np.float64))
 
     @property
     def motors(self) -> NDArray[np.intp]:

@@ -1,4 +1,4 @@
-"""Which channels an arm has, where in the simulation each is read, and what its sensor makes of it.
+"""The channels of an arm: where in the simulation each is read, and the errors of its sensor.
 
 A contact can come and go inside one control step, so torques, wrenches and contacts are sampled after every physics
 substep and summarised (mean, and signed peak: the value of largest magnitude), while positions and velocities are read
@@ -7,8 +7,7 @@ at the end of the step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import mujoco
@@ -17,73 +16,63 @@ from numpy.typing import NDArray
 
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.mujoco_views import Views
-from asm_gym.spec import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel
 
 Corruption = Callable[[NDArray[np.float64]], None]
 """A sensor fault: edits a measured row in place."""
 
 GROUPS = ("joint", "torque", "hand", "wrench", "gripper", MOTOR)
-"""The channel groups of a stream by default, in the order they stand in a row."""
+"""The channel groups of a stream by default, in the order of a row."""
 
 EXTRA_GROUPS = ("contact", "object")
-"""What no real robot measures about itself, for those who ask."""
+"""Groups that no real robot measures about itself."""
 
 
 class _Sensor(NamedTuple):
-    """What one reading is worth."""
+    """One channel of an arm."""
 
-    noise: float  # standard deviation [unit of the channel]
-    resolution: float = 0.0  # step between readings [unit of the channel]; 0 for what is computed from several sensors
+    name: str
+    group: str
+    unit: str  # of fingers that slide; see ``_TURNING``
+    source: str  # a key of ``Proprioception._sources``
+    part: slice | str  # of a sample, or a key of ``_indices``
+    noise: float = 0.0  # standard deviation [unit]
+    resolution: float = 0.0  # step between readings [unit]; 0 for what is computed from several sensors
 
 
 _COUNT = np.deg2rad(0.01)
 """[rad]: 15 bits of a turn; the link-side encoders of DLR's light-weight arm, from which the iiwa descends."""
 
+_FORCE, _TORQUE = (slice(kernels.WRENCH.start + i, kernels.WRENCH.start + i + 3) for i in (0, 3))
+_LINEAR, _ANGULAR = (slice(kernels.VELOCITY.start + i, kernels.VELOCITY.start + i + 3) for i in (0, 3))
+
 # About what a research arm's own sensors have. Resolutions: DLR, "Joint sensors of the light-weight robot" (0.01°);
 # Franka Emika, Panda data sheet (0.02 N m, 13 bits of ±87 N m); ATI Industrial Automation, Gamma SI-130-10 (±130 N in
 # steps of 1/20 N, ±10 N m in steps of 1/800 N m). A velocity is the difference of two counts, 50 ms apart. Mean and
 # peak come out of the sensor's own filter, in its steps. The rest is computed in floating point from several of these.
-_SENSORS = {
-    "joint_position": _Sensor(2e-4, _COUNT),
-    "joint_velocity": _Sensor(3e-3, _COUNT / 0.05),
-    "measured_torque": _Sensor(0.1, 0.02),
-    "external_torque": _Sensor(0.15),
-    "external_torque_peak": _Sensor(0.3),
-    "hand_position": _Sensor(3e-4),
-    "hand_orientation": _Sensor(5e-4),
-    "hand_velocity": _Sensor(3e-3),
-    "hand_angular_velocity": _Sensor(1e-2),
-    "wrist_force": _Sensor(0.2, 1 / 20),
-    "wrist_force_peak": _Sensor(0.4, 1 / 20),
-    "wrist_torque": _Sensor(0.01, 1 / 800),
-    "wrist_torque_peak": _Sensor(0.02, 1 / 800),
-    "gripper_opening": _Sensor(2e-4),
-    "gripper_velocity": _Sensor(2e-3),
-    "gripper_force": _Sensor(0.2),
-}
-_EXACT = _Sensor(0.0)
-
-
-Stops = tuple[tuple[float, float], ...]
-
-
-@dataclass
-class _Table:
-    """Channels, and the index of each of their numbers in what ``Proprioception.sources`` lays end to end."""
-
-    starts: dict[str, int]
-    prefix: str
-    channels: list[Channel] = field(default_factory=list)
-    indices: list[NDArray[np.intp]] = field(default_factory=list)
-
-    def add(self, group: str, name: str, unit: str, source: str, where: Any, stops: Stops = ()) -> None:
-        index = np.atleast_1d(np.asarray(where, dtype=np.intp)) + self.starts[source]
-        if index.size:
-            noise, resolution = _SENSORS.get(name, _EXACT)
-            self.channels.append(
-                Channel(self.prefix + name, index.size, unit, noise, group, resolution=resolution, stops=stops)
-            )
-            self.indices.append(index)
+_SENSORS = (
+    _Sensor("joint_position", "joint", "rad", "qpos", "joints", 2e-4, _COUNT),
+    _Sensor("joint_velocity", "joint", "rad/s", "qvel", "dofs", 3e-3, _COUNT / 0.05),
+    _Sensor("commanded_torque", "torque", "N m", "ctrl", "motors"),
+    _Sensor("measured_torque", "torque", "N m", "mean", kernels.MOTOR, 0.1, 0.02),
+    _Sensor("external_torque", "torque", "N m", "mean", kernels.EXTERNAL, 0.15),
+    _Sensor("external_torque_peak", "torque", "N m", "peak", kernels.EXTERNAL, 0.3),
+    _Sensor("hand_position", "hand", "m", "site", "hand", 3e-4),
+    _Sensor("hand_orientation", "hand", "1", "body", "turn", 5e-4),
+    _Sensor("hand_velocity", "hand", "m/s", "last", _LINEAR, 3e-3),
+    _Sensor("hand_angular_velocity", "hand", "rad/s", "last", _ANGULAR, 1e-2),
+    _Sensor("wrist_force", "wrench", "N", "mean", _FORCE, 0.2, 1 / 20),
+    _Sensor("wrist_torque", "wrench", "N m", "mean", _TORQUE, 0.01, 1 / 800),
+    _Sensor("wrist_force_peak", "wrench", "N", "peak", _FORCE, 0.4, 1 / 20),
+    _Sensor("wrist_torque_peak", "wrench", "N m", "peak", _TORQUE, 0.02, 1 / 800),
+    _Sensor("gripper_opening", "gripper", "m", "qpos", "fingers", 2e-4),
+    _Sensor("gripper_velocity", "gripper", "m/s", "qvel", "finger_dofs", 2e-3),
+    _Sensor("gripper_force", "gripper", "N", "force", "finger_dofs", 0.2),
+    _Sensor("contact_force", "contact", "N", "mean", kernels.CONTACT),
+    _Sensor("contact_force_peak", "contact", "N", "peak", kernels.CONTACT),
+)
+_TURNING = {"m": "rad", "m/s": "rad/s", "N": "N m"}
+"""Units of a gripper whose fingers turn."""
 
 
 class Proprioception:
@@ -97,7 +86,7 @@ class Proprioception:
     def __init__(self, parts: list[tuple[Any, str]], views: Views, data: mujoco.MjData) -> None:
         shape = (len(parts), kernels.SAMPLE)
         self.mean, self.peak, self.last = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-        self._sources = {
+        sources = {
             "mean": self.mean.ravel(),
             "peak": self.peak.ravel(),
             "last": self.last.ravel(),
@@ -108,91 +97,56 @@ class Proprioception:
             "site": views.site_xpos.ravel(),
             "body": data.xmat.ravel(),
         }
-        ends = np.cumsum([a.size for a in self._sources.values()])
-        starts = {n: int(e) - a.size for (n, a), e in zip(self._sources.items(), ends, strict=True)}
-        tables = [_Table(starts, f"robot{i}_" if len(parts) > 1 else "") for i in range(len(parts))]
-        for i, ((robot, arm), table) in enumerate(zip(parts, tables, strict=True)):
-            _fill(table, robot, arm, i * kernels.SAMPLE)
-        self.channels = tuple(c for t in tables for c in t.channels)
-        self._index = np.concatenate([index for t in tables for index in t.indices])
-        begins = np.array(list(starts.values()))
-        which = np.searchsorted(begins, self._index, side="right") - 1
-        self.where = np.stack([which, self._index - begins[which]], axis=1)
-        """(P, 2) of each of their numbers the source, and its place there."""
-        self.sources = [self.mean, self.peak, self.last, *list(self._sources.values())[3:]]
-        """What they are read from."""
-
-    def read(self) -> NDArray[np.float64]:
-        """One number for every element of ``channels``; noiseless."""
-        values: NDArray[np.float64] = np.concatenate(list(self._sources.values()))[self._index]
-        return values
-
-
-class SensorErrors:
-    """What sensors make of the truth: noise, then whatever a fault does, then steps of their resolution.
-
-    Args:
-        spec: of the row that is read.
-        scale: of the noise; at 0 readings are exact, and in no steps.
-    """
-
-    def __init__(self, spec: StreamSpec, scale: float) -> None:
-        self.noise = spec.noise * scale
-        """(M,) standard deviations."""
-        self.steps = spec.resolution if scale else np.zeros(spec.size)
-        """(M,) of resolution; 0 for none."""
-        self._stepped = np.flatnonzero(self.steps)
-
-    def added(
-        self, row: NDArray[np.float64], faults: Sequence[Corruption], rng: np.random.Generator
-    ) -> NDArray[np.float64]:
-        """(M,) the row as it is read; it is changed in place."""
-        row += self.noise * rng.standard_normal(row.size)
-        for corrupt in faults:
-            corrupt(row)
-        with np.errstate(over="ignore"):  # of a simulation that diverges
-            steps = self.steps[self._stepped]
-            row[self._stepped] = np.rint(row[self._stepped] / steps) * steps
-        return row
+        self.sources = tuple(sources.values())
+        """Arrays that the sensors read."""
+        channels, where, names = [], [], list(sources)
+        for i, (robot, arm) in enumerate(parts):
+            indices, slides, stops = _indices(robot, arm)
+            joints = len(indices["joints"])
+            for sensor in _SENSORS:
+                if isinstance(sensor.part, str):
+                    at = indices[sensor.part]
+                else:
+                    at = np.arange(sensor.part.start, sensor.part.stop) + i * kernels.SAMPLE
+                    at = at[:joints] if sensor.group == "torque" else at
+                if not len(at):
+                    continue
+                unit = _TURNING[sensor.unit] if sensor.group == "gripper" and not slides else sensor.unit
+                channels.append(
+                    Channel(
+                        (f"robot{i}_" if len(parts) > 1 else "") + sensor.name,
+                        len(at),
+                        unit,
+                        sensor.noise,
+                        sensor.group,
+                        resolution=sensor.resolution,
+                        stops=stops if sensor.name == "joint_position" else (),
+                    )
+                )
+                where += [(names.index(sensor.source), int(k)) for k in at]
+        self.channels = tuple(channels)
+        self.where = np.array(where, np.int64)
+        """(P, 2) of each number its source and its index there."""
 
 
-def _fill(table: _Table, robot: Any, arm: str, sample: int) -> None:
-    """Adds one arm's channels; ``sample`` is where its samples begin."""
+def _indices(robot: Any, arm: str) -> tuple[dict[str, NDArray[np.intp]], bool, tuple[tuple[float, float], ...]]:
+    """Return where an arm's sensors read, whether its fingers slide, and the joints' stops where any has some [rad]."""
     model = robot.sim.model._model
-    site = 3 * robot.eef_site_id[arm]
-    body = 9 * mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, robot.robot_model.eef_name[arm])
-    gripper = robot.gripper[arm]
-    fingers = robot._ref_gripper_joint_pos_indexes[arm] if gripper.joints else []
-    finger_velocity = robot._ref_gripper_joint_vel_indexes[arm] if gripper.joints else []
-    dofs = np.asarray(robot._ref_joint_vel_indexes)
-    n = len(dofs)
-
-    def sampled(part: slice, count: int | None = None, skip: int = 0) -> NDArray[np.intp]:
-        return np.arange(part.start + skip, part.stop)[:count] + sample
-
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, robot.robot_model.eef_name[arm])
+    fingers = robot.gripper[arm].joints
+    finger_dofs = np.asarray(robot._ref_gripper_joint_vel_indexes[arm] if fingers else [], np.intp)
+    indices = {
+        "joints": robot._ref_joint_pos_indexes,
+        "dofs": robot._ref_joint_vel_indexes,
+        "motors": robot._ref_actuators_indexes_dict[arm],
+        "hand": 3 * robot.eef_site_id[arm] + np.arange(3),
+        # The first two columns of the rotation: six numbers that turn smoothly, where a quaternion flips its sign.
+        "turn": 9 * body + np.array([0, 3, 6, 1, 4, 7]),
+        "fingers": robot._ref_gripper_joint_pos_indexes[arm] if fingers else [],
+        "finger_dofs": finger_dofs,
+    }
+    slides = all(model.jnt_type[model.dof_jntid[d]] == mujoco.mjtJoint.mjJNT_SLIDE for d in finger_dofs)
     joints = robot._ref_joint_indexes
     ranges = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], (-np.inf, np.inf))
     stops = tuple((float(low), float(high)) for low, high in ranges) if model.jnt_limited[joints].any() else ()
-    table.add("joint", "joint_position", "rad", "qpos", robot._ref_joint_pos_indexes, stops)
-    table.add("joint", "joint_velocity", "rad/s", "qvel", dofs)
-    table.add("torque", "commanded_torque", "N m", "ctrl", robot._ref_actuators_indexes_dict[arm])
-    table.add("torque", "measured_torque", "N m", "mean", sampled(kernels.MOTOR, n))
-    table.add("torque", "external_torque", "N m", "mean", sampled(kernels.EXTERNAL, n))
-    table.add("torque", "external_torque_peak", "N m", "peak", sampled(kernels.EXTERNAL, n))
-    table.add("hand", "hand_position", "m", "site", site + np.arange(3))
-    # The first two columns of the rotation: six numbers that turn smoothly, where a quaternion flips its sign.
-    table.add("hand", "hand_orientation", "1", "body", body + np.array([0, 3, 6, 1, 4, 7]))
-    table.add("hand", "hand_velocity", "m/s", "last", sampled(kernels.VELOCITY, 3))
-    table.add("hand", "hand_angular_velocity", "rad/s", "last", sampled(kernels.VELOCITY, 3, 3))
-    table.add("wrench", "wrist_force", "N", "mean", sampled(kernels.WRENCH, 3))
-    table.add("wrench", "wrist_torque", "N m", "mean", sampled(kernels.WRENCH, 3, 3))
-    table.add("wrench", "wrist_force_peak", "N", "peak", sampled(kernels.WRENCH, 3))
-    table.add("wrench", "wrist_torque_peak", "N m", "peak", sampled(kernels.WRENCH, 3, 3))
-    # Fingers slide or turn, by the gripper.
-    slides = [model.jnt_type[model.dof_jntid[d]] == mujoco.mjtJoint.mjJNT_SLIDE for d in finger_velocity]
-    length, force = ("m", "N") if all(slides) else ("rad", "N m")
-    table.add("gripper", "gripper_opening", length, "qpos", fingers)
-    table.add("gripper", "gripper_velocity", f"{length}/s", "qvel", finger_velocity)
-    table.add("gripper", "gripper_force", force, "force", finger_velocity)
-    table.add("contact", "contact_force", "N", "mean", sampled(kernels.CONTACT))
-    table.add("contact", "contact_force_peak", "N", "peak", sampled(kernels.CONTACT))
+    return {name: np.asarray(at, np.intp) for name, at in indices.items()}, slides, stops

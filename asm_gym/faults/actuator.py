@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Apply, Fault, check_joint, edited, group_labels, joint_labels, listed, model_of, within
+from asm_gym.faults.base import Apply, Fault, check_joint, group_labels, joint_labels, listed, model_of, within
 
 _TORQUES = ("measured_torque", "commanded_torque", "external_torque", "external_torque_peak")
 _MOTION = ("joint_velocity", "joint_position")
@@ -52,7 +52,7 @@ class WeakJoint(_OnJoint):
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with edited(env, model_of(env).actuator_gear, (int(env.motors[self.joint]), 0)) as change:
+        with env.edits.edit(model_of(env).actuator_gear, (int(env.motors[self.joint]), 0)) as change:
             yield lambda i: change(lambda gear: gear * (1.0 - i * (1.0 - self.strength)))
 
 
@@ -67,7 +67,7 @@ class StuckJoint(_OnJoint):
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with edited(env, model_of(env).dof_frictionloss, self.dof(env)) as change:
+        with env.edits.edit(model_of(env).dof_frictionloss, self.dof(env)) as change:
             yield lambda _: change(lambda friction: friction + 1000.0)
 
 
@@ -87,7 +87,7 @@ class JointFriction(_OnJoint):
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
         model, dof = model_of(env), self.dof(env)
-        with edited(env, model.dof_frictionloss, dof) as dry, edited(env, model.dof_damping, dof) as wet:
+        with env.edits.edit(model.dof_frictionloss, dof) as dry, env.edits.edit(model.dof_damping, dof) as wet:
 
             def apply(i: float) -> None:
                 dry(lambda friction: friction + i * self.newton_metres)
@@ -183,7 +183,10 @@ class WeakGripper(_OnGripper):
             for arm in robot.arms
             for m in robot._ref_joint_gripper_actuator_indexes[arm] or ()
         ]
-        with edited(env, model.actuator_gainprm, *motors) as gain, edited(env, model.actuator_biasprm, *motors) as bias:
+        with (
+            env.edits.edit(model.actuator_gainprm, *motors) as gain,
+            env.edits.edit(model.actuator_biasprm, *motors) as bias,
+        ):
 
             def apply(i: float) -> None:
                 left = 1.0 - i * (1.0 - self.strength)

@@ -213,22 +213,6 @@ def data_of(env: RobosuiteEnv) -> mujoco.MjData:
 
 
 @contextmanager
-def edited(env: RobosuiteEnv, array: NDArray[Any], *indices: Any) -> Iterator[Callable[[Callable[[Any], Any]], None]]:
-    """Entries of an array that are changed alike; yields the function that says how."""
-    edits = [env.edits.edit(array, index) for index in indices]
-
-    def change(rule: Callable[[Any], Any]) -> None:
-        for edit in edits:
-            edit.change(rule)
-
-    try:
-        yield change
-    finally:
-        for edit in edits:
-            edit.release()
-
-
-@contextmanager
 def listed(items: list[Any], item: Any) -> Iterator[None]:
     """``item`` stands in the list while the block runs."""
     items.append(item)

@@ -18,7 +18,6 @@ from asm_gym.faults.base import (
     along,
     body_id,
     data_of,
-    edited,
     group_labels,
     listed,
     model_of,
@@ -51,7 +50,7 @@ def _force_field(env: RobosuiteEnv, body: int, force: Force) -> Iterator[None]:
     """A force that follows the body's position and velocity, brought up to date in every physics substep."""
     model, data = model_of(env), data_of(env)
     velocity = np.zeros(6)
-    with edited(env, data.xfrc_applied, (body, slice(0, 3))) as change:
+    with env.edits.edit(data.xfrc_applied, (body, slice(0, 3))) as change:
 
         def update(_: int = 0) -> None:
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
@@ -83,7 +82,7 @@ class Push(_OnBody):
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
         force = self.newtons * along("direction", self.direction)
-        with edited(env, data_of(env).xfrc_applied, (body_id(env, self.body), slice(0, 3))) as change:
+        with env.edits.edit(data_of(env).xfrc_applied, (body_id(env, self.body), slice(0, 3))) as change:
             yield lambda i: change(lambda others: others + i * force)
 
 
@@ -101,7 +100,7 @@ class Payload(_OnBody):
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with edited(env, model_of(env).body_mass, body_id(env, self.body)) as change:
+        with env.edits.edit(model_of(env).body_mass, body_id(env, self.body)) as change:
             yield lambda i: change(lambda mass: mass + i * self.kilograms)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Apply, Fault, edited, listed, model_of, within
+from asm_gym.faults.base import Apply, Fault, listed, model_of, within
 from asm_gym.faults.body import Push
 from asm_gym.faults.object import ObjectFault
 
@@ -54,7 +54,7 @@ class ObjectMass(ObjectFault):
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with edited(env, model_of(env).body_mass, self.body_of(env)) as change:
+        with env.edits.edit(model_of(env).body_mass, self.body_of(env)) as change:
             yield lambda i: change(lambda mass: mass * (1.0 + i * (self.factor - 1.0)))
 
 
@@ -74,7 +74,7 @@ class ObjectFriction(ObjectFault):
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
         entries = [(g, slice(0, 1)) for g in self.geoms_of(env)]
-        with edited(env, model_of(env).geom_friction, *entries) as change:
+        with env.edits.edit(model_of(env).geom_friction, *entries) as change:
             yield lambda i: change(lambda mu: mu * (1.0 + i * (self.factor - 1.0)))
 
 
@@ -131,7 +131,7 @@ class Lighting(_Anywhere):
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
         light = model_of(env).light_diffuse
-        with edited(env, light, *range(len(light))) as change:
+        with env.edits.edit(light, *range(len(light))) as change:
             yield lambda i: change(lambda colour: colour * (1.0 + i * (self.factor - 1.0)))
 
 
@@ -150,5 +150,5 @@ class CameraShift(_Anywhere):
         cameras = model_of(env).cam_pos
         direction = self.rng().standard_normal(3)
         shift = self.metres * direction / np.linalg.norm(direction)
-        with edited(env, cameras, *range(len(cameras))) as change:
+        with env.edits.edit(cameras, *range(len(cameras))) as change:
             yield lambda i: change(lambda position: position + i * shift)

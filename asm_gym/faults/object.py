@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Apply, Fault, Vector3, along, data_of, edited, group_labels, model_of, within
+from asm_gym.faults.base import Apply, Fault, Vector3, along, data_of, group_labels, model_of, within
 from asm_gym.validation import check_numbers
 
 _AWAY = np.array([8.0, 8.0, 0.5])  # where a missing object lies [m]
@@ -98,7 +98,10 @@ class Slip(ObjectFault):
         model, geoms = model_of(env), self.geoms_of(env)
         entries = [(g, slice(0, 1)) for g in geoms]
         # Between two surfaces the higher friction counts, unless one has priority.
-        with edited(env, model.geom_friction, *entries) as change, edited(env, model.geom_priority, *geoms) as first:
+        with (
+            env.edits.edit(model.geom_friction, *entries) as change,
+            env.edits.edit(model.geom_priority, *geoms) as first,
+        ):
             first(lambda priority: priority + 1)
             yield lambda i: change(lambda mu: mu * (self.friction / mu) ** i)
 
@@ -123,7 +126,7 @@ class Snatch(ObjectFault):
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
         force = self.newtons * along("direction", self.direction)
-        with edited(env, data_of(env).xfrc_applied, (self.body_of(env), slice(0, 3))) as change:
+        with env.edits.edit(data_of(env).xfrc_applied, (self.body_of(env), slice(0, 3))) as change:
             yield lambda i: change(lambda others: others + i * force)
 
 
@@ -178,5 +181,5 @@ class Heavy(ObjectFault):
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with edited(env, model_of(env).body_mass, self.body_of(env)) as change:
+        with env.edits.edit(model_of(env).body_mass, self.body_of(env)) as change:
             yield lambda i: change(lambda mass: mass + i * self.kilograms)

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.envs.backend import PHYSICS_FREQ
+from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
 from asm_gym.policies.hostile import BANG_STEPS, Hostile

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.envs.backend import PHYSICS_FREQ
+from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.scripts.reproduce.harm_agents import EXCESS
 from asm_gym.scripts.reproduce.harm_report import TRANSIENT
 from asm_gym.scripts.reproduce.kit import Record

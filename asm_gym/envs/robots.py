@@ -1,0 +1,272 @@
+"""The robots of a loaded model: arms, controllers, kinematic chains, grippers, and their nominal dynamics."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.envs import compiled_substeps as kernels
+from asm_gym.envs.mujoco_views import JOINT_POSITION, JOINTS, OSC_POSE, Arms, Ints, NominalViews, Views
+from asm_gym.kinematics import Chain
+from asm_gym.tasks import ROBOTS, TaskSpec
+from asm_gym.validation import check_choice, check_text, shown
+
+PHYSICS_FREQ = 500
+"""Robosuite's physics rate [Hz]."""
+
+Part = tuple[Any, str]
+"""One of robosuite's robots, and the name of one of its arms."""
+
+
+def robots_for(task: TaskSpec, robot: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Return one robot for each of the task's arms; one name stands for as many as the task takes.
+
+    Raises:
+        ValueError: an unknown robot, or the wrong number of them.
+    """
+    if robot is not None and not isinstance(robot, Sequence):
+        raise ValueError(f"robot must be a name or a sequence of names, got {shown(robot)}")
+    names = (robot or "Panda",) * task.arms if robot is None or isinstance(robot, str) else tuple(robot)
+    for name in names:
+        check_choice("robot", check_text("robot", name), ROBOTS)
+    if len(names) != task.arms:
+        raise ValueError(f"{task.name} takes {task.arms} robot{'s' * (task.arms > 1)}, got {', '.join(names)}")
+    return names
+
+
+def free_first_joints(env: Any) -> None:
+    """Let every Sawyer turn in its base, once a model is loaded.
+
+    Robosuite's Sawyer touches its own base with its shoulder, to within rounding (1e-16 m): where that makes a contact,
+    which depends on the pose, its friction holds the first joint against 20 N m and more.
+    """
+    model = env.sim.model
+    for robot in env.robots:
+        if robot.name == "Sawyer":
+            shoulder = model.geom_name2id(f"{robot.robot_model.naming_prefix}link0_collision")
+            model.geom_contype[shoulder] = model.geom_conaffinity[shoulder] = 0
+
+
+def gripper_actions(robots: list[Any]) -> tuple[int, ...]:
+    """Return the indices of an action that command grippers."""
+    found: list[int] = []
+    start = 0
+    for robot in robots:
+        for part, (low, high) in robot._action_split_indexes.items():
+            if "gripper" in part:
+                found += range(start + low, start + high)
+        start += robot.action_dim
+    return tuple(found)
+
+
+def is_compilable(robot: Any, arm: str) -> bool:
+    """Whether the compiled loop implements the arm's controller."""
+    controller = robot.composite_controller.part_controllers[arm]
+    if len(robot.arms) > 1 or robot.is_mobile or controller.name not in ("OSC_POSE", "JOINT_POSITION"):
+        return False
+    if controller.impedance_mode != "fixed" or controller.input_type != "delta" or not controller.lite_physics:
+        return False
+    if controller.joint_dim > JOINTS:
+        return False
+    if controller.name == "JOINT_POSITION":
+        return controller.interpolator is None
+    return bool(
+        controller.uncoupling
+        and controller._goal_update_mode == "achieved"
+        and controller.interpolator_pos is None
+        and controller.interpolator_ori is None
+        and controller.position_limits is None
+        and controller.orientation_limits is None
+    )
+
+
+def describe(parts: list[Part], model: mujoco.MjModel) -> Arms:
+    """Return one row for each arm; the settings of controllers that do not run compiled stay 0."""
+    n = len(parts)
+
+    def whole(*shape: int) -> Ints:
+        return np.zeros((n, *shape), np.int64)
+
+    arms = Arms(
+        joints=whole(),
+        qpos=whole(JOINTS),
+        dofs=whole(JOINTS),
+        motors=whole(JOINTS),
+        site=whole(),
+        site_body=whole(),
+        root=whole(),
+        base=whole(),
+        wrench=whole(),
+        bodies=_padded([bodies(model, robot) for robot, _ in parts]),
+        tree=_padded([_carried_dofs(model, robot) for robot, _ in parts]),
+        kind=whole(),
+        kp=np.zeros((n, JOINTS)),
+        kd=np.zeros((n, JOINTS)),
+        compensate=np.zeros(n, bool),
+        rest=np.zeros((n, JOINTS)),
+        limits=np.tile([-np.inf, np.inf], (n, JOINTS, 1)),
+    )
+    for a, (robot, arm) in enumerate(parts):
+        _fill_indices(arms, a, model, robot, arm)
+        if is_compilable(robot, arm):
+            _fill_settings(arms, a, model, robot.composite_controller.part_controllers[arm])
+    return arms
+
+
+def bodies(model: mujoco.MjModel, robot: Any) -> Ints:
+    """Return the bodies of a robot."""
+    root = model.body(robot.robot_model.root_body).id
+    return np.flatnonzero(model.body_rootid == root).astype(np.int64)
+
+
+def _fill_indices(arms: Arms, a: int, model: mujoco.MjModel, robot: Any, arm: str) -> None:
+    joints = slice(len(robot._ref_joint_pos_indexes))
+    arms.joints[a] = joints.stop
+    arms.qpos[a, joints] = robot._ref_joint_pos_indexes
+    arms.dofs[a, joints] = robot._ref_joint_vel_indexes
+    arms.motors[a, joints] = robot._ref_actuators_indexes_dict[arm]
+    arms.site[a] = robot.eef_site_id[arm]
+    arms.site_body[a] = model.site_bodyid[arms.site[a]]
+    arms.root[a] = model.body_rootid[arms.site_body[a]]
+    sensors = robot.gripper[arm].important_sensors
+    force, torque = (model.sensor(sensors[k]).adr[0] for k in ("force_ee", "torque_ee"))
+    if torque != force + 3:
+        raise RuntimeError("the wrist's force and torque sensors are expected side by side")
+    arms.wrench[a] = force
+
+
+def _fill_settings(arms: Arms, a: int, model: mujoco.MjModel, controller: Any) -> None:
+    joints = slice(arms.joints[a])
+    gains = slice(len(controller.kp))
+    arms.kp[a, gains], arms.kd[a, gains] = controller.kp, controller.kd
+    if controller.name == "OSC_POSE":
+        arms.kind[a] = OSC_POSE
+        arms.rest[a, joints] = controller.initial_joint
+        base = f"{controller.naming_prefix}{controller.part_name}_center"
+        arms.base[a] = model.site(base).id if controller.input_ref_frame == "base" else -1
+    else:
+        arms.kind[a] = JOINT_POSITION
+        arms.compensate[a] = controller.use_torque_compensation
+        if controller.position_limits is not None:
+            arms.limits[a, joints] = np.transpose(controller.position_limits)
+
+
+def _carried_dofs(model: mujoco.MjModel, robot: Any) -> Ints:
+    """Return the dofs of the arm and of everything fixed to it."""
+    first = min(robot._ref_joint_vel_indexes)
+    found = []
+    for dof in range(model.nv):
+        j = dof
+        while j > first:
+            j = model.dof_parentid[j]
+        if j == first:
+            found.append(dof)
+    return np.array(found, np.int64)
+
+
+def _padded(rows: list[Ints]) -> Ints:
+    out = np.full((len(rows), max(map(len, rows)) + 1), -1, np.int64)
+    for row, values in zip(out, rows, strict=True):
+        row[: len(values)] = values
+    return out
+
+
+def chains_of(parts: list[Part], model: mujoco.MjModel, noise: float) -> tuple[Chain, ...]:
+    """Return the kinematic chain of each arm; an arm on a moving base has none.
+
+    Args:
+        noise: scale of the sensors' noise.
+    """
+    data, found = mujoco.MjData(model), []
+    for robot, _ in parts:
+        data.qpos[robot._ref_joint_pos_indexes] = 0.0
+    mujoco.mj_kinematics(model, data)
+    for i, (robot, arm) in enumerate(parts):
+        joints = np.asarray(robot._ref_joint_indexes)
+        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, robot.robot_model.eef_name[arm])
+        turns = model.jnt_type[joints] == int(mujoco.mjtJoint.mjJNT_HINGE)
+        if set(_joints_between(model, body)) != set(joints.tolist()) or not turns.all():
+            continue
+        turn = data.xmat[body].reshape(3, 3)
+        hand = np.stack([data.site_xpos[robot.eef_site_id[arm]], turn[:, 0], turn[:, 1]])
+        prefix = f"robot{i}_" if len(parts) > 1 else ""
+        # Sites and bodies are where they were before the last substep moved the joints.
+        late = 1.0 / PHYSICS_FREQ
+        found.append(Chain(prefix, data.xaxis[joints].copy(), data.xanchor[joints].copy(), hand, late, max(noise, 1.0)))
+    return tuple(found)
+
+
+def _joints_between(model: mujoco.MjModel, body: int) -> list[int]:
+    """Return the joints between a body and the world."""
+    found: list[int] = []
+    while body:
+        first = int(model.body_jntadr[body])
+        found += range(first, first + int(model.body_jntnum[body])) if first >= 0 else ()
+        body = int(model.body_parentid[body])
+    return found
+
+
+class NominalDynamics:
+    """The robot's own model of its dynamics, frozen when the model was loaded.
+
+    Whoever edits masses in the live model edits the world, and not the robot's knowledge of itself.
+
+    Args:
+        model: the live one.
+        views: of the model and its data.
+        robots: (R,) the bodies of the robots.
+    """
+
+    _INERTIA = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
+
+    def __init__(self, model: mujoco.MjModel, views: Views, robots: Ints) -> None:
+        self._model, self._robots = model, robots
+        self._live = {name: getattr(model, name).reshape(model.nbody, -1) for name in self._INERTIA}
+        self._frozen = {name: live.copy() for name, live in self._live.items()}
+        v = views
+        self.unedited = NominalViews(0, 0, v.qpos, v.qvel, v.mass, v.bias, v.damping.copy())
+        """Views of the live model, valid while the robots' masses are as they were loaded."""
+        self._copy: tuple[mujoco.MjModel, mujoco.MjData, NominalViews] | None = None
+
+    def now(self) -> NominalViews:
+        """Return views of the live model, or of a copy once somebody has edited the robots' masses."""
+        if not any(kernels.edited(self._live[n], self._frozen[n], self._robots) for n in self._INERTIA):
+            return self.unedited
+        if self._copy is None:
+            model = copy.copy(self._model)
+            for name in self._INERTIA:
+                getattr(model, name)[:] = self._frozen[name].reshape(getattr(model, name).shape)
+            data = mujoco.MjData(model)
+            addresses, motion = (model._address, data._address), (data.qpos, data.qvel, data.qM)
+            nominal = NominalViews(*addresses, *motion, np.zeros(model.nv), self.unedited.damping)
+            self._copy = model, data, nominal
+        return self._copy[2]
+
+
+def force_behind(
+    model: mujoco.MjModel, data: mujoco.MjData, motors: NDArray[np.intp], dofs: NDArray[np.intp], torques: Any
+) -> tuple[str, NDArray[np.float64]]:
+    """Return the link on which a force would explain external torques (J,) [N m] best, and that force (3,) [N].
+
+    For a force F on link k, τ = J_kᵀ F, and no joint beyond k is loaded: of all links the one that leaves the least.
+
+    Args:
+        motors: (J,) actuators of the arms' joints, from the base on.
+        dofs: (J,) their places among the velocities.
+    """
+    best: tuple[float, str, NDArray[np.float64]] = (np.inf, "", np.zeros(3))
+    jacobian = np.zeros((3, model.nv))
+    for joint in model.actuator_trnid[motors, 0]:
+        link = int(model.jnt_bodyid[joint])
+        mujoco.mj_jacBodyCom(model, data, jacobian, None, link)
+        J = jacobian[:, dofs]  # (3, J)
+        force = np.linalg.lstsq(J.T, torques, rcond=1e-2)[0]
+        left = float(np.sum((torques - J.T @ force) ** 2))
+        if left < best[0]:
+            best = left, model.body(link).name, force
+    return best[1], best[2]
