@@ -1,6 +1,7 @@
 """Faults change the simulation while they act, nothing before, and nothing after a reset."""
 
 import dataclasses
+from contextlib import ExitStack
 
 import gymnasium as gym
 import numpy as np
@@ -135,16 +136,16 @@ def test_half_of_each_family_is_kept_for_testing_and_nothing_is_in_both():
 
 def test_edits_of_one_number_compose_and_end_in_any_order():
     ledger, array = SimulatorEdits(), np.array([0.3, 5.0])
-    nominal = array.copy()
-    double, add = ledger.edit(array, 0), ledger.edit(array, 0)
-    double.change(lambda v: 2 * v)
-    add.change(lambda v: v + 0.1)
+    nominal, first, second = array.copy(), ExitStack(), ExitStack()
+    double, add = first.enter_context(ledger.edit(array, 0)), second.enter_context(ledger.edit(array, 0))
+    double(lambda v: 2 * v)
+    add(lambda v: v + 0.1)
     assert array[0] == 2 * 0.3 + 0.1
-    double.release()
+    first.close()
     assert array[0] == 0.3 + 0.1
-    add.change(lambda v: v + 0.7)
+    add(lambda v: v + 0.7)
     assert array[0] == 0.3 + 0.7
-    add.release()
+    second.close()
     np.testing.assert_array_equal(array, nominal)
     assert len(ledger) == 0
 
