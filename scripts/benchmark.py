@@ -169,11 +169,11 @@ def measure_safety(args: Args, console: Console) -> Table:
         envs[name], inner = _made(args.task, rate), _made(args.task, rate)
         envs[f"{name}, guarded"] = NeuralASMSafety(inner, _memory(inner), monitor_freq=rate)
         pairs.append((name, f"{name}, guarded"))
-    bare, inner = (SyncVectorEnv([partial(_made, args.task)] * args.members) for _ in range(2))
+    bare, within = (SyncVectorEnv([partial(_made, args.task)] * args.members) for _ in range(2))
     name = f"{args.members} members"
-    envs |= {name: bare, f"{name}, guarded": VectorNeuralASMSafety(inner, _memory(envs["20 Hz"]))}
+    envs |= {name: bare, f"{name}, guarded": VectorNeuralASMSafety(within, _memory(envs["20 Hz"]))}
     pairs.append((name, f"{name}, guarded"))
-    rivals = {}
+    rivals: dict[str, Callable[[], Any]] = {}
     for each, env in envs.items():
         env.reset(seed=args.seed)
         rivals[each] = partial(env.step, np.zeros(env.action_space.shape, np.float32))
@@ -207,10 +207,10 @@ def _robosuite(task: str) -> Any:
 
 def measure_env(args: Args, console: Console) -> Table:
     """Compare a control step with robosuite's, and with its physics alone."""
-    ours, bare, floor = (_made(args.task, **more).unwrapped for more in ({}, {"stream": (), "sensor_noise": 0.0}, {}))
+    ours, bare, floor = _made(args.task), _made(args.task, stream=(), sensor_noise=0.0), _made(args.task)
     for env in (ours, bare, floor):
         env.reset(seed=args.seed)
-    simulation: Any = floor.simulation  # type: ignore[attr-defined]
+    simulation: Any = floor.get_wrapper_attr("simulation")
     rng = np.random.default_rng(args.seed)
 
     def drive(step: Callable[[Any], Any], size: int) -> Callable[[], Any]:
@@ -221,8 +221,8 @@ def measure_env(args: Args, console: Console) -> Table:
 
     (size,) = ours.action_space.shape or (0,)
     rivals: dict[str, Callable[[], Any]] = {
-        "asm_gym": drive(ours.step, size),
-        "asm_gym, no stream": drive(bare.step, size),
+        "asm_gym": drive(ours.unwrapped.step, size),
+        "asm_gym, no stream": drive(bare.unwrapped.step, size),
         "robosuite": drive(_robosuite(args.task).step, size),
         "mj_step alone": partial(mujoco.mj_step, simulation.model, simulation.data, simulation.substeps),
     }

@@ -22,6 +22,7 @@ Args = TypeVar("Args")
 Names = Iterable[str] | Callable[[], Iterable[str]]
 
 _SAME: Any = object()
+_ANNOTATED: Any = Annotated
 
 
 def option(
@@ -102,19 +103,20 @@ def parser(kind: type[Any], hurried: bool = False) -> Any:
     """Return a subclass of ``kind`` that tyro reads: annotated, and not checked while it is read."""
     import tyro
 
-    hints, annotated = get_type_hints(kind, include_extras=True), Annotated  # type: ignore[var-annotated]
+    hints: dict[str, Any] = get_type_hints(kind, include_extras=True)
+    marks: Any = tyro.conf
     made: list[Any] = []
     for each in fields(kind):
         about, hint = each.metadata, hints[each.name]
         quick = about.get("quick", _SAME)
         if about.get("fixed"):
-            hint = tyro.conf.Suppress[tyro.conf.Fixed[hint]]  # type: ignore[valid-type]
+            hint = marks.Suppress[marks.Fixed[hint]]
         else:
             many = " ..." if get_origin(hint) is tuple and about.get("metavar") else ""
             metavar = about.get("metavar", "") + many or None
             names = _names(about.get("known") or about.get("listed"))
-            hint = annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint(names, quick))]
-            hint = tyro.conf.Positional[hint] if about.get("positional") else hint
+            hint = _ANNOTATED[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint(names, quick))]
+            hint = marks.Positional[hint] if about.get("positional") else hint
         default = quick if hurried and quick is not _SAME else each.default
         made.append((each.name, hint, field(default=tyro.MISSING if default is MISSING else default)))
     unchecked = {"__post_init__": lambda self: None}

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
-from asm_gym.envs.backend import PHYSICS_FREQ
+from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.evaluation.statistics import wilson_interval
 from asm_gym.evaluation.tables import Column, Table, tabulate
@@ -338,8 +338,8 @@ def settings_table(records: Sequence[Record], guards: Sequence[str]) -> Table:
         shares = avoided(records_of, guard), worst(records_of, guard)
         rows.append((f"{key['robot']}, {key['rate']} Hz", guard, *shares, blow, over, strain))
     headings = ("arm, rows of the memory", "guard", "harm avoided", "in the worst cell", "first blow, mean")
-    headings += ("time and steps above 280 N", "external torque of an episode: median, most")
-    return Table("Hostile policies, by arm and rate", headings, rows)
+    more = ("time and steps above 280 N", "external torque of an episode: median, most")
+    return Table("Hostile policies, by arm and rate", (*headings, *more), rows)
 
 
 def cases_table(records: Sequence[Record], guards: Sequence[str]) -> Table:
