@@ -54,7 +54,7 @@ CHECKS = {
         "cluster", "tests/test_learners.py tests/test_learners_train.py", "ray[rllib] torch", pins="gymnasium"
     ),
     "cluster": Check("robosuite,report,cluster", "tests/test_parallel.py -k cluster"),
-    "notebooks": Check("robosuite,report,notebooks", "tests/test_notebooks.py"),
+    "notebooks": Check("robosuite,report,notebooks", "tests/test_docs.py -k notebook"),
     "hub": Check("hub", "tests/test_hub.py"),
     "environments": Check("environments,report", "tests/test_elsewhere.py"),
     "robosuite": Check("robosuite,report,video", "tests/test_robosuite_env.py -m 'not slow'", "stable-baselines3"),
