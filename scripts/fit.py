@@ -20,7 +20,7 @@ from rich.console import Console
 from asm_gym.body_model import read_urdf
 from asm_gym.data.commands import feedback
 from asm_gym.data.gaps import filled
-from asm_gym.data.live import is_live, lines_from, record
+from asm_gym.data.live import record
 from asm_gym.data.logs import LogLayout, read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.selection import (
@@ -33,6 +33,7 @@ from asm_gym.data.selection import (
     unbroken,
     unmarked,
 )
+from asm_gym.data.sources import is_live, lines_from
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.detection.hourly import least_per_hour

@@ -21,9 +21,9 @@ from typing import Any
 
 from rich.console import Console
 
-from asm_gym.data.live import RETURNING, is_live, lines_from
 from asm_gym.data.logs import Log, LogLayout, read_logs
 from asm_gym.data.reader_notes import noted
+from asm_gym.data.sources import lines_from, live_source
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, traces_of
 from asm_gym.evaluation.rerun_view import LiveView
 from asm_gym.evaluation.scored_episode import ScoredEpisode, moments_of
@@ -175,16 +175,17 @@ def write_rerun(path: Path, traces: Sequence[ScoredEpisode], monitor: Any) -> No
 
 def watch(args: Args, console: Console) -> int:
     """Watches whichever it is."""
+    live = live_source(args.source)
     if args.rerun is not None:
-        if is_live(args.source):
+        if live is not None:
             raise ValueError(f"--rerun is for a recording, and {args.source} is live")
         require("rerun", what="a live view")
     monitor: Any = load_monitor(args.monitor)
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
-    if is_live(args.source):
+    if live is not None:
         opened = partial(lines_from, args.source, sys.stdin, args.silence)
-        again = opened if args.source.startswith(RETURNING) else None
+        again = opened if live.returns else None
         return follow(opened(), monitor, console, args.bridge, again, args.wait)
     return review(args, monitor, console)
 

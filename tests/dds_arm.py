@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from asm_gym.data.live import lines_from
+from asm_gym.data.sources import lines_from
 from asm_gym.episode import Episode
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.live_watching import follow
@@ -97,7 +97,7 @@ def watched(monitor: Any, topic: str, seconds: float, every: float) -> dict[str,
     """What came of watching the topic for so long."""
     there = publisher(topic, "--seconds", str(seconds), "--every", str(every))
     try:
-        tap = Tap(lines_from(f"dds:{topic}", sys.stdin, 1.0, monitor.spec))
+        tap = Tap(lines_from(f"dds:{topic}", sys.stdin, 1.0))
         said = Said(tap)
         follow(tap, monitor, Console(file=said, width=200))
         out, _ = there.communicate(timeout=30)

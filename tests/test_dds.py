@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from asm_gym.data.live import SourceDied, lines_from
+from asm_gym.data.live import SourceDied
+from asm_gym.data.sources import lines_from
 from asm_gym.scripts.live_watching import follow
 from tests import dds_arm as dds
 from tests.needs import needs

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from asm_gym.data.live import RowReader, SourceDied, is_live, lines_from
+from asm_gym.data.live import RowReader, SourceDied
+from asm_gym.data.sources import is_live, lines_from
 from asm_gym.detection.events import EVENTS, KNOCK
 from asm_gym.evaluation.alarms import excused_in
 from asm_gym.evaluation.scored_episode import ScoredEpisode

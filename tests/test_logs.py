@@ -1,29 +1,37 @@
-"""From logs to a memory to alarms: tables, readers, and the commands fit and watch."""
+"""Logs of every format and shape: which channels, rate and rows are read, and what is refused."""
 
 from __future__ import annotations
 
-import io
 import json
-import sys
+import os
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
-from rich.console import Console
 
-from asm_gym.data.channels import read_table, stream_of
-from asm_gym.data.logs import READERS, Log, LogLayout, read_logs
-from asm_gym.data.selection import divided, normal_episodes, pieces
+from asm_gym.data.arrays import read_parquet
+from asm_gym.data.channels import read_recorded
+from asm_gym.data.clock import clock_among, evenly, period
+from asm_gym.data.logs import LogLayout, read_logs
+from asm_gym.data.names import is_clock, is_command
+from asm_gym.data.reader_notes import LogWarning
+from asm_gym.data.selection import normal_episodes
+from asm_gym.data.sources import FILES
+from asm_gym.data.text import read_text
 from asm_gym.episode import Episode, EpisodeLabel, save_episode
-from asm_gym.evaluation.alarms import traces_of
-from asm_gym.monitors import load_monitor, make_monitor
-from asm_gym.scripts import watch
-from asm_gym.scripts.cli import main
+from asm_gym.readings import noise_of, resolution
 from asm_gym.spec import MOTOR
+from tests.needs import needs
 
-RATE = 50.0
-ROWS = 80
+RATE, ROWS = 50.0, 80
+
+REAL = Path(os.environ.get("ASM_GYM_REAL", "/nowhere"))
+"""A folder of recordings of real arms, which are published elsewhere."""
 
 
 def log(seed: int, rows: int = ROWS) -> dict[str, np.ndarray]:
@@ -41,33 +49,26 @@ def log(seed: int, rows: int = ROWS) -> dict[str, np.ndarray]:
 
 
 def write_csv(path: Path, columns: dict[str, np.ndarray]) -> Path:
-    rows = zip(*columns.values(), strict=True)
-    path.write_text("\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)]) + "\n")
+    pd.DataFrame(columns).to_csv(path, index=False)
     return path
 
 
-@pytest.fixture(scope="module")
-def logs(tmp_path_factory):
-    """A folder of normal logs."""
-    folder = tmp_path_factory.mktemp("logs")
-    for n in range(40):
-        write_csv(folder / f"run{n:02}.csv", log(n))
-    return folder
+def read(path: Path, **layout: Any) -> Episode:
+    ((_, episode),) = read_logs(path, LogLayout(**layout))
+    return episode
 
 
-FIT = ["--monitor", "kalman", "--action", "cmd*", "--seed", "1"]
+def written(path: Path, text: str, encoding: str = "utf-8") -> Path:
+    path.write_text(text, encoding=encoding)
+    return path
 
 
-@pytest.fixture(scope="module")
-def memory(logs):
-    """What is fitted to them."""
-    file = logs / "memory.asm"
-    assert main(["fit", str(logs), "--out", str(file), *FIT]) == 0
-    return file
+# ------------------------------------------------------------------ tables
 
 
 def test_columns_become_channels_by_name():
-    rows, spec = stream_of(log(0), action=["cmd*"])
+    episode = Episode.from_table(log(0), action=["cmd*"])
+    rows, spec = episode.stream, episode.spec
     assert spec.labels == ("q[0]", "q[1]", "torque", "cmd[0]", "cmd[1]")
     assert spec.dt == pytest.approx(1 / RATE)
     assert [c.group for c in spec.channels] == ["q", "torque", MOTOR]
@@ -75,29 +76,11 @@ def test_columns_become_channels_by_name():
     np.testing.assert_allclose(rows[:, 4], log(0)["cmd_1"], rtol=1e-6)
 
 
-def test_a_frame_an_arrow_table_and_a_dictionary_say_the_same():
-    class Frame(dict):  # as pandas and Polars: no mapping to them, but columns
-        columns = property(lambda self: list(self.keys()))
-
-    class Series:
-        def __init__(self, values):
-            self.values = values
-
-        def __array__(self, dtype=None, copy=None):
-            return np.asarray(self.values, dtype)
-
-    class DataFrame:
-        def __init__(self, data):
-            self.data, self.columns = data, list(data)
-
-        def __getitem__(self, name):
-            return Series(self.data[name])
-
-    wanted = Episode.from_table(log(3))
-    for frame in (pa.table(log(3)), DataFrame(log(3)), Frame(log(3))):
-        made = Episode.from_table(frame)
-        assert made.spec == wanted.spec
-        np.testing.assert_array_equal(made.stream, wanted.stream)
+@pytest.mark.parametrize("frame", [pd.DataFrame, pa.table, lambda columns: needs("polars").DataFrame(columns)])
+def test_a_frame_an_arrow_table_and_a_dictionary_say_the_same(frame):
+    made, wanted = Episode.from_table(frame(log(3))), Episode.from_table(log(3))
+    assert made.spec == wanted.spec
+    np.testing.assert_array_equal(made.stream, wanted.stream)
 
 
 def test_channels_can_be_chosen_and_named():
@@ -147,27 +130,293 @@ def test_a_memory_says_what_a_log_lacks():
         Episode.from_table(log(0), channels=spec, rate=100)
 
 
+def test_units_stand_behind_names_and_must_be_those_of_the_memory():
+    q = np.stack([log(0)["q_0"], log(0)["q_1"]])
+    columns = {"time [s]": log(0)["time"], "q_0 [rad]": q[0], "q_1 [rad]": q[1]}
+    episode = Episode.from_table(columns)
+    assert [(c.name, c.size, c.unit) for c in episode.spec.channels] == [("q", 2, "rad")]
+    in_degrees = {n.replace("rad", "deg"): np.rad2deg(v) if "rad" in n else v for n, v in columns.items()}
+    np.testing.assert_allclose(Episode.from_table(in_degrees, episode.spec).stream, episode.stream, rtol=1e-6)
+    in_volts = {name.replace("rad", "V"): values for name, values in columns.items()}
+    with pytest.raises(ValueError, match="q_0 is in V, and the memory reads rad"):
+        Episode.from_table(in_volts, channels=episode.spec)
+    with pytest.raises(ValueError, match="'q' is of several units: deg, rad"):
+        Episode.from_table({**columns, "q_2 [deg]": q[0]})
+    with pytest.raises(ValueError, match="'q_0' twice"):
+        Episode.from_table({**columns, "q_0": q[0]})
+
+
+def test_the_noise_and_the_step_of_a_sense_are_found():
+    t, rng = np.linspace(0, 20, 4000), np.random.default_rng(0)
+    assert noise_of(np.sin(t) + 0.01 * rng.normal(size=t.size)) == pytest.approx(0.01, rel=0.1)
+    assert noise_of(np.zeros(100)) == 0.0
+    spec = Episode.from_table(log(0, 2000), action=["cmd*"]).spec
+    assert spec.channels[0].noise == pytest.approx(0.01, rel=0.15)
+    assert spec.channels[2].noise == 0.0
+    for step in (0.001, 0.0625, 1.0):
+        smooth = np.sin(np.arange(5000) / 200) * 20 * step + rng.normal(0, step, 5000)
+        for kind in (np.float64, np.float32):
+            assert resolution((np.round(smooth / step) * step).astype(kind)) == pytest.approx(step, rel=0.02)
+        assert resolution(smooth) == 0.0
+
+
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("name", "commanded"),
     [
-        ("", "a header and at least one row, got 0 lines"),
-        ("a,b\n", "a header and at least one row, got 1 lines"),
-        ("a,a\n1,2\n", "columns of the same name: 'a'"),
-        ("a,b\n1,2\n3\n", "line 3 has 1 cells, its header 2"),
-        ("a,b\n1,2\n3,oops\n", "b, line 3 must be a number, got 'oops'"),
+        ("target_q_0", True),
+        ("Desired Torque", True),
+        ("cmd", True),
+        ("actual_q", False),
+        ("motor_reference_3", True),
+        ("preference", False),
+        ("distance_to_goalkeeper", False),
     ],
 )
-def test_a_damaged_csv_is_refused_with_the_line(text, message, tmp_path):
-    (tmp_path / "x.csv").write_text(text)
-    with pytest.raises(ValueError, match=message):
-        read_table(tmp_path / "x.csv")
+def test_commands_go_by_their_names(name, commanded):
+    assert is_command(name) is commanded
+
+
+# ------------------------------------------------------------------ clocks
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        *(("time", None), ("t", None), ("Timestamp", None), ("__time", None), ("%time", None), ("header.stamp", None)),
+        *(("Timestamp (s)", 1.0), ("Time [sec]", 1.0), ("time_s", 1.0), ("TIME (ms)", 1e-3), ("timestamp_us", 1e-6)),
+    ],
+)
+def test_a_clock_is_known_by_its_name_whatever_the_case(name, unit):
+    found = clock_among(["q", name])
+    assert found is not None
+    assert (found.column, found.unit) == (name, unit)
+
+
+@pytest.mark.parametrize("name", ["T", "temperature", "torque_t", "target", "timestep_error", "wrist.t", "timeout"])
+def test_what_senses_something_is_no_clock(name):
+    assert not is_clock(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "times"),
+    [
+        ("Timestamp (s)", np.arange(40) * 0.02),
+        ("Time [ms]", np.arange(40) * 20.0),
+        ("timestamp", 1_666_772_241_847 + 20 * np.arange(40)),
+        ("stamp", 1_666_772_241_847_000_000 + 20_000_000 * np.arange(40)),
+        ("time", 1.6667e9 + 0.02 * np.arange(40)),
+    ],
+)
+def test_clocks_of_every_unit_tell_the_rate_and_are_no_sense(name, times):
+    episode = Episode.from_table({name: times, "q": np.sin(np.arange(40))})
+    assert episode.spec.labels == ("q",)
+    assert episode.spec.dt == pytest.approx(0.02, rel=1e-4)
+    assert len(episode) == 40
+
+
+def test_a_clock_that_may_count_anything_is_asked_for_its_unit():
+    with pytest.raises(ValueError, match=r"'t' goes on by 50 from row to row, and says no unit: call it 't \[ms\]'"):
+        Episode.from_table({"t": np.arange(0, 2000, 50), "q": np.zeros(40)})
+
+
+def test_the_period_is_the_mean_step_and_gaps_and_lost_rows_are_none_of_it():
+    rng = np.random.default_rng(0)
+    steady = np.arange(5000) / 100.331
+    assert 1 / period(steady) == pytest.approx(100.331, rel=1e-5)
+    assert 1 / period(np.delete(steady, rng.choice(4998, 300, replace=False) + 1)) == pytest.approx(100.331, rel=1e-5)
+    # Most steps are of 10 ms and some of 12 to 15: the mean is what a row takes.
+    jittering = np.cumsum(np.where(rng.random(4000) < 0.7, 0.01, rng.uniform(0.012, 0.015, 4000)))
+    assert np.median(np.diff(jittering)) == pytest.approx(0.01)
+    assert period(jittering) == pytest.approx(np.diff(jittering).mean(), rel=1e-5)
+    with_a_gap = np.concatenate([jittering, 60 + jittering])
+    assert period(with_a_gap) == pytest.approx(np.diff(jittering).mean(), rel=1e-3)
+
+
+def test_rows_that_come_on_time_are_left_as_they_are():
+    t = np.arange(50) * 0.02 + np.random.default_rng(0).uniform(-0.003, 0.003, 50)
+    columns = {"x": np.arange(50.0)}
+    assert evenly(columns, t, 0.02)["x"] is columns["x"]
+
+
+def test_rows_that_were_lost_are_marked_and_the_others_keep_their_place_and_values():
+    kept = np.delete(np.arange(50), [10, 11, 30])
+    out = evenly({"x": kept.astype(float), "pose": np.stack([kept, -kept], axis=1)}, kept * 0.02, 0.02)
+    assert len(out["x"]) == 50
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(out["x"])), [10, 11, 30])
+    np.testing.assert_array_equal(out["x"][kept], kept)
+    np.testing.assert_array_equal(out["pose"][kept, 1], -kept)
+
+
+def test_a_clock_that_runs_a_little_fast_moves_no_row():
+    t = np.arange(5000) * 0.0201
+    assert len(evenly({"x": t}, t, 0.02)["x"]) == 5000
+
+
+def test_rows_at_odd_times_are_interpolated_and_gaps_are_not():
+    rng = np.random.default_rng(1)
+    t = np.sort(np.concatenate([[0.0], rng.uniform(0, 1, 120), rng.uniform(2, 3, 120), [3.0]]))
+    out = evenly({"x": 3.0 * t}, t, float(np.median(np.diff(t))))
+    due = np.arange(len(out["x"])) * np.median(np.diff(t))
+    known = np.isfinite(out["x"])
+    np.testing.assert_allclose(out["x"][known], 3.0 * due[known], atol=1e-9)
+    assert not known[(due > 1.1) & (due < 1.9)].any()
+    assert known[(due < 0.9)].mean() > 0.8
+
+
+def test_time_that_jumps_or_runs_backwards_is_refused():
+    t = np.concatenate([np.arange(50) * 0.02, 1e9 + np.arange(50) * 0.02])
+    with pytest.raises(ValueError, match=r"time jumps by 1e\+09 s after 0.98 s: cut the log there"):
+        Episode.from_table({"time": t, "x": t})
+    with pytest.raises(ValueError, match="time must be a number in every row, got nan in row 3"):
+        Episode.from_table({"time": np.where(np.arange(9) == 3, np.nan, np.arange(9)), "x": np.arange(9.0)})
+
+
+def test_rows_that_were_written_twice_are_left_out_and_that_is_said():
+    times = np.sort(np.concatenate([np.arange(200) * 0.02, [1.0]]))
+    with pytest.warns(LogWarning, match="1 rows have the same time"):
+        episode = Episode.from_table({"time": times, "q": times})
+    assert len(episode) == 200
+
+
+def test_a_log_at_another_rate_is_read_by_its_clock(tmp_path):
+    def column(rate: float) -> dict[str, np.ndarray]:
+        t = np.arange(int(10 * rate)) / rate
+        return {"time": t, "q": np.sin(t)}
+
+    spec = Episode.from_table(column(99)).spec
+    with pytest.warns(LogWarning, match="rows that come at 125 a second are read at 99, by their clock"):
+        episode = Episode.from_table(column(125), channels=spec)
+    np.testing.assert_allclose(episode.stream[:, 0], np.sin(np.arange(len(episode)) / 99), atol=1e-4)
+    with pytest.raises(ValueError, match="the memory reads 99 rows a second, these come at 30"):
+        Episode.from_table(column(30), channels=spec)
+
+
+# ------------------------------------------------------------------ text
+
+
+COBOT = """Num;Timestamp;Current_J0;Temperature_T0;cycle ;Robot_ProtectiveStop;grip_lost;;;
+1;2022-10-26T08:17:21.847Z;0,109627604;27,875;1;False;False;;;
+2;2022-10-26T08:17:22.847Z;-7,39E-30;27,875;1;False;True;;;
+3;2022-10-26T08:17:23.847Z;-2,5;;1;False;False;;;
+4;2022-10-26T08:17:24.847Z;1;28;1;;False;;;
+"""
+"""As a UR3 of CobotOps writes it: semicolons, decimal commas, ISO times, trailing empty columns, labels in words."""
+
+
+def test_semicolons_decimal_commas_iso_times_and_labels(tmp_path):
+    episode = read(written(tmp_path / "x.csv", COBOT))
+    assert episode.spec.labels == ("Current_J0", "Temperature_T0", "cycle")
+    assert episode.spec.dt == 1.0
+    np.testing.assert_allclose(episode.stream[:, 0], [0.109627604, 0, -2.5, 1], atol=1e-8)
+    assert np.isnan(episode.stream[2, 1])
+    np.testing.assert_array_equal(episode.faults, [False, True, False, False])
+    kept = normal_episodes(read_logs(tmp_path / "x.csv"))
+    assert kept.left_out == {"with a fault": 1}
+
+
+def test_labels_are_asked_for_by_name_and_words_of_them_are_read(tmp_path):
+    path = written(tmp_path / "x.csv", "time,q,state\n0,1,ok\n1,2,crash\n2,3,ok\n3,4,normal\n")
+    assert not read(path).faults.any()
+    np.testing.assert_array_equal(read(path, labels=["state"]).faults, [False, True, False, False])
+
+
+def test_labels_keep_their_rows_where_rows_are_put_right():
+    t = np.delete(np.arange(50) * 0.02, [10, 11])
+    wrong = (t > 0.5).astype(int)
+    found = read_recorded({"time": t, "q": t, "anomaly": wrong})
+    assert found.spec.labels == ("q",)
+    np.testing.assert_array_equal(found.faults, np.arange(50) * 0.02 > 0.5)
 
 
 def test_an_empty_cell_is_a_lost_number_and_a_column_of_words_is_left_out(tmp_path):
     (tmp_path / "x.csv").write_text("a,word\n1,go\n,\n3,stop\n")
-    (columns,) = [read_table(tmp_path / "x.csv")]
+    (columns,) = [read_text(tmp_path / "x.csv")]
     assert list(columns) == ["a"]
     np.testing.assert_array_equal(columns["a"], [1, np.nan, 3])
+
+
+@pytest.mark.parametrize(
+    ("text", "columns"),
+    [
+        ("0 0.5 1\n0.1 0.6 2\n0.2 0.7 3\n", ["t", "a", "b"]),
+        ("# t a b\n0 0.5 1\n0.1 0.6 2\n0.2 0.7 3\n", []),
+        ("t\ta\tb\n0\t0.5\t1\n0.1\t0.6\t2\n0.2\t0.7\t3\n", []),
+        ("0,0.5,1\n0.1,0.6,2\n0.2,0.7,3", ["t", "a", "b"]),
+        ("t;- a;- b\n0;0,5;1\n0,1;0,6;2\n0,2;0,7;3\n", []),
+    ],
+)
+def test_tables_with_and_without_a_header(text, columns, tmp_path):
+    episode = read(written(tmp_path / "x.txt", text), columns=columns)
+    np.testing.assert_allclose(episode.stream, [[0.5, 1], [0.6, 2], [0.7, 3]], rtol=1e-6)
+    assert episode.spec.labels == ("a", "b")
+    assert episode.spec.dt == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+def test_text_is_read_in_the_encodings_of_loggers(encoding, tmp_path):
+    path = written(tmp_path / "x.csv", "time [s];Achse 1 [°]\n0;90,5\n1;180\n", encoding)
+    if encoding == "latin-1":
+        with pytest.warns(LogWarning, match="is not in UTF-8"):
+            episode = read(path)
+    else:
+        episode = read(path)
+    assert [(c.name, c.unit) for c in episode.spec.channels] == [("Achse 1", "°")]
+    np.testing.assert_array_equal(episode.stream[:, 0], [90.5, 180])
+
+
+@pytest.mark.parametrize(
+    ("text", "columns", "message"),
+    [
+        ("", [], "a header and at least one row, got 0 lines"),
+        ("a,b\n", [], "a header and at least one row, got 1 lines"),
+        ("a,a\n1,2\n", [], "columns of the same name: 'a'"),
+        ("a,b\n1,2\n3,oops\n4,5\n", [], "b, line 3 must be a number, got 'oops'"),
+        ("a,b\n1,2\n3,4,5\n", [], "line 3 has 3 cells, its header 2"),
+        ("a,b\n1,2\n3\n", [], "line 3 has 1 cells, its header 2"),
+        ("0,1\n1,2\n", [], "its first line is of 2 numbers and no header: name its columns with --columns"),
+        ("0,1\n1,2\n", ["t"], "1 columns are named, and its first line has 2 cells"),
+        ("a,b\n1," + "9" * 1_000_000 + "\n", [], "line 2 has a cell of more than 65536 characters"),
+        (",".join(f"x{k}" for k in range(100_000)) + "\n", [], "it has 100000 columns, and at most 8192"),
+        ("a,b\n" + "1" * 5_000_000, [], "a line of 4194304 characters or more is no row"),
+    ],
+)
+def test_text_that_is_no_table_is_refused_soon_and_in_one_line(text, columns, message, tmp_path):
+    path = written(tmp_path / "x.csv", text)
+    start = time.perf_counter()
+    with pytest.raises(ValueError, match=message) as refused:
+        read(path, columns=columns, rate=10.0)
+    assert time.perf_counter() - start < 5
+    assert str(refused.value).startswith(f"{path}: ")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("end", ["1.5,2", "1.5,2.5,x", "1.5,"])
+def test_a_last_row_that_was_cut_off_is_left_out_and_that_is_said(end, tmp_path):
+    path = written(tmp_path / "x.csv", "time,a,b\n0,1,2\n1,1,2\n" + end)
+    with pytest.warns(LogWarning, match="its last line was cut off, and is left out"):
+        columns = read_text(path)
+    np.testing.assert_array_equal(columns["time"], [0, 1])
+    whole = written(tmp_path / "y.csv", "time,a,b\n0,1,2\n1,1,2\n2,1,2")  # many write no last end of line
+    assert len(read_text(whole)["time"]) == 3
+
+
+def test_json_lines_are_rows(tmp_path):
+    rows = [{"t": 0.1 * k, "q": [k, -k], "tool": {"force": None if k == 3 else 2.0 * k}} for k in range(8)]
+    path = written(tmp_path / "x.jsonl", "".join(json.dumps(row) + "\n" for row in rows) + '{"t": 0.8, "q"')
+    with pytest.warns(LogWarning, match="cut off"):
+        episode = read(path)
+    assert episode.spec.labels == ("q[0]", "q[1]", "tool.force")
+    np.testing.assert_array_equal(episode.stream[:, 1], -np.arange(8))
+    assert np.flatnonzero(np.isnan(episode.stream[:, 2])).tolist() == [3]
+    lists = written(tmp_path / "y.jsonl", "[0, 1]\n[1, 2]\n[2, 5]\n")
+    np.testing.assert_array_equal(read(lists, columns=["t", "q"]).stream[:, 0], [1, 2, 5])
+    with pytest.raises(ValueError, match=r"y\.jsonl: line 1 is no row: it is a list of 2, and 0 columns are named"):
+        read(lists)
+    with pytest.raises(ValueError, match=r"z\.jsonl: line 2 is no row"):
+        read(written(tmp_path / "z.jsonl", '{"t": 0}\n{"t": \n{"t": 1}\n'))
+
+
+# ------------------------------------------------------------------ files and folders
 
 
 def test_a_run_folder_a_file_and_arrays_are_read(tmp_path):
@@ -201,190 +450,124 @@ def test_what_holds_no_log_is_refused(make, error, message, tmp_path):
         list(read_logs(tmp_path / "thing"))
 
 
-def test_a_damaged_file_among_logs_is_named(tmp_path):
-    write_csv(tmp_path / "a.csv", log(0))
-    (tmp_path / "b.npz").write_bytes(b"no zip")
-    with pytest.raises(ValueError, match=r"b\.npz: it is damaged"):
+def test_every_format_of_a_table_gives_the_same_rows(tmp_path):
+    columns = log(0)
+    wanted = Episode.from_table(columns, action=["cmd*"])
+    arrays = {"time": columns["time"]} | {n: np.stack([columns[f"{n}_{k}"] for k in (0, 1)], 1) for n in ("q", "cmd")}
+    arrays["torque"] = columns["torque"]
+    write_csv(tmp_path / "a.csv", columns)
+    pq.write_table(pa.table(columns), tmp_path / "b.parquet")
+    pq.write_table(pa.table({n: pa.array(v.tolist()) for n, v in arrays.items()}), tmp_path / "c.parquet")
+    np.savez(tmp_path / "d.npz", **arrays)
+    records = pd.DataFrame(columns).to_records(index=False)
+    np.save(tmp_path / "e.npy", np.array(records, records.dtype.descr))
+    pd.DataFrame(columns).to_json(tmp_path / "f.jsonl", orient="records", lines=True, double_precision=15)
+    found = {name: episode for name, episode in read_logs(tmp_path, LogLayout(action=["cmd*"]))}
+    assert list(found) == ["a.csv", "b.parquet", "c.parquet", "d.npz", "e.npy", "f.jsonl"]
+    for episode in found.values():
+        np.testing.assert_allclose(episode.stream, wanted.stream, rtol=1e-6)
+        assert episode.spec.labels == wanted.spec.labels
+    np.save(tmp_path / "bare.npy", wanted.stream)
+    np.testing.assert_array_equal(read(tmp_path / "bare.npy", rate=RATE).stream, wanted.stream)
+
+
+def test_three_files_of_one_recording_are_joined_by_their_clocks(tmp_path):
+    t = np.arange(100) * 0.01
+    for name, start in (("position", 0), ("velocity", 0), ("effort", 5)):
+        values = np.sin(t[start:]) + len(name)
+        lines = [f"{a},{b}" for a, b in zip(t[start:], values, strict=True)]
+        written(tmp_path / f"arm_{name}.csv", "\n".join([f"t,- joint_{name}", *lines]) + "\n")
+    episode = read(tmp_path, join=True)
+    assert episode.spec.labels == ("joint_effort", "joint_position", "joint_velocity")
+    assert len(episode) == 95
+    np.testing.assert_allclose(episode.stream, np.add(np.sin(t[5:, None]), [6, 8, 8]), atol=1e-6)
+    with pytest.raises(ValueError, match="channels that are not there: joint_effort; --join reads files as parts"):
         list(read_logs(tmp_path))
 
 
-@pytest.mark.parametrize("suffix", READERS)
-def test_a_file_of_any_kind_that_is_none_is_named(suffix, tmp_path):
-    (tmp_path / f"no{suffix}").write_bytes(b"\x00\xff no file of this kind \x00")
-    with pytest.raises(ValueError, match=rf"no\{suffix}: ."):
-        list(read_logs(tmp_path / f"no{suffix}"))
-
-
-def test_only_normal_episodes_are_learned_from():
-    normal = Episode.from_table(log(0), success=True)
-    episodes = {
-        "normal": normal,
-        "failed": Episode.from_table(log(1)),
-        "fault": Episode.from_table(log(2), success=True, faults=np.arange(ROWS) > 9),
-        "faulty": Episode.from_table(log(3), success=True, label=EpisodeLabel("Lift", "faulty", "push")),
-        "harmless": Episode.from_table(log(4), success=True, label=EpisodeLabel("Lift", "harmless", "slower")),
-    }
-    found = [Log(name, episode) for name, episode in episodes.items()]
-    kept = normal_episodes(found)
-    assert kept.episodes == [normal]
-    assert kept.left_out == {"failed": 1, "with a fault": 2, "under a harmless variation": 1}
-
-
-def test_long_logs_are_cut_into_pieces_of_one_length():
-    cut = pieces(Episode.from_table(log(0)), 0.5)
-    assert [len(piece) for piece in cut] == [25, 25, 25]
-    np.testing.assert_array_equal(np.vstack([p.stream for p in cut]), Episode.from_table(log(0)).stream[:75])
-
-
-def test_episodes_that_calibrate_are_not_learned_from_and_both_are_drawn_by_the_seed():
-    episodes = [Episode.from_table(log(n)) for n in range(40)]
-    fitting, calibration = divided(episodes, 0.05, 0.5, seed=1)
-    assert len(calibration) == 20
-    assert sorted(map(id, fitting + calibration)) == sorted(map(id, episodes))
-    assert divided(episodes, 0.05, 0.5, seed=1)[1] == calibration
-    assert divided(episodes, 0.05, 0.5, seed=2)[1] != calibration
-
-
-def test_too_few_episodes_are_refused_with_how_many_are_needed(logs, tmp_path, capsys):
-    out = tmp_path / "x.asm"
-    assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarm-rate", "0.01"]) == 2
-    assert "a false-alarm rate of 0.01 needs 198 normal episodes, 99 of them to calibrate on, got 40" in (
-        capsys.readouterr().err
+def test_files_without_a_clock_are_joined_row_by_row(tmp_path):
+    for name in ("current", "position"):
+        written(tmp_path / f"{name}.csv", "J_1,J_2\n1,2\n3,4\n")
+    assert read(tmp_path, join=True, rate=10.0).spec.labels == (
+        *("current.J[1]", "current.J[2]"),
+        *("position.J[1]", "position.J[2]"),
     )
-    assert not out.exists()
-    # 40 logs of 80 rows at 50 Hz: 7 pieces of 0.2 s each.
-    assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarm-rate", "0.01", "--split", "0.2"]) == 0
+    written(tmp_path / "position.csv", "J_1,J_2\n1,2\n")
+    with pytest.raises(ValueError, match="without a clock must be of one length, got current: 2, position: 1"):
+        read(tmp_path, join=True, rate=10.0)
+    with pytest.raises(ValueError, match="--join takes a folder of the files of one recording, got 0 in"):
+        read(tmp_path / "position.csv", join=True)
 
 
-def test_a_promise_by_the_hour_takes_the_hours_and_says_so(logs, tmp_path, capsys):
-    out = tmp_path / "m.asm"
-    assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarms-per-hour", "0.5"]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "0.5 false alarms an hour need at least 2 hours of nominal episodes" in said
-    assert not out.exists()
-    assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarms-per-hour", "5000"]) == 0
-    assert "at most 5000 alarms an hour of normal ones" in " ".join(capsys.readouterr().out.split())
-    assert load_monitor(out).promise.per == "hour"
+# ------------------------------------------------------------------ damage
 
 
-def test_a_fitted_memory_alarms_for_a_stuck_joint_and_not_for_a_normal_log(memory, tmp_path, capsys):
-    write_csv(tmp_path / "good.csv", log(100))
-    stuck = log(101)
-    stuck["q_1"][40:] = stuck["q_1"][40]
-    write_csv(tmp_path / "stuck.csv", stuck)
-    how = ["--monitor", str(memory), "--out", str(tmp_path / "out")]
-    assert main(["watch", str(tmp_path / "good.csv"), *how]) == 0
-    assert "0 alarms in 0 of 1 episodes" in capsys.readouterr().out
-    assert not (tmp_path / "out" / "moments.png").exists()
-    assert main(["watch", str(tmp_path / "stuck.csv"), *how]) == 1
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {
-        *("alarms.csv", "report.html", "surprise.png", "attribution.png", "stream.png", "moments.png"),
-    }
-    alarms = read_table(tmp_path / "out" / "alarms.csv")
-    assert 40 / RATE < alarms["from [s]"][0] < 60 / RATE
-    assert alarms["thresholds"].min() > 1
-    assert "stuck.csv" in (tmp_path / "out" / "report.html").read_text()
-
-
-def test_a_memory_of_the_same_seed_is_the_same(logs, memory, tmp_path):
-    assert main(["fit", str(logs), "--out", str(tmp_path / "again.asm"), *FIT]) == 0
-    first, again = load_monitor(memory), load_monitor(tmp_path / "again.asm")
-    assert first.threshold == again.threshold
-    for name, array in first.learned_.items():
-        np.testing.assert_array_equal(array, again.learned_[name])
-
-
-def streamed(monitor, columns, form=lambda row: json.dumps(row.tolist())):
-    """What following these rows prints, and its exit code."""
-    rows = Episode.from_table(columns, channels=monitor.spec).stream
-    said = io.StringIO()
-    code = watch.follow([form(row) for row in rows], monitor, Console(file=said))
-    return code, said.getvalue()
-
-
-def test_rows_as_they_come_raise_the_alarms_of_the_recording(memory, tmp_path):
-    monitor = load_monitor(memory)
-    stuck = log(101)
-    stuck["q_1"][40:] = stuck["q_1"][40]
-    episode = Episode.from_table(stuck, channels=monitor.spec)
-    (trace,) = traces_of([Log("stuck", episode)], monitor)
-    code, said = streamed(monitor, stuck)
-    assert code == 1
-    *alarms, summary = said.strip().splitlines()
-    assert [float(line.split()[0]) for line in alarms] == [pytest.approx((t + 1) / RATE) for t in trace.alarms]
-    assert summary.startswith(f"{ROWS} rows, {len(trace.alarms)} alarm")
-    assert streamed(monitor, log(100))[0] == 0
-
-    def by_channel(row):
-        return json.dumps(
-            {"q": row[:2].tolist(), "torque": float(row[2]), "cmd_0": float(row[3]), "cmd[1]": float(row[4])}
-        )
-
-    assert [line.split("thresholds")[0] for line in streamed(monitor, stuck, by_channel)[1].splitlines()[:-1]] == [
-        line.split("thresholds")[0] for line in alarms
-    ]
-
-
-def test_a_number_that_is_lost_is_an_alarm(memory):
-    monitor = load_monitor(memory)
-    rows = Episode.from_table(log(100), channels=monitor.spec).stream.astype(float)
-    lines = [json.dumps(dict(zip(monitor.spec.labels, row.tolist(), strict=True))) for row in rows[:10]]
-    lost = json.loads(lines[5])
-    del lost["torque"]
-    for line in (json.dumps(lost), json.dumps({**lost, "torque": None})):
-        said = io.StringIO()
-        assert watch.follow([*lines[:5], line], monitor, Console(file=said)) == 1
-        assert "torque  inf thresholds" in said.getvalue()
+@pytest.mark.parametrize("content", [b"", b"\x00\xff no file of this kind \x00", b"version https://git-lfs.github.com"])
+@pytest.mark.parametrize("suffix", FILES)
+def test_a_file_of_any_kind_that_is_none_is_named(suffix, content, tmp_path):
+    (tmp_path / f"no{suffix}").write_bytes(content)
+    with pytest.raises(ValueError, match=rf"no\{suffix}: ."):
+        read(tmp_path / f"no{suffix}")
 
 
 @pytest.mark.parametrize(
-    ("lines", "message"),
+    ("damage", "message"),
     [
-        ([], "no row came"),
-        (["\n"], "no row came"),
-        (["[1, 2]"], r"line 1 must hold 5 numbers, got the shape \(2,\)"),
-        (["{"], "line 1 is no row of numbers"),
-        (['["a", 1, 2, 3, 4]'], "line 1 is no row of numbers"),
-        (['{"q": [1, 2]}'], "line 1 is no row of numbers: it lacks torque, cmd"),
-        (['{"q": [1, 2, 3], "torque": 1, "cmd": [1, 2]}'], "line 1 must hold 5 numbers"),
+        (lambda raw: raw[: len(raw) // 2], r"x\.parquet"),
+        (lambda raw: b"", r"x\.parquet"),
+        (lambda raw: b"PAR1" + raw[4:-8] + b"\xff\xff\xff\x7fPAR1", r"x\.parquet"),
     ],
 )
-def test_a_line_that_is_no_row_is_refused_with_its_number(lines, message, memory):
+def test_a_damaged_parquet_file_is_named(damage, message, tmp_path):
+    path = tmp_path / "x.parquet"
+    pq.write_table(pa.table(log(0)), path)
+    path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(ValueError, match=message):
-        watch.follow(lines, load_monitor(memory), Console(file=io.StringIO()))
+        list(read_logs(path))
 
 
-def test_standard_input_is_watched_as_a_command(memory, monkeypatch, capsys):
-    rows = Episode.from_table(log(100), channels=load_monitor(memory).spec).stream
-    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(json.dumps(row.tolist()) for row in rows)))
-    assert main(["watch", "-", "--monitor", str(memory)]) == 0
-    assert f"{ROWS} rows, 0 alarms" in capsys.readouterr().out
+def test_a_small_file_that_claims_a_gigabyte_is_refused_unread(tmp_path):
+    path = tmp_path / "bomb.parquet"
+    zeros = pa.array(np.zeros(2_000_000))
+    pq.write_table(pa.table({f"x{k}": zeros for k in range(8)}), path, compression="zstd")
+    assert path.stat().st_size < 1_000_000
+    with pytest.raises(ValueError, match=r"bomb.parquet declares \d+ bytes, and has \d+"):
+        read_parquet(path)
+
+
+def test_a_damaged_header_of_an_array_is_one_line(tmp_path):
+    path = tmp_path / "x.npy"
+    np.save(path, np.zeros((20, 3), np.float32))
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    said = []
+    for _ in range(300):
+        raw = bytearray(whole)
+        raw[rng.integers(0, 128)] ^= 1 << rng.integers(0, 8)
+        path.write_bytes(bytes(raw))
+        try:
+            read(path, rate=10.0)
+        except ValueError as error:
+            said.append(str(error))
+    assert len(said) > 100
+    assert all(line.startswith(f"{path}: ") and "\n" not in line for line in said)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("place", "layout", "rate", "shape", "faults"),
     [
-        (["fit"], "DATA"),
-        (["fit", "nowhere"], "there is no nowhere"),
-        (["fit", "nowhere", "--monitor", "asm"], "unknown monitor 'asm'"),
-        (["fit", "nowhere", "--split", "0"], "split must be"),
-        (["fit", "nowhere", "--rate", "-1"], "rate must be"),
-        (["fit", "nowhere", "--out", "."], "is a folder"),
-        (["watch", "nowhere"], "--monitor"),
-        (["watch", "nowhere", "--monitor", "none.asm"], "none.asm"),
-        (["watch", "nowhere", "--monitor", "x.asm", "--silence", "0"], "silence must be"),
-        (["watch", "-", "--monitor", "x.asm", "--rerun", "x.rrd"], "--rerun is for a recording, and - is live"),
+        ("ur3_cobotops/dataset_02052023.csv", {}, 0.9949, (26188, 20), 518),
+        ("tiago_figaroh", {"join": True}, 99.999, (8022, 24), 0),
+        ("staubli_tx40_figaroh", {"join": True, "rate": 5000.0}, 5000.0, (45000, 12), 0),
+        ("unisa_acg/panda_exciting_trajectory.db3", {}, 29.9999, (727, 21), 0),
+        ("unisa_acg/ur10_exciting_trajectory.db3", {}, 125.0, (3441, 18), 0),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_one_line(arguments, message, capsys):
-    assert main(arguments) == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert len(said.strip().splitlines()) == 1
-
-
-def test_a_memory_without_a_threshold_cannot_watch(tmp_path, capsys):
-    episodes = [Episode.from_table(log(n)) for n in range(4)]
-    make_monitor("kalman", episodes[0].spec).fit(episodes).save(tmp_path / "raw.asm")
-    assert main(["watch", "-", "--monitor", str(tmp_path / "raw.asm")]) == 2
-    assert "raw.asm has no threshold" in capsys.readouterr().err
+def test_recordings_of_real_arms_are_read(place, layout, rate, shape, faults):
+    if not (REAL / place).exists():
+        pytest.skip(f"ASM_GYM_REAL names no folder with {place}")
+    episode = read(REAL / place, **layout)
+    assert episode.stream.shape == shape
+    assert 1 / episode.spec.dt == pytest.approx(rate, rel=1e-4)
+    assert episode.faults.sum() == faults
+    assert not any(is_clock(label) for label in episode.spec.labels)

@@ -56,7 +56,7 @@ def test_live_rows_with_units_behind_their_names_are_read_in_those_of_the_memory
     ]
     by_label = '{"angle[0] [deg]": 180, "angle[1] [rad]": 1, "current": 0.5, "u": 1}'
     assert lines(by_label) == [pytest.approx([np.pi, 1.0, 0.5, 1.0])]
-    with pytest.raises(ValueError, match=r"current \[V\] is in V, and the memory reads A"):
+    with pytest.raises(ValueError, match=r"current is in V, and the memory reads A"):
         lines("angle_0,angle_1,current [V],u", "1,1,1,1")
 
 

@@ -11,7 +11,6 @@ Source: Granger 1969 (Econometrica), of causality in the mean, on innovations.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,11 +19,6 @@ from numpy.typing import NDArray
 from asm_gym.episode import Episode
 
 Floats = NDArray[np.float64]
-
-COMMAND = re.compile(
-    r"(.*[^a-z])?(target|desired|cmd|commands?|commanded|set_?points?|goal|ref|reference|action)([^a-z].*)?"
-)
-"""What a column is called that was commanded and not sensed."""
 
 REACTS = 0.3
 """R² from which on a command is taken for feedback: of plans it was 0.09 at most, of controllers 0.5 and more."""
@@ -35,11 +29,6 @@ PENALTY = 1e-7
 
 LEAST_ROWS = 1000
 """Under so many nobody can tell."""
-
-
-def is_command(name: str) -> bool:
-    """Whether a column of that name was commanded."""
-    return COMMAND.fullmatch(name.lower()) is not None
 
 
 def feedback(episodes: Sequence[Episode]) -> dict[str, float]:

@@ -1,13 +1,12 @@
-"""Minari datasets: episodes written so that others can read them, and read whoever wrote them.
+"""Write episodes as Minari datasets, and read those of others.
 
 A dataset holds T + 1 observations and T actions, rewards, terminations and truncations of each episode; ours hold the
-sensorimotor stream, (T, D), in ``infos`` as well, and name its channels in the metadata. See Younis et al. 2024,
+sensorimotor stream, (T, D), in ``infos`` as well, and name its channels in the metadata. Source: Younis et al. 2024,
 https://minari.farama.org.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import shutil
@@ -21,7 +20,7 @@ import numpy as np
 from gymnasium.spaces.utils import flatten_space
 from numpy.typing import NDArray
 
-from asm_gym.data.hdf5 import opened_hdf5
+from asm_gym.data.integrity import digest, opened_hdf5
 from asm_gym.episode import Episode, check_recorded
 from asm_gym.extras import require
 from asm_gym.files import named, require_space, written_whole
@@ -30,18 +29,32 @@ from asm_gym.tasks import TASKS
 from asm_gym.validation import check_text, typed
 
 METADATA, ARRAYS, CHECKSUMS = "metadata.json", "main_data.hdf5", "SHA256SUMS"
-"""What a dataset's folder ``data`` holds; the first two are Minari's."""
+"""Files of a dataset's folder ``data``; the first two are Minari's."""
+
+
+def require_minari() -> None:
+    """Raise ImportError that says how to get what datasets need, where it is missing."""
+    for package in ("h5py", "minari"):
+        require(package, what="a dataset")
+
+
+def _minari(name: str) -> Any:
+    """Something of Minari's, which is an extra."""
+    require_minari()
+    module, attribute = name.rsplit(".", 1)
+    return getattr(import_module(module), attribute)
 
 
 @typed
 def write_dataset(
     root: Path, dataset_id: str, episodes: Sequence[Episode], env: gym.Env[Any, Any], details: dict[str, Any]
 ) -> Path:
-    """Writes episodes as a Minari dataset to ``root/<dataset_id>``, in place of the one that is there.
+    """Write episodes as a Minari dataset to ``root/<dataset_id>``, in place of the one that is there.
 
-    ``root`` is what Minari calls its root: ``MINARI_DATASETS_PATH=root`` lets ``minari.load_dataset`` find it.
+    ``MINARI_DATASETS_PATH=root`` lets ``minari.load_dataset`` find it.
 
     Args:
+        root: the folder of all datasets.
         dataset_id: such as ``asm_gym/lift-v0``.
         episodes: of one spec.
         env: that they were recorded in.
@@ -62,11 +75,12 @@ def write_dataset(
         if not steps or len(episode.observations) != steps + 1 or len(episode.rewards) != steps:
             raise ValueError(f"episode {n} needs an action, a reward and a flat observation of every step")
         check_recorded(episode)
-    folder = _place(root, dataset_id)
+    folder = _folder(root, dataset_id)
     unfinished, replaced = (folder.with_name(f".{folder.name}.{what}") for what in ("unfinished", "replaced"))
     for before in (folder, unfinished, replaced):
-        _refuse_what_is_not_ours(before)
-    require_space(folder, sum(map(_bytes, episodes)))
+        _refuse_foreign(before)
+    image = _hdf5(episodes)
+    require_space(folder, len(image) + 2**20)
     for before in (unfinished, replaced):
         shutil.rmtree(before, ignore_errors=True)
     data = unfinished / "data"
@@ -76,14 +90,13 @@ def write_dataset(
     with named(data):
         storage = storage_class.new(data, **spaces, env_spec=env.spec)
         with written_whole(data / ARRAYS) as file:
-            file.write(_as_hdf5(episodes))
+            file.write(image)
         counted = {"total_episodes": len(episodes), "total_steps": sum(len(e.rewards) for e in episodes)}
         about = {"dataset_id": dataset_id, "minari_version": _minari("minari.__version__")}
         size = {"dataset_size": storage.get_size(), "stream_spec": spec.to_json()}
         storage.update_metadata({**counted, **size, **details, **about})
-        (data / CHECKSUMS).write_text(
-            "".join(f"{_digest(data / name)}  {name}\n" for name in (ARRAYS, METADATA)), encoding="ascii"
-        )
+        sums = "".join(f"{digest(data / name)}  {name}\n" for name in (ARRAYS, METADATA))
+        (data / CHECKSUMS).write_text(sums, encoding="ascii")
     if folder.exists():
         folder.rename(replaced)
     unfinished.rename(folder)
@@ -91,36 +104,18 @@ def write_dataset(
     return folder
 
 
-def _as_hdf5(episodes: Sequence[Episode]) -> bytes:
-    """The file that Minari keeps them in, made in memory: HDF5 ends the process where a disk takes no more of it."""
-    h5py = require("h5py", what="a dataset")
-    with h5py.File("episodes", "w", driver="core", backing_store=False, track_order=True) as file:
-        for n, episode in enumerate(episodes):
-            group, columns = file.create_group(f"episode_{n}"), _columns(episode)
-            about = {"id": n, "seed": columns.pop("seed"), "total_steps": len(episode.rewards)}
-            about |= {"success": bool(episode.success), "info": json.dumps(episode.info)}
-            group.attrs.update({name: value for name, value in about.items() if value is not None})
-            infos = {f"infos/{name}": array for name, array in columns.pop("infos").items()}
-            for name, array in {**columns, **infos}.items():
-                group.create_dataset(name, data=array, chunks=True, maxshape=(None, *array.shape[1:]))
-        file.flush()
-        image: bytes = file.id.get_file_image()
-    return image
-
-
-def _place(root: Path, dataset_id: str) -> Path:
+def _folder(root: Path, dataset_id: str) -> Path:
     """The folder of a dataset. Raises ValueError for a name that leads anywhere but below ``root``."""
     check_text("dataset_id", dataset_id)
     if not all(re.fullmatch(r"\w[\w.-]*", part) for part in dataset_id.split("/")):
         raise ValueError(f"dataset_id must be a name such as asm_gym/lift-v0, got {dataset_id!r}")
-    top = root.resolve()  # Minari doubles a relative path
-    folder = top / dataset_id
+    folder = root.resolve() / dataset_id  # Minari doubles a relative path
     if folder.resolve() != folder:
         raise ValueError(f"{folder} is a link to {folder.resolve()}, and is not replaced")
     return folder
 
 
-def _refuse_what_is_not_ours(folder: Path) -> None:
+def _refuse_foreign(folder: Path) -> None:
     """Raises ValueError unless a folder that is to be replaced holds at most what ``write_dataset`` writes."""
     found = {f for f in folder.rglob("*") if f.is_symlink() or not f.is_dir()} if folder.is_dir() else {folder}
     foreign = found - {folder / "data" / name for name in (ARRAYS, METADATA, CHECKSUMS)}
@@ -128,55 +123,36 @@ def _refuse_what_is_not_ours(folder: Path) -> None:
         raise ValueError(f"{min(foreign)} is nothing that asm-gym wrote, so {folder} is not replaced")
 
 
-def _bytes(episode: Episode) -> int:
-    """That an episode takes in a dataset, at most [bytes]."""
-    columns = _columns(episode)
-    arrays = [*columns["infos"].values(), *(a for a in columns.values() if isinstance(a, np.ndarray))]
-    total: int = sum(a.nbytes for a in arrays)
-    return total + total // 10 + 2**16
-
-
-def _digest(file: Path) -> str:
-    with file.open("rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()
-
-
-def _check_whole(folder: Path) -> None:
-    """Raises ValueError unless the files are those that were written, and hold what they declare.
-
-    ``sha256sum --check SHA256SUMS`` asks the first. Datasets of others have no checksums.
-    """
-    if (folder / CHECKSUMS).is_file():
-        for line in (folder / CHECKSUMS).read_text(encoding="ascii").splitlines():
-            digest, _, name = line.partition("  ")
-            if name not in (ARRAYS, METADATA) or _digest(folder / name) != digest:
-                raise ValueError(
-                    f"{name} is not as it was written (where it was changed on purpose, remove {CHECKSUMS})"
-                )
-    if (folder / ARRAYS).exists():
-        with opened_hdf5(folder / ARRAYS):
-            pass
-
-
-def _columns(episode: Episode) -> dict[str, Any]:
-    """An episode's arrays by Minari's names."""
-    T = len(episode.rewards)
-    last = np.arange(T) == T - 1
-    terminated = bool(episode.info.get("terminated", False))
-    return {
-        "seed": episode.seed,
-        "observations": episode.observations,
-        "actions": episode.actions,
-        "rewards": episode.rewards,
-        "terminations": last & terminated,
-        "truncations": last & (not terminated),
-        "infos": {"stream": episode.stream, "fault": episode.faults},
-    }
+def _hdf5(episodes: Sequence[Episode]) -> bytes:
+    """Minari's file, made in memory: HDF5 ends the process where a disk is full."""
+    h5py = require("h5py", what="a dataset")
+    with h5py.File("episodes", "w", driver="core", backing_store=False, track_order=True) as file:
+        for n, episode in enumerate(episodes):
+            T = len(episode.rewards)
+            last = np.arange(T) == T - 1
+            terminated = bool(episode.info.get("terminated", False))
+            arrays = {
+                "observations": episode.observations,
+                "actions": episode.actions,
+                "rewards": episode.rewards,
+                "terminations": last & terminated,
+                "truncations": last & (not terminated),
+                "infos/stream": episode.stream,
+                "infos/fault": episode.faults,
+            }
+            about = {"id": n, "seed": episode.seed, "total_steps": T, "success": bool(episode.success)}
+            group = file.create_group(f"episode_{n}")
+            group.attrs.update({k: v for k, v in about.items() if v is not None} | {"info": json.dumps(episode.info)})
+            for name, array in arrays.items():
+                group.create_dataset(name, data=array, chunks=True, maxshape=(None, *array.shape[1:]))
+        file.flush()
+        image: bytes = file.id.get_file_image()
+    return image
 
 
 @typed
 def read_dataset(path: str | Path, env_id: str | None = None, dt: float | None = None) -> list[Episode]:
-    """The episodes of a Minari dataset, whoever recorded them.
+    """Return the episodes of a Minari dataset, whoever recorded them.
 
     Where it holds no stream, observation and action are the stream, as in ``StreamSpec.from_spaces``.
 
@@ -199,21 +175,20 @@ def read_dataset(path: str | Path, env_id: str | None = None, dt: float | None =
         dataset = dataset_class(folder)
         recorded = list(dataset.iterate_episodes())
         notes = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
-        known = {"dataset": dataset, "metadata": metadata}
+        spaces = dataset.observation_space, dataset.action_space
     except (OSError, KeyError, ValueError, AssertionError, RuntimeError, AttributeError) as error:
         raise ValueError(f"{folder} is damaged or not a Minari dataset: {error}") from error
     found = dataset.env_spec.id if dataset.env_spec is not None else None
     if env_id is not None and found != env_id:
         raise ValueError(f"{folder} was recorded in {found}, not in {env_id!r}")
-    spec = _spec(folder, known, found, dt)
+    spec = _spec(folder, metadata, spaces, found, dt)
     if not recorded:
         raise ValueError(f"{folder} holds no episode")
-    spaces = known["dataset"].observation_space, known["dataset"].action_space
     return [_episode(folder, data, note, spec, spaces) for data, note in zip(recorded, notes, strict=True)]
 
 
 def find_dataset(path: Path) -> Path:
-    """The folder with the metadata of the only dataset at or below ``path``. Raises FileNotFoundError or ValueError."""
+    """Return the folder with the only dataset's metadata at or below ``path``. Raises FileNotFoundError, ValueError."""
     if (path / METADATA).is_file():
         return path
     found = [f for f in sorted(path.rglob(METADATA)) if f.parent.name == "data"]
@@ -225,20 +200,35 @@ def find_dataset(path: Path) -> Path:
     return below[0]
 
 
-def _spec(folder: Path, known: dict[str, Any], env_id: str | None, dt: float | None) -> StreamSpec:
-    if "stream_spec" in known["metadata"]:
+def _check_whole(folder: Path) -> None:
+    """Raises ValueError unless the files are those that were written, and hold what they declare."""
+    if (folder / CHECKSUMS).is_file():  # others write none
+        for line in (folder / CHECKSUMS).read_text(encoding="ascii").splitlines():
+            written, _, name = line.partition("  ")
+            if name not in (ARRAYS, METADATA) or digest(folder / name) != written:
+                raise ValueError(
+                    f"{name} is not as it was written (where it was changed on purpose, remove {CHECKSUMS})"
+                )
+    if (folder / ARRAYS).exists():
+        with opened_hdf5(folder / ARRAYS):
+            pass
+
+
+def _spec(
+    folder: Path, metadata: dict[str, Any], spaces: tuple[Any, Any], env_id: str | None, dt: float | None
+) -> StreamSpec:
+    if "stream_spec" in metadata:
         try:
-            return StreamSpec.from_json(known["metadata"]["stream_spec"])
+            return StreamSpec.from_json(metadata["stream_spec"])
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{folder} names its channels in a way that cannot be read: {error}") from error
     if env_id in {task.id for task in TASKS.values()}:
         raise ValueError(f"{folder} was recorded in {env_id} and holds no streams: record it with `asm-gym collect`")
-    dataset = known["dataset"]
-    return StreamSpec.from_spaces(dataset.observation_space, dataset.action_space, dt or _period(env_id))
+    return StreamSpec.from_spaces(*spaces, dt or _period(env_id))
 
 
 def _period(env_id: str | None) -> float:
-    """[s] of an environment that is registered here; what the file itself says of how to make it is not followed."""
+    """[s] of an environment that is registered here; how the file itself says to make it is not followed."""
     if env_id not in gym.registry:
         return 1.0
     try:
@@ -256,12 +246,10 @@ def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec, sp
     infos = data.infos or {}
     seed = note.get("seed")
     try:
-        lengths = {"actions": T, "observations": T + 1, "terminations": T, "truncations": T}
-        for name, length in lengths.items():
-            for found in {len(part) for part in _parts(getattr(data, name))}:
+        for name, length in {"actions": T, "observations": T + 1, "terminations": T, "truncations": T}.items():
+            for found in {len(part) for part in _leaves(getattr(data, name))}:
                 if found != length:
                     raise ValueError(f"{T} rewards need {length} {name}, got {found}")
-        actions = np.asarray(data.actions, np.float32).reshape(T, -1)
         observations = flat_rows(spaces[0], data.observations, T + 1)
         if spec.source == "spaces" and "stream" not in infos:
             stream = np.concatenate([observations[1:], flat_rows(spaces[1], data.actions, T)], axis=1)
@@ -272,7 +260,7 @@ def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec, sp
             spec=spec,
             success=bool(note["success"] if "success" in note else np.any(infos.get("success", False))),
             seed=None if seed is None else int(seed),
-            actions=actions,
+            actions=np.asarray(data.actions, np.float32).reshape(T, -1),
             observations=observations,
             rewards=np.asarray(data.rewards, np.float32),
             faults=_without_reset(np.asarray(infos.get("fault", np.zeros(len(stream))), np.bool_), T),
@@ -284,9 +272,9 @@ def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec, sp
         raise ValueError(f"{folder}, episode {data.id}: {error}") from error
 
 
-def _parts(values: Any) -> list[Any]:
-    """The arrays that a dict holds, at any depth."""
-    return [part for value in values.values() for part in _parts(value)] if isinstance(values, dict) else [values]
+def _leaves(values: Any) -> list[Any]:
+    """The arrays of a dict, at any depth."""
+    return [leaf for value in values.values() for leaf in _leaves(value)] if isinstance(values, dict) else [values]
 
 
 def _without_reset(rows: NDArray[Any], T: int) -> NDArray[Any]:
@@ -295,16 +283,3 @@ def _without_reset(rows: NDArray[Any], T: int) -> NDArray[Any]:
     if not T or len(rows) % T:
         raise ValueError(f"{T} steps cannot have {len(rows)} rows of a stream")
     return rows
-
-
-def require_minari() -> None:
-    """Raises ImportError that says how to get what datasets need, where it is missing."""
-    for package in ("h5py", "minari"):
-        require(package, what="a dataset")
-
-
-def _minari(name: str) -> Any:
-    """Something of Minari's, which is an extra."""
-    require_minari()
-    module, attribute = name.rsplit(".", 1)
-    return getattr(import_module(module), attribute)

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.channels import bare_name, counts_rows, is_label, unit_of
-from asm_gym.data.clock_column import clock_among, is_clock
-from asm_gym.data.commands import is_command
-from asm_gym.data.row_times import FAR, increasing, period
+from asm_gym.data.clock import FAR, clock_among, distinct, period
+from asm_gym.data.names import is_clock, is_command, is_counter, is_label
+from asm_gym.data.units import bare_name, unit_of
 from asm_gym.readings import noise_of, resolution
 
 FEW_VALUES = 8
@@ -191,7 +190,7 @@ def _clock(
         return ClockFound("", known, 0.0, nothing, rows, rows / known if known else 0.0), count / (known or 1.0)
     try:
         times = clock.seconds(columns[clock.column])
-        kept = times[increasing(times)]
+        kept = times[distinct(times)]
         dt = period(kept)
     except ValueError as error:
         return ClockFound(clock.column, 0.0, 0.0, nothing, rows, 0.0, str(error)), count
@@ -228,6 +227,6 @@ def _role(column: str, values: NDArray[Any]) -> str:
         return "clock"
     if is_label(name):
         return "label"
-    if counts_rows(name, values):
+    if is_counter(name, values):
         return "counter"
     return "command" if is_command(name) else "sense"

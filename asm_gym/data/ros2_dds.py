@@ -1,13 +1,11 @@
-"""Rows from ROS 2 topics over DDS, without ROS: what joints and wrists say, as they say it.
+"""Follow ROS 2 topics over DDS, without ROS.
 
     /joint_states      on DDS rt/joint_states, of type sensor_msgs::msg::dds_::JointState_
-    a row              a message of the first topic, at the time in its header; of the others what they said last
+    a row              a message of the first topic, at the time in its header, with the newest of the others
     numbers            named as those of a bag are, joint_states.position[panda_joint1] (``asm_gym.data.bags``)
 
 So a memory fitted from a bag reads the topics that the bag recorded. A reader asks for no more than best effort, which
-every writer offers. It was tried with publishers of CycloneDDS in other processes, and never with a robot's.
-
-Sources: ROS 2 design, “Topic and Service name mapping to DDS”; ROS_DOMAIN_ID as ROS 2 reads it.
+every writer offers. Sources: ROS 2 design, "Topic and Service name mapping to DDS"; ROS_DOMAIN_ID as ROS 2 reads it.
 """
 
 from __future__ import annotations
@@ -20,12 +18,13 @@ from functools import cache
 from typing import Any
 
 from asm_gym.data.bags import MESSAGES, Numbers
+from asm_gym.data.live import SourceDied
 from asm_gym.extras import require
 
 CONNECT_S = 5.0
 """How long a topic may take to be found [s]."""
 
-LOOK_S = 0.05
+POLL_S = 0.05
 """How often the end of a source is looked for while nothing comes [s]."""
 
 AT_ONCE = 2048
@@ -46,40 +45,43 @@ FIELDS: dict[str, dict[str, str]] = {
     "std_msgs/msg/MultiArrayLayout": {"dim": "[std_msgs/msg/MultiArrayDimension]", "data_offset": "uint32"},
     "std_msgs/msg/Float64MultiArray": {"layout": "std_msgs/msg/MultiArrayLayout", "data": "[float64]"},
 }
-"""What the messages hold, from their .msg files."""
+"""Fields of the messages, from their .msg files."""
+
+
+def _dds(part: str) -> Any:
+    return require(f"cyclonedds.{part}", what="a DDS topic")
 
 
 @cache
 def message(name: str) -> Any:
-    """The IDL type of a message, ``sensor_msgs/msg/JointState``, or of a field, ``float64`` or ``[float64]``."""
-    idl, types = (require(f"cyclonedds.{part}", what="a DDS topic") for part in ("idl", "idl.types"))
+    """Return the IDL type of a message, ``sensor_msgs/msg/JointState``, or of a field, ``float64`` or ``[float64]``."""
     if name == "str":
         return str
     if name.startswith("["):
-        return types.sequence[message(name[1:-1])]
+        return _dds("idl.types").sequence[message(name[1:-1])]
     if name not in FIELDS:
-        return getattr(types, name)
+        return getattr(_dds("idl.types"), name)
     fields = {field: message(kind) for field, kind in FIELDS[name].items()}
-    return idl.make_idl_struct(name.rpartition("/")[2], f"{_on_dds(name)}".replace("::", "."), fields)
+    return _dds("idl").make_idl_struct(name.rpartition("/")[2], _type_name(name).replace("::", "."), fields)
 
 
-def _on_dds(name: str) -> str:
-    """What a type is called there: ``sensor_msgs::msg::dds_::JointState_``."""
+def _type_name(name: str) -> str:
+    """The name of a type on DDS: ``sensor_msgs::msg::dds_::JointState_``."""
     package, kind, last = name.split("/")
     return f"{package}::{kind}::dds_::{last}_"
 
 
-def dds_lines(topics: str, silence: float) -> Iterator[str]:
-    """Rows of topics as JSON lines, their time in seconds since 1970 or whatever the stamps count from.
+def follow_topics(topics: str, silence: float) -> Iterator[str]:
+    """Yield rows of topics as JSON lines, with the time of their stamps [s].
 
     Args:
         topics: ``/joint_states``, or several with commas between, the first being the clock.
-        silence: seconds without a row from which on the source has died, which ends the lines with a TimeoutError.
+        silence: seconds without a row from which on the source has died.
 
     Raises:
         ValueError: no such names, or a topic is of another type, or ROS_DOMAIN_ID is no number.
-        OSError: nobody publishes one of them.
-        TimeoutError: nothing came for so long.
+        OSError: nobody publishes one of them, or no first row came.
+        SourceDied: nothing came for so long after a row.
         ImportError: cyclonedds is not installed.
     """
     names = [name.strip() for name in topics.split(",")]
@@ -88,34 +90,37 @@ def dds_lines(topics: str, silence: float) -> Iterator[str]:
     domain = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not domain.isdigit():
         raise ValueError(f"ROS_DOMAIN_ID must be a number, got {domain!r}")
-    participant = require("cyclonedds.domain", what="a DDS topic").DomainParticipant(int(domain))
-    sub, core, util = (require(f"cyclonedds.{part}", what="a DDS topic") for part in ("sub", "core", "util"))
+    participant = _dds("domain").DomainParticipant(int(domain))
+    core = _dds("core")
     kinds = {name: _kind(participant, name) for name in names}
-    policy = core.Policy
-    quality = core.Qos(policy.Reliability.BestEffort, policy.History.KeepLast(AT_ONCE))
-    topic = require("cyclonedds.topic", what="a DDS topic").Topic
-    readers = {
-        name: sub.DataReader(participant, topic(participant, _topic(name), message(kind)), qos=quality)
-        for name, kind in kinds.items()
-    }
+    quality = core.Qos(core.Policy.Reliability.BestEffort, core.Policy.History.KeepLast(AT_ONCE))
+    readers = {}
+    for name, kind in kinds.items():
+        topic = _dds("topic").Topic(participant, _topic(name), message(kind))
+        readers[name] = _dds("sub").DataReader(participant, topic, qos=quality)
+    clock, *others = names
     waiting = core.WaitSet(participant)
-    clock = readers[names[0]]
-    condition = core.ReadCondition(clock, core.ViewState.Any | core.InstanceState.Any | core.SampleState.NotRead)
+    unread = core.ViewState.Any | core.InstanceState.Any | core.SampleState.NotRead
+    condition = core.ReadCondition(readers[clock], unread)
     waiting.attach(condition)
-    heard = dict.fromkeys(names, time.monotonic())
+    last_at = dict.fromkeys(names, time.monotonic())
     latest: dict[str, Numbers] = {}
+    rows = 0
     while True:
-        waiting.wait(util.duration(seconds=LOOK_S))
-        for name in names[1:]:
+        waiting.wait(_dds("util").duration(seconds=POLL_S))
+        for name in (*others, clock):
             for sample in _taken(readers[name]):
-                heard[name], latest[name] = time.monotonic(), _named(name, kinds[name], sample)
-            if time.monotonic() - heard[name] > silence:
-                latest.pop(name, None)  # what is no longer said is missing, and not as it was
-        for sample in _taken(clock):
-            heard[names[0]], latest[names[0]] = time.monotonic(), _named(names[0], kinds[names[0]], sample)
-            yield json.dumps({"time": _stamp(sample)} | {n: v for said in latest.values() for n, v in said.items()})
-        if time.monotonic() - heard[names[0]] > silence:
-            raise TimeoutError(f"nothing came for {silence:g} s")
+                last_at[name], latest[name] = time.monotonic(), _named(name, kinds[name], sample)
+                if name == clock:
+                    rows += 1
+                    numbers = {n: v for part in latest.values() for n, v in part.items()}
+                    yield json.dumps({"time": _stamp(sample)} | numbers)
+            if name != clock and time.monotonic() - last_at[name] > silence:
+                latest.pop(name, None)  # an old value is a missing one
+        if time.monotonic() - last_at[clock] > silence:
+            if not rows:
+                raise OSError(f"no row came from {topics} for {silence:g} s")
+            raise SourceDied(f"nothing came for {silence:g} s")
 
 
 def _topic(name: str) -> str:
@@ -124,9 +129,9 @@ def _topic(name: str) -> str:
 
 def _kind(participant: Any, name: str) -> str:
     """The type of message that somebody publishes there."""
-    builtin = require("cyclonedds.builtin", what="a DDS topic")
+    builtin = _dds("builtin")
     found = builtin.BuiltinDataReader(participant, builtin.BuiltinTopicDcpsPublication)
-    known = {_on_dds(kind): kind for kind in MESSAGES}
+    known = {_type_name(kind): kind for kind in MESSAGES}
     until, others = time.monotonic() + CONNECT_S, set[str]()
     while time.monotonic() < until:
         for publication in found.take(N=AT_ONCE):
@@ -136,16 +141,14 @@ def _kind(participant: Any, name: str) -> str:
                 return known[publication.type_name]
             if publication.topic_name.startswith("rt/"):
                 others.add(publication.topic_name[2:])
-        time.sleep(LOOK_S)
+        time.sleep(POLL_S)
     there = f"; there are {', '.join(sorted(others))}" if others else ""
     raise OSError(f"nobody publishes {name}{there}")
 
 
 def _taken(reader: Any) -> list[Any]:
-    """Messages since the last look; what only says that a writer went is none."""
-    return [
-        sample for sample in reader.take(N=AT_ONCE) if hasattr(sample, "sample_info") and sample.sample_info.valid_data
-    ]
+    """Messages since the last look, without those that only say that a writer went."""
+    return [s for s in reader.take(N=AT_ONCE) if hasattr(s, "sample_info") and s.sample_info.valid_data]
 
 
 def _named(name: str, kind: str, sample: Any) -> Numbers:
@@ -153,7 +156,7 @@ def _named(name: str, kind: str, sample: Any) -> Numbers:
 
 
 def _stamp(sample: Any) -> float:
-    """The time in its header [s]; where it says none, when it was written."""
+    """The time in its header [s]; where it has none, when it was written."""
     stamp = getattr(getattr(sample, "header", None), "stamp", None)
-    said = 0.0 if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
-    return float(said or 1e-9 * sample.sample_info.source_timestamp)
+    seconds = 0.0 if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
+    return seconds or 1e-9 * sample.sample_info.source_timestamp

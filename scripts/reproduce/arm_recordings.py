@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from asm_gym.body_model import read_urdf
 from asm_gym.data.bags import read_bag
-from asm_gym.data.joining import joined
-from asm_gym.data.text import read_table
+from asm_gym.data.logs import joined
+from asm_gym.data.text import read_text
 from asm_gym.episode import Episode
 
 BODIES = "urdf"
@@ -77,9 +77,9 @@ def _bag(path: Path) -> Columns:
 
 def _flattened(path: Path) -> Columns:
     """One number a line, a line a joint, seven lines a row."""
-    found = {"time": read_table(path / "time.txt", ["time"])["time"]}
+    found = {"time": read_text(path / "time.txt", ["time"])["time"]}
     for name, file in (("position", "positions"), ("velocity", "velocity"), ("effort", "torques")):
-        numbers = read_table(path / f"{file}.txt", [name])[name]
+        numbers = read_text(path / f"{file}.txt", [name])[name]
         if len(numbers) % len(found["time"]):
             raise ValueError(f"{path / file}.txt holds {len(numbers)} numbers, for {len(found['time'])} times")
         found[name] = numbers.reshape(len(found["time"]), -1)
@@ -87,7 +87,7 @@ def _flattened(path: Path) -> Columns:
 
 
 def _three_files(path: Path) -> Columns:
-    whole = joined({file.stem: read_table(file) for file in sorted(path.glob("*.csv"))})
+    whole = joined({file.stem: read_text(file) for file in sorted(path.glob("*.csv"))})
     kinds = ("position", "velocity", "effort")
     return {"time": whole["time"]} | {
         kind: np.column_stack([v for n, v in whole.items() if n.endswith(kind)]) for kind in kinds
@@ -100,7 +100,7 @@ EVERY = 50
 
 def _two_files(path: Path) -> Columns:
     position, current = (
-        np.column_stack(list(read_table(path / name).values())) for name in ("pos_read_data.csv", "curr_data.csv")
+        np.column_stack(list(read_text(path / name).values())) for name in ("pos_read_data.csv", "curr_data.csv")
     )
     rows = len(position) // EVERY
     means = current[: rows * EVERY].reshape(rows, EVERY, -1).mean(axis=1)
@@ -172,7 +172,7 @@ def read_cobot(folder: Path) -> tuple[Columns, dict[str, NDArray[np.bool_]]]:
     path = folder / COBOT
     if not path.exists():
         raise FileNotFoundError(f"{path} is missing: it is {COBOT_SOURCE}")
-    columns = read_table(path)
+    columns = read_text(path)
     events = {name: np.nan_to_num(columns.pop(name)) > 0 for name in COBOT_EVENTS}
     return {n: v for n, v in columns.items() if not COBOT_LEFT_OUT.fullmatch(n)}, events
 

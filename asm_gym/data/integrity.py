@@ -1,7 +1,8 @@
-"""HDF5 files of others, looked at before they are read: what they declare must be in them."""
+"""Refuse files that are not as they were written, or that declare more than they hold."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,9 +18,21 @@ SMALL = 16 * 2**20
 """[bytes] that no file is too small for."""
 
 
+def check_declared(path: Path, declared: int, size: int) -> None:
+    """Raise ValueError where a file of ``size`` says that it holds ``declared`` [bytes], and that cannot be."""
+    if declared > max(SMALL, MOST_EXPANDED * size):
+        raise ValueError(f"{path} declares {declared} bytes, and has {size}")
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal digits."""
+    with path.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
 @contextmanager
 def opened_hdf5(path: Path) -> Iterator[Any]:
-    """The file, open for reading.
+    """Open an HDF5 file for reading.
 
     Raises:
         FileNotFoundError: there is none.
@@ -29,17 +42,14 @@ def opened_hdf5(path: Path) -> Iterator[Any]:
     h5py = require("h5py", what="an HDF5 file")
     size = regular_file(path)
     with h5py.File(path, "r") as file:
-        declared = sum(_declared(h5py, file))
-        if declared > max(SMALL, MOST_EXPANDED * size):
-            raise ValueError(f"{path} declares {declared} bytes, and has {size}")
+        check_declared(path, sum(_declared(h5py, file)), size)
         yield file
 
 
 def _declared(h5py: Any, group: Any) -> Iterator[int]:
     """[bytes] of each array at or below a group."""
     for name in group:
-        link = group.get(name, getlink=True)
-        if not isinstance(link, h5py.HardLink):
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
             raise ValueError(f"{group.name}/{name} points elsewhere, which is not followed")
         node = group[name]
         if isinstance(node, h5py.Group):

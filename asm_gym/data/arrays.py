@@ -1,4 +1,4 @@
-"""Columns of numbers from binary files, Parquet and NumPy, looked at before they are read; text is read by ``text``."""
+"""Read the columns of Parquet files and NumPy arrays, which are looked at before they are read."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.hdf5 import MOST_EXPANDED, SMALL
+from asm_gym.data.integrity import check_declared
 from asm_gym.extras import require
 from asm_gym.files import regular_file
 
+Columns = dict[str, NDArray[Any]]
 
-def read_parquet(path: Path) -> dict[str, NDArray[Any]]:
-    """The columns of a Parquet file, those of lists as arrays of two dimensions.
+
+def read_parquet(path: Path) -> Columns:
+    """Return the columns of a Parquet file, those of lists as arrays of two dimensions.
 
     Raises:
         ValueError: it is damaged, empty, or declares far more than it holds.
@@ -34,14 +36,8 @@ def read_parquet(path: Path) -> dict[str, NDArray[Any]]:
     return {name: as_array(table[name]) for name in table.column_names}
 
 
-def check_declared(path: Path, declared: int, size: int) -> None:
-    """Raises ValueError where a file of ``size`` says that it holds ``declared`` [bytes], and that cannot be."""
-    if declared > max(SMALL, MOST_EXPANDED * size):
-        raise ValueError(f"{path} declares {declared} bytes, and has {size}")
-
-
 def as_array(column: Any) -> NDArray[Any]:
-    """(T,) or, of lists of one length, (T, k)."""
+    """Return (T,) or, of lists of one length, (T, k)."""
     array = np.asarray(column)
     if array.dtype == object and len(array) and isinstance(array[0], list | tuple | np.ndarray):
         lengths = {len(row) for row in array if row is not None}
@@ -50,8 +46,8 @@ def as_array(column: Any) -> NDArray[Any]:
     return array
 
 
-def read_array(path: Path, columns: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
-    """The array of a ``.npy`` file, (T,) or (T, k), as columns of these names, or as the one column ``value``.
+def read_array(path: Path, columns: Sequence[str] = ()) -> Columns:
+    """Return the array of a ``.npy`` file, (T,) or (T, k), as columns of these names, or as the one column ``value``.
 
     Raises:
         ValueError: it is damaged, or has not as many columns as are named.
@@ -61,16 +57,16 @@ def read_array(path: Path, columns: Sequence[str] = ()) -> dict[str, NDArray[Any
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)  # which refuses a file shorter than it declares
     except Exception as error:  # its header is Python, and whatever reading that may raise, damage raises
-        raise ValueError(
-            f"{path} is damaged: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
-        ) from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
-        raise ValueError(f"{path} must hold rows of numbers, got {getattr(array, 'dtype', type(array).__name__)}")
-    if array.ndim not in (1, 2):
-        raise ValueError(f"{path} must hold rows of numbers, got an array of shape {array.shape}")
-    if columns:
-        rows = array.reshape(len(array), -1)
-        if rows.shape[1] != len(columns):
-            raise ValueError(f"{len(columns)} columns are named, and {path} has {rows.shape[1]}")
-        return {name: np.array(rows[:, k]) for k, name in enumerate(columns)}
-    return {"value": np.array(array)}
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path} is damaged: {reason}") from error
+    if isinstance(array, np.ndarray) and array.dtype.names:
+        return {name: np.array(array[name]) for name in array.dtype.names}
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf" or array.ndim not in (1, 2):
+        what = f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+        raise ValueError(f"{path} must hold rows of numbers, got {what}")
+    if not columns:
+        return {"value": np.array(array)}
+    rows = array.reshape(len(array), -1)
+    if rows.shape[1] != len(columns):
+        raise ValueError(f"{len(columns)} columns are named, and {path} has {rows.shape[1]}")
+    return {name: np.array(rows[:, k]) for k, name in enumerate(columns)}

@@ -1,0 +1,514 @@
+"""From logs to a memory to alarms: inspect, fit and watch as commands, and which episodes are learned from."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from asm_gym.data.commands import REACTS, feedback
+from asm_gym.data.inspection import inspected
+from asm_gym.data.logs import Log
+from asm_gym.data.selection import declared_by_all, divided, divided_in_time, normal_episodes, pieces
+from asm_gym.data.text import read_text
+from asm_gym.episode import Episode, EpisodeLabel
+from asm_gym.evaluation.alarms import traces_of
+from asm_gym.monitors import load_monitor, make_monitor
+from asm_gym.scripts import watch
+from asm_gym.scripts.cli import main
+from asm_gym.scripts.unlike_pieces import kind_of, unlike
+
+RATE, ROWS = 50.0, 80
+
+
+def log(seed: int, rows: int = ROWS) -> dict[str, np.ndarray]:
+    """Two joints that follow a command, and the torque that takes."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(rows) / RATE
+    command = np.sin(np.outer(t, [2.0, 3.0]) + rng.uniform(0, 6, 2))
+    joints = command + 0.01 * rng.normal(size=command.shape)
+    return {
+        "time": t,
+        **{f"q_{k}": joints[:, k] for k in range(2)},
+        **{f"cmd_{k}": command[:, k] for k in range(2)},
+        "torque": joints.sum(axis=1) + 0.01 * rng.normal(size=rows),
+    }
+
+
+def write_csv(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    pd.DataFrame(columns).to_csv(path, index=False)
+    return path
+
+
+# ------------------------------------------------------------------ which episodes
+
+
+def test_only_normal_episodes_are_learned_from():
+    normal = Episode.from_table(log(0), success=True)
+    episodes = {
+        "normal": normal,
+        "failed": Episode.from_table(log(1)),
+        "fault": Episode.from_table(log(2), success=True, faults=np.arange(ROWS) > 9),
+        "faulty": Episode.from_table(log(3), success=True, label=EpisodeLabel("Lift", "faulty", "push")),
+        "harmless": Episode.from_table(log(4), success=True, label=EpisodeLabel("Lift", "harmless", "slower")),
+    }
+    found = [Log(name, episode) for name, episode in episodes.items()]
+    kept = normal_episodes(found)
+    assert kept.episodes == [normal]
+    assert kept.left_out == {"failed": 1, "with a fault": 2, "under a harmless variation": 1}
+
+
+def test_long_logs_are_cut_into_pieces_of_one_length():
+    cut = pieces(Episode.from_table(log(0)), 0.5)
+    assert [len(piece) for piece in cut] == [25, 25, 25]
+    np.testing.assert_array_equal(np.vstack([p.stream for p in cut]), Episode.from_table(log(0)).stream[:75])
+
+
+def test_episodes_that_calibrate_are_not_learned_from_and_both_are_drawn_by_the_seed():
+    episodes = [Episode.from_table(log(n)) for n in range(40)]
+    fitting, calibration = divided(episodes, 0.05, 0.5, seed=1)
+    assert len(calibration) == 20
+    assert sorted(map(id, fitting + calibration)) == sorted(map(id, episodes))
+    assert divided(episodes, 0.05, 0.5, seed=1)[1] == calibration
+    assert divided(episodes, 0.05, 0.5, seed=2)[1] != calibration
+
+
+def test_the_head_of_a_log_is_learned_from_and_its_tail_calibrated_on():
+    log = Episode.from_table({"q": np.arange(100.0)}, rate=10.0)
+    fitting, calibration = divided_in_time([pieces(log, 1.0)], 0.5)
+    assert [int(e.stream[0, 0]) for e in fitting] == [0, 10, 20, 30, 40]
+    assert [int(e.stream[0, 0]) for e in calibration] == [60, 70, 80, 90]
+    with pytest.raises(ValueError, match="too few"):
+        divided_in_time([pieces(log, 10.0)], 0.5)
+
+
+def test_noise_is_declared_by_all_logs_and_not_by_the_first():
+    def log(noise: float, seed: int) -> Episode:
+        rows = np.random.default_rng(seed)
+        return Episode.from_table({"q": np.sin(np.arange(900) / 50) + noise * rows.normal(size=900)}, rate=50.0)
+
+    first = log(0.0, 0)
+    others = [Episode.from_stream(log(0.1, n).stream, first.spec) for n in range(1, 5)]
+    (spec,) = {e.spec for e in declared_by_all([first, *others])}
+    assert first.spec.channels[0].noise < 1e-3
+    assert spec.channels[0].noise == pytest.approx(0.1, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("maxima", "odd"),
+    [
+        ([1, 2, 3, 4, 5, 6, 7, 33], [7]),
+        ([33, 2, 3, 4, 31, 6, 7, 5], [0, 4]),
+        ([1, 2, 3, 4, 5, 6, 7, 8], []),
+        ([1, 1, 1, 9, 9, 9, 9, 9], []),
+        ([5.0], []),
+    ],
+)
+def test_what_stands_apart_is_found_and_nothing_else(maxima, odd):
+    assert unlike(np.array(maxima, float)).tolist() == odd
+
+
+def test_a_kind_is_a_folder_or_else_a_log():
+    assert [kind_of(log) for log in ("a.csv", "pick/a.csv", "pick/b.csv")] == ["a.csv", "pick", "pick"]
+
+
+# ------------------------------------------------------------------ inspect
+
+
+def columns() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    t = np.arange(3000) / 100 + rng.normal(0, 1e-3, 3000)
+    q = np.sin(np.arange(3000) / 100)
+    kept = np.r_[0:1000, 1200:3000]
+    made = {
+        "Time (s)": t,
+        "Num": np.arange(3000),
+        "q_1 [rad]": np.round(q / 0.002) * 0.002,
+        "current_1 [A]": q + 0.05 * rng.normal(size=3000),
+        "fan": np.full(3000, 3.0),
+        "target_1": q,
+        "anomaly": np.zeros(3000),
+    }
+    made["current_1 [A]"][50:60] = np.nan
+    return {name: values[kept] for name, values in made.items()}
+
+
+def test_an_inspection_says_what_is_known_of_a_log():
+    found = inspected("x", columns())
+    channels = {c.name: c for c in found.channels}
+    assert found.clock.rate == pytest.approx(100, rel=1e-3)
+    assert found.clock.jitter == pytest.approx(0.1 * np.sqrt(2), rel=0.05)
+    ((start, stop),) = found.clock.gaps
+    assert stop - start == pytest.approx(2.01, abs=0.01)
+    assert {c.name: c.role for c in found.channels} == {
+        **{"Time": "clock", "Num": "counter", "q_1": "sense", "current_1": "sense", "fan": "sense"},
+        **{"target_1": "command", "anomaly": "label"},
+    }
+    assert channels["q_1"].unit == "rad"
+    assert channels["q_1"].resolution == pytest.approx(0.002, rel=1e-3)
+    assert channels["current_1"].noise == pytest.approx(0.05, rel=0.1)
+    assert channels["current_1"].resolution == 0.0
+    assert channels["current_1"].missing == 10
+    assert channels["fan"].constant
+    assert "never moves" in channels["fan"].treatment()
+    assert "healthy" in channels["q_1"].treatment()
+    assert any("1 gaps in the clock, the longest 2.01 s" in line for line in found.remarks())
+
+
+def test_what_forbids_reading_a_log_is_said():
+    backwards = {"t": np.array([0.0, 1, 2, 0, 1]), "q": np.zeros(5)}
+    assert inspected("x", backwards).remarks()[0].startswith("cannot be read: time must increase")
+    assert "no clock: say --rate, rows a second" in inspected("x", {"q": np.arange(9.0)}).remarks()
+
+
+def test_the_command_prints_a_table_and_draws_a_picture(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    rows = zip(*columns().values(), strict=True)
+    text = "\n".join([";".join(columns()), *(";".join(map(str, row)) for row in rows)])
+    (tmp_path / "arm.csv").write_text(text + "\n")
+    assert main(["inspect", str(tmp_path / "arm.csv"), "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "commanded, by its name: fit takes it so" in said
+    assert "0.002" in said
+    assert (tmp_path / "out" / "arm.png").read_bytes().startswith(b"\x89PNG")
+    (tmp_path / "bad.csv").write_text("t,q\n1,2\n0,3\n")
+    assert main(["inspect", str(tmp_path / "bad.csv"), "--out", str(tmp_path / "out")]) == 1
+    assert "cannot be read: time must increase" in capsys.readouterr().out
+
+
+def test_logs_of_different_columns_are_one_line_each(tmp_path, capsys):
+    for n, name in enumerate(("q_2", "q_3")):
+        rows = np.random.default_rng(n).normal(size=(600, 2)).cumsum(axis=0)
+        table = np.column_stack([np.arange(600) / 100, rows])
+        np.savetxt(tmp_path / f"{n}.csv", table, "%.5f", ",", header=f"time,q_1,{name}", comments="")
+    assert main(["inspect", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
+    assert "1.csv has other columns than 0.csv: q_2, q_3" in capsys.readouterr().out
+    assert main(["fit", str(tmp_path), "--out", str(tmp_path / "m.asm")]) == 2
+    said = capsys.readouterr()
+    assert "1.csv: the memory reads channels that are not there: q[2]" in said.out + said.err
+    assert not (tmp_path / "m.asm").exists()
+
+
+# ------------------------------------------------------------------ fit and watch
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """A folder of normal logs."""
+    folder = tmp_path_factory.mktemp("logs")
+    for n in range(40):
+        write_csv(folder / f"run{n:02}.csv", log(n))
+    return folder
+
+
+FIT = ["--monitor", "kalman", "--action", "cmd*", "--seed", "1"]
+
+
+@pytest.fixture(scope="module")
+def memory(logs):
+    """What is fitted to them."""
+    file = logs / "memory.asm"
+    assert main(["fit", str(logs), "--out", str(file), *FIT]) == 0
+    return file
+
+
+def test_too_few_episodes_are_refused_with_how_many_are_needed(logs, tmp_path, capsys):
+    out = tmp_path / "x.asm"
+    assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarm-rate", "0.01"]) == 2
+    assert "a false-alarm rate of 0.01 needs 198 normal episodes, 99 of them to calibrate on, got 40" in (
+        capsys.readouterr().err
+    )
+    assert not out.exists()
+    # 40 logs of 80 rows at 50 Hz: 7 pieces of 0.2 s each.
+    assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarm-rate", "0.01", "--split", "0.2"]) == 0
+
+
+def test_a_promise_by_the_hour_takes_the_hours_and_says_so(logs, tmp_path, capsys):
+    out = tmp_path / "m.asm"
+    assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarms-per-hour", "0.5"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "0.5 false alarms an hour need at least 2 hours of nominal episodes" in said
+    assert not out.exists()
+    assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarms-per-hour", "5000"]) == 0
+    assert "at most 5000 alarms an hour of normal ones" in " ".join(capsys.readouterr().out.split())
+    assert load_monitor(out).promise.per == "hour"
+
+
+def test_a_fitted_memory_alarms_for_a_stuck_joint_and_not_for_a_normal_log(memory, tmp_path, capsys):
+    write_csv(tmp_path / "good.csv", log(100))
+    stuck = log(101)
+    stuck["q_1"][40:] = stuck["q_1"][40]
+    write_csv(tmp_path / "stuck.csv", stuck)
+    how = ["--monitor", str(memory), "--out", str(tmp_path / "out")]
+    assert main(["watch", str(tmp_path / "good.csv"), *how]) == 0
+    assert "0 alarms in 0 of 1 episodes" in capsys.readouterr().out
+    assert not (tmp_path / "out" / "moments.png").exists()
+    assert main(["watch", str(tmp_path / "stuck.csv"), *how]) == 1
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {
+        *("alarms.csv", "report.html", "surprise.png", "attribution.png", "stream.png", "moments.png"),
+    }
+    alarms = read_text(tmp_path / "out" / "alarms.csv")
+    assert 40 / RATE < alarms["from [s]"][0] < 60 / RATE
+    assert alarms["thresholds"].min() > 1
+    assert "stuck.csv" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_memory_of_the_same_seed_is_the_same(logs, memory, tmp_path):
+    assert main(["fit", str(logs), "--out", str(tmp_path / "again.asm"), *FIT]) == 0
+    first, again = load_monitor(memory), load_monitor(tmp_path / "again.asm")
+    assert first.threshold == again.threshold
+    for name, array in first.learned_.items():
+        np.testing.assert_array_equal(array, again.learned_[name])
+
+
+def streamed(monitor, columns, form=lambda row: json.dumps(row.tolist())):
+    """What following these rows prints, and its exit code."""
+    rows = Episode.from_table(columns, channels=monitor.spec).stream
+    said = io.StringIO()
+    code = watch.follow([form(row) for row in rows], monitor, Console(file=said))
+    return code, said.getvalue()
+
+
+def test_rows_as_they_come_raise_the_alarms_of_the_recording(memory, tmp_path):
+    monitor = load_monitor(memory)
+    stuck = log(101)
+    stuck["q_1"][40:] = stuck["q_1"][40]
+    episode = Episode.from_table(stuck, channels=monitor.spec)
+    (trace,) = traces_of([Log("stuck", episode)], monitor)
+    code, said = streamed(monitor, stuck)
+    assert code == 1
+    *alarms, summary = said.strip().splitlines()
+    assert [float(line.split()[0]) for line in alarms] == [pytest.approx((t + 1) / RATE) for t in trace.alarms]
+    assert summary.startswith(f"{ROWS} rows, {len(trace.alarms)} alarm")
+    assert streamed(monitor, log(100))[0] == 0
+
+    def by_channel(row):
+        return json.dumps(
+            {"q": row[:2].tolist(), "torque": float(row[2]), "cmd_0": float(row[3]), "cmd[1]": float(row[4])}
+        )
+
+    assert [line.split("thresholds")[0] for line in streamed(monitor, stuck, by_channel)[1].splitlines()[:-1]] == [
+        line.split("thresholds")[0] for line in alarms
+    ]
+
+
+def test_a_number_that_is_lost_is_an_alarm(memory):
+    monitor = load_monitor(memory)
+    rows = Episode.from_table(log(100), channels=monitor.spec).stream.astype(float)
+    lines = [json.dumps(dict(zip(monitor.spec.labels, row.tolist(), strict=True))) for row in rows[:10]]
+    lost = json.loads(lines[5])
+    del lost["torque"]
+    for line in (json.dumps(lost), json.dumps({**lost, "torque": None})):
+        said = io.StringIO()
+        assert watch.follow([*lines[:5], line], monitor, Console(file=said)) == 1
+        assert "torque  inf thresholds" in said.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ([], "no row came"),
+        (["\n"], "no row came"),
+        (["[1, 2]"], r"line 1 must hold 5 numbers, got the shape \(2,\)"),
+        (["{"], "line 1 is no row of numbers"),
+        (['["a", 1, 2, 3, 4]'], "line 1 is no row of numbers"),
+        (['{"q": [1, 2]}'], "line 1 is no row of numbers: it lacks torque, cmd"),
+        (['{"q": [1, 2, 3], "torque": 1, "cmd": [1, 2]}'], "q must hold 2 numbers, got 3"),
+    ],
+)
+def test_a_line_that_is_no_row_is_refused_with_its_number(lines, message, memory):
+    with pytest.raises(ValueError, match=message):
+        watch.follow(lines, load_monitor(memory), Console(file=io.StringIO()))
+
+
+def test_standard_input_is_watched_as_a_command(memory, monkeypatch, capsys):
+    rows = Episode.from_table(log(100), channels=load_monitor(memory).spec).stream
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(json.dumps(row.tolist()) for row in rows)))
+    assert main(["watch", "-", "--monitor", str(memory)]) == 0
+    assert f"{ROWS} rows, 0 alarms" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fit", "nowhere"], "there is no nowhere"),
+        (["fit", "nowhere", "--monitor", "asm"], "unknown monitor 'asm'"),
+        (["fit", "nowhere", "--split", "0"], "split must be"),
+        (["fit", "nowhere", "--rate", "-1"], "rate must be"),
+        (["fit", "nowhere", "--out", "."], "is a folder"),
+        (["watch", "nowhere", "--monitor", "none.asm"], "none.asm"),
+        (["watch", "nowhere", "--monitor", "x.asm", "--silence", "0"], "silence must be"),
+        (["watch", "-", "--monitor", "x.asm", "--rerun", "x.rrd"], "--rerun is for a recording, and - is live"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(arguments, message, capsys):
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert len(said.strip().splitlines()) == 1
+
+
+def test_a_memory_without_a_threshold_cannot_watch(tmp_path, capsys):
+    episodes = [Episode.from_table(log(n)) for n in range(4)]
+    make_monitor("kalman", episodes[0].spec).fit(episodes).save(tmp_path / "raw.asm")
+    assert main(["watch", "-", "--monitor", str(tmp_path / "raw.asm")]) == 2
+    assert "raw.asm has no threshold" in capsys.readouterr().err
+
+
+def test_what_lost_rows_is_learned_in_parts_and_a_lost_row_is_an_alarm(tmp_path, capsys):
+    (tmp_path / "logs").mkdir()
+    for n in range(24):
+        columns = {name: np.delete(values, [40, 41]) if n % 2 else values for name, values in log(n).items()}
+        write_csv(tmp_path / "logs" / f"{n}.csv", columns)
+    out = ["--out", str(tmp_path / "x.asm"), *FIT, "--false-alarm-rate", "0.1"]
+    assert main(["fit", str(tmp_path / "logs"), *out]) == 0
+    assert "Rows were lost: 24 episodes were cut there, into 36 parts." in capsys.readouterr().out
+    how = ["--monitor", str(tmp_path / "x.asm"), "--out", str(tmp_path / "out")]
+    assert main(["watch", str(tmp_path / "logs" / "1.csv"), *how]) == 1
+    alarms = read_text(tmp_path / "out" / "alarms.csv")
+    assert alarms["from [s]"][0] == pytest.approx(41 / RATE)
+    assert np.isinf(alarms["thresholds"][0])
+
+
+def test_a_memory_is_fitted_from_a_pipe(tmp_path, monkeypatch, capsys):
+    rows = pd.DataFrame(log(0, 3000)).to_json(orient="records", lines=True)
+    monkeypatch.setattr("sys.stdin", io.StringIO(rows))
+    out = tmp_path / "arm.asm"
+    assert main(["fit", "-", "--out", str(out), *FIT, "--false-alarm-rate", "0.1", "--split", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "the source ended: 3000 rows" in said
+    assert "Learned from 30 episodes: 1500 rows" in said
+    assert out.exists()
+    assert len(out.with_suffix(".jsonl").read_text().splitlines()) == 3000
+
+
+# ------------------------------------------------------------------ few and long logs
+
+
+def write(path, seed, seconds, weight=1.0, jolt=None):
+    rng, rows = np.random.default_rng(seed), int(seconds * 50)
+    q = np.sin(np.outer(np.arange(rows) / 50, [1.0, 1.7]) + rng.uniform(0, 6, 2)) + 1e-3 * rng.normal(size=(rows, 2))
+    torque = weight * 3 * q + 0.01 * rng.normal(size=q.shape)
+    if jolt is not None:
+        torque[int(50 * jolt) :][:10] += 5.0
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        out = csv.writer(file)
+        out.writerow(["time", "q_0", "q_1", "torque_0", "torque_1"])
+        out.writerows(np.column_stack([np.arange(rows) / 50, q, torque]).tolist())
+
+
+SPLIT = ["--monitor", "association_values+evidence", "--split", "2"]
+
+
+def test_fit_names_the_piece_that_sets_the_threshold(tmp_path, capsys):
+    for n in range(3):
+        write(tmp_path / "logs" / f"{n}.csv", n, 60, jolt=45 if n == 1 else None)
+    fit = ["fit", str(tmp_path / "logs"), "--out", str(tmp_path / "m.asm"), *SPLIT, "--false-alarms-per-hour", "80"]
+    assert main(fit) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 of 42 pieces are unlike the others" in said
+    assert "1.csv from 44 s" in said
+
+
+def test_a_kind_that_was_left_out_is_surprising_where_it_differs(tmp_path, capsys):
+    for kind, weight in (("empty", 1.0), ("light", 1.0), ("heavy", 2.0)):
+        write(tmp_path / "logs" / kind / "a.csv", len(kind), 60, weight)
+    fit = ["fit", str(tmp_path / "logs"), "--out", str(tmp_path / "m.asm"), *SPLIT, "--false-alarm-rate", "0.1"]
+    assert main([*fit, "--leave-out"]) == 0
+    said = {
+        line.split()[2].rstrip(":"): line for line in capsys.readouterr().out.splitlines() if "Learned without" in line
+    }
+    assert set(said) == {"empty", "light", "heavy"}
+    share = {kind: float(line.split(" min, ")[1].split(" %")[0]) for kind, line in said.items()}
+    assert share["heavy"] > 50
+    assert max(share["light"], share["empty"]) < 5
+
+
+def test_a_long_log_is_learned_from_between_its_marked_rows(tmp_path, capsys):
+    write(tmp_path / "log.csv", 0, 120)
+    rows = (tmp_path / "log.csv").read_text().splitlines()
+    marked = [f"{row},{'fault' if n == 0 else int(2500 <= n < 2550)}" for n, row in enumerate(rows)]
+    (tmp_path / "log.csv").write_text("\n".join(marked))
+    fit = ["fit", str(tmp_path / "log.csv"), "--out", str(tmp_path / "m.asm"), "--monitor", "kalman"]
+    fit += ["--false-alarm-rate", "0.1"]
+    assert main(fit) == 2
+    assert "1 with a fault; --split 5 learns from between" in " ".join(capsys.readouterr().err.split())
+    assert main([*fit, "--split", "1"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Learned from 54 episodes: 2700 rows" in said  # half of 44 pieces before the mark, 64 after it
+    assert "with a fault" not in said
+
+
+def test_a_threshold_that_is_refused_names_the_piece(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("asm_gym.monitors.blindness.MOST", 0.0)
+    write(tmp_path / "log.csv", 0, 60)
+    rows = [row.split(",") for row in (tmp_path / "log.csv").read_text().splitlines()]
+    for row in rows[2701:2750]:
+        row[1:] = [str(1e4 * float(cell)) for cell in row[1:]]
+    (tmp_path / "log.csv").write_text("\n".join(map(",".join, rows)))
+    fit = ["fit", str(tmp_path / "log.csv"), "--out", str(tmp_path / "m.asm"), *SPLIT]
+    assert main([*fit, "--false-alarms-per-hour", "200"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "could pass" in said
+    assert "log.csv from 54 s" in said
+
+
+# ------------------------------------------------------------------ commands of a controller
+
+
+FAST = 100.0
+
+
+def controlled_arm(seed: int, rows: int = 1500) -> dict[str, np.ndarray]:
+    """Three joints under a PD controller, that follow a plan against friction and pushes by chance."""
+    rng = np.random.default_rng(seed)
+    plan = np.sin(np.outer(np.arange(rows) / FAST, [1, 1.7, 2.3]) + rng.uniform(0, 6, 3))
+    q, v, found = plan[0].copy(), np.zeros(3), []
+    for k in range(rows):
+        sensed = q + 1e-3 * rng.normal(size=3)
+        torque = 100 * (plan[k] - sensed) - 10 * v
+        found.append([*sensed, *(v + 1e-3 * rng.normal(size=3)), *torque])
+        v = v + (torque - 0.5 * np.tanh(v / 0.05) + 0.3 * rng.normal(size=3)) / FAST
+        q = q + v / FAST
+    said = np.array(found)
+    forward = 3 * np.sin(plan) + 0.2 * np.gradient(plan, axis=0) * FAST
+    made = {"q": said[:, :3], "dq": said[:, 3:6], "output": said[:, 6:], "plan": plan, "forward": forward}
+    return {**made, "rounded": np.round(plan, 3), "chance": rng.normal(size=(rows, 3))}
+
+
+@pytest.fixture(scope="module")
+def controlled():
+    return [controlled_arm(seed) for seed in range(3)]
+
+
+def episodes(controlled, command, late=0):
+    return [
+        Episode.from_table({"q": a["q"], "dq": a["dq"], "cmd": np.roll(a[command], late, axis=0)}, None, FAST, ["cmd"])
+        for a in controlled
+    ]
+
+
+@pytest.mark.parametrize("command", ["plan", "rounded", "forward", "chance"])
+def test_a_plan_answers_nothing(controlled, command):
+    assert feedback(episodes(controlled, command)) == {}
+
+
+@pytest.mark.parametrize(("late", "least"), [(0, 3), (1, 2)])
+def test_a_controllers_output_answers_what_is_sensed(controlled, late, least):
+    found = feedback(episodes(controlled, "output", late))
+    assert len(found) >= least
+    assert all(share > REACTS for share in found.values())
+
+
+def test_of_few_rows_or_no_command_nothing_is_said(controlled):
+    short = [{k: v[:200] for k, v in controlled[0].items()}]
+    assert feedback(episodes(short, "output")) == {}
+    assert feedback([Episode.from_table({"q": controlled[0]["q"]}, rate=FAST)]) == {}
