@@ -1,15 +1,13 @@
-"""One memory of a body, for any policy: records motor babbling, learns from it, and examines what came of it.
+"""One memory of a body, for any policy: records motor babbling, learns from it, and examines the memory.
 
-The memory alarms at what no body does, whatever the policy wants. It is examined on policies and on tasks that babbling
-never showed. A run lives in one folder and can be killed at any time: what was recorded is not recorded again.
+The memory alarms at what no body does, whatever the policy. It is examined on policies and on tasks that babbling never
+showed. A run lives in one folder and can be killed at any time: what was recorded is not recorded again.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,53 +17,38 @@ from rich.console import Console
 
 from asm_gym.detection import check_per_hour
 from asm_gym.detection.hourly import check_hours
-from asm_gym.episode import Episode, EpisodeLabel, load_episode
+from asm_gym.episode import Episode, load_episode
+from asm_gym.evaluation.corpus import Corpus
 from asm_gym.evaluation.defaults import WINDOW_S
+from asm_gym.evaluation.recordings import NOMINAL_ROLES
 from asm_gym.evaluation.tables import ConsoleTable, markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.shipped import USUAL
 from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
-from asm_gym.rollouts.corpus import Corpus
+from asm_gym.rollouts.collect import record_missing
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
-from asm_gym.rollouts.pretraining.healthy import (
-    Lessons,
-    apart,
-    calibrate_body,
-    for_threshold,
-    healthy,
-    held_out,
-    learn_body,
-)
-from asm_gym.rollouts.pretraining.model_card import Exam, Marks, at_rates, card, examine, usual_force
+from asm_gym.rollouts.pretraining.exam import Exam, Marks, card, examine, summary, usual_force
+from asm_gym.rollouts.pretraining.healthy import Lessons, calibrate_body, healthy, held_out, learn_body
 from asm_gym.rollouts.progress import stage
-from asm_gym.rollouts.record import record
-from asm_gym.rollouts.run_folder import NOMINAL_ROLES, claimed, labelled, make_missing, versions
-from asm_gym.rollouts.scoring import code_digest
+from asm_gym.rollouts.run_folder import claimed, make_missing, versions
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.staging import environment
-from asm_gym.rollouts.trial import RolloutConfig
+from asm_gym.rollouts.trial import RolloutConfig, nominal_trials
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.tasks import ROBOTS, TASKS
 from asm_gym.tasks import task as task_spec
-from asm_gym.validation import check_choice, check_number
+from asm_gym.validation import check_choice
 
 SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
-PER_HOUR, RATES = 5.0, (10.0, 3.0, 1.0)
-"""False alarms an hour that a memory is calibrated for, and at which an examination is also told."""
-HEALTHY, HOURS_SEED = 60, 11
-"""Episodes of the expert of each task to calibrate on, and of what their seeds are drawn."""
-LEARNING = (
-    *("memory", "detection", "scaling.py", "spec.py", "rollouts/pretraining/healthy.py"),
-    *("monitors/memory_model.py", "monitors/monitor.py", "monitors/neural_asm.py"),
-)
-"""What decides, in the package, over what a body learns of the same lessons."""
+HOURS_SEED = 11
+"""Seed of the healthy hours."""
 _PANDAS = {"Door", "NutAssemblySquare", "NutAssemblyRound"}
-"""Tasks whose experts are at home with the Panda: with other arms some of them never succeed."""
+"""Tasks whose experts often fail with other arms than the Panda."""
 _GRIPPED = tuple(name for name, task in TASKS.items() if task.arms == 1 and name in EXPERTS and name != "Wipe")
 """Tasks of one arm with a gripper, whose streams are alike."""
 
@@ -79,17 +62,17 @@ class Args:
     guides: tuple[str, ...] = option((), metavar="AGENT")
     """Agents that lead in turn with the experts, by name or the files of asm-gym train; none by default."""
     episodes: int = option(60, quick=18, least=1)
-    """Lessons in each task; a second call with more of them goes on."""
+    """Lessons in each task; a second call with more of them continues."""
     reaching: bool = False
-    """Whether hands reach for places where noise alone would move them; one lesson more for each three presses."""
+    """Hands reach for places where noise alone would move them; one lesson more for each three presses."""
     stream_freq: int | None = option(None, least=1, metavar="HZ")
-    """Rows of the stream a second; one each control step by default."""
-    exam_policies: tuple[str, ...] | None = fixed(None, quick=())
-    """Agents to examine under, as guides are named; by default all that are shipped and fit this arm."""
-    healthy_episodes: int = option(HEALTHY, quick=0, least=0)
-    """Episodes of the expert of each task to calibrate on, beside the lessons that are left out."""
+    """Rows of the stream per second; one per control step by default."""
+    healthy_episodes: int = option(60, quick=0, least=0)
+    """Episodes of the expert of each task to calibrate on, beside the held-out lessons."""
     corpus: Path | None = option(None, metavar="FOLDER")
-    """What asm-gym corpus has recorded: the experts' healthy hours in it are calibrated on, too."""
+    """A corpus of asm-gym corpus, whose experts' healthy hours are calibrated on, too."""
+    exam_episodes: int = option(60, quick=0, least=0)
+    """Healthy episodes of each examination; 0 examines nothing."""
     workers: str = option("2", check=ParallelConfig.named, metavar="N")
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
     seed: int = option(0, least=0)
@@ -98,31 +81,20 @@ class Args:
     """Folder of the run."""
     quick: bool = False
     """To see that everything runs, not to judge the figures."""
-    exam_episodes: int = fixed(60, quick=2, least=0)
-    """Healthy episodes of each examination; 0 examines nothing."""
-    exam_faults: tuple[str, ...] = fixed((TEST,), quick=())
-    """Kinds of fault, each medium and strong but for pushes of 20 N, where the policy or the task was left out."""
-    exam_pushes: int = fixed(3, quick=0)
-    """Pushes of 20 N in each examination in which there are faults; they are judged by how soon they are noticed."""
     tasks: tuple[str, ...] | None = fixed(None)
-    """Tasks to babble in; by default seven with the Panda, and with other arms those of them that their experts do."""
-    exam_tasks: tuple[str, ...] | None = fixed(None, quick=())
-    """Further tasks to examine in; by default two that Panda experts do, with other arms those of them they do."""
-    false_alarms_per_hour: float = fixed(PER_HOUR, quick=120.0, check=check_per_hour)
-    """Faults that may be said in an hour of healthy episodes."""
-    window: float = fixed(WINDOW_S, check=partial(check_number, "window", above=0))
-    """How soon after its onset a fault must be noticed [s]."""
+    """Tasks to babble in; by default seven with the Panda, and those of them that other arms' experts do."""
+    false_alarms_per_hour: float = fixed(5.0, quick=120.0, check=check_per_hour)
+    """False alarms per hour of healthy episodes."""
 
     def __post_init__(self) -> None:
         check_options(self)
-        for name in (*self.shown, *self.left_out):
+        for name in self.shown:
             check_choice("task of one arm with a gripper", name, _GRIPPED)
-        for name in (*self.guides, *(self.exam_policies or ())):
-            if not name.endswith(".npz"):  # whether a file is there is asked later
+        for name in self.guides:
+            if not name.endswith(".npz"):  # a file is checked later
                 check_choice("agent", name, agents())
         if not self.shown:
             raise ValueError("there must be at least one task to babble in")
-        kinds_of(self.exam_faults)
         each = sum(map(held_out, range(self.episodes))) + self.healthy_episodes
         check_hours(self.false_alarms_per_hour, each * sum(task_spec(t).horizon for t in self.shown) / USUAL / 3600)
 
@@ -134,43 +106,34 @@ class Args:
     @property
     def shown(self) -> tuple[str, ...]:
         """Tasks to babble in."""
-        if self.tasks is not None:
-            return self.tasks
-        return self._able(SHOWN)[: 2 if self.quick else None]
-
-    @property
-    def left_out(self) -> tuple[str, ...]:
-        """Further tasks to examine in."""
-        return self._able(LEFT_OUT) if self.exam_tasks is None else self.exam_tasks
+        return self.tasks if self.tasks is not None else self._able(SHOWN)[: 2 if self.quick else None]
 
     def _able(self, tasks: Sequence[str]) -> tuple[str, ...]:
         return tuple(t for t in tasks if self.robot == "Panda" or t not in _PANDAS)
 
     @property
     def config(self) -> RolloutConfig:
+        """How episodes are made."""
         return RolloutConfig(robot=self.robot, stream_freq=self.stream_freq)
 
     @property
     def name(self) -> str:
-        """Of the memory."""
+        """Name of the memory."""
         return self.robot.lower() + (f"_{self.stream_freq}hz" if self.stream_freq else "")
 
     @property
     def exams(self) -> list[Exam]:
-        """What to examine it on."""
-        policies = agents() if self.exam_policies is None else self.exam_policies
-        homes = {p: task_spec(trained_in(p)).name for p in policies}
-        if self.robot != "Panda":  # which all of them were trained with
-            homes = {}
+        """Policies and tasks to examine it on; shipped agents were trained with the Panda."""
+        homes = {p: task_spec(trained_in(p)).name for p in agents()} if self.robot == "Panda" else {}
         return [
             *(Exam(t, "scripted", known=True) for t in self.shown),
-            *(Exam(t, "scripted", known=False) for t in self.left_out if t not in self.shown),
+            *(Exam(t, "scripted", known=False) for t in self._able(LEFT_OUT) if t not in self.shown),
             *(Exam(t, p, known=p in self.guides) for p, t in homes.items()),
         ]
 
 
-def check(args: Args) -> None:
-    """Raises what is wrong with the agents that are to lead or to be examined under, before the folder is claimed.
+def check_guides(args: Args) -> None:
+    """Refuse agents that cannot lead, before the folder is claimed.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -185,43 +148,10 @@ def check(args: Args) -> None:
                 f"tasks to babble in: {', '.join(args.shown)}"
             )
         make_policy(guide, environment(home, args.config.settings))
-    for exam in args.exams:
-        if exam.policy.endswith(".npz"):
-            make_policy(exam.policy, environment(task_spec(exam.task).id, args.config.settings))
 
 
-def learn(args: Args, console: Console) -> NeuralASM:
-    """Records what is missing, and fits, calibrates and saves the memory, unless this code has learned it already."""
-    lessons = healthy_lessons(args, console)
-    hours = [e for e in healthy_hours(args, console) if e.success]
-    inner: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
-    whole = [*lessons.whole, *hours]
-    about = {
-        "name": args.name,
-        "controller": inner.controller,
-        "tasks": args.shown,
-        **{n: getattr(args, n) for n in ("guides", "reaching", "episodes", "seed", "false_alarms_per_hour")},
-        "lessons": len(lessons.fit),
-        "rows": sum(map(len, lessons.fit)),
-        **calibrated(whole, args.false_alarms_per_hour),
-        "code": code_digest(names=LEARNING),
-        **versions(),
-    }
-    about, path = json.loads(json.dumps(about)), args.out / f"{args.name}.asm"
-    with suppress(FileNotFoundError, ValueError):  # one that is damaged is learned anew
-        memory = NeuralASM.load(path)
-        if memory.about == about:
-            return memory
-    with stage("learning", console, {}) as progress:
-        memory = learn_body(lessons, inner.stream_spec, args.seed, progress)
-    calibrate_body(memory, lessons, hours, args.false_alarms_per_hour)
-    memory.about = about
-    memory.save(path)
-    return memory
-
-
-def healthy_lessons(args: Args, console: Console) -> Lessons:
-    """What is healthy of the lessons; those that are missing are recorded."""
+def record_lessons(args: Args, console: Console) -> Lessons:
+    """Record the lessons that are missing, and select what is healthy."""
     wanted = curriculum(args.shown, args.episodes, args.seed, args.guides, args.reaching)
     with stage("babbling", console, {}) as progress:
         make = partial(record_lesson, config=args.config, folder=args.out.resolve())
@@ -229,76 +159,73 @@ def healthy_lessons(args: Args, console: Console) -> Lessons:
     return healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
 
 
-def calibrated(whole: Sequence[Episode], per_hour: float) -> dict[str, Any]:
-    """What a memory says of the episodes that its threshold was set on, and of those that told ceilings."""
-    whole, told = for_threshold(whole)
-    found = {"calibrated_on": len(whole), "hours": _hours(whole), "each": bool(apart(whole, per_hour))}
-    return found | ({"ceilings_on": len(told), "ceilings_hours": _hours(told)} if told else {})
-
-
-def _hours(episodes: Sequence[Episode]) -> float:
-    return sum(len(e) * e.spec.dt for e in episodes) / 3600
-
-
-def healthy_hours(args: Args, console: Console) -> list[Episode]:
-    """Episodes of the experts of the tasks that are shown; those that are missing are recorded, a corpus is read."""
-    folder = (args.out / "hours").resolve()
-    labels = [
-        EpisodeLabel(task, "nominal", seed=seed)
-        for task in args.shown
-        for seed in role_seeds(HOURS_SEED, task, "hours", args.healthy_episodes)
-    ]
+def record_hours(args: Args, console: Console) -> list[Episode]:
+    """Record the missing episodes of the experts, read those of a corpus, and return what was solved."""
+    seeds = {task: role_seeds(HOURS_SEED, task, "hours", args.healthy_episodes) for task in args.shown}
+    trials = [trial for task, own in seeds.items() for trial in nominal_trials(task_spec(task).id, "nominal", own)]
     with stage("healthy hours", console, {}) as progress:
-        make = partial(record, config=args.config, folder=folder)
-        make_missing(make, labels, partial(_place, folder=folder), args.parallel, progress)
-    recorded = labelled(folder, labels)
-    if args.corpus is None:
-        return recorded
-    return [*recorded, *Corpus.open(args.corpus).episodes(*NOMINAL_ROLES, policies=("scripted",), tasks=args.shown)]
+        found = record_missing(trials, args.config, args.out / "hours", args.parallel, progress)
+    if args.corpus is not None:
+        found += Corpus.open(args.corpus).episodes(*NOMINAL_ROLES, policies=("scripted",), tasks=args.shown)
+    return [episode for episode in found if episode.success]
+
+
+def learn(args: Args, console: Console) -> NeuralASM:
+    """Record what is missing; fit, calibrate and save the memory."""
+    lessons, hours = record_lessons(args, console), record_hours(args, console)
+    inner: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
+    with stage("learning", console, {}) as progress:
+        memory = learn_body(lessons, inner.stream_spec, args.seed, progress)
+    calibrate_body(memory, lessons, hours, args.false_alarms_per_hour)
+    memory.about = {
+        "name": args.name,
+        "controller": inner.controller,
+        "tasks": list(args.shown),
+        "guides": list(args.guides),
+        **{n: getattr(args, n) for n in ("reaching", "episodes", "seed", "false_alarms_per_hour")},
+        "lessons": len(lessons.fit),
+        "rows": sum(map(len, lessons.fit)),
+        "hours": sum(len(e) * e.spec.dt for e in [*lessons.whole, *hours]) / 3600,
+        **versions(),
+    }
+    memory.save(args.out / f"{args.name}.asm")
+    return memory
 
 
 def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
-    """What the memory made of each exam, whose missing episodes are recorded."""
+    """Record the missing episodes of each exam, and score them; faults happen where a policy or a task is unknown."""
     marks = []
     usual: dict[str, float] = {}  # of each task, by its expert, who comes first
     for exam in args.exams:
         config = replace(args.config, policy=exam.policy)
-        folder = (args.out / "exams" / exam.policy.removesuffix(".npz").replace("/", "-")).resolve()
+        folder = args.out / "exams" / exam.policy.removesuffix(".npz").replace("/", "-")
         inner: Any = environment(task_spec(exam.task).id, config.settings).unwrapped
-        kinds = [] if exam.known else [k for k in kinds_of(args.exam_faults) if possible(k, inner)]
-        labels = exam.labels(args.exam_episodes, kinds, args.seed, 0 if exam.known else args.exam_pushes)
+        kinds = [] if exam.known else [k for k in kinds_of((TEST,)) if possible(k, inner)]
+        trials = exam.trials(args.exam_episodes, kinds, args.seed, 0 if exam.known else 3)
         with stage(exam.name, console, {}) as progress:
-            make = partial(record, config=config, folder=folder)
-            make_missing(make, labels, partial(_place, folder=folder), args.parallel, progress)
-            recordings = labelled(folder, labels)
+            recordings = record_missing(trials, config, folder, args.parallel, progress)
             expected = usual.setdefault(exam.task, usual_force(recordings))
-            marks.append(examine(memory, exam.name, recordings, args.window, expected))
+            marks.append(examine(memory, exam.name, recordings, WINDOW_S, expected))
     return marks
 
 
-def _place(label: EpisodeLabel, folder: Path) -> Path:
-    return folder / label.path
-
-
 def babble(args: Args, console: Console) -> None:
-    """Records, learns, examines, and says what came of it."""
-    check(args)
-    claim = {n: getattr(args, n) for n in ("robot", "guides", "stream_freq", "seed")}
-    claim["reaching"] = "and pressing" if args.reaching else None  # as folders of before there was any say nothing
+    """Record, learn, examine, and print the results."""
+    check_guides(args)
+    claim = {n: getattr(args, n) for n in ("robot", "guides", "stream_freq", "seed", "reaching")}
     with claimed(args.out, "babble.json", claim):
         memory = learn(args, console)
         marks = examined(args, memory, console) if args.exam_episodes else []
         if marks:
-            others = [rate for rate in RATES if rate != args.false_alarms_per_hour]
-            table, said = card(marks, memory, args.window), at_rates(marks, memory, others)
-            (args.out / "card.md").write_text(f"{markdown(table)}\n\n{said}\n", encoding="utf-8")
+            table = card(marks, memory, WINDOW_S)
+            (args.out / "card.md").write_text(f"{markdown(table)}\n\n{summary(marks)}\n", encoding="utf-8")
             console.print(ConsoleTable(table))
-            console.print(said)
+            console.print(summary(marks))
     console.print(f"Wrote {args.out / args.name}.asm: NeuralASMSafety(env, NeuralASM.load(...)) watches with it")
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Babbles, and returns the exit code."""
+    """Babble, and return the exit code."""
     return run("babble", Args, babble, argv, __doc__)
 
 

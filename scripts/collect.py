@@ -1,7 +1,7 @@
-"""Records a policy's episodes, in worker processes; as a command, into a Minari dataset.
+"""Records a policy's episodes, in worker processes, into a Minari dataset.
 
-Every episode is a file of its own as soon as it has ended: a run that is killed loses those that were running, and the
-same command goes on with the rest.
+Every episode is written to a file as soon as it has ended: a run that is killed loses those that were running, and the
+same command continues with the rest.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import gymnasium as gym
 from rich.console import Console
 
 from asm_gym.data.datasets import require_minari, write_dataset
-from asm_gym.episode import Episode, load_episode
+from asm_gym.episode import load_episode
 from asm_gym.rollouts.collect import check, collect_to
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.progress import stage
@@ -31,15 +31,15 @@ class Args:
     """Episodes of a policy, as a Minari dataset."""
 
     task: str = option("Lift", positional=True, check=env_id, listed=TASKS, metavar="TASK")
-    """Name of a task, or any Gymnasium id whose spaces are numbers, such as Pusher-v5."""
+    """Name of a task, or any Gymnasium id with numeric spaces, such as Pusher-v5."""
     policy: str = "scripted"
-    """What acts: scripted, hold, sway, a shipped agent, or the path of one."""
+    """Policy: scripted, hold, sway, a shipped agent, or the path of one."""
     robot: str | None = option(None, known=ROBOTS)
     """The arm; the task's own by default."""
     episodes: int = option(100, quick=4, least=1)
-    """How many; a second call with more of them goes on."""
+    """How many; a second call with more of them continues."""
     only_successful: bool = False
-    """Leave episodes that failed out of the dataset."""
+    """Leave failed episodes out of the dataset."""
     workers: str = option("2", check=ParallelConfig.named, metavar="N")
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
     seed: int = option(0, least=0)
@@ -53,63 +53,51 @@ class Args:
         check_options(self)
 
     @property
-    def parallel(self) -> ParallelConfig:
-        """Who does the work."""
-        return ParallelConfig.named(self.workers)
-
-    @property
-    def env_id(self) -> str:
-        return env_id(self.task)
-
-    @property
-    def dataset_id(self) -> str:
-        """Minari's name of the dataset."""
-        name = self.env_id.rsplit(":", 1)[-1].rsplit("/", 1)[-1].rsplit("-v", 1)[0].lower()
-        return f"asm_gym/{name}-{Path(self.policy).stem}-v0"
-
-    @property
     def config(self) -> RolloutConfig:
         """How the episodes are made."""
         return RolloutConfig(self.policy, self.robot)
 
+    @property
+    def dataset_id(self) -> str:
+        """Minari's name of the dataset."""
+        name = env_id(self.task).rsplit(":", 1)[-1].rsplit("/", 1)[-1].rsplit("-v", 1)[0].lower()
+        return f"asm_gym/{name}-{Path(self.policy).stem}-v0"
 
-def assemble(args: Args, files: list[Path]) -> tuple[Path, list[Episode]]:
-    """The dataset of recorded episodes, and what of them went into it."""
+
+def write(args: Args, files: list[Path], console: Console) -> None:
+    """Write the dataset of recorded episodes, and print where it is."""
     episodes = [load_episode(file) for file in files]
     kept = [e for e in episodes if e.success or not args.only_successful]
     if not kept:
         raise ValueError(f"none of {len(episodes)} episodes succeeded, so none is left for the dataset")
-    details = {"algorithm_name": args.policy, "versions": versions(), "settings": dict(args.config.settings)}
-    env = gym.make(args.env_id, **dict(args.config.settings))
+    settings = dict(args.config.settings)
+    details = {"algorithm_name": args.policy, "versions": versions(), "settings": settings}
+    env = gym.make(env_id(args.task), **settings)
     try:
-        return write_dataset(args.out, args.dataset_id, kept, env, details), kept
+        folder = write_dataset(args.out, args.dataset_id, kept, env, details)
     finally:
         env.close()
-
-
-def record(args: Args, console: Console) -> tuple[Path, list[Episode]]:
-    """Records the episodes that are not there yet, and writes the dataset of all."""
-    claim = {"env_id": args.env_id, "policy": args.policy, "settings": dict(args.config.settings), "seed": args.seed}
-    with claimed(args.out, "collect.json", claim):
-        with stage("recording", console, {}) as progress:
-            seeds = episode_seeds(args.seed, args.episodes)
-            files = collect_to(args.out / "episodes", args.env_id, args.config, seeds, args.parallel, progress)
-        return assemble(args, files)
-
-
-def record_and_report(args: Args, console: Console) -> None:
-    """Records, and says where the episodes are."""
-    require_minari()
-    check(args.env_id, args.config)
-    folder, kept = record(args, console)
-    steps = sum(map(len, kept))
-    console.print(f"{len(kept)} episodes, {steps} steps, {sum(e.success for e in kept)} successful: {folder}")
+    steps, solved = sum(map(len, kept)), sum(e.success for e in kept)
+    console.print(f"{len(kept)} episodes, {steps} steps, {solved} successful: {folder}")
     console.print(f"MINARI_DATASETS_PATH={args.out} lets minari.load_dataset({args.dataset_id!r}) find it")
 
 
+def collect(args: Args, console: Console) -> None:
+    """Record the episodes that are missing, and write the dataset of all."""
+    require_minari()
+    task, settings = env_id(args.task), dict(args.config.settings)
+    check(task, args.config)
+    claim = {"env_id": task, "policy": args.policy, "settings": settings, "seed": args.seed}
+    with claimed(args.out, "collect.json", claim):
+        with stage("recording", console, {}) as progress:
+            seeds, workers = episode_seeds(args.seed, args.episodes), ParallelConfig.named(args.workers)
+            files = collect_to(args.out / "episodes", task, args.config, seeds, workers, progress)
+        write(args, files, console)
+
+
 def main(argv: list[str] | None = None) -> int:
-    """Records, and returns the exit code."""
-    return run("collect", Args, record_and_report, argv, __doc__)
+    """Record, and return the exit code."""
+    return run("collect", Args, collect, argv, __doc__)
 
 
 if __name__ == "__main__":

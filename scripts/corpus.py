@@ -1,7 +1,7 @@
 """Records the corpus that every table of detection is judged on: healthy motion, and faults with their healthy twins.
 
-It can be killed at any time: what was recorded is not recorded again. The manifest says what is there after each task
-of each round, so that a corpus of which some rounds are missing can be used already.
+It can be killed at any time: what was recorded is not recorded again. A corpus of which some rounds are missing can be
+used already.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from pathlib import Path
 
 from rich.console import Console
 
+from asm_gym.evaluation.corpus import VERSION, Corpus
 from asm_gym.evaluation.tables import ConsoleTable, Table
-from asm_gym.rollouts.corpus import PARTS, QUICK, ROUNDS, VERSION, Corpus, record_corpus
+from asm_gym.rollouts.corpus import PARTS, QUICK, ROUNDS, record_corpus
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
@@ -26,7 +27,7 @@ class Args:
     """The recordings that monitors are judged on."""
 
     part: tuple[str, ...] = option(tuple(PARTS), least=1, known=PARTS)
-    """What of it to record."""
+    """Parts to record."""
     rounds: int = option(ROUNDS, quick=1, least=1)
     """How many rounds; each has as much of every task, and the first what is learned from."""
     workers: str = option("2", check=ParallelConfig.named, metavar="N")
@@ -42,19 +43,20 @@ class Args:
             raise ValueError(f"rounds must be at most {ROUNDS}, got {self.rounds}")
 
 
-def contents(corpus: Corpus) -> list[tuple[str, ...]]:
-    """Of each policy and task, how many episodes of each role there are, and how long the healthy ones last."""
+def contents(corpus: Corpus) -> Table:
+    """Count the episodes of each policy and task by role, and the hours of the healthy ones."""
     rows = []
+    roles = "fit", "calibration", "nominal", "faulty"
     for policy, task in dict.fromkeys((e.policy, e.label.task) for e in corpus.entries):
         own = [e for e in corpus.entries if (e.policy, e.label.task) == (policy, task)]
-        counts = [sum(e.label.role == role for e in own) for role in ("fit", "calibration", "nominal", "faulty")]
+        counts = [str(sum(e.label.role == role for e in own)) for role in roles]
         hours = sum(e.seconds for e in own if e.label.role != "faulty") / 3600
-        rows.append((f"{task}, {policy}", *map(str, counts), f"{hours:.2f}"))
-    return rows
+        rows.append((f"{task}, {policy}", *counts, f"{hours:.2f}"))
+    return Table(f"Corpus {VERSION}: {len(corpus.entries)} episodes.", ("", *roles, "healthy hours"), rows)
 
 
 def make(args: Args, console: Console) -> None:
-    """Records what is missing, part by part, and says what there is."""
+    """Record what is missing, part by part, and print the contents."""
     total = 1 if args.quick else ROUNDS
     with claimed(args.out, "recordings.json", {"corpus": VERSION, "quick": args.quick}):
         for part in args.part:
@@ -62,13 +64,11 @@ def make(args: Args, console: Console) -> None:
                 with stage(f"{part}, round {number + 1}", console, {}) as progress:
                     sources = (QUICK if args.quick else PARTS)[part]
                     record_corpus(args.out, sources, number, total, ParallelConfig.named(args.workers), progress)
-    titles = "", "fit", "calibration", "nominal", "faulty", "healthy hours"
-    corpus = Corpus.open(args.out)
-    console.print(ConsoleTable(Table(f"Corpus {VERSION}: {len(corpus.entries)} episodes.", titles, contents(corpus))))
+    console.print(ConsoleTable(contents(Corpus.open(args.out))))
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Records, and returns the exit code."""
+    """Record, and return the exit code."""
     return run("corpus", Args, make, argv, __doc__)
 
 

@@ -39,8 +39,8 @@ from asm_gym.rollouts.run_folder import versions
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.staging import play, staged
 from asm_gym.rollouts.trial import RolloutConfig, Trial
-from asm_gym.rollouts.video import Clip, can_record_video, record_video
-from asm_gym.rollouts.watch import watch_pair
+from asm_gym.rollouts.film import Clip, can_record_video, record_video
+from asm_gym.rollouts.film import watch_pair
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.tasks import TASKS, env_id

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from asm_gym import Channel, Episode, StreamSpec, harmless, make_monitor
-from asm_gym.crashes import crashes, peak_torques
+from asm_gym.data.crashes import crashes, peak_torques
 from asm_gym.episode import EpisodeLabel
 
 SPEC = StreamSpec((Channel("joint", 2, "rad"), Channel("external_torque", 2, "N m")), dt=0.05)

@@ -7,7 +7,7 @@ from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, Monito
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.resampling import Calibration, drawn_anew, interval
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.evaluation.standing import lead_table
+from asm_gym.evaluation.detection_tables import lead_table
 
 
 def a_trace(peak: float, seed: int, onset: int | None = None, before: float = 0.0) -> ScoredEpisode:

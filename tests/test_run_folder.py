@@ -11,7 +11,8 @@ import pytest
 
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.comparison import LeftOut
-from asm_gym.rollouts.run_folder import HOLDER, LOCK, NOMINAL_ROLES, Recordings, claimed, locked, make_missing
+from asm_gym.evaluation.recordings import NOMINAL_ROLES, Recordings
+from asm_gym.rollouts.run_folder import HOLDER, LOCK, claimed, locked, make_missing
 from asm_gym.scripts.cli import main
 from tests.streams import sine_episodes
 

@@ -1,4 +1,4 @@
-"""Alarms of recordings that nobody has labelled: when, how long, on which channel, how far over the threshold."""
+"""Alarms of recordings without labels: when, how long, on which channel, how far over the threshold."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from asm_gym.data.gaps import blamed, bridged, reason
 from asm_gym.data.logs import Log
 from asm_gym.episode import spans
-from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail, moments_of
+from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail
 from asm_gym.spec import StreamSpec
 
 
@@ -18,11 +18,11 @@ class Alarm(NamedTuple):
     """One alarm of a recording.
 
     Attributes:
-        log: in which.
-        start, end: from when to when [s]; a row is known at the end of its step.
-        channel: which number surprised most when it was raised; empty where a whole row was missing.
+        log: name of the recording.
+        start, end: span [s]; a row is known at the end of its step.
+        channel: the most surprising number when the alarm was raised; empty where a whole row was missing.
         why: surprise, missing data, or not finite.
-        excess: how surprising its worst row was, in thresholds; infinite where it was not finite.
+        excess: surprise of the worst row, in thresholds; infinite where it was not finite.
     """
 
     log: str
@@ -33,30 +33,29 @@ class Alarm(NamedTuple):
     excess: float
 
     def cells(self) -> tuple[str, ...]:
-        """For a table."""
+        """Format for a table."""
         return self.log, f"{self.start:.3f}", f"{self.end:.3f}", self.channel, self.why, f"{self.excess:.2f}"
 
 
 HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds")
-"""The last: how surprising the worst row was, in multiples of the threshold."""
 
 
 def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
-    """Every alarm of an episode, in order."""
+    """Return every alarm of an episode, in order."""
     detail = trace.detail
     assert detail is not None
     found = []
-    for m in moments_of(trace):
-        row = np.zeros(len(detail.channels)) if detail.stream is None else detail.stream[m.start]
-        at = blamed(row, detail.attribution[m.start])
+    for first, stop in spans(trace.alarm):
+        row = np.zeros(len(detail.channels)) if detail.stream is None else detail.stream[first]
+        at = blamed(row, detail.attribution[first])
         channel = "" if at is None else detail.channels[at]
-        start, end = (m.start + 1) * trace.dt, m.stop * trace.dt
-        found.append(Alarm(trace.kind, start, end, channel, reason(row), m.excess))
+        excess = float(trace.surprise[first:stop].max() / trace.threshold)
+        found.append(Alarm(trace.kind, (first + 1) * trace.dt, stop * trace.dt, channel, reason(row), excess))
     return found
 
 
 def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[ScoredEpisode]:
-    """What the monitor says of each; rows that lack something for at most ``bridge`` seconds are not judged."""
+    """Score logs; rows that lack a number for at most ``bridge`` seconds are not judged."""
     spec: StreamSpec = monitor.spec
     traces = []
     for (name, episode), surprise in zip(logs, monitor.score_episodes([log.episode for log in logs]), strict=True):
@@ -71,5 +70,5 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
 
 
 def excused_in(trace: ScoredEpisode) -> dict[str, int]:
-    """How often a knock, and a stop, was all that kept surprise from being an alarm."""
+    """Count how often a knock, and a stop, alone kept surprise from being an alarm."""
     return {e: len(spans((raw > trace.threshold) & ~trace.alarm)) for e, raw in trace.excused.items()}

@@ -1,4 +1,4 @@
-"""Monitors side by side, and the ideal observer, whom no monitor can surpass."""
+"""Monitors side by side with the ideal observer, whom no monitor can surpass."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asm_gym.detection import Blocks
 from asm_gym.evaluation.defaults import RATES
 from asm_gym.evaluation.ideal import auroc_bound, power_bound
 from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Kind, KindMetrics, false_alarms, in_words
+from asm_gym.evaluation.resampling import Calibration
 from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
-from asm_gym.evaluation.statistics import Floats, Share
+from asm_gym.evaluation.statistics import Share
 
 IDEAL = "ideal observer"
 
@@ -25,13 +25,13 @@ VISIBLE = 0.5
 
 @dataclass(frozen=True)
 class Detectability:
-    """What the ideal observer could see of one faulty episode.
+    """What the ideal observer could detect of one faulty episode.
 
     Args:
-        task, kind, severity, seed: which.
+        task, kind, severity, seed: identify the episode.
         separation: S at the end of the window.
-        earliest: steps from the onset to the first at which it could be sure; None where it never could.
-        dt: control period [s].
+        earliest: rows from the onset until the observer is sure; None if never.
+        dt: period of the rows [s].
     """
 
     task: str
@@ -44,37 +44,37 @@ class Detectability:
 
     @property
     def delay(self) -> float | None:
-        """Time from the beginning of the fault to being sure [s]; None where it never could be."""
+        """Time from the onset until the observer is sure [s]; None if never."""
         return None if self.earliest is None else (self.earliest + 1) * self.dt
 
 
 @dataclass(frozen=True, eq=False)
 class MonitorResult:
-    """What one monitor made of a run's episodes.
+    """The scores of one monitor on a run's episodes.
 
     Args:
-        traces: of nominal and faulty episodes, judged at the run's own false-alarm rate.
-        harmless: of harmless variations, likewise.
-        thresholds: by the false-alarm rate they were set for.
-        examples: typical faulty episodes with all that figures need.
-        maxima: (n,) the greatest surprise in each calibration episode.
-        hourly: thresholds again, by the false alarms an hour that they were set for.
-        blocks: the maxima by the hour; None where it was not calibrated so.
-        calibration_tasks: (n,) of those episodes, where they are known.
+        traces: nominal and faulty episodes, judged at the run's own false-alarm rate.
+        harmless: episodes of harmless variations, likewise.
+        calibration: the monitor's thresholds.
+        examples: typical faulty episodes with the detail that figures need.
     """
 
     traces: Sequence[ScoredEpisode]
     harmless: Sequence[ScoredEpisode]
-    thresholds: Mapping[float, float]
+    calibration: Calibration
     examples: Sequence[ScoredEpisode] = ()
-    maxima: Floats = field(default_factory=lambda: np.zeros(0))
-    hourly: Mapping[float, float] = field(default_factory=dict)
-    blocks: Blocks | None = None
-    calibration_tasks: Sequence[str] = ()
+
+    def metrics(self, name: str, window_s: float, visible: Mapping[Kind, bool] | None = None) -> DetectionMetrics:
+        """Sum up all kinds of fault, or those that are ``visible``."""
+        nominal = [t for t in self.traces if t.kind == NOMINAL]
+        faulty = [t for t in self.traces if t.onset is not None]
+        if visible is not None:
+            faulty = [t for t in faulty if visible.get((t.kind, t.severity), False)]
+        return DetectionMetrics(name, faulty, nominal, window_s, self.calibration)
 
 
 class LeftOut(NamedTuple):
-    """Nominal episodes that are no example of what is normal.
+    """Numbers of nominal episodes that are no example of normal operation.
 
     Attributes:
         failed: the policy did not do its task.
@@ -87,14 +87,14 @@ class LeftOut(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BenchmarkResult:
-    """What monitors made of a run's episodes, and what an ideal observer could.
+    """The scores of monitors on a run's episodes, and the bound of the ideal observer.
 
     Args:
         monitors: by name.
         detectability: of every faulty episode.
         rate: the run's own false-alarm rate.
-        window_s: how soon an alarm must come to count as detection [s].
-        left_out: how many nominal episodes are, and why.
+        window_s: an alarm within this time of the onset is a detection [s].
+        left_out: nominal episodes that are not used.
     """
 
     monitors: Mapping[str, MonitorResult]
@@ -105,21 +105,22 @@ class BenchmarkResult:
 
     @cached_property
     def visible(self) -> dict[Kind, bool]:
+        """Whether the ideal observer could detect each kind and severity."""
         return visible_kinds(self.detectability)
 
     @cached_property
     def on_all(self) -> list[DetectionMetrics]:
         """Each monitor on all kinds of fault."""
-        return [monitor_metrics(n, m, self.window_s) for n, m in self.monitors.items()]
+        return [m.metrics(name, self.window_s) for name, m in self.monitors.items()]
 
     @cached_property
     def on_visible(self) -> list[DetectionMetrics]:
-        """Each monitor on the kinds of fault that can be seen."""
-        return [monitor_metrics(n, m, self.window_s, self.visible) for n, m in self.monitors.items()]
+        """Each monitor on the visible kinds of fault."""
+        return [m.metrics(name, self.window_s, self.visible) for name, m in self.monitors.items()]
 
     @property
     def ideal(self) -> KindMetrics:
-        """The bound, over the kinds that can be seen."""
+        """The bound over the visible kinds."""
         seen = [d for d in self.detectability if self.visible[d.kind, d.severity]]
         return ideal_metrics(IDEAL, seen, (*RATES, self.rate))
 
@@ -133,7 +134,7 @@ class BenchmarkResult:
         return {IDEAL: bound} | {m.name: m.kinds for m in self.on_all}
 
     def false_alarms_by_variation(self) -> dict[str, dict[str, Share]]:
-        """Episodes of each harmless variation with an alarm, by monitor."""
+        """Count the episodes of each harmless variation with an alarm, by monitor."""
         return {
             name: {
                 kind: false_alarms([t for t in monitor.harmless if t.kind == kind])
@@ -144,7 +145,7 @@ class BenchmarkResult:
 
 
 def visible_kinds(detectability: Sequence[Detectability]) -> dict[Kind, bool]:
-    """Whether an ideal observer could see faults of a kind and severity, in order of appearance."""
+    """Return whether an ideal observer could detect each kind and severity, in order of appearance."""
     kinds: dict[Kind, list[Detectability]] = {}
     for one in detectability:
         kinds.setdefault((one.kind, one.severity), []).append(one)
@@ -152,30 +153,15 @@ def visible_kinds(detectability: Sequence[Detectability]) -> dict[Kind, bool]:
 
 
 def ideal_metrics(name: str, detectability: Sequence[Detectability], rates: Sequence[float] = RATES) -> KindMetrics:
-    """The bound on what any monitor can score on these faults."""
+    """Return the bound on the results of any monitor on these faults."""
     separations = np.array([d.separation for d in detectability])
+    n = len(separations)
     return KindMetrics(
         name=name,
-        auroc=float(np.mean(auroc_bound(separations))) if len(separations) else math.nan,
-        found={
-            r: Share(round(len(separations) * _mean_power(detectability, r)), len(separations))
-            for r in rates
-            if len(separations)
-        },
+        auroc=float(np.mean(auroc_bound(separations))) if n else math.nan,
+        found={r: Share(round(n * _mean_power(detectability, r)), n) for r in rates if n},
         delays=Delays.of([math.inf if d.delay is None else 1e3 * d.delay for d in detectability]),
     )
-
-
-def monitor_metrics(
-    name: str, result: MonitorResult, window_s: float, visible: Mapping[Kind, bool] | None = None
-) -> DetectionMetrics:
-    """One monitor on all kinds of fault, or on those that are ``visible``."""
-    nominal = [t for t in result.traces if t.kind == NOMINAL]
-    faulty = [t for t in result.traces if t.onset is not None]
-    if visible is not None:
-        faulty = [t for t in faulty if visible.get((t.kind, t.severity), False)]
-    kept = result.thresholds, result.maxima, result.hourly, result.blocks
-    return DetectionMetrics(name, faulty, nominal, window_s, *kept)
 
 
 def _mean_power(detectability: Sequence[Detectability], rate: float) -> float:

@@ -1,16 +1,16 @@
-"""What is judged by default: how soon a fault must be noticed, and how often nothing may raise an alarm."""
+"""Defaults of an evaluation: the detection window, and the false-alarm rates."""
 
 WINDOW_S = 1.0
-"""How soon after its onset a fault must be noticed to count as found [s]."""
+"""A fault counts as found within this time of its onset [s]."""
 
 FALSE_ALARM_RATE = 0.05
-"""Share of nominal episodes that may raise an alarm, where little is recorded: 19 episodes can promise it."""
+"""Share of nominal episodes that may raise an alarm where little is recorded: needs 19 calibration episodes."""
 
 REPORTED_RATE = 0.01
-"""The same where much is recorded, as in the tables that compare monitors: 99 episodes can promise it."""
+"""The same in the tables that compare monitors: needs 99 calibration episodes."""
 
 RATES = (0.005, REPORTED_RATE, FALSE_ALARM_RATE)
-"""Shares of nominal episodes with an alarm, at which detection is compared."""
+"""False-alarm rates at which detection is compared."""
 
 PER_HOUR = (10.0, 1.0)
-"""False alarms in an hour of nominal episodes, at which it is compared too where there are hours enough."""
+"""False alarms per hour at which detection is compared, where there are enough hours."""

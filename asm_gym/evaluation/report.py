@@ -1,4 +1,4 @@
-"""Results as files: one self-contained HTML page with nothing to fetch, and a benchmark's tables and rows."""
+"""Results as files: one self-contained HTML page, and a benchmark's tables and rows."""
 
 from __future__ import annotations
 
@@ -18,10 +18,8 @@ from matplotlib.figure import Figure
 
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability
-from asm_gym.evaluation.detection_tables import harmless_table, kinds_table, monitors_table
-from asm_gym.evaluation.figures.style import SAYS
+from asm_gym.evaluation.detection_tables import harmless_table, kept_table, kinds_table, lead_table, monitors_table
 from asm_gym.evaluation.scored_episode import ScoredEpisode, window_steps
-from asm_gym.evaluation.standing import card, coverage_table, kept_table, lead_table
 from asm_gym.evaluation.tables import Table, markdown
 from asm_gym.extras import needed_for
 from asm_gym.files import written_whole
@@ -34,32 +32,31 @@ def write_report(
     title: str,
     intro: str,
     tables: Sequence[Table],
-    drawn: Mapping[str, Path | Figure],
+    drawn: Mapping[str, Figure],
     video: Path | None = None,
     details: Mapping[str, object] | None = None,
 ) -> Path:
-    """Writes the report; the file appears under its name only when it is complete.
+    """Write the report; the file appears when it is complete.
 
     Args:
         path: the HTML file.
         title: one line.
         intro: plain text; an empty line starts a new paragraph.
         tables: in order.
-        drawn: caption to a PNG file, or to a Figure, which tells its numbers under the pointer.
+        drawn: figures by caption.
         video: an MP4 file.
-        details: what it takes to make the report again: arguments, seed, versions.
+        details: how to make the report again: arguments, seed, versions.
     """
     path = Path(path)
     parts = [f"<p>{escape(p)}</p>" for p in intro.split("\n\n") if p.strip()]
     if video is not None:
-        film = (
-            f'<video controls muted loop playsinline preload="metadata" src="{_uri("video/mp4", video.read_bytes())}">'
-        )
-        parts.append(f'<section class="film"><h2>Film</h2>\n{film}This browser plays no MP4.</video></section>')
+        source = f"data:video/mp4;base64,{base64.b64encode(video.read_bytes()).decode('ascii')}"
+        film = f'<video controls muted loop playsinline preload="metadata" src="{source}"></video>'
+        parts.append(f'<section class="film"><h2>Film</h2>\n{film}</section>')
     if tables:
         parts.append("<section><h2>Results</h2>\n" + "\n".join(map(_table, tables)) + "</section>")
     if drawn:
-        shown = "\n".join(_shown(caption, figure) for caption, figure in drawn.items())
+        shown = "\n".join(_figure(caption, figure) for caption, figure in drawn.items())
         parts.append(f'<section><h2>Figures</h2>\n<div class="figures">{shown}</div></section>')
     if details:
         items = "\n".join(f"<dt>{escape(k)}</dt><dd>{escape(str(v))}</dd>" for k, v in details.items())
@@ -70,15 +67,10 @@ def write_report(
 
 
 def _table(table: Table) -> str:
-    text = [any(_is_text(row[i]) for row in table.rows) for i in range(len(table.headings))]
-    head = "".join(
-        f'<th scope="col" class="text">{escape(h)}</th>' if words else f'<th scope="col">{escape(h)}</th>'
-        for words, h in zip(text, table.headings, strict=True)
-    )
-    open_td = ['<td class="text">' if words else "<td>" for words in text]
+    head = "".join(f'<th scope="col">{escape(h)}</th>' for h in table.headings)
     body = "\n".join(
         f'<tr><th scope="row">{escape(str(row[0]))}</th>'
-        + "".join(f"{td}{escape(str(cell))}</td>" for td, cell in zip(open_td[1:], row[1:], strict=True))
+        + "".join(f"<td>{escape(str(cell))}</td>" for cell in row[1:])
         + "</tr>"
         for row in table.rows
     )
@@ -88,40 +80,20 @@ def _table(table: Table) -> str:
     )
 
 
-def _is_text(cell: object) -> bool:
-    """Words are set to the left, numbers to the right."""
-    return isinstance(cell, str) and cell[:1].isalpha()
-
-
-def _shown(caption: str, figure: Path | Figure) -> str:
-    if isinstance(figure, Figure):
-        picture = _svg(figure, caption)
-    else:
-        png = Path(figure).read_bytes()
-        width = int.from_bytes(png[16:20], "big") * 3 // 4  # 150 dpi on a screen of about 112
-        picture = f'<img alt="{escape(caption)}" width="{width}" src="{_uri("image/png", png)}">'
-    return f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>"
-
-
-def _svg(figure: Figure, caption: str) -> str:
-    """As SVG, in which what has a text for an id (``figures.style.says``) says it under the pointer."""
+def _figure(caption: str, figure: Figure) -> str:
     buffer = io.StringIO()
-    with mpl.rc_context({"svg.hashsalt": caption}):  # ids are the same each time, and no other figure's
+    with mpl.rc_context({"svg.hashsalt": caption}):  # ids are the same each time, and differ between figures
         figure.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     svg = buffer.getvalue()[buffer.getvalue().index("<svg") :]
     svg = re.sub(r' xmlns(:xlink)?="[^"]*"', "", svg)  # HTML needs none
-    svg = re.sub(rf'<g id="{SAYS}([^"]*)">', r"<g><title>\1</title>", svg)
-    return svg.replace("<svg ", f'<svg role="img" aria-label="{escape(caption)}" ', 1)
-
-
-def _uri(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+    svg = svg.replace("<svg ", f'<svg role="img" aria-label="{escape(caption)}" ', 1)
+    return f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Writes what JSON can hold; a number that is not finite, such as a delay that never ended, is null."""
+    """Write JSON; a number that is not finite becomes null."""
     with written_whole(path) as file:
-        file.write((json.dumps(_finite(content), indent=2, allow_nan=False) + "\n").encode())
+        file.write((json.dumps(_finite(content), indent=2, allow_nan=False, default=str) + "\n").encode())
 
 
 def _finite(value: Any) -> Any:
@@ -134,35 +106,28 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any], video: Path | None = None) -> None:
-    """Writes ``results.parquet``, ``results.json``, ``results.md``, ``report.html``, and a card for each monitor."""
+def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -> None:
+    """Write ``results.parquet``, ``results.json``, ``results.md`` and ``report.html``."""
     _write_parquet(folder / "results.parquet", result)
-    tables = [monitors_table(result)]
+    tables = [monitors_table(result), kept_table(result), kinds_table(result)]
     if len(result.monitors) > 1:
-        tables.append(lead_table(result))
-    tables += [kept_table(result), coverage_table(result), kinds_table(result)]
+        tables.insert(1, lead_table(result))
     if any(monitor.harmless for monitor in result.monitors.values()):
         tables.append(harmless_table(result, list(result.monitors)))
-    for metrics in result.on_visible:
-        write_json(folder / "cards" / f"{metrics.name.replace(':', '.')}.json", {**card(metrics), "settings": details})
     (folder / "results.md").write_text("\n\n".join(map(markdown, tables)) + "\n", encoding="utf-8")
     summary = {"settings": details, "tables": [{"headings": t.headings, "rows": t.rows} for t in tables]}
-    (folder / "results.json").write_text(json.dumps(summary, indent=1, default=str) + "\n", encoding="utf-8")
-    write_report(
-        folder / "report.html",
-        "Who notices what",
+    write_json(folder / "results.json", summary)
+    intro = (
         f"{len(result.detectability)} faulty episodes, {len(result.monitors)} monitors. The ideal observer knows the "
-        "healthy twin of every faulty episode and the sensors' noise: no monitor can do better than its row.",
-        tables,
-        _benchmark_figures(result),
-        video,
-        details,
+        "healthy twin of every faulty episode and the sensors' noise: no monitor can do better than its row."
     )
+    drawn = _benchmark_figures(result)
+    write_report(folder / "report.html", "Who notices what", intro, tables, drawn, details=details)
 
 
 def _benchmark_figures(result: BenchmarkResult) -> dict[str, Figure]:
     drawn = {
-        "AUROC by kind of fault and severity. In brackets: no observer could see it.": figures.heat_map(
+        "AUROC by kind and severity of fault. In brackets: no observer could detect it.": figures.heat_map(
             result.kinds, result.visible
         ),
         "ROC over all faults, each against nominal episodes of its task in the same steps.": figures.roc_figure(
@@ -170,12 +135,9 @@ def _benchmark_figures(result: BenchmarkResult) -> dict[str, Figure]:
         ),
         "How soon faults were found.": figures.delay_figure(result.on_all),
     }
-    severities = list(dict.fromkeys(severity for _, severity in result.visible))
-    if len(severities) > 1:
-        drawn["Faults found at each severity."] = figures.severity_curves(result.kinds, severities, result.rate)
     first, examples = next((name, monitor.examples) for name, monitor in result.monitors.items())
     if examples:
-        drawn[f"Typical episodes as {first} saw them: surprise over its threshold, the fault's span, the alarms."] = (
+        drawn[f"Typical episodes as {first} scored them: surprise, threshold, fault and alarms."] = (
             figures.surprise_figure(examples)
         )
     for trace in examples:
@@ -195,21 +157,15 @@ def _write_parquet(path: Path, result: BenchmarkResult) -> None:
         for monitor in result.monitors.values()
         for trace in getattr(monitor, which)
     ]
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    pq.write_table(pa.Table.from_pylist(rows), unfinished, compression="zstd")
-    unfinished.replace(path)
+    with written_whole(path) as file:
+        pq.write_table(pa.Table.from_pylist(rows), file, compression="zstd")
 
 
 def _row(trace: ScoredEpisode, possible: Detectability | None, window_s: float) -> dict[str, Any]:
     after, affected = trace.detected_after, trace.affected_channels
     blamed = trace.top_channel if after is not None else ""
     return {
-        "task": trace.task,
-        "monitor": trace.monitor,
-        "kind": trace.kind,
-        "severity": trace.severity,
-        "seed": trace.seed,
-        "onset": trace.onset,
+        **{name: getattr(trace, name) for name in ("task", "monitor", "kind", "severity", "seed", "onset")},
         "steps": len(trace),
         "dt": trace.dt,
         "threshold": trace.threshold,

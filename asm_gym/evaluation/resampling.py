@@ -1,15 +1,15 @@
-"""How sure the figures of a comparison are: scenes and calibration episodes drawn anew, with replacement.
+"""Confidence intervals of a comparison: scenes and calibration episodes resampled with replacement.
 
-All faults of one seed and task share a scene and the course of one episode, and all are judged by one threshold. So it
-is scenes that are drawn and not faults, and the threshold is set anew on calibration episodes drawn anew: a cluster
-bootstrap (Davison and Hinkley 1997, ch. 3.8) with percentile intervals. Monitors are drawn alike, so that their
-differences are paired.
+All faults of one seed and task share a scene, and all are judged by one threshold. So scenes are resampled, not faults,
+and the threshold is set anew on resampled calibration episodes: a cluster bootstrap (Davison and Hinkley 1997, ch. 3.8)
+with percentile intervals. Monitors are resampled alike, so their differences are paired.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -20,44 +20,44 @@ from asm_gym.evaluation.scored_episode import ScoredEpisode, window_steps
 from asm_gym.evaluation.statistics import Estimate, Floats
 
 DRAWS = 400
-"""How often everything is drawn anew."""
+"""Bootstrap resamples."""
 
 
-class Calibration(NamedTuple):
-    """From what a monitor's thresholds are set, and for which promises.
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The thresholds of a monitor, and the scores that they were set on.
 
     Attributes:
-        maxima: (n,) the greatest surprise in each calibration episode.
-        blocks: the same by the hour; None where nothing is promised by it.
-        rates: of nominal episodes with an alarm; those that n is too small for are left out.
-        hourly: of alarms an hour.
+        thresholds: by the share of nominal episodes that may raise an alarm.
+        hourly: by the false alarms per hour.
+        maxima: (n,) the greatest surprise of each calibration episode.
+        blocks: the maxima by the hour; None if not calibrated by the hour.
     """
 
-    maxima: Floats
+    thresholds: Mapping[float, float] = field(default_factory=dict)
+    hourly: Mapping[float, float] = field(default_factory=dict)
+    maxima: Floats = field(default_factory=lambda: np.zeros(0))
     blocks: Blocks | None = None
-    rates: tuple[float, ...] = ()
-    hourly: tuple[float, ...] = ()
 
-    def anew(self, rng: np.random.Generator) -> tuple[dict[float, float], dict[float, float]]:
-        """Thresholds from episodes, and from blocks, drawn anew with replacement: by rate, and by alarms an hour."""
-        again = rng.integers(len(self.maxima), size=len(self.maxima))
-        possible = [r for r in self.rates if len(self.maxima) >= conformal_episodes(r)]
-        by_rate = {r: conformal_threshold(self.maxima[again], r) for r in possible}
+    def resampled(self, rng: np.random.Generator) -> tuple[dict[float, float], dict[float, float]]:
+        """Return thresholds by rate, and by alarms per hour, from resampled episodes and blocks."""
+        maxima = self.maxima[rng.integers(len(self.maxima), size=len(self.maxima))]
+        possible = [r for r in self.thresholds if len(maxima) >= conformal_episodes(r)]
+        by_rate = {r: conformal_threshold(maxima, r) for r in possible}
         if self.blocks is None or not self.hourly:
             return by_rate, {}
         again = rng.integers(len(self.blocks.maxima), size=len(self.blocks.maxima))
-        # As many hours as there were: short episodes drawn more often promise nothing else.
-        drawn = self.blocks._replace(maxima=self.blocks.maxima[again])
+        drawn = self.blocks._replace(maxima=self.blocks.maxima[again])  # the hours stay as they were
         return by_rate, {r: hourly_threshold(drawn, r) for r in self.hourly}
 
 
 class Draws(NamedTuple):
-    """Figures of one monitor, once for each time that everything was drawn anew.
+    """Results of one monitor in each of R resamples.
 
     Attributes:
         auroc: (R,) over matched steps, the mean over kinds.
-        found: (R,) share of faults detected within the window, by the false-alarm rate the threshold was set for.
-        hourly: (R,) the same, by the false alarms an hour that it was set for.
+        found: (R,) share of faults detected within the window, by false-alarm rate.
+        hourly: (R,) the same, by false alarms per hour.
     """
 
     auroc: Floats
@@ -66,14 +66,14 @@ class Draws(NamedTuple):
 
 
 def interval(value: float, draws: Floats) -> Estimate:
-    """The 95 % percentile interval about a figure; NaN where nothing was drawn."""
+    """Return the 95 % percentile interval about a value; NaN where nothing was resampled."""
     if not len(draws) or np.isnan(draws).all():
         return Estimate(value, math.nan, math.nan)
     low, high = np.nanquantile(draws, [0.025, 0.975])
     return Estimate(value, float(low), float(high))
 
 
-def drawn_anew(
+def resample(
     faulty: Sequence[ScoredEpisode],
     nominal: Sequence[ScoredEpisode],
     calibration: Calibration,
@@ -81,14 +81,15 @@ def drawn_anew(
     seed: int = 0,
     draws: int = DRAWS,
 ) -> Draws:
-    """The figures of one monitor over scenes and calibration episodes drawn anew.
+    """Resample the results of one monitor.
 
     Args:
-        faulty: traces with an onset; twins of nominal ones share their seed.
-        nominal: traces without one; each is a scene of its task.
-        calibration: by which thresholds are set anew.
-        window_s: how soon an alarm must come to count as detection [s].
-        seed: of what is drawn; the same for all monitors that are to be compared.
+        faulty: episodes with an onset; twins of nominal ones share their seed.
+        nominal: episodes without one; each is a scene of its task.
+        calibration: sets the thresholds anew.
+        window_s: an alarm within this time of the onset is a detection [s].
+        seed: the same for all monitors that are compared.
+        draws: number of resamples.
     """
     rng = np.random.default_rng(seed)
     names = sorted({(t.task, t.seed) for t in (*nominal, *faulty)})
@@ -97,9 +98,9 @@ def drawn_anew(
     kinds: dict[tuple[str, str], int] = {}
     kind = np.array([kinds.setdefault((t.kind, t.severity), len(kinds)) for t in faulty], int)
     scene = np.array([place[t.task, t.seed] for t in faulty], int)
-    beaten = _beaten(faulty, nominal, place, window_s)
-    known, beaten = ~np.isnan(beaten), np.nan_to_num(beaten)
-    alarms = _Alarms(faulty, window_s)
+    wins = _wins(faulty, nominal, place, window_s)
+    known, wins = ~np.isnan(wins), np.nan_to_num(wins)
+    detections = _detector(faulty, window_s)
     own = [np.array([i for i, name in enumerate(tasks) if name == task]) for task in dict.fromkeys(tasks)]
     auroc = np.full(draws, math.nan)
     found: tuple[dict[float, Floats], dict[float, Floats]] = {}, {}
@@ -107,42 +108,40 @@ def drawn_anew(
         weights = np.zeros(len(names))  # how often each scene was drawn
         for scenes in own:
             np.add.at(weights, rng.choice(scenes, len(scenes)), 1.0)
-        auroc[k] = _mean_auroc(beaten, known, weights, weights[scene], kind, len(kinds))
-        for kept, thresholds in zip(found, calibration.anew(rng), strict=True):
+        auroc[k] = _mean_auroc(wins, known, weights, weights[scene], kind, len(kinds))
+        for kept, thresholds in zip(found, calibration.resampled(rng), strict=True):
             for rate, threshold in thresholds.items():
-                kept.setdefault(rate, np.full(draws, math.nan))[k] = _mean(alarms.over(threshold), weights[scene])
+                shares = kept.setdefault(rate, np.full(draws, math.nan))
+                shares[k] = _mean(detections(threshold), weights[scene])
     return Draws(auroc, *found)
 
 
-def _beaten(
+def _wins(
     faulty: Sequence[ScoredEpisode],
     nominal: Sequence[ScoredEpisode],
     place: Mapping[tuple[str, int], int],
     window_s: float,
 ) -> NDArray[np.float32]:
-    """(F, scenes) 1 where a fault surprised more than the nominal episode in the same steps, ½ in ties, else NaN."""
+    """Return (F, scenes) 1 where a fault surprised more than the nominal episode in the same steps, ½ in ties."""
     won = np.full((len(faulty), len(place)), np.nan, np.float32)
-    by_task: dict[str, list[ScoredEpisode]] = {}
-    for trace in nominal:
-        by_task.setdefault(trace.task, []).append(trace)
     for row, trace in zip(won, faulty, strict=True):
         steps = trace.window(window_s)
         if steps.stop <= steps.start:
             continue
         mine = trace.surprise[steps].max()
-        for other in by_task.get(trace.task, []):
-            if len(other) > steps.start:
+        for other in nominal:
+            if other.task == trace.task and len(other) > steps.start:
                 theirs = other.surprise[steps].max()
                 row[place[other.task, other.seed]] = 0.5 * ((mine > theirs) + float(mine >= theirs))
     return won
 
 
 def _mean_auroc(
-    beaten: Floats, known: NDArray[np.bool_], scenes: Floats, faults: Floats, kind: NDArray[np.int_], kinds: int
+    wins: Floats, known: NDArray[np.bool_], scenes: Floats, faults: Floats, kind: NDArray[np.int_], kinds: int
 ) -> float:
-    """The mean over kinds, where each scene and each fault counts as often as it was drawn."""
+    """Return the mean over kinds, each scene and each fault weighted by how often it was drawn."""
     reached = known @ scenes
-    each = (beaten @ scenes) / np.maximum(reached, 1.0)
+    each = (wins @ scenes) / np.maximum(reached, 1.0)
     counts = np.where(reached > 0, faults, 0.0)
     total, drawn = (np.bincount(kind, w, kinds) for w in (counts * each, counts))
     return float((total[drawn > 0] / drawn[drawn > 0]).mean()) if drawn.any() else math.nan
@@ -152,20 +151,16 @@ def _mean(values: Floats, weights: Floats) -> float:
     return float(values @ weights / weights.sum()) if weights.sum() else math.nan
 
 
-class _Alarms:
-    """Which faults are detected at a threshold, without going through all traces again."""
+def _detector(faulty: Sequence[ScoredEpisode], window_s: float) -> Callable[[float], Floats]:
+    """Return a function of a threshold that gives (F,) 1 for each fault detected within the window."""
+    before = np.array([t.surprise[o - 1] if (o := t.onset or 0) and o <= len(t) else -math.inf for t in faulty])
+    peak = np.array([t.surprise[t.window(window_s)].max(initial=-math.inf) for t in faulty])
 
-    def __init__(self, faulty: Sequence[ScoredEpisode], window_s: float) -> None:
-        self._faulty, self._window_s = faulty, window_s
-        before = [t.surprise[o - 1] if (o := t.onset or 0) and o <= len(t) else -math.inf for t in faulty]
-        self._before = np.array(before, float)
-        self._peak = np.array([t.surprise[t.window(window_s)].max(initial=-math.inf) for t in faulty], float)
-
-    def over(self, threshold: float) -> NDArray[np.float64]:
-        """(F,) 1 where an alarm is raised within the window."""
-        hit = (self._peak > threshold).astype(float)
-        for i in np.flatnonzero(self._before > threshold):  # an alarm that was up already says nothing
-            trace = self._faulty[i]
-            late = trace.at(threshold).detected_after
-            hit[i] = late is not None and late < window_steps(self._window_s, trace.dt)
+    def detections(threshold: float) -> Floats:
+        hit = (peak > threshold).astype(float)
+        for i in np.flatnonzero(before > threshold):  # an alarm that was up already is no detection
+            late = faulty[i].at(threshold).detected_after
+            hit[i] = late is not None and late < window_steps(window_s, faulty[i].dt)
         return hit
+
+    return detections

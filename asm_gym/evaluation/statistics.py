@@ -1,22 +1,21 @@
-"""Statistics of proportions, ranks and resampled means: pure functions of numbers."""
+"""Statistics of proportions, counts and ranks: pure functions of numbers."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from statistics import NormalDist
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import betaln, gammainccinv, gammaincinv
+from scipy import stats
 
 from asm_gym.validation import check_number, shown
 
 Floats = NDArray[np.floating[Any]]
 
 RESAMPLES = 2000
-"""Of a bootstrap."""
+"""Resamples of a bootstrap."""
 
 
 class Share(NamedTuple):
@@ -27,6 +26,7 @@ class Share(NamedTuple):
 
     @property
     def value(self) -> float:
+        """The proportion; NaN for none of none."""
         return self.k / self.n if self.n else math.nan
 
     @property
@@ -36,6 +36,7 @@ class Share(NamedTuple):
 
     @classmethod
     def of(cls, outcomes: Sequence[bool]) -> Share:
+        """Count the true outcomes."""
         return cls(sum(map(bool, outcomes)), len(outcomes))
 
 
@@ -47,7 +48,7 @@ class Rate(NamedTuple):
 
     @property
     def value(self) -> float:
-        """An hour; NaN without any time."""
+        """Events per hour; NaN without any time."""
         return self.k / self.hours if self.hours else math.nan
 
     @property
@@ -84,78 +85,64 @@ class Spread(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
-        """Of one value a seed; a single one has no deviation, NaN."""
+        """Summarise one value per seed; the deviation of a single one is NaN."""
         return cls(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else math.nan)
 
     def text(self, scale: float = 1.0, digits: int = 3) -> str:
-        """``mean ± sd``, each times ``scale``; the mean alone where there is no deviation."""
-        if math.isnan(self.sd):
-            return f"{scale * self.mean:.{digits}f}"
-        return f"{scale * self.mean:.{digits}f} ± {scale * self.sd:.{digits}f}"
+        """``mean ± sd``, each times ``scale``; the mean alone without a deviation."""
+        deviation = "" if math.isnan(self.sd) else f" ± {scale * self.sd:.{digits}f}"
+        return f"{scale * self.mean:.{digits}f}{deviation}"
 
 
 def wilson_interval(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """The score interval of a proportion of ``k`` in ``n`` (Wilson 1927); (0, 1) where ``n`` is 0.
-
-    ``(p + z²/2n ± z √(p(1-p)/n + z²/4n²)) / (1 + z²/n)``
-    """
+    """Return the score interval of the proportion ``k`` in ``n`` (Wilson 1927); (0, 1) where ``n`` is 0."""
     check_number("n", n, low=0, whole=True)
     check_number("k", k, low=0, high=n, whole=True)
+    check_number("confidence", confidence, above=0, below=1)
     if n == 0:
         return 0.0, 1.0
-    z = NormalDist().inv_cdf(0.5 + _check_confidence(confidence) / 2)
-    p, shrink = k / n, 1 + z * z / n
-    centre = (p + z * z / (2 * n)) / shrink
-    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / shrink
-    # At the ends the bound is exact; rounding would leave 1e-17.
-    return (0.0 if k == 0 else centre - half), (1.0 if k == n else centre + half)
+    found = stats.binomtest(k, n).proportion_ci(confidence, method="wilson")
+    return float(found.low), float(found.high)
 
 
 def binomial_interval(n: int, p: float, confidence: float = 0.95) -> tuple[int, int]:
-    """Counts (lo, hi) that ``n`` trials of probability ``p`` stay within, equal tails: P(k < lo), P(k > hi) <= (1-c)/2.
+    """Return the counts (low, high) that ``n`` trials of probability ``p`` stay within, with equal tails.
 
-    For checking a calibration: alarms in n nominal episodes at the false-alarm rate p.
+    Checks a calibration: alarms in n nominal episodes at the false-alarm rate p.
     """
     check_number("p", p, low=0, high=1)
     check_number("n", n, low=0, high=1e7, whole=True)
-    tail = (1 - _check_confidence(confidence)) / 2
-    if p in (0.0, 1.0):
-        return round(n * p), round(n * p)
-    log_mass = [
-        math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) + k * math.log(p) + (n - k) * math.log1p(-p)
-        for k in range(n + 1)
-    ]
-    mass = np.exp(log_mass)  # (n + 1,)
-    below, above = np.cumsum(mass), np.cumsum(mass[::-1])[::-1]  # P(K <= k), P(K >= k)
-    return int(np.argmax(below > tail)), int(n - np.argmax(above[::-1] > tail))
+    check_number("confidence", confidence, above=0, below=1)
+    low, high = stats.binom.interval(confidence, n, p)
+    return int(low), int(high)
 
 
 def poisson_interval(k: int, confidence: float = 0.95) -> tuple[float, float]:
-    """The exact interval of the mean of a Poisson variable that came to ``k`` (Garwood 1936).
+    """Return the exact interval of the mean of a Poisson variable that came to ``k`` (Garwood 1936).
 
-    ``P(K >= k; low) = P(K <= k; high) = (1 - c)/2``, and low = 0 for k = 0. At least a share c of such intervals holds
-    the mean. Events that come in clusters are no Poisson variable: count each cluster once.
+    Events that come in clusters are not Poisson: count each cluster once.
     """
     check_number("k", k, low=0, high=1e9, whole=True)
-    tail = (1 - _check_confidence(confidence)) / 2
-    return (float(gammaincinv(k, tail)) if k else 0.0), float(gammainccinv(k + 1, tail))
+    tail = (1 - check_number("confidence", confidence, above=0, below=1)) / 2
+    low = stats.gamma.ppf(tail, k) if k else 0.0
+    return float(low), float(stats.gamma.isf(tail, k + 1))
 
 
 def chance_of_alarms(k: int, n: int, beyond: int, calibrated: int) -> float:
-    """P of at least ``k`` alarms in ``n`` fresh episodes, if ``beyond`` of those ``calibrated`` on exceed a threshold.
+    """Return P(at least ``k`` alarms in ``n`` fresh episodes) for a threshold set on ``calibrated`` maxima.
 
-    Which share of fresh ones exceeds one of the maxima that it was set on is itself drawn, from Beta(beyond + 1,
-    calibrated - beyond): the count is beta-binomial. Takes continuous and exchangeable maxima, and nothing else.
+    ``beyond`` of the maxima exceed the threshold. The share of fresh ones that exceed it is itself drawn, from
+    Beta(beyond + 1, calibrated - beyond), so the count is beta-binomial. Assumes continuous and exchangeable maxima.
     """
     check_number("beyond", beyond, low=0, high=calibrated - 1, whole=True)
-    a, b, j = beyond + 1, calibrated - beyond, np.arange(k, n + 1)
-    return float(np.exp(betaln(j + a, n - j + b) - betaln(a, b) - betaln(j + 1, n - j + 1) - math.log(n + 1)).sum())
+    return float(stats.betabinom.sf(k - 1, n, beyond + 1, calibrated - beyond))
 
 
 def auroc(scores_pos: ArrayLike, scores_neg: ArrayLike) -> float:
-    """The probability that a positive scores higher than a negative, ties counted half (Mann-Whitney).
+    """Return the probability that a positive scores higher than a negative, ties counted half (Mann-Whitney).
 
-    Takes infinite scores, refuses NaN.
+    Raises:
+        ValueError: a score is NaN (infinite ones are fine), or one of the two holds none.
     """
     pos, neg = _scores("scores_pos", scores_pos), _scores("scores_neg", scores_neg)
     if not pos.size or not neg.size:
@@ -165,22 +152,8 @@ def auroc(scores_pos: ArrayLike, scores_neg: ArrayLike) -> float:
     return float((lower + not_higher).sum() / (2 * pos.size * neg.size))
 
 
-def bootstrap(
-    statistic: Callable[[Floats], Floats], pairs: Floats, rng: np.random.Generator, resamples: int = RESAMPLES
-) -> Estimate:
-    """Percentile interval over resampled episodes (Efron and Tibshirani 1993, ch. 13).
-
-    Args:
-        statistic: from (…, n, 2) to (…).
-        pairs: (n, 2) what was measured with the policy alone, and with the reflex.
-    """
-    drawn = statistic(pairs[rng.integers(len(pairs), size=(resamples, len(pairs)))])
-    low, high = np.nanquantile(drawn, [0.025, 0.975])
-    return Estimate(float(statistic(pairs)), float(low), float(high))
-
-
 def _scores(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """(n,) numbers, infinite ones too."""
+    """Return (n,) numbers, infinite ones too."""
     try:
         scores: NDArray[Any] = np.asarray(values)
     except ValueError:  # rows of several lengths
@@ -190,7 +163,3 @@ def _scores(name: str, values: ArrayLike) -> NDArray[np.float64]:
     if np.isnan(scores).any():
         raise ValueError(f"{name} must not be NaN, got {shown(values)}")
     return scores.astype(np.float64)
-
-
-def _check_confidence(confidence: Any) -> float:
-    return check_number("confidence", confidence, above=0, below=1)

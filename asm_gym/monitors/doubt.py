@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from asm_gym.crashes import CRASH, crashes
+from asm_gym.data.crashes import CRASH, crashes
 from asm_gym.detection.base import Array
 from asm_gym.episode import Episode
 from asm_gym.monitors.promise import Asked

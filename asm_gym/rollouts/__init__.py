@@ -1,4 +1,4 @@
-"""Runs episodes: trials, collections, folders of runs, parallel work."""
+"""Run episodes: trials, collections, folders of runs, parallel work."""
 
 from typing import Any
 
@@ -12,8 +12,8 @@ try:
         from asm_gym.rollouts.pretraining.healthy import harmless
         from asm_gym.rollouts.trial import RolloutConfig, Trial
 except ImportError as error:
-    # Who watches logs has no simulator, and who asks for one of these is told what is missing. They are not looked up
-    # when they are asked for, as in ``asm_gym.wrappers``: ``collect`` is a module too, which would be found first.
+    # An install for logs has no simulator; the missing package is named when one of these is accessed. They are not
+    # imported on access, as in ``asm_gym.wrappers``: ``collect`` is a module too, which would be found first.
     _missing = error
 
 __all__ = ["ParallelConfig", "RolloutConfig", "Trial", "collect", "harmless", "parallel_map"]

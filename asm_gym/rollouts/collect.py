@@ -1,4 +1,4 @@
-"""Records a policy's episodes in any Gymnasium environment, by workers; in memory, or each as a file of its own."""
+"""Record a policy's episodes in any Gymnasium environment, by workers; in memory, or each in a file."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from asm_gym.episode import Episode, save_episode
+from asm_gym.episode import Episode, load_episode, save_episode
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 from asm_gym.rollouts.progress import in_a_notebook
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.staging import environment, play, policy_for, staged
+from asm_gym.rollouts.staging import environment, play, policy_for, record, staged
 from asm_gym.rollouts.trial import PolicySource, RolloutConfig, Trial
 from asm_gym.tasks import env_spec
 from asm_gym.validation import check_number, typed
@@ -34,26 +34,26 @@ def collect(
     progress: Progress | None = None,
     **env_kwargs: Any,
 ) -> list[Episode]:
-    """Episodes of ``policy`` in ``env_id``, in an order that does not depend on ``workers``.
+    """Record episodes of ``policy`` in ``env_id``, in an order that does not depend on ``workers``.
 
     Where ``info`` has no ``"stream"``, observation and action are the stream.
 
     Args:
-        env_id: any Gymnasium id whose spaces are numbers, such as ``asm_gym/Lift-v0``, ``Pusher-v5`` or ``module:id``.
-        policy: a name or a path, as ``asm_gym.policies.make_policy`` takes; whatever has stable-baselines3's
-            ``predict``; or a factory that makes one for an environment, called anew for every episode. An object is
-            shared by the episodes of one process, so it must forget the last one where ``episode_start`` is set; one
-            that draws at random must have ``set_random_seed``, as those of stable-baselines3 have.
+        env_id: any Gymnasium id with numeric spaces, such as ``asm_gym/Lift-v0``, ``Pusher-v5`` or ``module:id``.
+        policy: a name or a path, as ``asm_gym.policies.make_policy`` takes; any object with stable-baselines3's
+            ``predict``; or a factory that makes one for an environment, called for every episode. An object is shared
+            by the episodes of one process, so it must reset itself where ``episode_start`` is set; one that draws at
+            random must have ``set_random_seed``.
         episodes: how many.
         seed: of everything; the same seed gives the same episodes.
         workers: processes, 1 of which is this one; or a ``ParallelConfig`` that names a cluster.
         stage: sets of episodes with the same ``seed`` and different stages are different.
         progress: is called as (done, total); without it a notebook with widgets shows a bar.
-        env_kwargs: handed to ``gym.make``.
+        env_kwargs: arguments of ``gym.make``.
 
     Raises:
         ValueError: fewer than one episode or worker; whatever the environment and the policy refuse.
-        TypeError: spaces that are no numbers, or a policy that cannot be sent to another process.
+        TypeError: spaces that are not numeric, or a policy that cannot be sent to another process.
 
     Example:
         >>> from asm_gym import collect
@@ -69,8 +69,8 @@ def collect(
 
 
 def record_episode(seed: int, spec: EnvSpec, config: RolloutConfig) -> Episode:
-    """The episode of ``seed``."""
-    gym.registry.setdefault(spec.id, spec)  # what the user registered in one process is unknown in another
+    """Record the episode of ``seed``."""
+    gym.registry.setdefault(spec.id, spec)  # another process lacks what the user registered in this one
     trial = Trial(spec.id, seed)
     with staged(trial, config) as env:
         recorder = StreamRecorder(env)
@@ -86,19 +86,29 @@ def collect_to(
     parallel: ParallelConfig | int = 2,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Records the episodes that are not in ``folder`` yet; where all of them are."""
-
-    def place(seed: int) -> Path:
-        return folder.resolve() / f"{seed}.npz"
-
-    record = partial(_record_to, folder=folder.resolve(), spec=env_spec(env_id), config=config)
-    return make_missing(record, seeds, place, parallel, progress)
+    """Record the episodes that are not in ``folder`` yet; return the files of all."""
+    make = partial(_record_to, folder=folder.resolve(), spec=env_spec(env_id), config=config)
+    return make_missing(make, seeds, lambda seed: folder.resolve() / f"{seed}.npz", parallel, progress)
 
 
 def _record_to(seed: int, folder: Path, spec: EnvSpec, config: RolloutConfig) -> Path:
     return save_episode(folder / f"{seed}.npz", record_episode(seed, spec, config))
 
 
+def record_missing(
+    trials: Sequence[Trial],
+    config: RolloutConfig,
+    folder: Path,
+    parallel: ParallelConfig | int = 2,
+    progress: Progress | None = None,
+) -> list[Episode]:
+    """Record the trials that are not in ``folder`` yet; return the episodes of all, as monitors need them."""
+    folder = folder.resolve()
+    make = partial(record, config=config, folder=folder)
+    files = make_missing(make, trials, lambda trial: folder / trial.label.path, parallel, progress)
+    return [load_episode(file) for file in files]
+
+
 def check(env_id: str, config: RolloutConfig) -> None:
-    """Raises what the environment and the policy refuse, before anything runs."""
+    """Raise what the environment and the policy refuse, before anything runs."""
     policy_for(config.policy, StreamRecorder(environment(env_id, config.settings)), seed=0)

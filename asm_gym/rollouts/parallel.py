@@ -1,12 +1,10 @@
-"""Hands work out and takes the results back in order: processes here, a running Dask or Ray cluster elsewhere."""
+"""Map work over items in order: processes on this machine, or a running Dask or Ray cluster."""
 
 from __future__ import annotations
 
-import ctypes
 import os
 import pickle
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Sequence
@@ -29,20 +27,19 @@ Result = TypeVar("Result")
 Progress = Callable[[int, int], None]
 """Is called as (done, total)."""
 Ended = Generator[tuple[int, Any], None, None]
-"""Which item has ended, and its result."""
+"""The number of an item that has ended, and its result."""
 
 MOST_WORKERS = 1000
-"""Processes of one machine: each takes 60 MB before it does anything."""
 IDLE_S = 300.0
-"""How long a process waits for more work before it ends [s]."""
-ONE_THREAD = dict.fromkeys(
-    (
-        *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"),
-        *("VECLIB_MAXIMUM_THREADS", "NUMBA_NUM_THREADS", "NUMEXPR_NUM_THREADS"),
-    ),
-    "1",
-)
-"""Of each worker: more threads would fight over the same cores."""
+"""A process without work ends after this time [s]."""
+ONE_THREAD = {
+    f"{library}_THREADS": "1"
+    for library in (
+        *("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "NUMBA_NUM", "NUMEXPR_NUM"),
+        "VECLIB_MAXIMUM",
+    )
+}
+"""Environment of each worker: more threads would compete for the same cores."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +47,10 @@ class ParallelConfig:
     """Who does the work.
 
     Args:
-        workers: processes; 1 with ``loky`` stays in this one. A cluster has as many as it has.
-        backend: ``loky`` for processes on this machine; ``dask`` or ``ray`` for a cluster that is running already,
-            whose workers have this package and share the folder that results go to.
-        address: where the cluster is, such as ``tcp://host:8786``; Ray finds one on this machine by itself.
+        workers: processes; 1 with ``loky`` stays in this one. A cluster decides by itself.
+        backend: ``loky`` for processes on this machine; ``dask`` or ``ray`` for a running cluster, whose workers have
+            this package and share the folder of the results.
+        address: of the cluster, such as ``tcp://host:8786``; Ray finds one on this machine by itself.
     """
 
     workers: int = 2
@@ -70,7 +67,7 @@ class ParallelConfig:
 
     @classmethod
     def named(cls, workers: str) -> ParallelConfig:
-        """From one word: how many processes here, or ``dask:ADDRESS``, ``ray`` or ``ray:ADDRESS`` for a cluster.
+        """Parse a number of processes, ``dask:ADDRESS``, ``ray`` or ``ray:ADDRESS``.
 
         Raises:
             ValueError: it is none of these.
@@ -90,10 +87,9 @@ def parallel_map(
     parallel: ParallelConfig | int = 2,
     progress: Progress | None = None,
 ) -> list[Result]:
-    """``[task(item) for item in items]``, done by workers; a number stands for that many processes here.
+    """Return ``[task(item) for item in items]``, computed by workers; a number is that many processes here.
 
-    Processes stay alive between calls, and end with this one, however it ends. A cluster runs a task again whose
-    worker was lost.
+    Processes stay alive between calls, and end with this one. A cluster repeats the task of a lost worker.
 
     Raises:
         ValueError: fewer than one worker, or more than ``MOST_WORKERS``. What a task raises is raised here.
@@ -132,7 +128,7 @@ def _pickled(task: Callable[[Any], Any]) -> bytes:
 
 
 def _call(task: bytes, item: Any) -> Any:
-    """In a process of this machine; every item meets the task as it was sent, pickled by the parent, whom it trusts."""
+    """Run in a worker on this machine: every item gets the task as the parent pickled it."""
     return pickle.loads(task)(item)
 
 
@@ -140,25 +136,22 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 def _call_on_cluster(task: bytes, item: Any) -> Any:
-    """In a worker that may have threads, of its own and of its libraries: an environment can be used by one alone."""
+    """Run in a worker that may have several threads: an environment serves one at a time."""
     with _ONE_AT_A_TIME, threadpool_limits(1):
         return _call(task, item)
 
 
 def _loky(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
     get_reusable_executor = require("loky", what="running episodes in several processes").get_reusable_executor
-    # A process that another thread starts would end with that thread.
-    here = threading.current_thread() is threading.main_thread()
     workers = min(parallel.workers, len(items))  # an executor starts all of them at once
-    executor = get_reusable_executor(
-        workers, timeout=IDLE_S, initializer=_end_with_parent, initargs=(os.getpid(), here), env=ONE_THREAD
-    )
+    how = {"timeout": IDLE_S, "initializer": _end_with_parent, "initargs": (os.getpid(),), "env": ONE_THREAD}
+    executor = get_reusable_executor(workers, **how)
     try:
         yield from _as_they_end([executor.submit(_call, task, item) for item in items])
     except BrokenProcessPool as error:
         raise ChildProcessError(f"a worker process was killed, perhaps for want of memory: {error}") from error
     except BaseException:
-        executor.shutdown(wait=True, kill_workers=True)  # of an error or a Ctrl-C nothing is left running
+        executor.shutdown(wait=True, kill_workers=True)  # after an error or a Ctrl-C nothing runs on
         raise
 
 
@@ -168,18 +161,16 @@ def _as_they_end(futures: Sequence[Future[Any]]) -> Ended:
         yield index[future], future.result()
 
 
-def _end_with_parent(parent: int, by_signal: bool) -> None:
-    """Ends this worker as soon as its parent has ended, and leaves Ctrl-C to it."""
+def _end_with_parent(parent: int) -> None:
+    """End this worker soon after its parent has ended, and leave Ctrl-C to it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if by_signal and sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
-    def watch() -> None:
+    def wait() -> None:
         while os.getppid() == parent:
             time.sleep(1.0)
         os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _dask(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
@@ -188,7 +179,7 @@ def _dask(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
         client = distributed.Client(parallel.address, timeout=10)
     except OSError as error:
         raise ConnectionError(f"no dask scheduler answers at {parallel.address}: {error}") from error
-    with client:  # tasks that nobody waits for any more are dropped when it closes
+    with client:  # closing it cancels what still runs
         sent = client.map(partial(_call_on_cluster, task), list(items), pure=False)
         index = {future.key: k for k, future in enumerate(sent)}
         for future, result in distributed.as_completed(sent, with_results=True):
@@ -201,7 +192,7 @@ def _ray(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
     if joined:
         ray.init(address=parallel.address or "auto", log_to_driver=False, logging_level="ERROR")
     try:
-        remote, kept = ray.remote(_call_on_cluster), ray.put(task)  # which is sent once to each machine
+        remote, kept = ray.remote(_call_on_cluster), ray.put(task)  # sent once to each machine
         yield from _as_they_end([remote.remote(kept, item).future() for item in items])
     finally:
         if joined:
@@ -209,6 +200,4 @@ def _ray(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
 
 
 BACKENDS = {"loky": _loky, "dask": _dask, "ray": _ray}
-"""Each runs a pickled task on every item, and says of each, as it ends, which it was and what came out."""
-
-TWO_PROCESSES, THIS_PROCESS = ParallelConfig(), ParallelConfig(1)
+"""Each runs a pickled task on every item, and yields the number and the result of each as it ends."""

@@ -1,8 +1,7 @@
-"""How far a stage has come: a bar in a terminal or a notebook, elsewhere a line at least every ten seconds."""
+"""Progress of a stage: a bar in a terminal or a notebook, elsewhere a line every ten seconds."""
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,15 +14,15 @@ from rich.progress import Progress as Bars
 from asm_gym.rollouts.parallel import Progress
 
 EVERY_S = 10.0
-"""Between two lines where there is no terminal [s]."""
+"""Least time between two lines [s]."""
 
 
 @contextmanager
 def stage(name: str, console: Console, seconds: dict[str, float]) -> Iterator[Progress]:
-    """Shows how far ``name`` has come while the block runs, and notes how long it took in ``seconds``.
+    """Show the progress of ``name`` while the block runs, and store its duration in ``seconds``.
 
     Yields:
-        What the block calls as (done, total).
+        A function of (done, total), for the block to call.
     """
     start = time.perf_counter()
     with (_bar if console.is_terminal or _has_widgets(console) else _lines)(name, console) as progress:
@@ -33,7 +32,7 @@ def stage(name: str, console: Console, seconds: dict[str, float]) -> Iterator[Pr
 
 @contextmanager
 def in_a_notebook(name: str, progress: Progress | None) -> Iterator[Progress | None]:
-    """``progress``; where there is none, and this is a notebook with widgets, a bar."""
+    """Yield ``progress``; without one, a bar where this is a notebook with widgets."""
     console = Console()
     if progress is None and _has_widgets(console):
         with _bar(name, console) as bar:
@@ -58,26 +57,19 @@ def _bar(name: str, console: Console) -> Iterator[Progress]:
 
 @contextmanager
 def _lines(name: str, console: Console) -> Iterator[Progress]:
-    start, ended, reached = time.perf_counter(), threading.Event(), [""]
+    start = printed = time.perf_counter()
+    reached = ""
 
-    def say(what: str) -> None:
-        # Markup and wrapping are for readers; what reads a pipe wants a line.
-        console.print(
-            f"{name}: {what}{time.perf_counter() - start:.0f} s", markup=False, highlight=False, soft_wrap=True
-        )
+    def say(text: str) -> None:
+        line = f"{name}: {text}{time.perf_counter() - start:.0f} s"
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def note(done: int, total: int) -> None:
-        reached[0] = f"{done} of {total}, "
+        nonlocal printed, reached
+        reached = f"{done} of {total}, "
+        if time.perf_counter() - printed >= EVERY_S:
+            printed = time.perf_counter()
+            say(reached)
 
-    def keep_saying() -> None:
-        while not ended.wait(EVERY_S):
-            say(reached[0])
-
-    speaker = threading.Thread(target=keep_saying, daemon=True)
-    speaker.start()
-    try:
-        yield note
-    finally:
-        ended.set()
-        speaker.join()
-    say(f"{reached[0]}done in ")
+    yield note
+    say(f"{reached}done in ")

@@ -1,4 +1,4 @@
-"""Seeds of episodes, and when in an episode a fault begins: all that is random about a run follows from one number."""
+"""Seeds of episodes, and onsets of faults: all that is random about a run follows from one number."""
 
 from __future__ import annotations
 
@@ -9,21 +9,20 @@ import numpy as np
 from asm_gym.validation import check_number
 
 MOST_EPISODES = 10**6
-"""At ten seconds each, four months."""
 
 
 def episode_seeds(seed: int, episodes: int, stage: int = 0) -> list[int]:
-    """One seed an episode; lists of different ``stage`` have nothing in common."""
-    return _drawn([_natural("seed", seed), _natural("stage", stage)], episodes)
+    """Return one seed per episode; lists of different ``stage`` have nothing in common."""
+    return _draw([_natural("seed", seed), _natural("stage", stage)], episodes)
 
 
 def role_seeds(seed: int, task: str, role: str, episodes: int) -> list[int]:
-    """One seed an episode; those of different tasks and roles have nothing in common."""
-    return _drawn([_natural("seed", seed), zlib.crc32(f"{task}/{role}".encode())], episodes)
+    """Return one seed per episode; those of different tasks and roles have nothing in common."""
+    return _draw([_natural("seed", seed), zlib.crc32(f"{task}/{role}".encode())], episodes)
 
 
 def draw_onset(seed: int, horizon: int) -> int:
-    """When a fault begins in the episode of ``seed``: after its first 10 steps, in its first half."""
+    """Return when a fault begins in the episode of ``seed`` [steps]: after step 10, in the first half."""
     latest = max(11, check_number("horizon", horizon, low=0, high=1e9, whole=True) // 2)
     return int(np.random.default_rng([_natural("seed", seed), 1]).integers(10, latest))
 
@@ -32,6 +31,6 @@ def _natural(name: str, value: int) -> int:
     return check_number(name, value, low=0, whole=True)
 
 
-def _drawn(entropy: list[int], episodes: int) -> list[int]:
+def _draw(entropy: list[int], episodes: int) -> list[int]:
     check_number("episodes", episodes, low=0, high=MOST_EPISODES, whole=True)
     return [int(s) for s in np.random.SeedSequence(entropy).generate_state(episodes, np.uint32) // 2]

@@ -1,12 +1,14 @@
-"""Puts environment, faults and policy of an episode together, and runs it: the only place that does."""
+"""Put environment, faults and policy of a trial together, and run or record it: the only place that does."""
 
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 
 import asm_gym  # noqa: F401  (registers the environments in every worker)
 from asm_gym.envs.robosuite_env import RobosuiteEnv
+from asm_gym.episode import Episode, save_episode
 from asm_gym.evaluation.scored_episode import IDEAL, NOMINAL
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.anywhere import faults_anywhere, sigmas
@@ -29,55 +32,48 @@ from asm_gym.spec import control_period
 from asm_gym.wrappers import FaultInjection, StreamRecorder
 from asm_gym.wrappers.oracle import OracleReflex
 
-Made = TypeVar("Made")
+_CACHE: dict[str, tuple[Any, Any]] = {}
+"""What this process made last, by name: what it was made of, and the result."""
 
 
-class Latest(Generic[Made]):
-    """What was made last, for as long as it is asked for by what equals what it was made of."""
+def environment(env_id: str, settings: Settings = ()) -> gym.Env[Any, Any]:
+    """Return this process's environment: making one costs as much as an episode, and a seeded reset restores it.
 
-    def __init__(self) -> None:
-        self._made: tuple[Any, Made] | None = None
+    Args:
+        env_id: a Gymnasium id.
+        settings: further arguments of ``gym.make``.
+    """
+    given = copy.deepcopy(settings)  # the caller's own lists and dicts may change
+    made: gym.Env[Any, Any] = _latest("environment", (env_id, given), lambda: gym.make(env_id, **dict(given)))
+    return made
 
-    def __call__(self, of: Any, make: Callable[[], Made]) -> Made:
-        """The one of ``of``, which need not be hashable."""
-        if self._made is None or not _equal(self._made[0], of):
-            self._made = None  # two environments at a time would take twice the memory
-            self._made = of, make()
-        return self._made[1]
+
+def _latest(name: str, key: Any, make: Callable[[], Any]) -> Any:
+    """Return what was made last if its key, which need not be hashable, was equal; else make it."""
+    if name not in _CACHE or not _equal(_CACHE[name][0], key):
+        _CACHE.pop(name, None)  # two environments at a time would take twice the memory
+        _CACHE[name] = key, make()
+    return _CACHE[name][1]
 
 
 def _equal(a: Any, b: Any) -> bool:
     try:
         return bool(a == b)
-    except ValueError:  # of arrays, whose equality is not one answer
+    except ValueError:  # of arrays
         return False
 
 
-_LATEST_ENVIRONMENT: Latest[gym.Env[Any, Any]] = Latest()
-_LATEST_SIGMAS: Latest[NDArray[np.float64]] = Latest()
-
-
-def environment(env_id: str, settings: Settings = ()) -> gym.Env[Any, Any]:
-    """This process's environment: making one costs as much as an episode, and a seeded reset forgets the last one.
-
-    Args:
-        settings: what ``gym.make`` is given besides.
-    """
-    given = copy.deepcopy(settings)  # the caller's own lists and dicts may change
-    return _LATEST_ENVIRONMENT((env_id, given), lambda: gym.make(env_id, **dict(given)))
-
-
 def faults_in(trial: Trial, env: gym.Env[Any, Any], config: RolloutConfig) -> tuple[Fault, ...]:
-    """What goes wrong in ``env``, whose senses move as in episodes that are made as ``config`` says.
+    """Return what goes wrong in ``env``.
 
-    Outside of robosuite, how far senses move is measured: three nominal episodes are run for it, once a process.
+    Outside of robosuite, magnitudes are relative to how far senses move in three nominal episodes as of ``config``.
     """
     if trial.faults is not None or trial.kind == NOMINAL or trial.kind in EXECUTIONS:
         return trial.faults or ()
     inner: Any = env.unwrapped
     onset = trial.begins(env)
     if not isinstance(inner, RobosuiteEnv):
-        sigma = _LATEST_SIGMAS((trial.env_id, config), lambda: _sigmas(trial.env_id, config))
+        sigma = _latest("sigmas", (trial.env_id, config), lambda: _sigmas(trial.env_id, config))
         return faults_anywhere(trial.kind, FaultyInterface(env), sigma, trial.severity, onset, trial.seed)
     if trial.kind == PASSING:
         drawn, steps = draw(inner, onset, trial.seed), max(1, round(0.3 / control_period(env)))
@@ -88,7 +84,7 @@ def faults_in(trial: Trial, env: gym.Env[Any, Any], config: RolloutConfig) -> tu
 
 
 def _sigmas(env_id: str, config: RolloutConfig) -> NDArray[np.float64]:
-    """Of each sense, from nominal episodes of seeds that no role has."""
+    """Return the spread of each sense in nominal episodes of seeds that no role has."""
     env = StreamRecorder(environment(env_id, config.settings))
     streams = []
     for seed in episode_seeds(0, 3, stage=99):
@@ -97,15 +93,9 @@ def _sigmas(env_id: str, config: RolloutConfig) -> NDArray[np.float64]:
     return sigmas(FaultyInterface(env.env), streams)
 
 
-def interface_of(env: gym.Env[Any, Any]) -> Any:
-    """What faults in ``env`` act on: the environment, or an ``Interface`` to one that is not robosuite's."""
-    inner = env.unwrapped
-    return inner if isinstance(inner, RobosuiteEnv) else FaultyInterface(env)
-
-
 @contextmanager
 def staged(trial: Trial, config: RolloutConfig, env: gym.Env[Any, Any] | None = None) -> Iterator[gym.Env[Any, Any]]:
-    """``env``, or this process's environment, in which the trial's faults happen; they are undone in the end."""
+    """Yield ``env``, or this process's environment, with the trial's faults; they are undone in the end."""
     base = environment(trial.env_id, config.settings) if env is None else env
     faults = faults_in(trial, base, config)
     if trial.acting == IDEAL:
@@ -127,10 +117,12 @@ def play(
     env: gym.Env[Any, Any],
     on_step: Callable[[dict[str, Any]], None] | None = None,
 ) -> bool:
-    """Runs the policy in a staged and wrapped ``env``; whether the task was solved at some step.
+    """Run the policy in a staged and wrapped ``env``; return whether the task was solved at some step.
 
     Args:
-        on_step: is shown every step's ``info``.
+        trial, config: what is run.
+        env: a staged environment, perhaps wrapped.
+        on_step: called with every step's ``info``.
     """
     kwargs: dict[str, Any] = {}
     if trial.kind in EXECUTIONS and config.policy == "scripted":
@@ -140,10 +132,49 @@ def play(
 
 
 def policy_for(source: PolicySource, env: gym.Env[Any, Any], seed: int, **kwargs: Any) -> Policy:
-    """The policy for one episode; one with ``set_random_seed``, as stable-baselines3's have, is seeded anew."""
+    """Return the policy for one episode; one with ``set_random_seed``, as stable-baselines3's have, is seeded anew."""
     if isinstance(source, str | Path):
         return make_policy(str(source), env, seed=seed, **kwargs)
     policy = source if isinstance(source, Policy) and not isinstance(source, type) else source(env)
     if isinstance(policy, Seeded):
         policy.set_random_seed(seed)
     return policy
+
+
+def record_stream(trial: Trial, config: RolloutConfig) -> Episode:
+    """Return the stream, contact forces and label of a trial: what monitors need, without what agents learn from."""
+    forces: list[float] = []
+    with staged(trial, config) as env:
+        recorder = StreamRecorder(env)
+        play(trial, config, recorder, lambda info: forces.append(info.get("contact_force", math.nan)))
+    base = environment(trial.env_id, config.settings)
+    inner = base.unwrapped if isinstance(base.unwrapped, RobosuiteEnv) else FaultyInterface(base)
+    faults = faults_in(trial, base, config) if trial.role == "faulty" else ()
+    affected: frozenset[str] = frozenset().union(*(fault.labels(inner) for fault in faults))
+    recorded = recorder.finish()
+    return Episode(
+        stream=recorded.stream,
+        spec=recorded.spec,
+        success=recorded.success,
+        seed=trial.seed,
+        faults=recorded.faults,
+        contact_force=np.asarray([] if np.isnan(forces).all() else forces, np.float32),
+        label=replace(trial.label, affected_channels=affected),
+        info={"skill": trial.task, **_goal(base, recorded)},
+    )
+
+
+def record(trial: Trial, config: RolloutConfig, folder: Path) -> Path:
+    """Record a trial, and write it to its place under ``folder``."""
+    return save_episode(folder / trial.label.path, record_stream(trial, config))
+
+
+def _goal(env: gym.Env[Any, Any], recorded: Episode) -> dict[str, list[float]]:
+    """Return ``"goal"``: the objects' positions before the first step [m]; nothing where unknown."""
+    inner = env.unwrapped
+    if not isinstance(inner, RobosuiteEnv) or not len(recorded.observations):
+        return {}
+    objects = {c.name for c in inner.measured_spec.channels if c.group == "object" and c.size == 3}
+    ends = np.cumsum(list(inner.observation_layout.values()))
+    parts = zip(inner.observation_layout, np.split(recorded.observations[0], ends[:-1]), strict=True)
+    return {"goal": [float(number) for name, part in parts if name in objects for number in part]}

@@ -1,4 +1,4 @@
-"""One episode to run, in words: which environment and seed, what goes wrong and when, and what acts."""
+"""One episode to run: environment, seed, what goes wrong and when, and how to respond."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ from asm_gym.faults import Fault
 from asm_gym.policies import Policy
 from asm_gym.rollouts.seeds import draw_onset
 from asm_gym.spec import control_period
-from asm_gym.tasks import env_id
 
 Settings = tuple[tuple[str, Any], ...]
-"""Arguments by name, in an order of their own."""
+"""Arguments by name, in a fixed order."""
 PolicySource = str | Path | Policy | Callable[[gym.Env[Any, Any]], Policy]
-"""What ``make_policy`` takes, whatever has ``predict``, or what makes one for an environment."""
+"""What ``make_policy`` takes, any object with ``predict``, or a factory for an environment."""
 
 PASSING = "passing_push"
 """20 N for 0.3 s: a kind beside those of the suite."""
@@ -35,10 +34,10 @@ class RolloutConfig:
     """How the episodes of a run are made.
 
     Args:
-        policy: what acts.
+        policy: that acts.
         robot: the arm; the task's own by default.
-        stream_freq: rows of the stream a second [Hz]; one each control step by default.
-        env_kwargs: what ``gym.make`` is given besides.
+        stream_freq: rows of the stream per second [Hz]; one per control step by default.
+        env_kwargs: further arguments of ``gym.make``.
     """
 
     policy: PolicySource = "scripted"
@@ -48,7 +47,7 @@ class RolloutConfig:
 
     @property
     def settings(self) -> Settings:
-        """What the environment is made with."""
+        """Arguments of ``gym.make``."""
         named = ("robot", self.robot), ("stream_freq", self.stream_freq)
         return (*((name, value) for name, value in named if value is not None), *self.env_kwargs)
 
@@ -59,15 +58,16 @@ class Trial:
 
     Args:
         env_id: such as ``asm_gym/Lift-v0``.
-        seed: of the environment and of the policy: trials that differ only in ``acting`` are paired by it.
+        seed: of the environment and of the policy: trials that share it are twins.
         kind: ``"nominal"``, ``"passing_push"``, a kind of fault or harmless variation of the suite, or, with
-            ``faults``, what to call them.
+            ``faults``, their name.
         severity: of a fault of the suite.
         onset: when it begins [steps]; by default drawn from the seed, in the first half of the episode.
-        faults: what goes wrong, in place of what ``kind`` names.
-        acting: ``"policy alone"``, ``"ideal"`` for a reflex that is told what is wrong and when, or what ``on_alarm``
-            takes.
-        after_s: where to leave the episode, counted from the onset [s]; at its end by default.
+        faults: what goes wrong, in place of ``kind``.
+        acting: ``"policy alone"``, ``"ideal"`` for a reflex that knows the fault, or a value of ``on_alarm``.
+        after_s: the episode ends so long after the onset [s]; by default it runs to its end.
+        role: what it is recorded for: ``"fit"``, ``"calibration"``, ``"nominal"``, ``"faulty"``, ``"harmless"`` or
+            ``"babble"``.
     """
 
     env_id: str
@@ -78,13 +78,7 @@ class Trial:
     faults: tuple[Fault, ...] | None = None
     acting: str = POLICY_ALONE
     after_s: float | None = None
-
-    @classmethod
-    def of(cls, label: EpisodeLabel) -> Trial:
-        """The trial that is recorded as ``label`` says."""
-        after = AFTER_S if label.role == "faulty" else None
-        kind = label.kind or NOMINAL
-        return cls(env_id(label.task), label.seed, kind, label.severity, label.onset, after_s=after)
+    role: str = "nominal"
 
     @property
     def task(self) -> str:
@@ -92,22 +86,39 @@ class Trial:
         return self.env_id.rsplit("/", 1)[-1].rsplit("-v", 1)[0]
 
     @property
+    def label(self) -> EpisodeLabel:
+        """The label of its recording."""
+        kind = self.kind if self.role in ("faulty", "harmless") else ""
+        return EpisodeLabel(self.task, self.role, kind, self.severity, self.seed, self.onset)
+
+    @property
     def on_alarm(self) -> str:
-        """What the safety wrapper is told."""
+        """The response of the safety wrapper."""
         return "monitor" if self.acting in (POLICY_ALONE, IDEAL) else self.acting
 
     def begins(self, env: gym.Env[Any, Any]) -> int:
-        """When in ``env`` something goes wrong, or would [steps]."""
+        """Return the onset in ``env`` [steps]."""
         if self.onset is not None or self.faults:
             return self.onset if self.onset is not None else min(f.onset for f in self.faults or ())
         return draw_onset(self.seed, horizon_of(env))
 
     def steps_in(self, env: gym.Env[Any, Any]) -> int | None:
-        """Where the episode is left; None for its end."""
+        """Return the last step that is run; None for the end of the episode."""
         return None if self.after_s is None else self.begins(env) + round(self.after_s / control_period(env))
 
 
+def nominal_trials(env_id: str, role: str, seeds: list[int]) -> list[Trial]:
+    """Return an episode without a fault for each seed."""
+    return [Trial(env_id, seed, role=role) for seed in seeds]
+
+
+def faulty_trial(env_id: str, kind: str, severity: str, seed: int, horizon: int) -> Trial:
+    """Return the twin of a nominal episode with a fault of the suite, up to ``AFTER_S`` after its onset."""
+    onset = draw_onset(seed, horizon)
+    return Trial(env_id, seed, kind, severity, onset, after_s=AFTER_S, role="faulty")
+
+
 def horizon_of(env: gym.Env[Any, Any]) -> int:
-    """Control steps of an episode; 0 where nobody says."""
+    """Return the control steps of an episode; 0 where unknown."""
     limit = env.spec.max_episode_steps if env.spec else None
     return int(getattr(env.unwrapped, "horizon", limit) or 0)

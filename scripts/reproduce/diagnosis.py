@@ -23,7 +23,7 @@ from asm_gym.evaluation.reliability import Reliability, reliability
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.diagnosis import CLASSES, FAMILIES, WINDOW, Diagnosis, Hypothesis, Readout, averaged
-from asm_gym.rollouts.run_folder import files_in
+from asm_gym.evaluation.recordings import files_in
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record

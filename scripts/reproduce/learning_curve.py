@@ -20,7 +20,7 @@ from asm_gym.evaluation.metrics import false_alarms
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors.registry import check_monitor
-from asm_gym.rollouts.scoring import result_of
+from asm_gym.evaluation.scoring import result_of
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record

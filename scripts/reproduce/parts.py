@@ -24,7 +24,7 @@ from asm_gym.evaluation.detection_tables import monitors_table
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.metrics import DetectionMetrics, detected, false_alarms, in_words
 from asm_gym.evaluation.resampling import interval
-from asm_gym.evaluation.standing import lead_table
+from asm_gym.evaluation.detection_tables import lead_table
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.faults.suite import SEVERITIES
@@ -35,9 +35,10 @@ from asm_gym.monitors import CalibratedMonitor, NeuralASM
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.memory_parts import AssociationPart, TemporalPart
 from asm_gym.monitors.memory_model import MemoryModel
-from asm_gym.rollouts.corpus import SKILLS
-from asm_gym.rollouts.run_folder import Recordings
-from asm_gym.rollouts.scoring import detectability_of, fitted, judged, read
+from asm_gym.evaluation.corpus import SKILLS
+from asm_gym.evaluation.recordings import Recordings
+from asm_gym.evaluation.recordings import read
+from asm_gym.evaluation.scoring import detectability_of, fitted, judged
 from asm_gym.scripts.evaluate import Args, labels
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit

@@ -14,8 +14,8 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode
 from asm_gym.evaluation import defaults
 from asm_gym.evaluation.comparison import Detectability
-from asm_gym.rollouts.run_folder import recorded, tasks_in
-from asm_gym.rollouts.scoring import detectability_of
+from asm_gym.evaluation.recordings import recorded, tasks_in
+from asm_gym.evaluation.scoring import detectability_of
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.validation import check_number

@@ -1,1 +1,1 @@
-"""Motor babbling (random exploration), learning from its healthy episodes, and the card of the memory it gives."""
+"""Motor babbling, the memory that learns from its healthy episodes, and the memory's examination."""

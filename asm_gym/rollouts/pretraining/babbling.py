@@ -3,13 +3,11 @@
     a_t = clip(e_t + s x_t),   x_t = ρ x_{t-1} + √(1 - ρ²) ξ_t      e the guide's action, 0 without one; ξ white
 
 Each lesson is one episode. One in three is the expert's own and not learned from: the threshold is set on those. Of the
-others two in five are the expert's own too, at many speeds; in two of five noise drives the expert off its course, in
-jerks or slowly; in one noise alone moves the arm, or the hand reaches for one place after another, for nothing there.
-Where there is noise, the arm also drifts now and then, turning and with what it holds, as agents do once they have done
-their task. Where the hand reaches, no agent leads, and careful experts teach nothing of contact: so there is one lesson
-more for each three, in which the expert presses what it holds against what is around. In half of all lessons the arm
-stops now and then, whatever it holds or leans on, and in half a thing weighs more or less. No noise is so strong that
-most of a lesson would be hits: those taught the memory to expect them, and cost more faults than they spared alarms.
+others two in five are the expert's own too, at many speeds; in two of five noise disturbs the expert; in one noise
+alone moves the arm, or the hand reaches for one place after another. Under noise the arm also drifts now and then, as
+agents do once they have done their task. With reaching, one lesson more for each three has the expert press what it
+holds against its surroundings. In half of all lessons the arm stops now and then, and in half an object's mass differs.
+The noise is weak enough that most of a lesson is free of impacts: those would teach the memory to expect them.
 
 Sources: Laskey et al. 2017 (CoRL, DART) for noise on an expert's commands; Saegusa et al. 2009 (ROBIO) for babbling.
 """
@@ -26,7 +24,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episode import Episode, EpisodeLabel, save_episode
+from asm_gym.episode import save_episode
 from asm_gym.faults.harmless import ObjectMass
 from asm_gym.faults.object import movable
 from asm_gym.policies import Policy, make_policy
@@ -35,10 +33,9 @@ from asm_gym.policies.scripted.base import Style
 from asm_gym.rollouts.pretraining.healthy import HELD_OUT, held_out
 from asm_gym.rollouts.pretraining.reaching import Reaching
 from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.staging import environment, play, staged
+from asm_gym.rollouts.staging import environment, record_stream
 from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.tasks import task as task_spec
-from asm_gym.wrappers import StreamRecorder
 
 ALONE, LED, DRIVEN, REACHING = "noise", "expert", "disturbed", "reaching"
 LEADING = (LED, DRIVEN, ALONE, LED, DRIVEN)
@@ -46,41 +43,36 @@ LEADING = (LED, DRIVEN, ALONE, LED, DRIVEN)
 SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
 """ρ: from the noise by which agents explore to pushing on in one direction, as half-trained ones do."""
 NOISE = 0.02, 0.2
-"""s, from hardly to about what a half-trained agent explores by [action units]."""
+"""Range of s, up to about the exploration of a half-trained agent [action units]."""
 SPEED = 0.5, 1.5
-"""Of the expert, relative to its usual one."""
+"""Speed of the expert, relative to its usual one."""
 WEIGHT = 0.7, 1.4
-"""What the mass of a thing is multiplied by."""
+"""Factor of an object's mass."""
 PAUSE, PAUSED = 0.01, (5, 60)
-"""Probability in a step that the arm stops, and for how many steps."""
+"""Probability per step that the arm stops, and for how many steps."""
 DRIFT, DRIFTED, DRIFTING = 0.01, (5, 60), (0.05, 0.5)
-"""Probability in a step of a disturbed lesson that the arm drifts, for how many steps, and by which commands [action
-units]."""
-
+"""Probability per step of a disturbed lesson that the arm drifts, steps, and command [action units]."""
 PRESS, PRESSED, PRESSING, HELD = 0.04, (8, 40), (0.1, 0.6), 10
-"""Probability in a step that what has been gripped for so many steps is pressed against what is around, for how many,
-and by which commands [action units]."""
-
+"""Probability per step that an object gripped for ``HELD`` steps is pressed, steps, and command [action units]."""
 LOOSENED, LOOSE = 0.05, 0.05
-"""Probability in a step of a disturbed lesson that the grip is commanded more or less firmly from then on, and the
-least share of what the guide would: agents seldom command it all, and a gripper may go by the sign alone."""
+"""Probability per step of a disturbed lesson that the grip's command changes, and its least share of the guide's."""
 
 
 class Lesson(NamedTuple):
-    """One episode of babbling.
+    """How the arm moves in one episode of babbling.
 
     Attributes:
         task: its name.
-        number: among the lessons of its task; of one that presses, that of the one it comes beside.
+        number: among the lessons of its task.
         seed: of the environment, of the guide and of the noise.
-        guide: what leads, ``"reaching"``, a policy's name or its file; noise alone where empty.
+        guide: ``"reaching"``, a policy's name or its file; empty for noise alone.
         noise: s, standard deviation of the noise [action units].
         smoothness: ρ.
         speed: of a scripted guide, relative to its usual one.
-        pause: probability in a step that the arm stops for a while.
-        weight: what the mass of the task's thing is multiplied by.
-        drift: probability in a step that the arm drifts for a while, in one direction that is drawn.
-        press: probability in a step that it presses what it holds for a while, down or in a direction that is drawn.
+        pause: probability per step that the arm stops for a while.
+        weight: factor of the mass of the task's object.
+        drift: probability per step that the arm drifts for a while, in one direction.
+        press: probability per step that it presses what it holds for a while.
     """
 
     task: str
@@ -96,28 +88,29 @@ class Lesson(NamedTuple):
     press: float = 0.0
 
     @property
-    def path(self) -> Path:
-        """Where in a run's folder its recording lies."""
-        return self.label.path
+    def trial(self) -> Trial:
+        """The episode to run, without the change of mass."""
+        return Trial(task_spec(self.task).id, self.seed, "babble", faults=(), role="babble")
 
     @property
-    def label(self) -> EpisodeLabel:
-        """What it is recorded as."""
-        return EpisodeLabel(self.task, "babble", seed=self.seed)
+    def path(self) -> Path:
+        """Path of its recording in a run's folder."""
+        return self.trial.label.path
 
 
 def curriculum(
     tasks: Sequence[str], episodes: int, seed: int, guides: Sequence[str] = (), reaching: bool = False
 ) -> list[Lesson]:
-    """Lessons, task by task; all of them follow from ``seed``, and fewer ``episodes`` are the first of more.
+    """Return the lessons, task by task; all follow from ``seed``, and fewer ``episodes`` are the first of more.
 
     Args:
         tasks: their names.
         episodes: of each task.
-        guides: agents that take turns with the experts, in the tasks that each was trained in; by name, or the files
-            of ``asm-gym train``.
-        reaching: the hand reaches for places where noise alone would lead, as ``leads`` says, and there is one lesson
-            more for each three, which presses. For arms that no agent leads.
+        seed: of the curriculum.
+        guides: agents that take turns with the experts in the tasks that each was trained in; names, or files of
+            ``asm-gym train``.
+        reaching: the hand reaches for places where noise alone would lead, and one lesson more for each three presses.
+            For arms that no agent leads.
 
     Raises:
         ValueError: fewer than one episode.
@@ -126,27 +119,21 @@ def curriculum(
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     homes = {guide: trained_in(guide) for guide in guides}
-    usual = [
-        _lesson(
-            task,
-            number,
-            drawn,
-            leads(number, reaching),
-            ["scripted", *(guide for guide, home in homes.items() if home == task_spec(task).id)],
-        )
-        for task in tasks
-        for number, drawn in enumerate(role_seeds(seed, task, "babble", episodes))
-    ]
+    lessons = []
+    for task in tasks:
+        leaders = ["scripted", *(guide for guide, home in homes.items() if home == task_spec(task).id)]
+        for number, drawn in enumerate(role_seeds(seed, task, "babble", episodes)):
+            lessons.append(_lesson(task, number, drawn, leads(number, reaching), leaders))
     beside = range(0, episodes if reaching else 0, HELD_OUT)
-    return usual + [
-        _pressing(task, number, drawn)
-        for task in tasks
-        for number, drawn in zip(beside, role_seeds(seed, task, "press", len(beside)), strict=True)
-    ]
+    for task in tasks:
+        for number, drawn in zip(beside, role_seeds(seed, task, "press", len(beside)), strict=True):
+            driven = _lesson(task, number, drawn, DRIVEN, ["scripted"])
+            lessons.append(driven._replace(noise=NOISE[0], pause=0.0, drift=0.0, press=PRESS))
+    return lessons
 
 
 def leads(number: int, reaching: bool = False) -> str:
-    """What leads the lesson of this number: the expert alone, where the threshold is set on it."""
+    """Return what leads the lesson of this number: the expert alone, where the threshold is set on it."""
     usual = LEADING[number % len(LEADING)]
     return LED if held_out(number) else REACHING if reaching and usual == ALONE else usual
 
@@ -167,17 +154,12 @@ def _lesson(task: str, number: int, seed: int, lead: str, guides: Sequence[str])
     )
 
 
-def _pressing(task: str, number: int, seed: int) -> Lesson:
-    """It is hardly disturbed else."""
-    lesson = _lesson(task, number, seed, DRIVEN, ["scripted"])
-    return lesson._replace(noise=NOISE[0], pause=0.0, drift=0.0, press=PRESS)
-
-
 class Babbler:
-    """Acts as a lesson says.
+    """The policy of a lesson.
 
     Args:
         env: one of the lesson's task.
+        lesson: how it acts.
     """
 
     def __init__(self, env: gym.Env[Any, Any], lesson: Lesson) -> None:
@@ -185,7 +167,7 @@ class Babbler:
         self._lesson, self._rng = lesson, np.random.default_rng([lesson.seed, 1])
         self._noise = self._rng.standard_normal(env.action_space.shape or ())
         self._grip = np.isin(np.arange(len(self._noise)), list(getattr(env.unwrapped, "gripper_actions", ())))
-        self._fumbles = bool(self._rng.random() < 0.5)
+        self._noisy_grip = bool(self._rng.random() < 0.5)
         self._left, self._course, self._grasp, self._held = 0, np.zeros_like(self._noise), 1.0, 0
 
     def predict(
@@ -195,26 +177,26 @@ class Babbler:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], Any]:
-        """The next action (A,)."""
+        """Return the next action (A,)."""
         lesson, rng = self._lesson, self._rng
         fresh = rng.standard_normal(self._noise.shape)
         self._noise = lesson.smoothness * self._noise + np.sqrt(1.0 - lesson.smoothness**2) * fresh
         action = lesson.noise * self._noise  # (A,)
         if self._guide is not None:
-            meant, state = self._guide.predict(observation, state, episode_start)
-            # A hand that never keeps hold would never learn what holding feels like.
+            guided, state = self._guide.predict(observation, state, episode_start)
+            # Without a guide's grip, however loose, the memory would never learn what holding feels like.
             if lesson.noise and rng.random() < LOOSENED:
                 self._grasp = rng.uniform(LOOSE, 1.0)
-            self._held = self._held + 1 if (meant[self._grip] > 0.0).any() else 0
-            meant = np.where(self._grip, self._grasp, 1.0) * meant
-            action = np.where(self._grip & (not self._fumbles), 0.0, action) + meant
-        self._left = self._left - 1 if self._left else self._leaves()
+            self._held = self._held + 1 if (guided[self._grip] > 0.0).any() else 0
+            guided = np.where(self._grip, self._grasp, 1.0) * guided
+            action = np.where(self._grip & (not self._noisy_grip), 0.0, action) + guided
+        self._left = self._left - 1 if self._left else self._steps_astray()
         if self._left:  # it keeps its grip
             action = np.where(self._grip, action, self._course)
         return np.clip(action, -1.0, 1.0).astype(np.float32), state
 
-    def _leaves(self) -> int:
-        """For how many steps nothing leads from now on: 0, or as long as the arm stops, drifts or presses."""
+    def _steps_astray(self) -> int:
+        """Return for how many steps the arm stops, drifts or presses from now on; 0 where the guide leads on."""
         rng, lesson = self._rng, self._lesson
         if rng.random() < lesson.pause:
             self._course = np.zeros_like(self._noise)
@@ -225,12 +207,12 @@ class Babbler:
             return int(rng.integers(*DRIFTED))
         if lesson.press and self._held > HELD and rng.random() < lesson.press:
             strength = np.exp(rng.uniform(*np.log(PRESSING)))
-            self._course = strength * self._against()
+            self._course = strength * self._press_direction()
             return int(rng.integers(*PRESSED))
         return 0
 
-    def _against(self) -> NDArray[np.float64]:
-        """(A,) where it presses: down half of the time, else aside or anywhere; its largest entry is 1."""
+    def _press_direction(self) -> NDArray[np.float64]:
+        """Return (A,) a direction: down half of the time, else aside or anywhere; its largest entry is 1."""
         to, kind = np.zeros_like(self._noise), int(self._rng.integers(4))
         if kind < 2:
             to[2] = -1.0
@@ -248,29 +230,18 @@ def _guide(lesson: Lesson, env: gym.Env[Any, Any]) -> Policy | None:
 
 
 def record_lesson(lesson: Lesson, config: RolloutConfig, folder: Path) -> Path:
-    """Records the episode of a lesson, and writes it to its place under ``folder``.
+    """Record the episode of a lesson, and write it to its place under ``folder``.
 
     Args:
-        config: how; what acts is the lesson's to say.
+        lesson: how the arm moves.
+        config: of the environment; the lesson tells the policy.
+        folder: of the run.
     """
-    forces: list[float] = []
-    config = replace(config, policy=partial(Babbler, lesson=lesson))
-    env_id = task_spec(lesson.task).id
-    base: Any = environment(env_id, config.settings).unwrapped
-    heavy = lesson.weight != 1.0 and bool(movable(base))
-    faults = (ObjectMass(factor=lesson.weight, onset=0, seed=lesson.seed),) if heavy else ()
-    trial = Trial(env_id, lesson.seed, "babble", faults=faults)
-    with staged(trial, config) as env:
-        recorder = StreamRecorder(env)
-        play(trial, config, recorder, lambda info: forces.append(info["contact_force"]))
-    recorded = recorder.finish()
-    kept = Episode(
-        stream=recorded.stream,
-        spec=recorded.spec,
-        success=recorded.success,
-        seed=lesson.seed,
-        contact_force=np.asarray(forces, np.float32),
-        label=lesson.label,
-        info={"skill": lesson.task, "lesson": lesson._asdict()},
-    )
+    trial, config = lesson.trial, replace(config, policy=partial(Babbler, lesson=lesson))
+    base: Any = environment(trial.env_id, config.settings).unwrapped
+    if lesson.weight != 1.0 and movable(base):
+        trial = replace(trial, faults=(ObjectMass(factor=lesson.weight, onset=0, seed=lesson.seed),))
+    recorded = record_stream(trial, config)
+    about = {"skill": lesson.task, "lesson": lesson._asdict()}
+    kept = replace(recorded, faults=np.zeros(0, np.bool_), info=about)
     return save_episode(folder / lesson.path, kept)

@@ -1,6 +1,6 @@
-"""Reaching for nothing: the hand goes from place to place, turns, and opens or closes on the way.
+"""Reaching for places in the air: the hand goes from place to place, turns, and opens or closes on the way.
 
-Experts keep to the courses of their tasks, so that a memory of theirs alone is unsure of every other place.
+Experts keep to the paths of their tasks, so a memory of theirs alone is unsure of every other place.
 
 Source: Rolf et al. 2010 (IEEE TAMD 2(3)) for goals in place of random commands.
 """
@@ -17,20 +17,20 @@ from scipy.spatial.transform import Rotation
 from asm_gym.policies.scripted.base import CLOSE, OPEN, ObservationReader, Vector, move, rotation
 
 AROUND = (-0.25, -0.4, -0.12), (0.25, 0.4, 0.25)
-"""Where places are, from where the hand begins [m]."""
+"""Range of places, relative to where the hand begins [m]."""
 TURNED = 0.2, 0.2, 0.8
-"""How far the hand turns there at most, about the axes of the world [rad]."""
+"""Greatest turn of the hand about the axes of the world [rad]."""
 PACE = 0.45
-"""How fast the hand reaches [action units]."""
+"""Speed of the hand [action units]."""
 ARRIVED, GIVEN_UP = 0.02, 60
-"""How near it comes [m], and after how many steps it reaches for the next place anyway."""
+"""The hand goes on to the next place this near to one [m], or after so many steps."""
 
 
 class Aim(NamedTuple):
     """Where a hand began, and where it is going."""
 
     began: Vector  # (3,) [m]
-    upright: Vector  # (3, 3) how it was turned then
+    upright: Vector  # (3, 3) its orientation then
     place: Vector  # (3,) [m]
     turned: Vector  # (3, 3)
     grip: float  # as commanded
@@ -56,7 +56,7 @@ class Reaching:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], Aim]:
-        """The next action (7,)."""
+        """Return the next action (7,)."""
         at, hand = self._read(observation, "hand_position"), rotation(self._read(observation, "hand_orientation"))
         if state is None:
             state = self._next(at, hand)

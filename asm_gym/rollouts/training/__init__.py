@@ -1,1 +1,1 @@
-"""What ``asm-gym train`` and ``train-safely`` share: learners, cloning, and runs that go on where they were killed."""
+"""Train agents with stable-baselines3, from demonstrations and from their own steps."""

@@ -1,4 +1,4 @@
-"""A callback of stable-baselines3 that logs what the safety wrapper says: to TensorBoard, CSV, or whatever logs."""
+"""A callback of stable-baselines3 that logs the safety wrapper's numbers to its logger."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from asm_gym.wrappers.logging import EpisodeSafety, SafetyCounter
 
 
 class SafetyCallback(BaseCallback):
-    """Logs the mean of each number of the episodes that have ended: ``safety/surprise``, ``/alarms``, ``/cost``, …
+    """Log the mean of each number of the episodes that have ended: ``safety/surprise``, ``/alarms``, ``/cost``, …
 
     Args:
-        dt: control period of the environments [s]; where None, what the first of them says.
+        dt: control period of the environments [s]; by default the first of them tells.
     """
 
     def __init__(self, dt: float | None = None) -> None:
@@ -22,11 +22,10 @@ class SafetyCallback(BaseCallback):
         dt = self._control_period() if self.dt is None else self.dt
         self._counters = [SafetyCounter(dt) for _ in range(self.training_env.num_envs)]
         self.ended: list[EpisodeSafety] = []
-        """Of all episodes that have ended."""
-        self._told = 0
+        """All episodes that have ended."""
 
     def _control_period(self) -> float:
-        """As ``asm_gym.spec.control_period`` has it, of environments that may be in other processes."""
+        """Return ``asm_gym.spec.control_period`` of environments that may be in other processes."""
         try:
             return float(self.training_env.get_attr("dt", 0)[0])
         except AttributeError:
@@ -38,9 +37,7 @@ class SafetyCallback(BaseCallback):
             counter.add(info)
             if done:
                 self.ended.append(counter.total)
+                for name, value in counter.total._asdict().items():
+                    self.logger.record_mean(f"safety/{name}", float(value))
                 counter.clear()
-        for episode in self.ended[self._told :]:
-            for name, value in episode._asdict().items():
-                self.logger.record_mean(f"safety/{name}", float(value))
-        self._told = len(self.ended)
         return True

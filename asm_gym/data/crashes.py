@@ -1,0 +1,58 @@
+"""Crashes in healthy episodes: those that press twice as hard as the policy does at its hardest in most episodes.
+
+    healthy    the task was solved, and the hardest moment is at most CRASH times that of the task's median episode
+
+Measured by contact forces where an episode has them, and by external joint torques where its stream has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.episode import Episode
+
+CRASH = 2.0
+"""A crash presses this many times as hard as is usual."""
+
+
+def peak_force(episode: Episode) -> float:
+    """Return the greatest contact force [N]; NaN where none was measured."""
+    force = episode.contact_force
+    return float(np.nanmax(force)) if np.isfinite(force).any() else float("nan")
+
+
+def peak_torques(episode: Episode) -> NDArray[np.float64]:
+    """Return (T,) the largest external torque on a joint in each row [N m], within it where sensed; 0 without any."""
+    slices = episode.spec.slices
+    sensed = [[s for name, s in slices.items() if name.endswith(f"external_torque{end}")] for end in ("_peak", "")]
+    torques = [np.abs(episode.stream[:, s]).max(axis=1) for s in sensed[0] or sensed[1]]
+    found: NDArray[np.float64] = np.max([np.zeros(len(episode)), *torques], axis=0)
+    return found
+
+
+def crashes(
+    episodes: Sequence[Episode], tasks: Sequence[str], reference: Sequence[bool] = (), torques: bool = True
+) -> dict[int, float]:
+    """Return the numbers of the episodes that crash, and how many times as hard as usual they press.
+
+    Args:
+        episodes: of policies that do their tasks.
+        tasks: task or policy of each.
+        reference: whether each tells what is usual in its task; by default, and where none does, all tell.
+        torques: whether joint torques count, beside contact forces.
+    """
+    of, times = np.asarray(tasks), np.zeros(len(episodes))
+    tells = np.array(reference or [True] * len(episodes), bool)
+    peaks = [np.array([peak_force(e) for e in episodes])]
+    if torques:
+        peaks.append(np.array([peak_torques(e).max() for e in episodes]))
+    for peak in peaks:
+        for task in dict.fromkeys(tasks):
+            own = (of == task) & np.isfinite(peak)
+            known = own & tells if (own & tells).any() else own
+            if own.any() and (usual := np.median(peak[known])) > 0:
+                times[own] = np.maximum(times[own], peak[own] / usual)
+    return {int(n): float(times[n]) for n in np.flatnonzero(times > CRASH)}
