@@ -24,7 +24,7 @@ from rich.console import Console
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
-from asm_gym.evaluation.detection_tables import BRIEF_CONDITION_COLUMNS, detection_table, headline, outcome_table
+from asm_gym.evaluation.detection_tables import CONDITION_COLUMNS, headline
 from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, hourly_alarms, typical
 from asm_gym.evaluation.report import write_json, write_report
 from asm_gym.evaluation.scored_episode import NOMINAL
@@ -33,14 +33,13 @@ from asm_gym.evaluation.tables import ConsoleTable, tabulate
 from asm_gym.faults import Collision, Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.collect import collect
+from asm_gym.rollouts.film import can_record_video, record_video, watch_pair
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.staging import play, staged
 from asm_gym.rollouts.trial import RolloutConfig, Trial
-from asm_gym.rollouts.film import Clip, can_record_video, record_video
-from asm_gym.rollouts.film import watch_pair
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.tasks import TASKS, env_id
@@ -188,7 +187,6 @@ def draw(rows: Sequence[DetectionMetrics], folder: Path) -> dict[str, Figure]:
             "surprise",
             figures.surprise_figure(examples),
         ),
-        "The greatest surprise of every episode against the threshold": ("maxima", figures.maxima_figure(rows)),
         "How soon faults were noticed": ("delay", figures.delay_figure(rows)),
         "Faults told from nominal episodes at the same time": ("roc", figures.roc_figure(rows)),
         "Where the surprise came from when an encoder froze": ("attribution", figures.attribution_figure(frozen)),
@@ -247,7 +245,8 @@ def demonstrate(args: Args, console: Console) -> None:
     rows = by_condition(traces, WINDOW_S)
     latency = observe_latency_us(memory)
     title = f"Noticed while the policy acts alone; solved and force: alone → {args.on_alarm}"
-    console.print("", ConsoleTable(tabulate(title, BRIEF_CONDITION_COLUMNS, rows), plain=True), "")
+    table = tabulate(title, CONDITION_COLUMNS, rows)
+    console.print("", ConsoleTable(table, plain=True), "")
     low, high = binomial_interval(args.nominal_episodes, args.false_alarm_rate)
     expected = (
         f"At a false-alarm rate of {args.false_alarm_rate:g}, {low} to {high} of {args.nominal_episodes} nominal "
@@ -265,15 +264,14 @@ def demonstrate(args: Args, console: Console) -> None:
         examples = {(t.kind, t.seed) for t in (typical(m.watched) for m in rows)}
         shown = [t for t in todo if (t.kind, t.seed) in examples]
         with timed("recording a video") as progress:
-            clips = [Clip(trial, trial.kind) for trial in shown]
-            video = record_video(clips, RolloutConfig(), memory, folder / "demo.mp4", progress)
+            video = record_video(shown, RolloutConfig(), memory, folder / "demo.mp4", progress)
     write_json(folder / "demo.json", figures_of(args, rows, expert, latency, seconds))
     write_report(
         folder / "report.html",
         f"asm-gym demo: {args.task}",
         f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "
         f"watched others, some of them faulty. {headline(rows)} {expected}",
-        [detection_table(rows), outcome_table(rows)],
+        [table],
         drawn,
         video,
         {"command": f"asm-gym demo --seed {args.seed}", **asdict(args), "observe() [µs]": latency},

@@ -35,7 +35,7 @@ from asm_gym.rollouts.plan import evaluation_trials
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, make_missing
 from asm_gym.rollouts.staging import record
-from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig
+from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial
 from asm_gym.scripts.command import one_line, run
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.stream_source import StreamSource
@@ -167,6 +167,12 @@ def without_unfit_monitors(args: Args, console: Console) -> Args:
     return replace(args, monitors=tuple(m for m in args.monitors if m not in refused))
 
 
+def trials_of(args: Args, task: str) -> list[Trial]:
+    """Return every trial of a task."""
+    what = args.faults, args.severities, args.harmless
+    return evaluation_trials(env_id(task), task, args.config, args.episodes, *what, args.seed)
+
+
 def evaluate(args: Args, console: Console) -> BenchmarkResult:
     """Record, fit, judge and publish."""
     args = without_unfit_monitors(args, console)
@@ -177,9 +183,7 @@ def evaluate(args: Args, console: Console) -> BenchmarkResult:
         labels, recorded = skill_labels(args.corpus), args.corpus / "scripted"
         claim["corpus"] = VERSION
     else:
-        what = args.faults, args.severities, args.harmless, args.seed
-        tasks = [(env_id(task), task) for task in args.tasks]
-        trials = [t for task in tasks for t in evaluation_trials(*task, args.config, args.episodes, *what)]
+        trials = [trial for task in args.tasks for trial in trials_of(args, task)]
         labels, recorded = [trial.label for trial in trials], args.out
     with claimed(args.out, "recordings.json", claim):
         if args.corpus is None:

@@ -96,7 +96,9 @@ def demonstrations(args: Args, console: Console) -> list[Episode]:
 
 def train_and_report(args: Args, console: Console) -> None:
     """Train, judge the best agent, and write it to ``out/agent.npz``."""
-    gym.make(env_id(args.task), **args.plan.settings).close()  # what makes no sense is refused before the folder is made
+    gym.make(
+        env_id(args.task), **args.plan.settings
+    ).close()  # what makes no sense is refused before the folder is made
     if args.dataset is not None:
         read_dataset(args.dataset, env_id=env_id(args.task))
     else:

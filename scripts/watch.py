@@ -26,7 +26,7 @@ from asm_gym.data.reader_notes import noted
 from asm_gym.data.sources import lines_from, live_source
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, traces_of
 from asm_gym.evaluation.rerun_view import LiveView
-from asm_gym.evaluation.scored_episode import ScoredEpisode, moments_of
+from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
 from asm_gym.monitors import load_monitor
@@ -38,9 +38,6 @@ from asm_gym.validation import check_number
 
 AT_ONCE = 64
 """Episodes scored side by side."""
-
-MOMENTS = 6
-"""Worst moments drawn."""
 
 SHOWN_ROWS = 20
 """Alarms printed; the file holds them all."""
@@ -137,14 +134,6 @@ def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Scor
         "attribution": ("Where surprise came from in the most surprising one", figures.attribution_figure(worst[0])),
         "stream": ("What its most surprising channels sensed", figures.stream_figure(worst[0])),
     }
-    moments = sorted((m for trace in worst for m in moments_of(trace)), key=lambda m: -m.excess)[:MOMENTS]
-    if moments:
-        drawn = {
-            "moments": (
-                "How the worst alarms began; × the threshold that each reached",
-                figures.moments_figure(moments),
-            )
-        } | drawn
     for name, (_, figure) in drawn.items():
         figures.save(figure, args.out / f"{name}.png")
     write_report(

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from asm_gym.episode import EpisodeLabel, save_episode
+from asm_gym.evaluation.corpus import MANIFEST, VERSION, Corpus, Entry
 from asm_gym.monitors import MONITORS
 from asm_gym.rollouts import corpus as module
-from asm_gym.evaluation.corpus import MANIFEST, VERSION, Corpus, Entry
 from asm_gym.rollouts.corpus import PARTS, ROUNDS, Source, record_corpus, wanted
 from asm_gym.rollouts.parallel import THIS_PROCESS
 from asm_gym.rollouts.run_folder import unread

@@ -12,11 +12,11 @@ import gymnasium as gym
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from asm_gym.rollouts.record import record
 
 from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.monitors import load_monitor, registry
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
-from asm_gym.rollouts.record import record
 from asm_gym.rollouts.seeds import draw_onset
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts import command

@@ -1,9 +1,9 @@
 """Harmless exploration: who explores, and up to where it is harmless."""
 
 import numpy as np
+from asm_gym.rollouts.training.exploration import Explorer, Gentle, until_contact
 
 from asm_gym.episode import Episode
-from asm_gym.rollouts.training.exploration import Explorer, Gentle, until_contact
 from asm_gym.spec import Channel, StreamSpec
 
 

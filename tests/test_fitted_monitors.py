@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from asm_gym.episode import EpisodeLabel
-from asm_gym.rollouts import scoring
 from asm_gym.evaluation.scoring import LEARNING, code_digest, fitted
+from asm_gym.rollouts import scoring
 from tests.streams import sine_episodes
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.rollouts.pretraining.model_card import Marks
+from asm_gym.rollouts.pretraining.exam import Marks
 from asm_gym.scripts.reproduce.hours import Setting, each, kept, missed, records
 
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from asm_gym.evaluation.earliness import aucpdt
 
 from asm_gym.episode import spans
 from asm_gym.evaluation import metrics
-from asm_gym.evaluation.earliness import aucpdt
 from asm_gym.evaluation.metrics import (
     Delays,
     by_condition,

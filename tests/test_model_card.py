@@ -10,9 +10,9 @@ from asm_gym.detection import Blocks
 from asm_gym.episode import EpisodeLabel
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.monitors import NeuralASM, Surprise
-from asm_gym.rollouts.pretraining.model_card import Alarms, Exam, Marks, at_rates, examine, usual_force
 from asm_gym.evaluation.scoring import detectability_of, onset_row
+from asm_gym.monitors import NeuralASM, Surprise
+from asm_gym.rollouts.pretraining.exam import Alarms, Exam, Marks, at_rates, examine, usual_force
 from tests.test_babble import ARM, lesson_of
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from asm_gym.evaluation.reliability import reliability
+from asm_gym.scripts.reproduce.reliability import reliability
 
 EDGES = (0.5, 0.75, 0.9, 1.0)
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
+from asm_gym.evaluation.detection_tables import lead_table
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.resampling import Calibration, drawn_anew, interval
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.evaluation.detection_tables import lead_table
 
 
 def a_trace(peak: float, seed: int, onset: int | None = None, before: float = 0.0) -> ScoredEpisode:

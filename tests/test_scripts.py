@@ -12,10 +12,10 @@ from asm_gym import collect
 from asm_gym.evaluation.report import write_json
 from asm_gym.evaluation.statistics import Share
 from asm_gym.faults import FrozenEncoder, Push
+from asm_gym.rollouts.film import watch
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial
-from asm_gym.rollouts.film import watch
 from asm_gym.scripts import command, demo
 from asm_gym.scripts.cli import main
 from asm_gym.wrappers import StreamRecorder

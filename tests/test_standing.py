@@ -6,8 +6,8 @@ from scipy import stats
 
 from asm_gym.detection import conformal_threshold
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
-from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.detection_tables import UNLIKELY, coverage_table, kept_table
+from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.statistics import chance_of_alarms
 from asm_gym.monitors import make_monitor
 from tests.streams import sine_episodes

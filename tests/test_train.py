@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from asm_gym.rollouts.training.state import TrainingState, newest, resume, save
 from rich.console import Console
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -23,7 +24,6 @@ from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
 from asm_gym.rollouts.training.learners import ALGORITHMS, RECIPES, export, make_learner, warm_critic
 from asm_gym.rollouts.training.run import ObservationScale, Plan, TrainingRun
-from asm_gym.rollouts.training.state import TrainingState, newest, resume, save
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.train import Args, train_and_report
 from asm_gym.spec import StreamSpec

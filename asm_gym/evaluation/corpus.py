@@ -3,8 +3,8 @@
     FOLDER/manifest.json                              the files, with the SHA-256 of each
     FOLDER/POLICY/episodes/TASK/ROLE/KIND-SEVERITY-SEED.npz
 
-Roles are ``fit`` to learn from, ``calibration`` for thresholds, ``nominal`` to test on, and ``faulty``: each the twin of
-the nominal episode with its seed, alike in all that is random but the fault.
+Roles are ``fit`` to learn from, ``calibration`` for thresholds, ``nominal`` to test on, and ``faulty``: each the twin
+of the nominal episode with its seed, alike in all that is random but the fault.
 """
 
 from __future__ import annotations
@@ -83,9 +83,7 @@ def read_manifest(folder: Path) -> list[Entry]:
         version, lines = about["version"], about["files"]
         if version != VERSION:
             raise ValueError(f"it holds version {version!r} of the corpus, and this asm-gym reads {VERSION}")
-        return [
-            Entry(e["policy"], EpisodeLabel(**{n: e[n] for n in _LABEL}), e["sha256"], e["seconds"]) for e in lines
-        ]
+        return [Entry(e["policy"], EpisodeLabel(**{n: e[n] for n in _LABEL}), e["sha256"], e["seconds"]) for e in lines]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} cannot be read: {error}; asm-gym corpus makes it anew") from error
 

@@ -89,14 +89,22 @@ def monitors_table(result: BenchmarkResult) -> Table:
         f"episodes in which the policy failed ({result.left_out.failed}) or crashed ({result.left_out.crashed}), and "
         "faults in such scenes." + (f" Kinds that cannot be detected: {', '.join(hidden)}." if hidden else "")
     )
-    return tabulate(caption, monitor_columns(result), [result.ideal, *result.on_visible])
+    return tabulate(caption, monitor_columns(result), _compared(result))
 
 
 def brief_monitors_table(result: BenchmarkResult) -> Table:
-    """Return the chief columns, narrow enough for a terminal."""
+    """Return the chief columns without their intervals, narrow enough for a terminal."""
     wanted = {*BRIEF, f"Found at {100 * result.rate:g} %"}
-    columns = [column for column in monitor_columns(result) if column.heading in wanted]
-    return tabulate(f"found within {result.window_s:g} s of the onset", columns, [result.ideal, *result.on_visible])
+    columns = [_without_interval(column) for column in monitor_columns(result) if column.heading in wanted]
+    return tabulate(f"found within {result.window_s:g} s of the onset", columns, _compared(result))
+
+
+def _compared(result: BenchmarkResult) -> list[Compared]:
+    return [result.ideal, *result.on_visible]
+
+
+def _without_interval(column: Column[Compared]) -> Column[Compared]:
+    return Column(column.heading, lambda m: column.cell(m).partition(" (")[0])
 
 
 def kinds_table(result: BenchmarkResult) -> Table:

@@ -242,7 +242,7 @@ class DetectionMetrics:
 
     @property
     def unmatched_auroc(self) -> float:
-        """The peak in the window against the peak of whole nominal episodes, as a threshold sees it; mean over kinds."""
+        """The peak in the window against the peak of whole nominal episodes; mean over kinds."""
         nominal = [t.surprise.max() for t in self.nominal]
         peaks = [
             [t.surprise[t.window(self.window_s)].max(initial=0.0) for t in own] for own in by_kind(self.faulty).values()

@@ -65,8 +65,7 @@ def benchmark(
     models: dict[str, list[str]] = {}  # one that is judged in two ways is fitted once
     for name in monitors:
         models.setdefault(name.removesuffix(EVIDENCE), []).append(name)
-    how = {"folder": folder.resolve(), "recorded": recorded, "labels": wanted, "rate": rate, "seed": seed}
-    score = partial(_results, **how)
+    score = partial(_results, folder=folder.resolve(), recorded=recorded, labels=wanted, rate=rate, seed=seed)
     found = {name: result for results in each(score, list(models.values())) for name, result in results.items()}
     by_role, left_out, twins = read(recorded, wanted)
     seen = detectability_of(twins, by_role.get("faulty", []), window_s)

@@ -74,9 +74,9 @@ def record_corpus(
     known = {entry.path: entry for entry in read_manifest(folder)} if (folder / MANIFEST).is_file() else {}
     for source in sources:
         wanted = trials(source, number, rounds)
-        place = folder.resolve() / source.policy
-        make = partial(record, config=RolloutConfig(source.policy), folder=place)
-        files = make_missing(make, wanted, lambda trial, place=place: place / trial.label.path, parallel, progress)
+        make = partial(record, config=RolloutConfig(source.policy), folder=folder.resolve() / source.policy)
+        places = {trial: folder / source.policy / trial.label.path for trial in wanted}
+        files = make_missing(make, wanted, places.__getitem__, parallel, progress)
         for trial, file in zip(wanted, files, strict=True):
             if Path(source.policy) / trial.label.path not in known:
                 episode = load_episode(file)

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from asm_gym.evaluation.film import write_video
 from asm_gym.evaluation.scored_episode import POLICY_ALONE, InterventionOutcome, ScoredEpisode, TraceDetail
 from asm_gym.graphics import GET_ENCODER, GET_RENDERING, encoder_problem, rendering_backend, rendering_problem
 from asm_gym.monitors import Monitor, NeuralASM
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.staging import play, staged
 from asm_gym.rollouts.trial import RolloutConfig, Trial
-from asm_gym.view.film import write_video
 from asm_gym.wrappers import NeuralASMSafety, SurpriseOverlay
 
 PICTURE: dict[str, Any] = {"render_mode": "rgb_array", "camera": "frontview", "render_size": (512, 640)}

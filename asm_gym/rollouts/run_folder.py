@@ -72,9 +72,7 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout:
-        raise BlockingIOError(
-            f"{folder} is in use by another process: wait for it, or name another --out"
-        ) from None
+        raise BlockingIOError(f"{folder} is in use by another process: wait for it, or name another --out") from None
     try:
         yield
     finally:

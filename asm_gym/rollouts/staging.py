@@ -148,7 +148,7 @@ def record_stream(trial: Trial, config: RolloutConfig) -> Episode:
         recorder = StreamRecorder(env)
         play(trial, config, recorder, lambda info: forces.append(info.get("contact_force", math.nan)))
     base = environment(trial.env_id, config.settings)
-    inner = base.unwrapped if isinstance(base.unwrapped, RobosuiteEnv) else FaultyInterface(base)
+    inner: Any = base.unwrapped if isinstance(base.unwrapped, RobosuiteEnv) else FaultyInterface(base)
     faults = faults_in(trial, base, config) if trial.role == "faulty" else ()
     affected: frozenset[str] = frozenset().union(*(fault.labels(inner) for fault in faults))
     recorded = recorder.finish()

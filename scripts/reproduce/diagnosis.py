@@ -19,14 +19,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from asm_gym.episode import Episode, load_episode
-from asm_gym.evaluation.reliability import Reliability, reliability
+from asm_gym.evaluation.recordings import files_in
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.diagnosis import CLASSES, FAMILIES, WINDOW, Diagnosis, Hypothesis, Readout, averaged
-from asm_gym.evaluation.recordings import files_in
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record
+from asm_gym.scripts.reproduce.reliability import Reliability, reliability
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers.responses import SURE
 

@@ -13,16 +13,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 from asm_gym.detection.hourly import Blocks, hourly_threshold
+from asm_gym.evaluation.corpus import Corpus
 from asm_gym.evaluation.defaults import WINDOW_S
-from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
-from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.detection_tables import kept_rate
+from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
+from asm_gym.evaluation.recordings import NOMINAL_ROLES
+from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.statistics import Rate, Share
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.monitors import NeuralASM
-from asm_gym.evaluation.corpus import Corpus
-from asm_gym.rollouts.pretraining.model_card import SEVERITIES, Alarms, Exam, Marks, examine, usual_force
-from asm_gym.evaluation.recordings import NOMINAL_ROLES
+from asm_gym.rollouts.pretraining.exam import SEVERITIES, Alarms, Exam, Marks, examine, usual_force
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record

@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from asm_gym.evaluation.comparison import Detectability, MonitorResult, monitor_metrics, visible_kinds
+from asm_gym.evaluation.comparison import Detectability, MonitorResult, visible_kinds
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.metrics import false_alarms
+from asm_gym.evaluation.scoring import fitted, judged
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors.registry import check_monitor
-from asm_gym.evaluation.scoring import result_of
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record
@@ -68,13 +68,14 @@ def score(job: Job, config: Config) -> Record:
     recordings = config.roles
     learned = in_turn(recordings["fit"], job.seed)[: job.episodes]
     by_role = {**recordings, "fit": learned, "harmless": []}
-    result = result_of(job.monitor, config.out / "learning_curve", by_role, config.false_alarm_rate, job.seed)
+    monitor = fitted(config.out / "learning_curve", job.monitor, learned, job.seed)
+    result = judged(job.monitor, monitor, by_role, config.false_alarm_rate)
     return job._asdict() | measured(result, config.detectable(recordings.get("faulty", [])), config, job.monitor)
 
 
 def measured(result: MonitorResult, seen: Sequence[Detectability], config: Config, name: str) -> Record:
     """AUROC, faults found, and nominal episodes with an alarm, over the kinds that can be seen."""
-    metrics = monitor_metrics(name, result, config.window, visible_kinds(seen))
+    metrics = result.metrics(name, config.window, visible_kinds(seen))
     found, alarms = metrics.found[config.false_alarm_rate].value, false_alarms(metrics.nominal).value
     return {"auroc": metrics.auroc, "whole": metrics.unmatched_auroc, "found": found, "false_alarms": alarms}
 

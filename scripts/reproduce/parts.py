@@ -19,12 +19,14 @@ from asm_gym.detection import EvidenceDetection, conformal_episodes
 from asm_gym.episode import Episode
 from asm_gym.evaluation import defaults
 from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
+from asm_gym.evaluation.corpus import SKILLS, skill_labels
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE
-from asm_gym.evaluation.detection_tables import monitors_table
+from asm_gym.evaluation.detection_tables import lead_table, monitors_table
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.metrics import DetectionMetrics, detected, false_alarms, in_words
+from asm_gym.evaluation.recordings import Recordings, read
 from asm_gym.evaluation.resampling import interval
-from asm_gym.evaluation.detection_tables import lead_table
+from asm_gym.evaluation.scoring import detectability_of, fitted, judged
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.faults.suite import SEVERITIES
@@ -35,11 +37,6 @@ from asm_gym.monitors import CalibratedMonitor, NeuralASM
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.memory_parts import AssociationPart, TemporalPart
 from asm_gym.monitors.memory_model import MemoryModel
-from asm_gym.evaluation.corpus import SKILLS
-from asm_gym.evaluation.recordings import Recordings
-from asm_gym.evaluation.recordings import read
-from asm_gym.evaluation.scoring import detectability_of, fitted, judged
-from asm_gym.scripts.evaluate import Args, labels
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record, shown
@@ -71,7 +68,7 @@ class Config(kit.Config):
     @property
     def recordings(self) -> Recordings:
         """Of the skills in the corpus; raises as ``Corpus.open``."""
-        own = (label for label in labels(Args(corpus=self.corpus)) if label.task in self.tasks)
+        own = (label for label in skill_labels(self.corpus) if label.task in self.tasks)
         return read(self.corpus / "scripted", tuple(own))
 
 

@@ -25,7 +25,9 @@ def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
         for ax, trace in zip(panels, traces, strict=True):
             _surprise_panel(ax, trace)
         floor, ceiling = limits(traces)
-        panels[0].set(yscale="log", ylim=(floor / 1.5, ceiling * 5), xlim=(0, 1.01 * max(len(t) * t.dt for t in traces)))
+        panels[0].set(
+            yscale="log", ylim=(floor / 1.5, ceiling * 5), xlim=(0, 1.01 * max(len(t) * t.dt for t in traces))
+        )
         panels[0].yaxis.set_major_locator(LogLocator(numticks=5))
         panels[0].yaxis.set_minor_formatter(NullFormatter())
         panels[-1].set_xlabel("time [s]")
@@ -116,7 +118,11 @@ def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
         handles = [
             Line2D([], [], color=BLUE, label="sensed"),
             Line2D([], [], color=GREY, linestyle=DASHED, label="without the fault"),
-            Patch(color=VERMILLION if trace.onset is None else ORANGE, alpha=0.3, label="alarm" if trace.onset is None else "fault"),
+            Patch(
+                color=VERMILLION if trace.onset is None else ORANGE,
+                alpha=0.3,
+                label="alarm" if trace.onset is None else "fault",
+            ),
         ]
         fig.legend(handles=handles, loc="outside upper right", ncols=3)
     return fig

@@ -77,7 +77,9 @@ class Marks(NamedTuple):
         """Return the result at another threshold."""
         parts = self.solved, self.failed, self.pushes, self.metrics.faulty
         solved, failed, pushes, faulty = ([t.at(threshold) for t in traces] for traces in parts)
-        return Marks(self.name, solved, failed, pushes, DetectionMetrics(self.name, faulty, solved, self.metrics.window_s))
+        return Marks(
+            self.name, solved, failed, pushes, DetectionMetrics(self.name, faulty, solved, self.metrics.window_s)
+        )
 
 
 def usual_force(recordings: Sequence[Episode]) -> float:
@@ -161,6 +163,6 @@ def summary(marks: Sequence[Marks]) -> str:
     delays = [t.delay for m in marks for t in m.pushes]
     prompt = Share.of([delay is not None and delay <= PROMPT_S + 1e-9 for delay in delays])
     return (
-        f"In all: {alarms.text} in {alarms.fault.hours:.2f} healthy hours, {count(found)} faults found, {count(prompt)} "
-        f"pushes of 20 N detected within {1e3 * PROMPT_S:.0f} ms."
+        f"In all: {alarms.text} in {alarms.fault.hours:.2f} healthy hours, {count(found)} faults found, "
+        f"{count(prompt)} pushes of 20 N detected within {1e3 * PROMPT_S:.0f} ms."
     )

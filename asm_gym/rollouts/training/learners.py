@@ -31,7 +31,7 @@ class NormalisedCritic(SACPolicy):
 
     def make_critic(self, features_extractor: Any = None) -> Any:
         """Make the critics."""
-        critic = super().make_critic(features_extractor)
+        critic: Any = super().make_critic(features_extractor)
         for n, q in enumerate(critic.q_networks):
             layers: list[nn.Module] = []
             for layer in q:
