@@ -22,8 +22,7 @@ from asm_gym.faults import (
     Push,
     Scale,
 )
-from asm_gym.faults.anywhere import KINDS, faults_anywhere, sigmas
-from asm_gym.faults.interface import FaultyInterface
+from asm_gym.faults.anywhere import KINDS, FaultyInterface, faults_anywhere, sigmas
 from asm_gym.faults.suite import SEVERITIES
 from asm_gym.policies import make_policy
 from asm_gym.rollouts import collect
@@ -259,7 +258,7 @@ def test_every_kind_strikes_a_sense_that_moves_and_a_twin_shows_it():
             assert "joint_position[0]" in struck
             if severity == "strong":
                 assert not np.array_equal(broken, healthy), kind
-    with pytest.raises(ValueError, match="no sense of this environment moves"):
+    with pytest.raises(ValueError, match="no sensor of this environment moves"):
         faults_anywhere("frozen_sense", interface, 0 * sigma, "strong", ONSET, seed=1)
 
 

@@ -199,7 +199,6 @@ def test_options_and_actions_are_taken_or_refused(lift, value):
         (lambda: Teleport(offset=float("nan")), "offset"),
         (lambda: FAULTS["scale"](factor=-1), "factor"),
         (lambda: FAULTS["object_mass"](factor=-0.5), "factor"),
-        (lambda: FAULTS["lighting"](factor=-1), "factor"),
         (lambda: Push(newtons=1e300), "newtons"),
         (lambda: Push(seed=-1), "seed"),
         (lambda: FAULTS["delay"](steps=10**9), "steps"),
@@ -255,6 +254,6 @@ def test_a_fault_of_ones_own_has_a_name_where_it_is_defined():
         assert FAULTS["loose_screw"] is LooseScrew
         assert "on_body" not in FAULTS
         assert "sensor_fault" not in FAULTS
-        assert len(FAULTS) == 40
+        assert len(FAULTS) == 38
     finally:
         del FAULTS["loose_screw"]

@@ -11,7 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import Fault
-from asm_gym.faults.interface import FaultyInterface
+from asm_gym.faults.anywhere import FaultyInterface
 from asm_gym.validation import shown, typed
 
 

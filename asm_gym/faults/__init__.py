@@ -12,10 +12,20 @@ from asm_gym.faults.action import (
 )
 from asm_gym.faults.actuator import Backlash, GripperOpens, JointFriction, StuckJoint, WeakGripper, WeakJoint
 from asm_gym.faults.base import FAULTS, Fault, make_fault
-from asm_gym.faults.body import CablePull, Collision, HeldByPerson, Payload, Push
-from asm_gym.faults.harmless import CameraShift, Lighting, NoisySensors, ObjectFriction, ObjectMass, Touch
-from asm_gym.faults.object import Heavy, Missing, Slip, Snatch, Teleport
-from asm_gym.faults.sensor import Bias, Delay, Drift, Dropout, Freeze, FrozenEncoder, Noise, Scale, Spikes
+from asm_gym.faults.body import CablePull, Collision, HeldByPerson, Payload, Push, Touch
+from asm_gym.faults.object import Heavy, Missing, ObjectFriction, ObjectMass, Slip, Snatch, Teleport
+from asm_gym.faults.sensor import (
+    Bias,
+    Delay,
+    Drift,
+    Dropout,
+    Freeze,
+    FrozenEncoder,
+    Noise,
+    NoisySensors,
+    Scale,
+    Spikes,
+)
 
 __all__ = [
     "FAULTS",
@@ -29,7 +39,6 @@ __all__ = [
     "Backlash",
     "Bias",
     "CablePull",
-    "CameraShift",
     "Collision",
     "Delay",
     "Drift",
@@ -41,7 +50,6 @@ __all__ = [
     "Heavy",
     "HeldByPerson",
     "JointFriction",
-    "Lighting",
     "Missing",
     "Noise",
     "NoisySensors",

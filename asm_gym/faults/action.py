@@ -1,16 +1,15 @@
 """Faults between policy and controller: what arrives is not what was commanded.
 
-The stream's efference copy carries the action as commanded; nobody tells the robot what became of it.
+The stream's efference copy carries the action as commanded, without the fault.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -19,38 +18,43 @@ from numpy.typing import NDArray
 from asm_gym.faults.base import LONGEST, Apply, Fault, Interface, group_labels, listed, within
 
 Action = NDArray[np.float32]
-Deliver = Callable[[Action, float, int], Action]
 
 
-@dataclass(frozen=True, kw_only=True)
 class ActionFault(Fault):
-    """One that acts on the commanded action, grippers aside."""
+    """One that acts on the commanded action."""
 
     anywhere = True
+    grippers_too: ClassVar[bool] = False
+    """Whether it acts on the numbers that command grippers as well."""
 
     def check(self, env: Interface) -> None:
         axis = getattr(self, "axis", 0)
         if not 0 <= axis < len(_arm_axes(env)):
             raise ValueError(f"axis must be 0 to {len(_arm_axes(env)) - 1}, got {axis}")
 
-    @abstractmethod
-    def deliver(self, axes: NDArray[np.intp]) -> Deliver:
-        """What arrives: a function of (action, intensity, k), with k steps since the onset.
+    def begin(self) -> Any:
+        """Return the fault's memory for one injection."""
+        return None
 
-        Args:
-            axes: the numbers of the action that move arms.
-        """
+    @abstractmethod
+    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Any:
+        """Return what arrives instead of the numbers that were ``commanded``, k steps since the onset."""
 
     @contextmanager
     def applied(self, env: Interface) -> Iterator[Apply]:
-        intensity, k = 0.0, -1
-        rule = self.deliver(_arm_axes(env))
+        intensity, k, memory = 0.0, -1, self.begin()
+        axes = np.arange(gym.spaces.flatdim(env.action_space)) if self.grippers_too else _arm_axes(env)
 
         def apply(share: float) -> None:
             nonlocal intensity, k
             intensity, k = share, k + 1
 
-        with listed(env.deliveries, lambda action: rule(action, intensity, k)):
+        def change(action: Action) -> Action:
+            delivered = action.copy()
+            delivered[axes] = self.deliver(action[axes], intensity, k, memory)
+            return delivered
+
+        with listed(env.deliveries, change):
             yield apply
 
     def labels(self, env: Interface) -> frozenset[str]:
@@ -58,160 +62,100 @@ class ActionFault(Fault):
 
 
 def _arm_axes(env: Interface) -> NDArray[np.intp]:
+    """Return the indices of the action that move arms."""
     size = gym.spaces.flatdim(env.action_space)
     return np.setdiff1d(np.arange(size), np.asarray(env.gripper_actions, dtype=int))
 
 
-@dataclass(frozen=True, kw_only=True)
 class ActionDelay(ActionFault):
-    """Actions that arrive late.
-
-    Args:
-        steps: by how many control steps.
-    """
+    """Deliver actions ``steps`` control steps late."""
 
     graded = False
+    grippers_too = True
 
     steps: int = within(4, low=1, high=LONGEST)
 
-    def deliver(self, axes: NDArray[np.intp]) -> Deliver:
-        queue: deque[Action] = deque()
+    def begin(self) -> deque[Action]:
+        return deque()
 
-        def late(action: Action, _: float, __: int) -> Action:
-            queue.append(action)
-            return queue.popleft() if len(queue) > self.steps else queue[0]
-
-        return late
+    def deliver(self, commanded: Action, intensity: float, k: int, memory: deque[Action]) -> Action:
+        memory.append(commanded)
+        return memory.popleft() if len(memory) > self.steps else memory[0]
 
 
-@dataclass(frozen=True, kw_only=True)
 class ActionDrop(ActionFault):
-    """Actions that are lost: the arm is told to stay, and the grippers what they were told.
-
-    Args:
-        probability: of each action.
-    """
+    """Lose actions, each with ``probability``: the arm is told to stay, and the grippers what they were told."""
 
     probability: float = within(0.5, low=0, high=1)
 
-    def deliver(self, axes: NDArray[np.intp]) -> Deliver:
-        def drop(action: Action, intensity: float, k: int) -> Action:
-            if self.rng(2 + k).random() < intensity * self.probability:
-                return _with(action, axes, 0.0)
-            return action
-
-        return drop
+    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Any:
+        return 0.0 if self.rng(2 + k).random() < intensity * self.probability else commanded
 
 
-@dataclass(frozen=True, kw_only=True)
 class ActionBias(ActionFault):
-    """Something is added to one axis.
-
-    Args:
-        axis: counted among those that move arms.
-        amount: in action units.
-    """
+    """Add ``amount`` [action units] to one ``axis``, counted among those that move arms."""
 
     axis: int = 0
     amount: float = within(0.3, low=-2, high=2)
 
-    def deliver(self, axes: NDArray[np.intp]) -> Deliver:
-        where = axes[self.axis]
-        return lambda action, intensity, _: _with(action, where, action[where] + intensity * self.amount)
+    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Action:
+        commanded[self.axis] = commanded[self.axis] + intensity * self.amount
+        return commanded
 
 
-@dataclass(frozen=True, kw_only=True)
 class ActionScale(ActionFault):
-    """Motors do more or less than they are told, all alike.
-
-    Args:
-        factor: what the action is multiplied by.
-    """
+    """Multiply the action by ``factor``."""
 
     factor: float = within(0.5, low=0, high=100)
 
-    def deliver(self, axes: NDArray[np.intp]) -> Deliver:
-        return lambda action, intensity, _: _with(action, axes, action[axes] * (1 + intensity * (self.factor - 1)))
+    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Action:
+        return commanded * (1 + intensity * (self.factor - 1))
 
 
-@dataclass(frozen=True, kw_only=True)
 class ActionRepeat(ActionFault):
-    """Each action is repeated, and those in between are lost.
-
-    Args:
-        steps: how long one is held [control steps].
-    """
+    """Repeat each action for ``steps`` control steps, and lose those in between."""
 
     graded = False
+    grippers_too = True
 
     steps: int = within(5, low=1, high=LONGEST)
 
-    def deliver(self, axes: NDArray[np.intp]) -> Deliver:
-        held: list[Action] = []
+    def begin(self) -> list[Action]:
+        return []
 
-        def repeat(action: Action, _: float, k: int) -> Action:
-            if k % self.steps == 0 or not held:
-                held[:] = [action]
-            return held[0]
-
-        return repeat
+    def deliver(self, commanded: Action, intensity: float, k: int, memory: list[Action]) -> Action:
+        if k % self.steps == 0 or not memory:
+            memory[:] = [commanded]
+        return memory[0]
 
 
-@dataclass(frozen=True, kw_only=True)
 class SignFlip(ActionFault):
-    """One axis goes the wrong way.
-
-    Args:
-        axis: counted among those that move arms.
-    """
+    """Reverse one ``axis``, counted among those that move arms."""
 
     graded = False
 
     axis: int = 0
 
-    def deliver(self, axes: NDArray[np.intp]) -> Deliver:
-        where = axes[self.axis]
-        return lambda action, _, __: _with(action, where, -action[where])
+    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Action:
+        commanded[self.axis] = -commanded[self.axis]
+        return commanded
 
 
-@dataclass(frozen=True, kw_only=True)
 class ActionNoise(ActionFault):
-    """The action is replaced by noise, in part or as a whole.
-
-    Args:
-        share: how much of it.
-        std: standard deviation of the noise, in action units.
-    """
+    """Replace a ``share`` of the action by noise of standard deviation ``std`` [action units]."""
 
     share: float = within(1.0, low=0, high=1)
     std: float = within(0.5, low=0, high=2)
 
-    def deliver(self, axes: NDArray[np.intp]) -> Deliver:
-        def noise(action: Action, intensity: float, k: int) -> Action:
-            share = intensity * self.share
-            drawn = self.std * self.rng(2 + k).standard_normal(len(axes))
-            return _with(action, axes, (1.0 - share) * action[axes] + share * drawn)
-
-        return noise
+    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Any:
+        share = intensity * self.share
+        return (1.0 - share) * commanded + share * (self.std * self.rng(2 + k).standard_normal(len(commanded)))
 
 
-@dataclass(frozen=True, kw_only=True)
 class Adversary(ActionFault):
-    """Of all disturbances of a given size, the one that takes most of the commanded motion away: straight against it.
-
-    Args:
-        size: of the disturbance in each axis, in action units.
-    """
+    """Disturb each axis by ``size`` [action units] straight against the commanded motion, the worst of this size."""
 
     size: float = within(0.4, low=0, high=2)
 
-    def deliver(self, axes: NDArray[np.intp]) -> Deliver:
-        return lambda action, intensity, _: _with(
-            action, axes, action[axes] - intensity * self.size * np.sign(action[axes])
-        )
-
-
-def _with(action: Action, where: Any, values: Any) -> Action:
-    delivered = action.copy()
-    delivered[where] = values
-    return delivered
+    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Action:
+        return commanded - intensity * self.size * np.sign(commanded)

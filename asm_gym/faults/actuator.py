@@ -4,26 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Apply, Fault, check_joint, group_labels, joint_labels, listed, model_of, within
+from asm_gym.faults.base import (
+    Apply,
+    Edit,
+    EditingFault,
+    Fault,
+    Floats,
+    check_joint,
+    group_labels,
+    joint_labels,
+    listed,
+    model_of,
+    within,
+)
 
 _TORQUES = ("measured_torque", "commanded_torque", "external_torque", "external_torque_peak")
 _MOTION = ("joint_velocity", "joint_position")
 
 
-@dataclass(frozen=True, kw_only=True)
 class _OnJoint(Fault):
-    """Acts on one joint.
-
-    Args:
-        joint: counted from the base, 0 first; a second arm's go on after the first one's.
-    """
+    """Acts on one joint, counted from the base, 0 first; a second arm's go on after the first one's."""
 
     joint: int = 3
 
@@ -34,46 +39,35 @@ class _OnJoint(Fault):
         return joint_labels(env, self.joint, *_TORQUES, *_MOTION)
 
     def dof(self, env: RobosuiteEnv) -> int:
-        """The joint's place among the velocities."""
+        """Return the joint's index among the velocities."""
         model = model_of(env)
         return int(model.jnt_dofadr[model.actuator_trnid[env.motors[self.joint], 0]])
 
 
-@dataclass(frozen=True, kw_only=True)
-class WeakJoint(_OnJoint):
-    """A joint's motor gives only part of the torque it is told to.
-
-    Args:
-        joint: counted from the base, 0 first.
-        strength: share of the commanded torque that arrives; 0 is a dead motor.
-    """
+class WeakJoint(_OnJoint, EditingFault):
+    """A ``joint`` whose motor gives only a share ``strength`` of the commanded torque; 0 is a dead motor."""
 
     strength: float = within(0.5, low=0, high=1)
 
-    @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with env.edits.edit(model_of(env).actuator_gear, (int(env.motors[self.joint]), 0)) as change:
-            yield lambda i: change(lambda gear: gear * (1.0 - i * (1.0 - self.strength)))
+    def edits(self, env: RobosuiteEnv) -> list[Edit]:
+        motor = (int(env.motors[self.joint]), 0)
+        return [(model_of(env).actuator_gear, [motor], lambda i, gear: gear * (1.0 - i * (1.0 - self.strength)))]
 
 
-@dataclass(frozen=True, kw_only=True)
-class StuckJoint(_OnJoint):
-    """A joint that is blocked, by friction beyond what its motor can overcome."""
+class StuckJoint(_OnJoint, EditingFault):
+    """A ``joint`` that is blocked, by friction beyond what its motor can overcome."""
 
     graded = False
 
     def holds(self, env: RobosuiteEnv) -> frozenset[str]:
         return frozenset({f"joint {self.joint}"})
 
-    @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with env.edits.edit(model_of(env).dof_frictionloss, self.dof(env)) as change:
-            yield lambda _: change(lambda friction: friction + 1000.0)
+    def edits(self, env: RobosuiteEnv) -> list[Edit]:
+        return [(model_of(env).dof_frictionloss, [self.dof(env)], lambda _, friction: friction + 1000.0)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class JointFriction(_OnJoint):
-    """A joint that goes stiffly.
+class JointFriction(_OnJoint, EditingFault):
+    """A ``joint`` that moves stiffly.
 
     Args:
         joint: counted from the base, 0 first.
@@ -84,19 +78,14 @@ class JointFriction(_OnJoint):
     newton_metres: float = within(4.0, low=0, high=1e4)
     viscous: float = within(2.0, low=0, high=1e4)
 
-    @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+    def edits(self, env: RobosuiteEnv) -> list[Edit]:
         model, dof = model_of(env), self.dof(env)
-        with env.edits.edit(model.dof_frictionloss, dof) as dry, env.edits.edit(model.dof_damping, dof) as wet:
-
-            def apply(i: float) -> None:
-                dry(lambda friction: friction + i * self.newton_metres)
-                wet(lambda damping: damping + i * self.viscous)
-
-            yield apply
+        return [
+            (model.dof_frictionloss, [dof], lambda i, friction: friction + i * self.newton_metres),
+            (model.dof_damping, [dof], lambda i, damping: damping + i * self.viscous),
+        ]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Backlash(_OnJoint):
     """Play in a joint's gear, before its encoder: the reading follows the joint only after it has crossed the gap.
 
@@ -109,12 +98,10 @@ class Backlash(_OnJoint):
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        (position,) = (
-            i for i, label in enumerate(env.measured_spec.labels) if label in joint_labels(env, self.joint, _MOTION[1])
-        )
+        position = env.measured_spec.labels.index(next(iter(joint_labels(env, self.joint, _MOTION[1]))))
         reading, half = float(env.measured[position]), 0.0
 
-        def play(row: NDArray[Any]) -> None:
+        def play(row: Floats) -> None:
             nonlocal reading
             reading = float(np.clip(reading, row[position] - half, row[position] + half))
             row[position] = reading
@@ -130,7 +117,6 @@ class Backlash(_OnJoint):
         return joint_labels(env, self.joint, *_MOTION)
 
 
-@dataclass(frozen=True, kw_only=True)
 class _OnGripper(Fault):
     """Acts on the grippers."""
 
@@ -142,7 +128,6 @@ class _OnGripper(Fault):
         return group_labels(env, "gripper", "wrench")
 
 
-@dataclass(frozen=True, kw_only=True)
 class GripperOpens(_OnGripper):
     """The grippers open, and stay open whatever they are told."""
 
@@ -164,18 +149,12 @@ class GripperOpens(_OnGripper):
             yield lambda _: None
 
 
-@dataclass(frozen=True, kw_only=True)
-class WeakGripper(_OnGripper):
-    """The grippers close with only part of their force.
-
-    Args:
-        strength: the share that is left.
-    """
+class WeakGripper(_OnGripper, EditingFault):
+    """The grippers close with only a share ``strength`` of their force."""
 
     strength: float = within(0.2, low=0, high=1)
 
-    @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+    def edits(self, env: RobosuiteEnv) -> list[Edit]:
         model = model_of(env)
         motors = [
             int(m)
@@ -183,14 +162,8 @@ class WeakGripper(_OnGripper):
             for arm in robot.arms
             for m in robot._ref_joint_gripper_actuator_indexes[arm] or ()
         ]
-        with (
-            env.edits.edit(model.actuator_gainprm, *motors) as gain,
-            env.edits.edit(model.actuator_biasprm, *motors) as bias,
-        ):
 
-            def apply(i: float) -> None:
-                left = 1.0 - i * (1.0 - self.strength)
-                gain(lambda p: p * left)
-                bias(lambda p: p * left)
+        def weaken(i: float, parameters: Floats) -> Floats:
+            return parameters * (1.0 - i * (1.0 - self.strength))
 
-            yield apply
+        return [(model.actuator_gainprm, motors, weaken), (model.actuator_biasprm, motors, weaken)]

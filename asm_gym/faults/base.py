@@ -6,9 +6,10 @@ import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import Field, dataclass, field, fields
-from typing import Any, ClassVar, Protocol, cast
+from functools import partial
+from typing import Any, ClassVar, Protocol, cast, dataclass_transform
 
 import gymnasium as gym
 import mujoco
@@ -24,32 +25,10 @@ SHAPES = ("constant", "pulse", "ramp", "periodic", "random_walk")
 Vector3 = tuple[float, float, float]
 """In the world's axes."""
 
+Floats = NDArray[np.float64]
+
 Apply = Callable[[float], None]
 """Gives a fault an intensity in [0, 1] for the next control step."""
-
-
-class Interface(Protocol):
-    """What lies between senses and policy, and between policy and motors: all that faults of either act on."""
-
-    measured_spec: StreamSpec
-    corruptions: list[Callable[[NDArray[np.float64]], None]]
-    """Each edits what was measured, in place."""
-    deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]]
-    """Each makes another action of what was commanded."""
-
-    @property
-    def measured(self) -> NDArray[np.float64]:
-        """The row measured last, laid out as ``measured_spec`` says; a copy."""
-        ...
-
-    @property
-    def gripper_actions(self) -> tuple[int, ...]:
-        """Numbers of the action that command grippers."""
-        ...
-
-    @property
-    def action_space(self) -> gym.Space[Any]: ...
-
 
 FAULTS: dict[str, type[Fault]] = {}
 """Every fault and harmless variation by its name in lower case; a class of yours is added where it is defined."""
@@ -58,14 +37,38 @@ MOST = 1e9
 """No parameter is larger, so that nothing overflows."""
 
 LONGEST = 10_000
-"""Control steps that something may be late by."""
+"""The longest delay [control steps]."""
+
+
+class Interface(Protocol):
+    """What faults of sensors and actions act on; any environment with Box spaces has one."""
+
+    measured_spec: StreamSpec
+    corruptions: list[Callable[[Floats], None]]
+    """Each edits the measured row in place."""
+    deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]]
+    """Each replaces the commanded action."""
+
+    @property
+    def measured(self) -> Floats:
+        """The row measured last, laid out as ``measured_spec`` says; a copy."""
+        ...
+
+    @property
+    def gripper_actions(self) -> tuple[int, ...]:
+        """Indices of the action that command grippers."""
+        ...
+
+    @property
+    def action_space(self) -> gym.Space[Any]: ...
 
 
 def within(default: Any, *, low: float | None = None, high: float | None = None, above: float | None = None) -> Any:
-    """A parameter of a fault, and its bounds."""
+    """Declare a parameter of a fault, and its bounds."""
     return field(default=default, metadata={"low": low, "high": high, "above": above})
 
 
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field, within))
 @dataclass(frozen=True, kw_only=True)
 class Fault(ABC):
     """Something that goes wrong for a while.
@@ -73,8 +76,8 @@ class Fault(ABC):
     Args:
         onset: the first control step it acts in; step 0 is the first one after reset.
         duration: how many control steps it lasts; to the end of the episode where None.
-        shape: how its intensity goes with time: ``constant``; ``pulse``, up and down again over the duration; ``ramp``,
-            up over the duration, or over ``period`` where it has none; ``periodic``, up and down every ``period``;
+        shape: its intensity over time: ``constant``; ``pulse``, up and down again over the duration; ``ramp``, up over
+            the duration, or over ``period`` where it has none; ``periodic``, up and down every ``period``;
             ``random_walk`` between 0 and 1.
         period: [control steps].
         seed: of whatever the fault draws. It draws nothing from the environment's own generator, so that an episode
@@ -88,15 +91,16 @@ class Fault(ABC):
     seed: int = within(0, low=0, high=2**63)
 
     graded: ClassVar[bool] = True
-    """Whether there is a little of it; what is all or nothing takes the shape ``constant`` alone."""
+    """Whether its intensity can vary; a fault that is all or nothing takes the shape ``constant`` alone."""
     harmless: ClassVar[bool] = False
     """A variation that should raise no alarm."""
     anywhere: ClassVar[bool] = False
-    """Whether it takes no more than an ``Interface``, which any environment with Boxes has."""
+    """Whether it needs no more than an ``Interface``."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Every fault that can be made has a name: ``weak_joint`` is ``WeakJoint``."""
+        """Make every fault a frozen dataclass, and register those that can be made: ``weak_joint`` is ``WeakJoint``."""
         super().__init_subclass__(**kwargs)
+        dataclass(frozen=True, kw_only=True)(cls)
         # The list of abstract methods is not there yet.
         abstract = any(getattr(getattr(cls, n, None), "__isabstractmethod__", False) for n in dir(cls))
         if not abstract and not cls.__name__.startswith("_"):
@@ -116,10 +120,11 @@ class Fault(ABC):
         return type(self).__name__
 
     def active(self, step: int) -> bool:
+        """Whether the fault acts in a control step."""
         return self.onset <= step and (self.duration is None or step < self.onset + self.duration)
 
     def intensity(self, k: int) -> float:
-        """In [0, 1], at the k-th control step since the onset."""
+        """Return the intensity in [0, 1] at the k-th control step since the onset."""
         if self.shape == "pulse":
             return math.sin(math.pi * (k + 0.5) / (self.duration or 1)) ** 2
         if self.shape == "ramp":
@@ -128,31 +133,31 @@ class Fault(ABC):
             return 0.5 * (1.0 - math.cos(2 * math.pi * (k + 1) / self.period))
         if self.shape == "random_walk":
             walk = 0.5 + np.cumsum(self.rng(0).normal(0.0, 0.15, k + 1))[k]
-            return float(1.0 - abs((walk % 2.0) - 1.0))  # thrown back at 0 and at 1
+            return float(1.0 - abs((walk % 2.0) - 1.0))  # reflected at 0 and at 1
         return 1.0
 
     def rng(self, purpose: int = 1) -> np.random.Generator:
-        """A generator of the fault's own."""
+        """Return a generator of the fault's own."""
         return np.random.default_rng([self.seed, purpose])
 
     @abstractmethod
     def check(self, env: RobosuiteEnv) -> None:
-        """Raises ValueError, listing what exists, where the environment has nothing this fault could act on."""
+        """Raise ValueError, listing what exists, where the environment has nothing this fault could act on."""
 
     @abstractmethod
     def applied(self, env: RobosuiteEnv) -> AbstractContextManager[Apply]:
-        """Applies the fault; leaving the context undoes everything, exactly."""
+        """Apply the fault; leaving the context undoes everything, exactly."""
 
     @abstractmethod
     def labels(self, env: RobosuiteEnv) -> frozenset[str]:
-        """Elements of the stream in which an attentive observer would see this fault first."""
+        """Return the stream elements in which this fault shows first."""
 
     def holds(self, env: RobosuiteEnv) -> frozenset[str]:
-        """What it sets to a value of its own, so that no other fault can: two of the same are a contradiction."""
+        """Return what the fault sets to a value of its own: two faults of the same contradict each other."""
         return frozenset()
 
     def inject(self, env: RobosuiteEnv) -> Generator[None, None, None]:
-        """Runs on to its next ``yield`` before every control step in which the fault acts; closing it undoes it."""
+        """Run on to the next ``yield`` before every control step in which the fault acts; closing undoes it."""
         with self.applied(env) as apply:
             k = 0
             while True:
@@ -161,8 +166,32 @@ class Fault(ABC):
                 k += 1
 
 
+Edit = tuple[NDArray[Any], list[Any], Callable[[float, Any], Any]]
+"""An array of the simulator, the indices that are edited, and their value by intensity and nominal value."""
+
+
+class EditingFault(Fault):
+    """One that edits numbers of the simulator."""
+
+    @abstractmethod
+    def edits(self, env: RobosuiteEnv) -> list[Edit]:
+        """Return the edits."""
+
+    @contextmanager
+    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+        with ExitStack() as stack:
+            edits = self.edits(env)
+            changes = [stack.enter_context(env.edits.edit(array, *indices)) for array, indices, _ in edits]
+
+            def apply(intensity: float) -> None:
+                for change, (_, _, rule) in zip(changes, edits, strict=True):
+                    change(partial(rule, intensity))
+
+            yield apply
+
+
 def make_fault(name: str, **parameters: Any) -> Fault:
-    """The fault called ``name``.
+    """Make the fault called ``name``.
 
     Raises:
         ValueError: an unknown name or parameter; the message lists what exists.
@@ -176,7 +205,7 @@ def make_fault(name: str, **parameters: Any) -> Fault:
 
 
 def _check(parameter: Field[Any], value: object) -> None:
-    """Raises ValueError unless a parameter is of its type and within its bounds."""
+    """Raise ValueError unless a parameter is of its type and within its bounds."""
     low, high, above = (parameter.metadata.get(bound) for bound in ("low", "high", "above"))
     low = -MOST if low is None and above is None else low
     high = MOST if high is None else high
@@ -189,18 +218,17 @@ def _check(parameter: Field[Any], value: object) -> None:
             check_number(parameter.name, value, low=low, high=high, whole=True)
         case "Vector3":
             check_numbers(parameter.name, cast(Vector3, value), 3, low=low, high=high)
+            if parameter.name == "direction" and not np.linalg.norm(cast(Vector3, value)) > 0:
+                raise ValueError(f"direction must not be all zero, got {value}")
         case "str":
             if not isinstance(value, str):
                 raise ValueError(f"{parameter.name} must be a name, got {shown(value)}")
 
 
-def along(name: str, direction: Vector3) -> NDArray[np.float64]:
-    """(3,) of length 1. Raises ValueError for a direction that is none."""
+def along(direction: Vector3) -> Floats:
+    """Return a direction (3,) at length 1."""
     way = np.asarray(direction, np.float64)
-    length = float(np.linalg.norm(way))
-    if not length > 0:
-        raise ValueError(f"{name} must not be all zero, got {direction}")
-    unit: NDArray[np.float64] = way / length
+    unit: Floats = way / float(np.linalg.norm(way))
     return unit
 
 
@@ -214,7 +242,7 @@ def data_of(env: RobosuiteEnv) -> mujoco.MjData:
 
 @contextmanager
 def listed(items: list[Any], item: Any) -> Iterator[None]:
-    """``item`` stands in the list while the block runs."""
+    """Keep ``item`` in the list while the block runs."""
     items.append(item)
     try:
         yield
@@ -224,7 +252,7 @@ def listed(items: list[Any], item: Any) -> Iterator[None]:
 
 
 def body_id(env: RobosuiteEnv, name: str) -> int:
-    """The body called ``name``.
+    """Return the body called ``name``.
 
     Raises:
         ValueError: there is none; the message lists those that exist.
@@ -237,24 +265,24 @@ def body_id(env: RobosuiteEnv, name: str) -> int:
 
 
 def check_joint(env: RobosuiteEnv, joint: int) -> None:
-    """Raises ValueError unless the arms have a joint with this index, counted through both where there are two."""
+    """Raise ValueError unless the arms have a joint with this index, counted through both where there are two."""
     count = len(env.motors)
     if not 0 <= joint < count:
         raise ValueError(f"joint must be 0 to {count - 1} for {env.measured_spec.source}, got {joint}")
 
 
 def joint_labels(env: RobosuiteEnv, joint: int, *names: str) -> frozenset[str]:
-    """The elements of the channels called ``names`` that belong to a joint, counted through both arms."""
-    prefixes = [c.name.removesuffix("joint_position") for c in env.measured_spec.channels if "joint_position" in c.name]
-    sizes = [c.size for c in env.measured_spec.channels if "joint_position" in c.name]
-    for prefix, size in zip(prefixes, sizes, strict=True):
-        if joint < size:
-            return frozenset(f"{prefix}{name}[{joint}]" for name in names)
-        joint -= size
+    """Return the elements of the channels ``names`` that belong to a joint, counted through both arms."""
+    for channel in env.measured_spec.channels:
+        if channel.name.endswith("joint_position"):
+            if joint < channel.size:
+                prefix = channel.name.removesuffix("joint_position")
+                return frozenset(f"{prefix}{name}[{joint}]" for name in names)
+            joint -= channel.size
     return frozenset()
 
 
 def group_labels(env: Interface, *groups: str) -> frozenset[str]:
-    """Every element of these channel groups; of all, in an environment that is not robosuite's."""
+    """Return every element of these channel groups; of all, in an environment that is not robosuite's."""
     every = not isinstance(env, RobosuiteEnv)
     return frozenset(label for c in env.measured_spec.channels if every or c.group in groups for label in c.labels)

@@ -1,19 +1,21 @@
-"""What pushes, pulls, holds or burdens the robot's body."""
+"""Faults that push, pull, hold or burden the robot's body."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults.base import (
     Apply,
+    Edit,
+    EditingFault,
     Fault,
+    Floats,
     Vector3,
     along,
     body_id,
@@ -24,17 +26,11 @@ from asm_gym.faults.base import (
     within,
 )
 
-Force = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
-"""(3,) force on a body [N] from its position [m] and velocity [m/s]."""
+HAND = "robot0_right_hand"
 
 
-@dataclass(frozen=True, kw_only=True)
 class _OnBody(Fault):
-    """Acts on one body.
-
-    Args:
-        body: a body of the model, such as ``robot0_link5``.
-    """
+    """Acts on one body of the model, such as ``robot0_link5``."""
 
     body: str = "robot0_link5"
 
@@ -45,25 +41,7 @@ class _OnBody(Fault):
         return group_labels(env, "torque", "wrench")
 
 
-@contextmanager
-def _force_field(env: RobosuiteEnv, body: int, force: Force) -> Iterator[None]:
-    """A force that follows the body's position and velocity, brought up to date in every physics substep."""
-    model, data = model_of(env), data_of(env)
-    velocity = np.zeros(6)
-    with env.edits.edit(data.xfrc_applied, (body, slice(0, 3))) as change:
-
-        def update(_: int = 0) -> None:
-            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
-            now = force(data.xipos[body], velocity[3:])
-            change(lambda others: others + now)
-
-        update()
-        with listed(env.substep_hooks, update):
-            yield
-
-
-@dataclass(frozen=True, kw_only=True)
-class Push(_OnBody):
+class Push(_OnBody, EditingFault):
     """A steady force on a body of the robot, or of anything else.
 
     Args:
@@ -75,37 +53,74 @@ class Push(_OnBody):
     newtons: float = within(20.0, low=-1e4, high=1e4)
     direction: Vector3 = (0.0, 1.0, 0.0)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        along("direction", self.direction)
-
-    @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        force = self.newtons * along("direction", self.direction)
-        with env.edits.edit(data_of(env).xfrc_applied, (body_id(env, self.body), slice(0, 3))) as change:
-            yield lambda i: change(lambda others: others + i * force)
+    def edits(self, env: RobosuiteEnv) -> list[Edit]:
+        force = self.newtons * along(self.direction)
+        where = (body_id(env, self.body), slice(0, 3))
+        return [(data_of(env).xfrc_applied, [where], lambda i, others: others + i * force)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Payload(_OnBody):
-    """A mass that nobody told the controller about.
+class Touch(Push):
+    """Somebody touches the arm; 2 N is the most that is harmless.
 
     Args:
-        body: where it hangs.
-        kilograms: how much [kg].
+        body, newtons, direction: as for ``Push``.
     """
 
-    body: str = "robot0_right_hand"
+    harmless = True
+
+    newtons: float = 1.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if abs(self.newtons) > 2.0:
+            raise ValueError(f"a touch has at most 2 N, got {self.newtons}: that is a Push")
+
+
+class Payload(_OnBody, EditingFault):
+    """A mass of so many ``kilograms`` on a ``body`` that the controller does not know of."""
+
+    body: str = HAND
     kilograms: float = within(1.0, above=0, high=1e3)
+
+    def edits(self, env: RobosuiteEnv) -> list[Edit]:
+        return [(model_of(env).body_mass, [body_id(env, self.body)], lambda i, mass: mass + i * self.kilograms)]
+
+
+Force = Callable[[Floats, Floats], Floats]
+"""(3,) force on a body [N] from its position (3,) [m] and velocity (3,) [m/s]."""
+
+
+class _ForceField(_OnBody):
+    """A force that follows the body's position and velocity, brought up to date in every physics substep."""
+
+    @abstractmethod
+    def force(self, env: RobosuiteEnv, position: Floats, velocity: Floats) -> Force:
+        """Return the force at full intensity, from where the body is at the onset."""
 
     @contextmanager
     def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        with env.edits.edit(model_of(env).body_mass, body_id(env, self.body)) as change:
-            yield lambda i: change(lambda mass: mass + i * self.kilograms)
+        model, data, body = model_of(env), data_of(env), body_id(env, self.body)
+        velocity = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
+        force = self.force(env, data.xipos[body].copy(), velocity[3:].copy())
+        share = 0.0 if self.graded else 1.0
+        with env.edits.edit(data.xfrc_applied, (body, slice(0, 3))) as change:
+
+            def update(_: int = 0) -> None:
+                mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
+                now = share * force(data.xipos[body], velocity[3:])
+                change(lambda others: others + now)
+
+            def apply(intensity: float) -> None:
+                nonlocal share
+                share = intensity
+
+            update()
+            with listed(env.substep_hooks, update):
+                yield apply
 
 
-@dataclass(frozen=True, kw_only=True)
-class Collision(_OnBody):
+class Collision(_ForceField):
     """An obstacle that appears in the way: a stiff wall, across the direction in which the body moves at the onset.
 
     A penalty contact on the body itself, F = k·depth - d·v while the body is inside: what a collision does to the arm,
@@ -121,32 +136,26 @@ class Collision(_OnBody):
 
     graded = False
 
-    body: str = "robot0_right_hand"
+    body: str = HAND
     gap: float = within(0.005, low=0, high=10)
     stiffness: float = within(3000.0, low=0, high=1e5)
     damping: float = within(50.0, low=0, high=1e4)
     newtons: float = within(150.0, low=0, high=1e4)
 
-    @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        model, data, body = model_of(env), data_of(env), body_id(env, self.body)
-        velocity = np.zeros(6)
-        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
-        speed = float(np.linalg.norm(velocity[3:]))
-        into = velocity[3:] / speed if speed > 1e-3 else np.array([0.0, 0.0, -1.0])
-        wall = float(data.xipos[body] @ into) + self.gap
+    def force(self, env: RobosuiteEnv, position: Floats, velocity: Floats) -> Force:
+        speed = float(np.linalg.norm(velocity))
+        into = velocity / speed if speed > 1e-3 else np.array([0.0, 0.0, -1.0])
+        wall = float(position @ into) + self.gap
 
-        def force(position: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-            depth = float(position @ into) - wall
+        def push(at: Floats, v: Floats) -> Floats:
+            depth = float(at @ into) - wall
             size = self.stiffness * depth + self.damping * max(0.0, float(v @ into)) if depth > 0 else 0.0
             return -min(size, self.newtons) * into
 
-        with _force_field(env, body, force):
-            yield lambda _: None
+        return push
 
 
-@dataclass(frozen=True, kw_only=True)
-class CablePull(_OnBody):
+class CablePull(_ForceField):
     """A cable that has caught: elastic, and taut from the onset on.
 
     Args:
@@ -156,34 +165,22 @@ class CablePull(_OnBody):
         newtons: the most it pulls with [N].
     """
 
-    body: str = "robot0_right_hand"
+    body: str = HAND
     stiffness: float = within(300.0, low=0, high=1e5)
     slack: float = within(0.01, low=0, high=10)
     newtons: float = within(60.0, low=0, high=1e4)
 
-    @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        body = body_id(env, self.body)
-        anchor = data_of(env).xipos[body].copy()
-        share = 0.0
-
-        def force(position: NDArray[np.float64], _: NDArray[np.float64]) -> NDArray[np.float64]:
-            away = position - anchor
+    def force(self, env: RobosuiteEnv, position: Floats, velocity: Floats) -> Force:
+        def pull(at: Floats, _: Floats) -> Floats:
+            away = at - position
             length = float(np.linalg.norm(away))
-            pull = min(self.stiffness * max(0.0, length - self.slack), self.newtons)
-            back: NDArray[np.float64] = -share * pull * away / max(length, 1e-9)
-            return back
+            size = min(self.stiffness * max(0.0, length - self.slack), self.newtons)
+            return -size * away / max(length, 1e-9)
 
-        def apply(intensity: float) -> None:
-            nonlocal share
-            share = intensity
-
-        with _force_field(env, body, force):
-            yield apply
+        return pull
 
 
-@dataclass(frozen=True, kw_only=True)
-class HeldByPerson(_OnBody):
+class HeldByPerson(_ForceField):
     """A person holds the arm: a spring and damper to a hand that sways.
 
     Args:
@@ -198,29 +195,21 @@ class HeldByPerson(_OnBody):
     newtons: float = within(60.0, low=0, high=1e4)
     sway: float = within(0.02, low=0, high=10)
 
-    @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        body, data = body_id(env, self.body), data_of(env)
-        hold, start = data.xipos[body].copy(), float(data.time)
+    def force(self, env: RobosuiteEnv, position: Floats, velocity: Floats) -> Force:
+        data = data_of(env)
+        start = float(data.time)
         direction = self.rng().standard_normal(3)
         direction /= np.linalg.norm(direction)
-        share = 0.0
 
-        def force(position: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-            hand = hold + self.sway * np.sin(np.pi * (data.time - start)) * direction
-            pull: NDArray[np.float64] = self.stiffness * (hand - position) - self.damping * v
+        def hold(at: Floats, v: Floats) -> Floats:
+            hand = position + self.sway * np.sin(np.pi * (data.time - start)) * direction
+            pull: Floats = self.stiffness * (hand - at) - self.damping * v
             size = max(float(np.linalg.norm(pull)), 1e-9)
-            held_by: NDArray[np.float64] = share * min(1.0, self.newtons / size) * pull
-            return held_by
+            return min(1.0, self.newtons / size) * pull
 
-        def apply(intensity: float) -> None:
-            nonlocal share
-            share = intensity
-
-        with _force_field(env, body, force):
-            yield apply
+        return hold
 
 
 def touches_body(fault: Fault) -> bool:
-    """Whether it acts on the robot's body from outside."""
+    """Whether a fault acts on the robot's body from outside."""
     return isinstance(fault, _OnBody)

@@ -7,22 +7,27 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import LONGEST, Apply, Fault, Interface, check_joint, joint_labels, listed, within
+from asm_gym.faults.base import (
+    LONGEST,
+    Apply,
+    Fault,
+    Floats,
+    Interface,
+    check_joint,
+    joint_labels,
+    listed,
+    within,
+)
 
-Row = NDArray[Any]
-Act = Callable[[Row, float, int], None]
 
-
-@dataclass(frozen=True, kw_only=True)
 class SensorFault(Fault):
     """One that acts on numbers of one channel.
 
@@ -41,7 +46,7 @@ class SensorFault(Fault):
         self.where(env)
 
     def where(self, env: Interface) -> NDArray[np.intp]:
-        """Where its numbers stand in a measured row."""
+        """Return the indices of the channel's numbers in a measured row."""
         slices = env.measured_spec.slices
         if self.channel not in slices:
             raise ValueError(f"unknown channel {self.channel!r}; known: {', '.join(slices)}")
@@ -55,18 +60,21 @@ class SensorFault(Fault):
     def labels(self, env: Interface) -> frozenset[str]:
         return frozenset(env.measured_spec.labels[i] for i in self.where(env))
 
+    def begin(self, last: Floats) -> Any:
+        """Return the fault's memory for one injection, from the readings (n,) before the onset."""
+        return last
+
     @abstractmethod
-    def act(self, last: Row, where: NDArray[np.intp]) -> Act:
-        """What the fault does to a measured row, in place: a function of (row, intensity, k), with k readings since the
-        onset; ``last`` is the row before it."""
+    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Any:
+        """Return what is read instead of the ``true`` readings (n,), at the k-th control step since the onset."""
 
     @contextmanager
     def applied(self, env: Interface) -> Iterator[Apply]:
         where, intensity, k = self.where(env), 0.0, -1
-        act = self.act(env.measured, where)
+        memory = self.begin(env.measured[where])
 
-        def edit(row: Row) -> None:
-            act(row, intensity, k)
+        def edit(row: Floats) -> None:
+            row[where] = self.read(row[where], intensity, k, memory)
 
         def apply(share: float) -> None:
             nonlocal intensity, k
@@ -76,157 +84,96 @@ class SensorFault(Fault):
             yield apply
 
 
-@dataclass(frozen=True, kw_only=True)
 class Bias(SensorFault):
-    """A constant error.
-
-    Args:
-        amount: [unit of the channel].
-    """
+    """Add a constant ``amount`` [unit of the channel]."""
 
     amount: float = within(0.05, low=-1e6, high=1e6)
 
-    def act(self, last: Row, where: NDArray[np.intp]) -> Act:
-        def change(row: Row, intensity: float, k: int) -> None:
-            row[where] += intensity * self.amount
-
-        return change
+    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Floats:
+        return true + intensity * self.amount
 
 
-@dataclass(frozen=True, kw_only=True)
 class Drift(SensorFault):
-    """An error that grows from the onset on.
-
-    Args:
-        rate: [unit of the channel per control step].
-    """
+    """Add an error that grows by ``rate`` [unit of the channel per control step] from the onset on."""
 
     rate: float = within(0.002, low=-1e6, high=1e6)
 
-    def act(self, last: Row, where: NDArray[np.intp]) -> Act:
-        def change(row: Row, intensity: float, k: int) -> None:
-            row[where] += intensity * self.rate * (k + 1)
-
-        return change
+    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Floats:
+        return true + intensity * self.rate * (k + 1)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Scale(SensorFault):
-    """A gain that is wrong.
-
-    Args:
-        factor: what the reading is multiplied by.
-    """
+    """Multiply the reading by ``factor``."""
 
     factor: float = within(1.2, low=0, high=1e3)
 
-    def act(self, last: Row, where: NDArray[np.intp]) -> Act:
-        def change(row: Row, intensity: float, k: int) -> None:
-            row[where] *= 1.0 + intensity * (self.factor - 1.0)
-
-        return change
+    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Floats:
+        return true * (1.0 + intensity * (self.factor - 1.0))
 
 
-@dataclass(frozen=True, kw_only=True)
 class Noise(SensorFault):
-    """More noise than there should be.
-
-    Args:
-        std: standard deviation of what is added [unit of the channel].
-    """
+    """Add noise of standard deviation ``std`` [unit of the channel]."""
 
     std: float = within(0.02, low=0, high=1e6)
 
-    def act(self, last: Row, where: NDArray[np.intp]) -> Act:
-        def change(row: Row, intensity: float, k: int) -> None:
-            row[where] += intensity * self.std * self.rng(2 + k).standard_normal(len(where))
-
-        return change
+    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Floats:
+        return true + intensity * self.std * self.rng(2 + k).standard_normal(len(true))
 
 
-@dataclass(frozen=True, kw_only=True)
 class Spikes(SensorFault):
-    """Single readings that are far off.
-
-    Args:
-        amount: how far, either way [unit of the channel].
-        probability: of each reading.
-    """
+    """Put single readings off by ``amount`` [unit of the channel] either way, each with ``probability``."""
 
     amount: float = within(0.5, low=-1e6, high=1e6)
     probability: float = within(0.2, low=0, high=1)
 
-    def act(self, last: Row, where: NDArray[np.intp]) -> Act:
-        def change(row: Row, intensity: float, k: int) -> None:
-            rng = self.rng(2 + k)
-            hit = rng.random(len(where)) < self.probability
-            row[where] += intensity * self.amount * hit * rng.choice([-1.0, 1.0], len(where))
-
-        return change
+    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Floats:
+        rng = self.rng(2 + k)
+        hit = rng.random(len(true)) < self.probability
+        off: Floats = intensity * self.amount * hit * rng.choice([-1.0, 1.0], len(true))
+        return true + off
 
 
-@dataclass(frozen=True, kw_only=True)
 class Dropout(SensorFault):
-    """Readings that are lost, and come as 0.
-
-    Args:
-        probability: of each reading.
-    """
+    """Lose readings, each with ``probability``: they read 0."""
 
     graded = False
 
     probability: float = within(0.3, low=0, high=1)
 
-    def act(self, last: Row, where: NDArray[np.intp]) -> Act:
-        def change(row: Row, intensity: float, k: int) -> None:
-            if self.rng(2 + k).random() < self.probability:
-                row[where] = 0.0
-
-        return change
+    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Any:
+        return 0.0 if self.rng(2 + k).random() < self.probability else true
 
 
-@dataclass(frozen=True, kw_only=True)
 class Freeze(SensorFault):
-    """The reading stays what it was, to the last digit."""
+    """Keep the last reading, to the last digit."""
 
     graded = False
 
     def holds(self, env: Interface) -> frozenset[str]:
         return self.labels(env)
 
-    def act(self, last: Row, where: NDArray[np.intp]) -> Act:
-        def freeze(row: Row, _: float, __: int) -> None:
-            row[where] = last[where]
-
-        return freeze
+    def read(self, true: Floats, intensity: float, k: int, memory: Floats) -> Floats:
+        return memory
 
 
-@dataclass(frozen=True, kw_only=True)
 class Delay(SensorFault):
-    """Readings that come late.
-
-    Args:
-        steps: by how many control steps.
-    """
+    """Deliver readings ``steps`` control steps late."""
 
     graded = False
 
     steps: int = within(3, low=1, high=LONGEST)
 
-    def act(self, last: Row, where: NDArray[np.intp]) -> Act:
+    def begin(self, last: Floats) -> deque[Floats]:
         # What was sensed before the onset is on its way already, and arrives first.
-        queue = deque([last[where].copy()] * self.steps)
+        return deque([last] * self.steps)
 
-        def late(row: Row, _: float, __: int) -> None:
-            queue.append(row[where].copy())
-            row[where] = queue.popleft()
-
-        return late
+    def read(self, true: Floats, intensity: float, k: int, memory: deque[Floats]) -> Floats:
+        memory.append(true)
+        return memory.popleft()
 
 
-@dataclass(frozen=True, kw_only=True)
 class FrozenEncoder(Fault):
-    """A joint's encoder keeps saying what it said last: the same position, to the last digit, and no velocity.
+    """Keep a joint's position at its last reading, to the last digit, and its velocity at 0.
 
     Args:
         joint: counted from the base, 0 first; a second arm's go on after the first one's.
@@ -248,7 +195,7 @@ class FrozenEncoder(Fault):
         )
         stuck_at = env.measured[position]
 
-        def freeze(row: Row) -> None:
+        def freeze(row: Floats) -> None:
             row[position], row[velocity] = stuck_at, 0.0
 
         with listed(env.corruptions, freeze):
@@ -261,6 +208,36 @@ class FrozenEncoder(Fault):
         return self.labels(env)
 
 
+class NoisySensors(Fault):
+    """Multiply the standard deviation of every sensor's noise by ``factor``."""
+
+    harmless = True
+
+    factor: float = within(2.0, low=1, high=1e3)
+
+    def check(self, env: RobosuiteEnv) -> None:
+        """Every environment has sensors."""
+
+    def labels(self, env: RobosuiteEnv) -> frozenset[str]:
+        return frozenset()
+
+    @contextmanager
+    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+        share, k = 0.0, -1
+        usual = env.measured_spec.noise * env.sensor_noise
+
+        def add(row: Floats) -> None:
+            extra = np.sqrt((1.0 + share * (self.factor - 1.0)) ** 2 - 1.0)
+            row += extra * usual * self.rng(2 + k).standard_normal(len(row))
+
+        def apply(intensity: float) -> None:
+            nonlocal share, k
+            share, k = intensity, k + 1
+
+        with listed(env.corruptions, add):
+            yield apply
+
+
 def corrupts_senses(fault: Fault) -> bool:
-    """Whether it changes what is measured, and nothing that happens."""
+    """Whether a fault changes what is measured, and nothing that happens."""
     return isinstance(fault, SensorFault | FrozenEncoder)

@@ -19,9 +19,8 @@ from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.episode import Episode, save_episode
 from asm_gym.evaluation.scored_episode import IDEAL, NOMINAL
 from asm_gym.faults import Fault, Push
-from asm_gym.faults.anywhere import faults_anywhere, sigmas
+from asm_gym.faults.anywhere import FaultyInterface, faults_anywhere, sigmas
 from asm_gym.faults.body import touches_body
-from asm_gym.faults.interface import FaultyInterface
 from asm_gym.faults.sensor import corrupts_senses
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
 from asm_gym.policies import Policy, Seeded, make_policy, rollout

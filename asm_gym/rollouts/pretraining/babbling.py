@@ -25,8 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.episode import save_episode
-from asm_gym.faults.harmless import ObjectMass
-from asm_gym.faults.object import movable
+from asm_gym.faults.object import ObjectMass, movable
 from asm_gym.policies import Policy, make_policy
 from asm_gym.policies.registry import trained_in
 from asm_gym.policies.scripted.base import Style
