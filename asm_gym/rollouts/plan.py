@@ -9,7 +9,7 @@ import gymnasium as gym
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import anywhere
-from asm_gym.faults.interface import FaultyInterface
+from asm_gym.faults.anywhere import FaultyInterface
 from asm_gym.faults.suite import KINDS, kinds_of, possible
 from asm_gym.policies import make_policy
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
