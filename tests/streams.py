@@ -65,3 +65,20 @@ def frozen(episode: Episode, column: int, onset: int) -> Episode:
     stream = episode.stream.copy()
     stream[onset:, column] = stream[onset, column]
     return replace(episode, stream=stream)
+
+
+def pendulum_columns(rows: int = 6000, rate: float = 100.0, seed: int = 0) -> dict[str, np.ndarray]:
+    """Columns of a pendulum of two joints: friction with a sign, weight, inertia, noise."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(rows) / rate
+    w = np.array([[1.1, 2.3], [0.7, 1.9]])
+    q = sum(np.sin(np.outer(t, w[:, k]) + k) for k in range(2))
+    dq = sum(w[:, k] * np.cos(np.outer(t, w[:, k]) + k) for k in range(2))
+    ddq = -sum(w[:, k] ** 2 * np.sin(np.outer(t, w[:, k]) + k) for k in range(2))
+    effort = 5 * np.sin(q) + 2 * np.tanh(dq / 0.02) + 0.3 * dq + 0.2 * ddq
+    return {
+        "time": t,
+        "position": q + 1e-4 * rng.normal(size=q.shape),
+        "velocity": dq + 1e-3 * rng.normal(size=q.shape),
+        "effort": effort + 0.05 * rng.normal(size=q.shape),
+    }

@@ -1,0 +1,185 @@
+"""Monitors that judge a joint's values beside its changes, on a pendulum of two joints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from asm_gym.data.selection import pieces
+from asm_gym.detection import EvidenceDetection
+from asm_gym.detection.scores import Largest
+from asm_gym.episode import Episode
+from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_monitor
+from asm_gym.monitors.base import Surprise
+from asm_gym.monitors.baselines.arm_inputs import forces, motion, speeds
+from asm_gym.monitors.baselines.association_values import ValueAssociation
+from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.monitors.monitor import MonitorState
+from asm_gym.monitors.values import Values
+from asm_gym.spec import Channel, StreamSpec
+from tests.streams import pendulum_columns
+
+
+def test_values_are_told_from_the_others_with_friction_and_sines_and_not_without():
+    whole = Episode.from_table(pendulum_columns())
+    cut = pieces(whole, 1.0)
+    effort = slice(4, 6)
+
+    def told(**options: bool) -> np.ndarray:
+        model = ValueAssociation(whole.spec, **options)
+        model.fit(cut, np.random.default_rng(0), lambda done, total: None)
+        return model.learned_["R2_values"][effort]
+
+    assert told().min() > 0.99
+    assert told(friction=False).max() < told().min()
+    assert told(body=False).max() < told().min()
+
+
+def test_a_held_push_is_found_by_values_and_explained_away_by_changes():
+    whole = Episode.from_table(pendulum_columns())
+    cut = pieces(whole, 1.0)
+    faulty = [pushed(piece, 1.0) for piece in cut[45:]]
+    found = {}
+    for name in ("association_values+evidence", "association_linear+evidence"):
+        monitor = make_monitor(name, whole.spec).fit(cut[:30]).calibrate(cut[30:45], 0.07)
+        scores = monitor.score_episodes(faulty)
+        found[name] = np.mean([(s.value[90:] > monitor.threshold).any() for s in scores])
+    assert found["association_values+evidence"] > 0.9
+    assert found["association_linear+evidence"] < found["association_values+evidence"]
+
+
+def pushed(piece: Episode, size: float) -> Episode:
+    """From its middle on the first torque is so much more [N m], in a fifth of a second."""
+    stream, half = piece.stream.copy(), len(piece) // 2
+    stream[half:, 4] += size * np.minimum(1.0, np.arange(len(piece) - half) / 20)
+    return Episode.from_stream(stream, piece.spec)
+
+
+def test_torques_are_judged_however_well_they_are_told_and_where_an_arm_may_go_is_not():
+    columns = pendulum_columns(3000)
+    columns["effort"][:, 1] = 0.05 * np.random.default_rng(1).normal(size=3000)  # nothing tells it
+    cut = pieces(Episode.from_table(columns), 1.0)
+    model = ValueAssociation(cut[0].spec, changes=False).fit(cut, np.random.default_rng(0), lambda done, total: None)
+    assert forces(cut[0].spec).tolist() == model.error_columns.tolist() == [4, 5]
+    assert motion(cut[0].spec).tolist() == [0, 1, 2, 3]
+    assert model.learned_["R2_values"][5] < 0.5
+
+
+def test_an_error_far_from_what_was_learned_counts_for_less():
+    whole = Episode.from_table(pendulum_columns(3000))
+    cut = pieces(whole, 1.0)
+    model = ValueAssociation(whole.spec, changes=False).fit(cut, np.random.default_rng(0), lambda done, total: None)
+    state = model.start(1)
+    for row in whole.stream[:20].astype(np.float64):
+        state, _ = model.predict(state, row[None])
+    inside = np.ones((1, model.learned_["D"].shape[1]))
+    inside[:, :-1] = 0.0  # the middle of all that was shown
+    assert model._farther(inside).max() == 1.0
+    z = np.hstack([np.full((1, inside.shape[1] - 1), 30.0), np.ones((1, 1))])
+    far = model.learned_["far"][0]
+    assert model._farther(z)[0, 0] == pytest.approx(np.sqrt(z[0] @ far @ z[0]))
+    assert model._farther(2 * z)[0, 0] == pytest.approx(2 * model._farther(z)[0, 0])
+
+
+def test_a_memory_judges_values_beside_changes_and_keeps_both(tmp_path):
+    cut = pieces(Episode.from_table(pendulum_columns()), 1.0)
+    faulty = [pushed(piece, 1.0) for piece in cut[45:]]
+    found = {}
+    for values in (False, True):
+        asm = NeuralASM(cut[0].spec, hidden_size=16, association_size=32, epochs=2, values=values)
+        asm.fit(cut[:30]).calibrate(cut[30:45], 0.07)
+        found[values] = np.mean([(s.value[90:] > asm.threshold).any() for s in asm.score_episodes(faulty)])
+        asm.save(tmp_path / "x.asm")
+        again = load_monitor(tmp_path / "x.asm")
+        np.testing.assert_array_equal(again.score(faulty[0]).value, asm.score(faulty[0]).value)
+    assert found[True] > 0.9 > found[False]
+    score = asm.score(faulty[0])
+    np.testing.assert_allclose(score.attribution.sum(axis=1), score.value)
+    assert np.argmax(score.attribution[-1]) == 4
+    assert asm.values_.monitor is not None
+    body = asm.values_.monitor.score(faulty[0]).value
+    assert (score.value >= body).all()
+
+
+def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_says():
+    cut = pieces(Episode.from_table(pendulum_columns(3000)), 1.0)
+    values = Values.learned(cut[:20], seed=0)
+    assert values.monitor is not None
+    senses = values.monitor.model.senses_
+    z = [np.hstack([senses.read_episode(e.stream).inputs, np.ones((len(e), 1))]) for e in (*cut[:20], cut[25])]
+    shown, asked = np.concatenate(z[:-1]).astype(np.float64), z[-1].astype(np.float64)
+    inverse = np.linalg.inv(shown.T @ shown + 1e-2 * len(shown) * np.eye(shown.shape[1]))
+    h, usual = (np.einsum("ni,ij,nj->n", rows, inverse, rows) for rows in (asked, shown))
+    root = np.sqrt(np.maximum(1.0, (1.0 + 10 * h) / (1.0 + 10 * np.median(usual))))  # a tenth of a second is 10 rows
+    one = Surprise(np.ones(1), np.full((1, 6), 1 / 6))
+    state, found = values.start(1), []
+    for row in cut[25].stream.astype(np.float64):
+        found.append(values._farther(state, row[None])[0])
+        now, judged = values.step(state, row[None], MonitorState((), ()), one)
+        state = now.values
+        assert judged.value[0] >= 1 / found[-1] - 1e-12
+    lag = senses.lag
+    np.testing.assert_allclose(found[:lag], 1.0)  # no change is known yet
+    np.testing.assert_allclose(found[lag:], root[lag:], rtol=1e-4)
+    arrays = {name.removeprefix("values."): array for name, array in values.arrays.items()}
+    again = Values.found(cut[0].spec, arrays, seed=0)
+    np.testing.assert_array_equal(again.far, values.far)
+    older = Values.found(cut[0].spec, {n: a for n, a in arrays.items() if n not in ("leverage", "usual")}, seed=0)
+    assert older._farther(older.start(1), cut[0].stream[:1].astype(np.float64)) == pytest.approx([1.0])
+    with pytest.raises(ValueError, match="the leverage of values should be of shape"):
+        Values.found(cut[0].spec, arrays | {"leverage": np.eye(3)}, seed=0)
+
+
+def test_a_memory_of_what_nothing_tells_judges_changes_alone():
+    rng = np.random.default_rng(0)
+    spec = StreamSpec((Channel("a", 1), Channel("b", 1)), dt=0.05)
+    episodes = [Episode.from_stream(rng.normal(size=(60, 2)), spec) for _ in range(10)]
+    asm = NeuralASM(spec, hidden_size=8, association_size=8, epochs=1, values=True).fit(episodes)
+    assert asm.values_.monitor is None
+
+
+def test_it_is_saved_and_says_the_same_again(tmp_path):
+    cut = pieces(Episode.from_table(pendulum_columns(3000)), 1.0)
+    monitor = make_monitor("association_values+evidence", cut[0].spec).fit(cut)
+    monitor.save(tmp_path / "x.asm")
+    again = load_monitor(tmp_path / "x.asm")
+    np.testing.assert_array_equal(again.score(cut[3]).value, monitor.score(cut[3]).value)
+    assert isinstance(monitor.detection, EvidenceDetection)
+
+
+def test_speeds_are_known_by_name_or_are_changes_of_positions():
+    spec = Episode.from_table(pendulum_columns(100)).spec
+    assert speeds(spec)[0].tolist() == [2, 3]
+    columns = {"position": np.zeros((9, 2)), "current": np.zeros((9, 2))}
+    assert speeds(Episode.from_table(columns, rate=10).spec) == (pytest.approx([0, 1]), True)
+
+
+def test_the_rule_takes_friction_from_torque_and_needs_a_speed():
+    columns = pendulum_columns()
+    columns["effort"] -= 5 * np.sin(columns["position"])  # gravity is none of its business
+    whole = Episode.from_table(columns)
+    cut = pieces(whole, 1.0)
+    monitor = CalibratedMonitor(FrictionRule(whole.spec), Largest(whole.spec)).fit(cut[:30])
+    quiet = max(float(s.value.max()) for s in monitor.score_episodes(cut[30:]))
+    stream = cut[40].stream.copy()
+    stream[50:, 4] += 5.0
+    score = monitor.score(Episode.from_stream(stream, whole.spec))
+    assert score.value[:50].max() <= quiet < score.value[70:].min()
+    assert np.argmax(score.attribution[-1]) == 4
+    with pytest.raises(ValueError, match="a rule of friction needs a torque and a speed of each joint"):
+        FrictionRule(Episode.from_table({"q": np.zeros((9, 2))}, rate=10).spec)
+
+
+def test_a_body_model_is_one_more_column():
+    columns = pendulum_columns(3000)
+    q = columns["position"]
+    columns["effort"] += 4 * np.sin(q[:, :1] + q[:, 1:]) * np.array([1.0, np.cos(3 * q[:, 0]).mean()])
+    exact = columns["effort"] - 2 * np.tanh(columns["velocity"] / 0.02)
+    found = []
+    for known in (columns, {**columns, "computed_torque": exact}):
+        cut = pieces(Episode.from_table(known), 1.0)
+        model = ValueAssociation(cut[0].spec, changes=False, body=False)
+        model.fit(cut, np.random.default_rng(0), lambda done, total: None)
+        found.append(model.learned_["R2_values"][4:6].min())
+        assert forces(cut[0].spec).tolist() == [4, 5]
+    assert found[1] > found[0] + 0.1
