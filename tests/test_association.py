@@ -1,24 +1,37 @@
-"""Association and its precision, against gradients and known noise."""
+"""Association, its linear part, precision, cross-fitting and adaptation, against gradients and known noise."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from asm_gym.memory.association import (
+from asm_gym.detection import Promise, conformal_threshold
+from asm_gym.episode import Episode
+from asm_gym.memory.adaptation import followed, specialise
+from asm_gym.memory.association import Association, complete, existing, hidden_units, synapses
+from asm_gym.memory.association_learning import (
+    ALL_TICKS,
+    FEEDBACK,
+    LEARNED,
     ROWS_PER_INPUT,
-    Association,
+    TRANSPORTED,
     association_change,
-    complete,
-    hidden_units,
     learn_association,
-    synapses,
 )
-from asm_gym.memory.crossfit import trust
-from asm_gym.memory.energy import energy
+from asm_gym.memory.crossfit import THIRDS, crossfit, thirds, trust
 from asm_gym.memory.inference import direct_synapses
-from asm_gym.memory.learning import hebbian_change
-from asm_gym.memory.network import Network, initial_weights
+from asm_gym.memory.linear import (
+    FEW_PENALTY,
+    conditional,
+    learn_by_delta,
+    learn_from_past,
+    learn_linear,
+    moments,
+)
+from asm_gym.memory.network import Network
+from asm_gym.memory.network_learning import hebbian_change, initial_weights
 from asm_gym.memory.precision import (
     BATCH,
     BATCHES,
@@ -29,8 +42,13 @@ from asm_gym.memory.precision import (
     unbounded,
     usual_span,
 )
+from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.scaling import ScaledRows
-from tests.problems import CHANGES, some_association
+from asm_gym.spec import Channel, StreamSpec
+from tests.problems import CHANGES, energy, some_association
+from tests.streams import frozen, sine_episodes, sine_spec
+
+GROUPS = np.array([0, 0, 1, 2, 2])
 
 
 @pytest.mark.parametrize("rows", [8000, 3 * BATCH * BATCHES])
@@ -46,16 +64,12 @@ def test_precision_recovers_noise_that_depends_on_context(rows):
     assert np.sqrt(np.mean((learned - truth) ** 2)) < 0.15  # against 1.15 and 0.8 for the best constant
 
 
-def test_log_variance_stays_in_bounds():
+def test_log_variance_stays_within_its_limits_and_those_of_nominal_contexts():
     f = np.ones((2, 3), np.float32)
     for sign, bound in ((1, LARGEST), (-1, SMALLEST)):
         W_S = np.full((2, 3), sign * 100, np.float32)
         assert np.all(log_variance(f, W_S, np.zeros(2, np.float32), unbounded(2)) == bound)
-
-
-def test_no_context_makes_errors_more_usual_than_nominal_ones_did():
-    rng = np.random.default_rng(0)
-    f = np.tanh(rng.normal(size=(20_000, 3))).astype(np.float32)
+    f = np.tanh(np.random.default_rng(0).normal(size=(20_000, 3))).astype(np.float32)
     W_S, b_S = np.array([[1.0, 0, 0], [0, 2.0, -1.0]], np.float32), np.array([0.5, -1.0], np.float32)
     span = usual_span(f, W_S, b_S)
     driven = f @ W_S.T + b_S
@@ -65,7 +79,7 @@ def test_no_context_makes_errors_more_usual_than_nominal_ones_did():
     np.testing.assert_array_equal(beyond, span[::-1])
 
 
-def test_network_reports_the_errors_of_association_in_the_spread_that_is_expected_of_them():
+def test_the_network_normalises_errors_of_association_by_their_expected_spread():
     rng = np.random.default_rng(0)
     association = some_association(rng, 13, 6, 5)
     network = Network(initial_weights(8, 5, 2, rng), association, 20, 1.0, 1.0)
@@ -81,24 +95,15 @@ def test_network_reports_the_errors_of_association_in_the_spread_that_is_expecte
     np.testing.assert_allclose(found, whole * error * np.exp(-0.5 * (f @ W_S.T + b_S)), atol=1e-4)
 
 
-def test_nothing_is_predicted_from_its_own_group():
-    groups = np.array([0, 0, 1, 2, 2])
-    exists = synapses(groups, CHANGES, 13, size=4)
+def test_no_group_predicts_itself():
+    exists = synapses(GROUPS, CHANGES, 13, size=4)
     reaches = (exists.U @ exists.V > 0) | (exists.D > 0)  # (X, I)
-    assert np.array_equal(reaches[:, CHANGES], groups[:, None] != groups)
+    assert np.array_equal(reaches[:, CHANGES], GROUPS[:, None] != GROUPS)
     assert reaches[:, :5].all()
     assert reaches[:, 10:].all()
 
 
-def test_hidden_units_are_believed_as_far_as_fresh_rows_bear_them_out():
-    rng = np.random.default_rng(4)
-    expected = rng.normal(size=(4000, 4)).astype(np.float32)
-    left = expected * np.array([1.0, 0.5, 0.0, -1.0], np.float32) + 0.1 * rng.normal(size=expected.shape)
-    np.testing.assert_allclose(trust(left, expected), [1.0, 0.5, 0.0, 0.0], atol=0.02)
-    assert np.array_equal(trust(left, np.zeros_like(expected)), np.zeros(4))
-
-
-def test_what_is_linear_is_known_exactly_and_noise_is_not_learned_by_heart():
+def test_linear_relations_are_exact_and_noise_is_not_learned_by_heart():
     rng = np.random.default_rng(5)
     N = 400
     cause = rng.normal(size=(N, 2))
@@ -112,7 +117,7 @@ def test_what_is_linear_is_known_exactly_and_noise_is_not_learned_by_heart():
 
 
 def few(rows: int) -> Association:
-    """Association from rows of two groups with one cause, each change a line of the past and of noise they share."""
+    """Association from rows of two groups, each change linear in the past and in noise that they share."""
     rng = np.random.default_rng(6)
     past = rng.normal(size=(rows, 3))
     noise = rng.normal(size=(rows, 1))
@@ -121,57 +126,30 @@ def few(rows: int) -> Association:
     return learn_association(inputs, inputs[:, 3:5], np.array([0, 1]), slice(3, 5), 8, rng, updates=20)
 
 
-def test_from_few_rows_changes_are_expected_from_the_past_alone_and_by_a_line():
+def test_few_rows_teach_the_past_only_and_more_teach_other_senses_too():
     w = few(ROWS_PER_INPUT * 6 - 1)
-    for nothing in (w.U, w.W_S, w.b_S):
+    for nothing in (w.U, w.W_S, w.b_S, w.D[:, 3:5]):
         assert not nothing.any()
-    assert not w.D[:, 3:5].any()  # what the others do now
     np.testing.assert_allclose(w.D[:, :3], [[0.5, 0.0, 0.2], [0.0, -0.7, 0.2]], atol=0.12)
     np.testing.assert_allclose(w.remainder, 0.3, rtol=0.2)
-    assert w.V.any()  # units that names can be read from
-
-
-def test_from_more_rows_what_one_sense_tells_of_another_is_known():
+    assert w.V.any()  # units that skills are named from
     w = few(ROWS_PER_INPUT * 6)
     np.testing.assert_allclose([w.D[0, 4], w.D[1, 3]], 1.0, atol=0.05)
     assert w.U.any() or w.W_S.any()
 
 
-def test_where_nothing_is_linear_the_others_change_as_by_synapses_of_nothing():
+def test_a_missing_linear_part_changes_like_one_of_zeros():
     rng = np.random.default_rng(4)
     a, delta = rng.normal(size=(4, 13)).astype(np.float32), rng.normal(size=(4, 5)).astype(np.float32)
     V, U, D, *_ = some_association(rng, 13, 6, 5)
     nothing, spread = np.zeros_like(D), np.ones(5, np.float32)
     change, error = association_change(a, delta, spread, V, U, nothing[:, :0])
     expected, errors = association_change(a, delta, spread, V, U, nothing)
-    np.testing.assert_array_equal(change.V, expected.V)
-    np.testing.assert_array_equal(change.U, expected.U)
-    np.testing.assert_array_equal(error, errors)
+    for found, wanted in ((change.V, expected.V), (change.U, expected.U), (error, errors)):
+        np.testing.assert_array_equal(found, wanted)
 
 
-def test_association_changes_are_the_gradient_of_half_the_squared_error():
-    rng = np.random.default_rng(3)
-    a, delta = rng.normal(size=(4, 13)).astype(np.float32), rng.normal(size=(4, 5)).astype(np.float32)
-    V, U, D, *_ = some_association(rng, 13, 6, 5)
-    spread = np.full(5, 1e3, np.float32)  # no error is so large that it is cut off
-    change, error = association_change(a, delta, spread, V, U, D)
-
-    def loss(V, U, D):
-        e = delta - np.tanh(a @ V.T) @ U.T - a @ D.T
-        return 0.5 * np.sum(e**2) / len(a)
-
-    np.testing.assert_allclose(error, delta - np.tanh(a @ V.T) @ U.T - a @ D.T, atol=1e-5)
-    exact = [W.astype(np.float64) for W in (V, U, D)]
-    for n, found in enumerate(change):
-        for place in [(0, 0), (2, 3), (4, 5)]:
-            up, down = ([W.copy() for W in exact] for _ in range(2))
-            up[n][place] += 1e-5
-            down[n][place] -= 1e-5
-            slope = (loss(*up) - loss(*down)) / 2e-5
-            assert found[place] * spread[0] == pytest.approx(-slope, rel=1e-2, abs=1e-4)
-
-
-def test_association_learns_what_ties_the_senses_together_and_how_sure_that_is():
+def test_hidden_units_learn_nonlinear_relations_and_their_noise():
     rng = np.random.default_rng(0)
     N = 6000
     cause = rng.normal(size=(N, 2))
@@ -183,12 +161,10 @@ def test_association_learns_what_ties_the_senses_together_and_how_sure_that_is()
     error = (delta - complete(f, inputs, w.U, w.D))[:, 2:]
     deviation = (w.remainder * np.exp(0.5 * log_variance(f, w.W_S, w.b_S, w.span_S)))[:, 2:]
     assert error.std() < 0.25  # 0.15 is the noise alone, 0.66 the best that a line could do
-    rough = cause[:, 0] > 0.5
-    calm = cause[:, 0] < -0.5
-    assert deviation[rough].mean() > 1.8 * deviation[calm].mean()
+    assert deviation[cause[:, 0] > 0.5].mean() > 1.8 * deviation[cause[:, 0] < -0.5].mean()
 
 
-def test_both_parts_of_the_memory_descend_one_energy():
+def test_all_rules_of_the_memory_descend_one_energy():
     rng = np.random.default_rng(3)
     B, H, S, A, units, inputs = 4, 6, 5, 2, 7, 13
     w = initial_weights(H, S, A, rng)
@@ -222,3 +198,267 @@ def test_both_parts_of_the_memory_descend_one_energy():
                 moved[index] += step
                 ends.append(total({**W, name: moved}))
             assert rules[name][index] == pytest.approx(-(ends[0] - ends[1]) / 2e-5, rel=1e-3, abs=1e-4), name
+
+
+def left_by(feedback):
+    """The association taught so, and the deviation that it leaves: 0.65 by a line, 0.05 by the noise alone."""
+    rng = np.random.default_rng(0)
+    cause = rng.normal(size=(3000, 2))
+    delta = np.hstack([cause, np.sin(2 * cause) + 0.05 * rng.normal(size=cause.shape)]).astype(np.float32)
+    a = np.hstack([delta, np.ones((len(delta), 2))]).astype(np.float32)
+    layout = np.array([0, 0, 1, 1]), slice(0, 4), 20
+    w = learn_association(a, delta, *layout, np.random.default_rng(1), updates=500, feedback=feedback)
+    return w, float((delta - complete(hidden_units(a, w.V), a, w.U, w.D))[:, 2:].std())
+
+
+@pytest.mark.parametrize("way", FEEDBACK)
+def test_hidden_units_learn_by_each_feedback(way):
+    assert left_by(FEEDBACK[way]())[1] < 0.45
+
+
+def test_learned_feedback_approaches_the_weights_that_predict():
+    learned = FEEDBACK[LEARNED]()
+    w, _ = left_by(learned)
+    U = w.U / w.remainder[:, None]
+    assert np.sum(U * learned.B) > 0.9 * np.linalg.norm(U) * np.linalg.norm(learned.B)
+    assert not (learned.B[U == 0] != 0).any()
+
+
+def test_the_delta_rule_approaches_the_closed_form():
+    rng = np.random.default_rng(2)
+    a = np.hstack([rng.normal(size=(4000, 6)) @ rng.normal(size=(6, 6)), np.ones((4000, 1))]).astype(np.float32)
+    groups, changes = np.array([0, 0, 1]), slice(0, 3)
+    exists = synapses(groups, changes, 7, 1).D
+    exact, local = learn_linear(a, groups, changes), learn_by_delta(a, changes, exists, rng)
+    left = [np.std(a[:, changes] - a @ D.T, axis=0) for D in (local, exact)]
+    assert (left[0] < 1.02 * left[1]).all()
+    assert not local[exists == 0].any()
+
+
+def test_a_memory_keeps_its_feedback_and_refuses_an_unknown_one(tmp_path):
+    episodes = sine_episodes(16)
+    asm = NeuralASM(episodes[0].spec, 8, 16, epochs=1, feedback=TRANSPORTED).fit(episodes)
+    asm.save(tmp_path / "a.asm")
+    assert NeuralASM.load(tmp_path / "a.asm").model.feedback == TRANSPORTED
+    with pytest.raises(ValueError, match=r"feedback 'none'; known: .*learned"):
+        NeuralASM(episodes[0].spec, feedback="none")
+
+
+def test_thirds_are_of_whole_episodes_and_of_similar_size():
+    lengths = [5, 9, 1, 7, 30, 2, 4, 8]
+    third = thirds(sum(lengths), lengths, np.random.default_rng(0))
+    whole = np.split(third, np.cumsum(lengths)[:-1])
+    assert all(len(set(rows)) == 1 for rows in whole)
+    assert sorted(np.bincount([rows[0] for rows in whole])) == [2, 3, 3]
+    skill = np.arange(60) % THIRDS  # episodes that alternate between skills
+    third = thirds(60, [1] * 60, np.random.default_rng(0))
+    assert all(len(set(third[skill == s])) == THIRDS for s in range(THIRDS))
+    for few_episodes in ((), (10,), (3, 7)):
+        assert thirds(10, few_episodes, np.random.default_rng(0)).tolist() == [0, 0, 0, 0, 1, 1, 1, 2, 2, 2]
+
+
+def test_crossfit_predicts_every_row_without_it():
+    rng = np.random.default_rng(1)
+    truth = rng.normal(size=(60, 2)).astype(np.float32)
+    third = thirds(60, [6] * 10, rng)
+
+    def mean(learned_from, asked):
+        assert (learned_from != asked).all()
+        return np.repeat(truth[learned_from].mean(axis=0, keepdims=True), asked.sum(), axis=0)
+
+    by_hand = np.array([truth[third != third[n]].mean(axis=0) for n in range(60)])
+    np.testing.assert_allclose(crossfit(mean, third, 2), by_hand, atol=1e-6)
+
+
+def test_trust_is_the_share_of_predictions_that_fresh_rows_confirm():
+    rng = np.random.default_rng(4)
+    expected = rng.normal(size=(4000, 4)).astype(np.float32)
+    left = expected * np.array([1.0, 0.5, 0.0, -1.0], np.float32) + 0.1 * rng.normal(size=expected.shape)
+    np.testing.assert_allclose(trust(left, expected), [1.0, 0.5, 0.0, 0.0], atol=0.02)
+    assert np.array_equal(trust(left, np.zeros_like(expected)), np.zeros(4))
+
+
+def lesson(rng: np.random.Generator, episodes: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs and changes of two groups; each episode bends their relation in a way of its own, as skills do."""
+    rows = []
+    for _ in range(episodes):
+        cause, own = rng.normal(size=(steps, 2)), rng.normal(size=2)
+        bent = np.sin(2 * cause) + 0.5 * np.cos(3 * cause + own) + 0.05 * rng.normal(size=cause.shape)
+        rows.append(np.hstack([cause, bent]))
+    delta = np.concatenate(rows).astype(np.float32)
+    return np.hstack([delta, np.ones((len(delta), 1), np.float32)]), delta
+
+
+def test_precision_is_that_of_rows_that_were_not_learned():
+    rng = np.random.default_rng(2)
+    layout, ticks = (np.array([0, 0, 1, 1]), slice(0, 4), 64), []
+    inputs, delta = lesson(rng, 12, 50)
+    w = learn_association(inputs, delta, *layout, rng, lambda: ticks.append(1), passes=400, lengths=[50] * 12)
+    assert len(ticks) == ALL_TICKS
+    inputs, delta = lesson(rng, 100, 50)
+    f = hidden_units(inputs, w.V)
+    error = (delta - complete(f, inputs, w.U, w.D)) / w.remainder
+    assert 0.6 < np.mean(error**2 * np.exp(-log_variance(f, w.W_S, w.b_S, w.span_S))) < 1.7
+
+
+@pytest.mark.parametrize("penalty", [1e-6, 0.1, 10.0])
+def test_one_inverse_gives_the_ridge_regression_of_every_group_on_all_else(penalty):
+    a = mixed_rows().astype(np.float64)
+    D = conditional(moments(a), penalty, GROUPS, CHANGES)
+    for g in range(3):
+        own = np.arange(5, 10)[g == GROUPS]
+        others = np.setdiff1d(np.arange(12), own)
+        X, Y = a[:, others] - a[:, others].mean(axis=0), a[:, own] - a[:, own].mean(axis=0)
+        W = np.linalg.solve(X.T @ X / len(X) + penalty * np.eye(len(others)), X.T @ Y / len(X))
+        np.testing.assert_allclose(D[g == GROUPS][:, others], W.T, atol=1e-6)
+        assert not D[g == GROUPS][:, own].any()
+        np.testing.assert_allclose(a @ D[g == GROUPS].T - a[:, own], X @ W - Y, atol=1e-5)
+
+
+def mixed_rows(N: int = 500) -> np.ndarray:
+    """(N, 13) inputs that depend on each other, with means, the last a constant 1."""
+    rng = np.random.default_rng(0)
+    mixed = rng.normal(size=(N, 12)) @ rng.normal(size=(12, 12)) + rng.normal(size=12)
+    return np.hstack([mixed, np.ones((N, 1))]).astype(np.float32)
+
+
+def test_few_rows_give_the_ridge_regression_on_everything_but_changes():
+    a = mixed_rows(60)
+    D, exact = learn_from_past(a, CHANGES), a.astype(np.float64)
+    past = np.setdiff1d(np.arange(12), np.arange(12)[CHANGES])
+    X, Y = (exact[:, part] - exact[:, part].mean(axis=0) for part in (past, CHANGES))
+    W = np.linalg.solve(X.T @ X / len(X) + FEW_PENALTY * np.eye(len(past)), X.T @ Y / len(X))
+    np.testing.assert_allclose(D[:, past], W.T, atol=1e-5)
+    assert not D[:, CHANGES].any()
+    np.testing.assert_allclose((exact @ D.T).mean(axis=0), exact[:, CHANGES].mean(axis=0), atol=1e-4)
+
+
+def test_each_sense_gets_the_penalty_that_held_out_rows_choose():
+    rng = np.random.default_rng(1)
+    N = 60
+    noise = rng.normal(size=(N, 40))
+    exact = noise[:, :3] @ [0.5, -1.0, 2.0]
+    a = np.column_stack([noise, exact, rng.normal(size=N), np.ones(N)]).astype(np.float32)
+    D = learn_linear(a, np.array([0, 1]), slice(40, 42))
+    np.testing.assert_allclose(D[0, :3], [0.5, -1.0, 2.0], atol=1e-3)
+    assert np.abs(D[1, :-1]).max() < 0.02  # by least squares it would be 0.5 and more
+
+
+def test_few_rows_constants_and_copies_stay_finite():
+    for N in (1, 2, 4, 5, 30):
+        a = mixed_rows(N)
+        a[:, 6] = a[:, 7]  # a copy in another group
+        a[:, 8] = 3.0
+        D = learn_linear(a, GROUPS, CHANGES)
+        assert np.isfinite(D).all()
+        np.testing.assert_allclose(a[:, 8] - a @ D[3], 0.0, atol=1e-3)
+    assert D[1, 7] == pytest.approx(1.0, abs=1e-2)
+
+
+@pytest.mark.parametrize("name", ["neural_asm", "association_linear"])
+def test_a_stream_too_wide_for_all_against_all_is_refused(name):
+    spec = StreamSpec((Channel("pixels", 10_000), Channel("action", 1, group="action")), dt=0.05)
+    episode = Episode.from_stream(np.random.default_rng(0).normal(size=(4, 10_001)), spec)
+    with pytest.raises(ValueError, match=r"at most 8192 of them"):
+        make_monitor(name, spec).fit([episode])
+
+
+def test_following_removes_the_share_of_an_error_that_was_asked_for():
+    rng = np.random.default_rng(0)
+    w = some_association(rng, 13, 6, 5)
+    a, delta = rng.normal(size=(1, 13)).astype(np.float32), rng.normal(size=(1, 5)).astype(np.float32)
+    w = w._replace(remainder=np.full(5, 100.0, np.float32))  # no error is clipped
+
+    def error(w):
+        return delta - complete(hidden_units(a, w.V), a, w.U, w.D)
+
+    np.testing.assert_allclose(error(followed(w, existing(w), a, delta, 0.25)), 0.75 * error(w), rtol=1e-3, atol=1e-4)
+
+
+SIZES = {"hidden_size": 8, "association_size": 24, "epochs": 2}
+
+
+@pytest.fixture(scope="module")
+def body():
+    """A memory of sines, calibrated."""
+    memory = NeuralASM(sine_spec(), **SIZES).fit(sine_episodes(40))
+    memory.about = {"name": "sines"}
+    return memory.calibrate(sine_episodes(40, seed=1), 0.1)
+
+
+def worn(episodes: list[Episode], gain: float = 0.6) -> list[Episode]:
+    """The same with a sense of smaller gain."""
+    gains = np.where(np.arange(sine_spec().size) == 3, gain, 1.0).astype(np.float32)
+    return [replace(e, stream=e.stream * gains) for e in episodes]
+
+
+@pytest.mark.parametrize("changed", [False, True])
+def test_specialising_learns_what_changed_and_forgets_nothing(body, changed):
+    def rows(episodes):
+        episodes = worn(episodes) if changed else episodes
+        inputs = np.concatenate([senses.read_episode(e.stream).inputs[1:] for e in episodes])
+        return inputs, inputs[:, senses.changes]
+
+    senses, known = body.senses_, body.network_.association
+    before = [array.copy() for array in known]
+    layout = senses.groups, senses.changes, body.association_size // (int(senses.groups.max()) + 1)
+    now = specialise(known, *rows(sine_episodes(10, seed=2)), *layout)
+    for array, old in zip(known, before, strict=True):
+        np.testing.assert_array_equal(array, old)
+    a, delta = rows(sine_episodes(20, seed=3))
+
+    def left(w):
+        return np.mean((delta - complete(hidden_units(a, w.V), a, w.U, w.D)) ** 2, axis=0)
+
+    assert left(now).sum() < (0.5 if changed else 1.1) * left(known).sum()
+    exists = synapses(senses.groups, senses.changes, senses.inputs, layout[2])
+    assert not (now.D * (1 - exists.D)).any()
+    assert not (now.U * (1 - exists.U)).any()
+
+
+def test_a_specialised_memory_is_calm_where_the_body_alarms_and_finds_what_freezes(body):
+    asm = body.with_threshold(body.threshold)  # a copy
+    asm.fit(worn(sine_episodes(20, seed=5)), warm_start=True)
+    for name, learned in body.detection.learned_.items():
+        np.testing.assert_array_equal(asm.detection.learned_[name], learned)
+    with pytest.raises(RuntimeError, match="no threshold"):
+        _ = asm.threshold
+    asm.calibrate(worn(sine_episodes(20, seed=6)), 0.1)
+    fresh = worn(sine_episodes(30, seed=7))
+    assert np.mean([(s.value > asm.threshold).any() for s in asm.score_episodes(fresh)]) < 0.35
+    assert np.mean([(s.value > body.threshold).any() for s in body.score_episodes(fresh)]) > 0.8
+    stuck = asm.score_episodes([frozen(e, 5, 20) for e in fresh])
+    assert np.mean([(s.value[20:] > asm.threshold).any() for s in stuck]) > 0.9
+    assert asm.about == {"name": "sines", "specialised_on": 20}
+    assert body.about == {"name": "sines"}
+
+
+def test_a_warm_start_needs_a_memory_that_has_learned(body):
+    with pytest.raises(RuntimeError, match="learned nothing"):
+        NeuralASM(sine_spec(), **SIZES).fit(sine_episodes(4), warm_start=True)
+    kalman = make_monitor("kalman", sine_spec()).fit(sine_episodes(4))
+    with pytest.raises(TypeError, match="warm_start"):
+        kalman.fit(sine_episodes(4), warm_start=True)
+    with pytest.raises(ValueError, match="at least one episode"):
+        body.fit([], warm_start=True)
+
+
+def test_a_promise_holds_on_average_and_nearly_always_below_its_bound():
+    rng, n, rate = np.random.default_rng(0), 40, 0.05
+    shares, promises = [], []
+    for _ in range(4000):
+        maxima = rng.random(n)
+        threshold = conformal_threshold(maxima, rate)
+        shares.append(1.0 - threshold)  # of fresh episodes, whose maxima are uniform too
+        promises.append(Promise.of(maxima, threshold))
+    assert np.mean(shares) == pytest.approx(promises[0].rate, abs=0.002)
+    assert promises[0].rate <= rate
+    assert np.mean(np.array(shares) <= promises[0].at_most) == pytest.approx(0.95, abs=0.015)
+
+
+def test_twenty_episodes_promise_what_they_can(body):
+    asm = body.with_threshold(body.threshold)
+    with pytest.raises(ValueError, match=r"at least 99 nominal episodes, got 20, .* 0\.048 at best"):
+        asm.calibrate(sine_episodes(20, seed=8), 0.01)
+    promise = asm.calibrate(sine_episodes(20, seed=8), 0.048).promise
+    assert promise == Promise(20, pytest.approx(1 / 21), pytest.approx(1 - 0.05 ** (1 / 20)))

@@ -10,6 +10,7 @@ import re
 
 import numpy as np
 import pytest
+from asm_gym.scripts.reproduce.laws import LAWS, fit
 
 from asm_gym.scripts.cli import main as cli
 from asm_gym.scripts.reproduce import (
@@ -28,7 +29,6 @@ from asm_gym.scripts.reproduce.expression import (
 )
 from asm_gym.scripts.reproduce.handwriting import NOISE, STEPS, copybook, repertoire
 from asm_gym.scripts.reproduce.kit import Config, over_seeds, shown
-from asm_gym.scripts.reproduce.laws import LAWS, fit
 
 
 def letters_of(count: int, each: int = 6, seed: int = 0) -> tuple[list, list]:

@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 
 from asm_gym.checkpoint import read_checkpoint
 from asm_gym.episode import Episode
 from asm_gym.memory.inference import infer
 from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.practice import LONGEST_CUE, Practice, one_after_another
 from asm_gym.memory.recall import follow, run_on
-from asm_gym.memory.scheduled_sampling import LONGEST_CUE, one_after_another
 from asm_gym.memory.settling import SettlingNetwork, SettlingWeights
 from asm_gym.memory.settling_learning import (
     SettlingLearner,
-    SettlingStreams,
     initial_settling_weights,
     learn_settling,
     settling_change,
 )
 from asm_gym.memory.temporal import unassociated
 from asm_gym.monitors import NeuralASM, load_monitor
-from asm_gym.policies import NeuralASMPolicy
 from asm_gym.spec import Channel, StreamSpec
-from asm_gym.wrappers import NeuralASMSafety
+from tests.problems import some_rows
 from tests.streams import frozen, sine_episodes, sine_spec
 
 H, S, A = 7, 4, 2
@@ -42,10 +37,7 @@ def network(iterations: int = 20) -> SettlingNetwork:
 
 
 def rows(steps: int, batch: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(1)
-    commands = rng.normal(size=(steps, batch, A + 1))
-    commands[:, :, -1] = 1.0
-    return rng.normal(size=(steps, batch, S)).astype(np.float32), commands.astype(np.float32)
+    return some_rows(steps, batch, S, A)
 
 
 def total_energy(w: SettlingWeights, before, u, x, z, pi_z, pi_x) -> float:
@@ -160,12 +152,11 @@ def some_trajectories(count: int) -> list[Trajectory]:
 def test_learning_sees_the_energy_that_the_network_has():
     net, (senses, commands) = network(), rows(1)
     step = net.follow(net.at_rest(3), commands[0], senses[0], np.ones_like(senses[0]))
-    learned = SettlingLearner(net.weights, SCHEDULE, np.random.default_rng(0)).step(
-        net.at_rest(3), commands[0], senses[0], rate=0.0
-    )
+    learner = SettlingLearner(net.weights, SCHEDULE, np.random.default_rng(0))
+    _, z, energy = learner.step(net.at_rest(3), commands[0], senses[0], rate=0.0)
     total = 3 * total_energy(net.weights, net.at_rest(3), commands[0], senses[0], step.z, 1.0, 1.0)
-    assert learned.energy == pytest.approx(total, rel=1e-4)
-    np.testing.assert_allclose(learned.z, step.z, atol=1e-3)  # the norm is that of twenty power iterations
+    assert energy == pytest.approx(total, rel=1e-4)
+    np.testing.assert_allclose(z, step.z, atol=1e-3)  # the norm is that of twenty power iterations
 
 
 def test_learning_lowers_the_energy_and_is_reproducible():
@@ -184,7 +175,8 @@ def test_learning_lowers_the_energy_and_is_reproducible():
 @pytest.mark.parametrize("free", [0.0, 1.0])
 def test_after_the_cue_the_state_that_was_expected_is_carried_on(free):
     episode, net = some_trajectories(1)[0], network()
-    streams = SettlingStreams(SettlingLearner(net.weights, SCHEDULE, np.random.default_rng(0)), 1)
+    rng = np.random.default_rng(0)
+    streams = Practice(SettlingLearner(net.weights, SCHEDULE, rng), 1, rng)
     moments = one_after_another([episode], 1, np.random.default_rng(0))
     first = next(m for m in moments if m.begins.all())
     streams.run([first], 0.0, free)
@@ -198,7 +190,7 @@ def test_after_the_cue_the_state_that_was_expected_is_carried_on(free):
         z = follow(net, net.at_rest(1), episode.senses[: length - 1, None], episode.commands[: length - 1, None]).traces
         z = net.follow(z, episode.commands[length - 1 : length], np.zeros((1, S), np.float32), np.zeros((1, S))).mu
         z = run_on(net, z, T - length).traces if length < T else z
-    np.testing.assert_allclose(streams.z, z, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(streams.state, z, rtol=1e-3, atol=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -266,55 +258,6 @@ def test_a_memory_of_fewer_senses_settles_where_it_would_had_it_never_seen_them(
         small = fewer.model.network.follow(small, v[None], y[None], np.ones((1, len(y)), np.float32)).traces
         np.testing.assert_allclose(small, z, atol=2e-4)
     assert np.isfinite(fewer.score(Episode.from_stream(left, fewer.spec)).value).all()
-
-
-class Sliding(gym.Env[Any, Any]):
-    """A point that a command moves."""
-
-    metadata = {"render_fps": 20}  # noqa: RUF012
-
-    def __init__(self) -> None:
-        self.observation_space = spaces.Box(-9.0, 9.0, (3,), np.float32)
-        self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        self.at, self.t = self.np_random.normal(size=3), 0
-        return self.at.astype(np.float32), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self.t += 1
-        self.at = self.at + 0.1 * np.asarray(action) + 0.01 * self.np_random.normal(size=3)
-        return self.at.astype(np.float32), 0.0, False, self.t >= 40, {}
-
-
-def test_it_guards_and_acts_as_any_memory_does():
-    env, rng, episodes = Sliding(), np.random.default_rng(0), []
-    spec = StreamSpec.from_spaces(env.observation_space, env.action_space, 0.05)
-    for seed in range(40):
-        at, _ = env.reset(seed=seed)
-        made, action = [np.concatenate([at, np.zeros(3)])], np.zeros(3)
-        for _ in range(39):
-            action = np.clip(-at + 0.1 * rng.normal(size=3), -1, 1)
-            at, *_ = env.step(action)
-            made.append(np.concatenate([at, action]))
-        episodes.append(Episode.from_stream(np.array(made, np.float32), spec))
-    asm = NeuralASM(spec, 16, 24, epochs=200, dynamics="settling").fit(episodes[:20]).calibrate(episodes[20:], 0.1)
-    guarded = NeuralASMSafety(Sliding(), asm, on_alarm="hold")
-    _, info = guarded.reset(seed=1)
-    for _ in range(10):
-        *_, info = guarded.step(np.zeros(3, np.float32))
-    assert np.isfinite(info["asm"]["surprise"])
-    policy = NeuralASMPolicy(asm, Sliding())
-    left = []
-    for seed in range(5):
-        at, _ = env.reset(seed=100 + seed)
-        away, state = np.linalg.norm(at), None
-        for t in range(30):
-            action, state = policy.predict(at, state, np.array([t == 0]))
-            at, *_ = env.step(action)
-        left.append(np.linalg.norm(at) / away)
-    assert np.mean(left) < 0.3
 
 
 def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):

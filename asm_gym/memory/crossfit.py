@@ -1,12 +1,11 @@
-"""Cross-fitting: what would be expected of each row by whoever has not learned from it.
+"""Cross-fitting: predict every row by what was learned without it.
 
-    Δ̂_n = the expectation of row n by what was learned from the two thirds of the episodes that n is not in
-    c = Σ_n ψ(Δ_n) Δ̂_n / Σ_n Δ̂_n², kept within 0 and 1           how far such expectations are to be believed
+    Δ̂_n = prediction of row n by what was learned from the two thirds of the episodes that n is not in
+    c = Σ_n ψ(Δ_n) Δ̂_n / Σ_n Δ̂_n², clipped to [0, 1]               share of such predictions to believe
 
-Rows of one episode are much alike, so thirds are of whole episodes, drawn at random. Each row is asked once, and none
-is left out of the final learning, which is from all of them.
+Rows of one episode are alike, so thirds are of whole episodes, drawn at random.
 
-Sources: Stone 1974 (cross-validation), Chernozhukov et al. 2018 (Econometrics Journal) for the name and the use.
+Sources: Stone 1974 (cross-validation); Chernozhukov et al. 2018 (Econometrics Journal) for the name and the use.
 """
 
 from __future__ import annotations
@@ -20,20 +19,20 @@ from asm_gym.memory.energy import Array
 
 THIRDS = 3
 
-DOUBTED = 3.0
-"""Standard deviations that an error counts at most where the hidden units are tried."""
+LARGEST_ERROR = 3.0
+"""Standard deviations to which errors are clipped in ``trust``."""
 
 SMALLEST_SPREAD = np.float32(1e-4)
-"""Of what is left of a change: below it, single precision is what is heard."""
+"""Spread below which single precision is noise."""
 
 
 def thirds(rows: int, lengths: Sequence[int], rng: np.random.Generator) -> NDArray[np.intp]:
-    """(N,) which third each of ``rows`` is in: 0, 1 or 2.
+    """Return the third (N,) of each row: 0, 1 or 2.
 
     Args:
         rows: N.
-        lengths: of the episodes, which add up to N. With fewer than three of them, thirds are of rows that follow
-            each other.
+        lengths: rows of each episode. With fewer than three episodes, thirds are of consecutive rows.
+        rng: draws the third of each episode.
     """
     if len(lengths) >= THIRDS:
         return np.repeat(rng.permutation(len(lengths)) % THIRDS, lengths)
@@ -43,11 +42,11 @@ def thirds(rows: int, lengths: Sequence[int], rng: np.random.Generator) -> NDArr
 def crossfit(
     expect: Callable[[NDArray[np.bool_], NDArray[np.bool_]], Array], third: NDArray[np.intp], size: int
 ) -> Array:
-    """(N, X) what is expected of each row by what was learned from the other thirds.
+    """Return the prediction (N, X) of each row by what was learned from the other thirds.
 
     Args:
-        expect: learns from the rows that a mask (N,) names, and expects (M, X) of the M rows that another one does.
-        third: (N,) as ``thirds`` has it.
+        expect: learns from the rows of one mask (N,), and predicts (M, X) the M rows of another.
+        third: (N,) of ``thirds``.
         size: X.
     """
     found = np.zeros((len(third), size), np.float32)
@@ -58,7 +57,8 @@ def crossfit(
 
 
 def trust(left: Array, expected: Array) -> Array:
-    """(X,) in [0, 1]: what share of the ``expected`` (N, X) leaves the least of what was ``left`` (N, X) to expect."""
+    """Return c (X,) in [0, 1]: the share of the predictions (N, X) that leaves the least of the targets (N, X)."""
     known = np.sum(expected**2, axis=0)
-    share: Array = np.sum(np.clip(left, -DOUBTED, DOUBTED) * expected, axis=0) / np.maximum(known, SMALLEST_SPREAD)
+    clipped = np.clip(left, -LARGEST_ERROR, LARGEST_ERROR)
+    share: Array = np.sum(clipped * expected, axis=0) / np.maximum(known, SMALLEST_SPREAD)
     return np.clip(share, 0.0, 1.0).astype(np.float32)

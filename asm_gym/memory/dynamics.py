@@ -1,32 +1,46 @@
-"""The ways to carry on what was, by name: what each is made of, how it learns, and what it learns best with.
+"""The two temporal networks by name, and the training of a whole memory.
 
-traces      what was sensed and done is carried on, decaying at fixed rates; a state follows from it     ``network``
-settling    the state itself is carried on, by learned synapses, and is inferred on every row           ``settling``
+    traces      traces of senses and actions are carried on, and the state follows from them     ``network``
+    settling    the state is carried on by learned synapses, and is inferred on every row        ``settling``
+
+Every synapse descends its own term of
+
+    F = ½ Π_z ‖z - μ‖² + ½ Π_x ‖[x, a] - [x̂, â](z)‖² + Σ_i σ_i ρ(e_i/σ_i),     e = Δ - D a - U f(V a)
+    ρ(r) = ½ r² for |r| ≤ 1, |r| - ½ beyond;     D in closed form, for ρ(r) = ½ r²
+
+The last sum is that of association. It shares rows and no state with the first two.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.memory.association_learning import ALL_TICKS, Feedback, learn_association
 from asm_gym.memory.inference import Weights, weight_shapes
-from asm_gym.memory.network import Network, learn_traces
+from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.network import Network
+from asm_gym.memory.network_learning import learn_traces
+from asm_gym.memory.practice import passes
 from asm_gym.memory.settling import SettlingNetwork, SettlingWeights, settling_shapes
 from asm_gym.memory.settling_learning import learn_settling
-from asm_gym.memory.temporal import Learn, TemporalNetwork
+from asm_gym.memory.temporal import Learn, TemporalNetwork, Trained
 
 TRACES, SETTLING = "traces", "settling"
 
 
 class Dynamics(NamedTuple):
-    """One way to carry on what was."""
+    """A kind of temporal network."""
 
-    shapes: Callable[[int, int, int], dict[str, tuple[int, ...]]]  # of the synapses, by name, for H, S and A
+    shapes: Callable[[int, int, int], dict[str, tuple[int, ...]]]  # of its synapses by name, for H, S and A
     weights: Callable[..., Any]  # all synapses together
-    network: Callable[..., TemporalNetwork]  # what runs by them
+    network: Callable[..., TemporalNetwork]
     learn: Learn
-    iterations: int  # unless asked otherwise
-    prior_precision: float
+    iterations: int  # default
+    prior_precision: float  # default
 
 
 DYNAMICS = {
@@ -38,5 +52,48 @@ DYNAMICS = {
 
 
 def dynamics_of(names: Collection[str]) -> str:
-    """Which dynamics the arrays of these names are of: one alone has synapses from state to state."""
+    """Return the dynamics whose arrays have these names."""
     return SETTLING if "W_H" in names else TRACES
+
+
+def train(
+    trajectories: Sequence[Trajectory],
+    groups: NDArray[np.intp],
+    changes: slice,
+    hidden: int,
+    units: int,
+    schedule: Schedule,
+    rng: np.random.Generator,
+    progress: Callable[[int, int], object] | None = None,
+    feedback: Feedback | None = None,
+    dynamics: str = TRACES,
+) -> Trained:
+    """Learn the synapses through time, then those of association, from whole episodes.
+
+    Args:
+        trajectories: the episodes.
+        groups: (X,) group number of each change.
+        changes: columns of the changes among the inputs of association.
+        hidden: H.
+        units: hidden units of association for each group.
+        schedule: of the temporal network.
+        rng: draws everything random.
+        progress: called with steps done and their total.
+        feedback: how errors come back to the hidden units of association; transported where None.
+        dynamics: one of ``DYNAMICS``.
+    """
+    done, total = 0, passes(trajectories, schedule) + ALL_TICKS
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    network, energy = DYNAMICS[dynamics].learn(trajectories, hidden, schedule, rng, tick)
+    inputs, lengths = np.concatenate([t.inputs for t in trajectories]), [len(t.inputs) for t in trajectories]
+    deltas, layout = np.ascontiguousarray(inputs[:, changes]), (groups, changes, units)
+    independent = sum(len(t.senses) for t in trajectories)  # changes over several rows overlap
+    how = {"feedback": feedback, "lengths": lengths, "independent": independent}
+    association = learn_association(inputs, deltas, *layout, rng, tick, **how)
+    return Trained(network.with_association(association), energy)

@@ -29,13 +29,13 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def kernel(function: F) -> F:
-    """Compiles ``function``, once a machine; its inputs must be finite, so that loops can use vector registers."""
+    """Compile ``function``, once a machine. Inputs must be finite, so that loops can use vector registers."""
     return compiled(function, fastmath=True)
 
 
 @kernel
 def activate(z: Array) -> Array:
-    """f(z) = tanh(z) to 5e-7, as a ratio of polynomials (Eigen's), which unlike libm's runs in vector registers."""
+    """Return tanh(z) to 5e-7, by Eigen's ratio of polynomials, which unlike libm's runs in vector registers."""
     out = np.empty_like(z)
     flat, result = z.reshape(-1), out.reshape(-1)
     for j in range(flat.size):
@@ -56,10 +56,10 @@ def activate(z: Array) -> Array:
 
 @kernel
 def outward(a: Array, W: Array) -> Array:
-    """a @ W.T: (B, P) from (B, Q), along the synapses ``W`` (P, Q).
+    """Return a @ W.T, (B, P) from (B, Q), along the synapses ``W`` (P, Q).
 
-    A single row is summed here and not by BLAS, whose threads cost more than so small a product; four synapses at a
-    time, for which the processor fetches weights faster than for one.
+    A single row is summed here, as BLAS threads cost more than so small a product, and four rows of W at a time, which
+    is faster than one.
     """
     out = np.empty((a.shape[0], W.shape[0]), a.dtype)
     if a.shape[0] > 1:
@@ -82,28 +82,12 @@ def outward(a: Array, W: Array) -> Array:
     return out
 
 
-def energy(z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array) -> Array:
-    """F for each of the batch: (B,).
-
-    Args:
-        z: (B, H) hidden state.
-        mu: (B, H) what was expected of it.
-        x: (B, X) what is sensed and done, less what is expected of it past the state.
-        W_F: (X, H) from hidden units to these.
-        pi_z: Π_z, precision of the hidden units.
-        pi_x: (B, X) Π_x, precision of the sensory units; 0 where a number was not sensed.
-    """
-    error = x - np.tanh(z) @ W_F.T  # (B, X)
-    total: Array = 0.5 * pi_z * np.sum((z - mu) ** 2, axis=1) + 0.5 * np.sum(pi_x * error**2, axis=1)
-    return total
-
-
 @kernel
 def feedback(f: Array, x: Array, W_F: Array, pi_x: Array) -> Array:
-    """W_Fᵀ Π_x ε_x (B, H) for firing rates ``f`` (B, H): what the senses ask of the hidden units.
+    """Return W_Fᵀ Π_x ε_x (B, H) for firing rates ``f`` (B, H).
 
-    Of a single row four synapses at a time are read once, forth and back: the weights come from the second level of
-    cache, and reading them is what inference takes its time with.
+    For a single row each weight is read once for both directions, four rows of W_F at a time: reading them from the
+    second level of cache takes most of the time of inference.
     """
     X, H = W_F.shape
     out = np.zeros(f.shape, f.dtype)
@@ -141,7 +125,16 @@ def feedback(f: Array, x: Array, W_F: Array, pi_x: Array) -> Array:
 
 @kernel
 def energy_gradient(z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array) -> tuple[Array, Array]:
-    """∂F/∂z (B, H), and what the bend of f can add to the curvature of F at most (B,); arguments as in ``energy``."""
+    """Return ∂F/∂z (B, H), and the most that the bend of f adds to the curvature of F (B,).
+
+    Args:
+        z: (B, H) hidden state.
+        mu: (B, H) its expectation.
+        x: (B, X) senses and actions, less what is predicted past the state.
+        W_F: (X, H) from hidden units to these.
+        pi_z: Π_z, precision of the hidden units.
+        pi_x: (B, X) Π_x, precision of the sensory units; 0 where a number was not sensed.
+    """
     f = activate(z)  # (B, H)
     gradient = feedback(f, x, W_F, pi_x)
     bend = np.empty(z.shape[0], z.dtype)

@@ -1,14 +1,14 @@
-"""Prediction before the senses are read, and inference after.
+"""Inference of the state, and the synapses of the network by traces.
 
-    μ_t = W_C c_{t-1}                                expected state; c are the traces of what was sensed and done
-    [x̂_t, â_t] = W_F f(z_t) + W_D [c_{t-1}, a_t, 1]  what a state predicts; â has no synapse from the action itself
+    μ_t = W_C c_{t-1}                                expected state; c are traces of the senses and the actions
+    [x̂_t, â_t] = W_F f(z_t) + W_D [c_{t-1}, a_t, 1]  prediction from a state; â has no synapse from the action itself
     z ← z - η ∂F/∂z,  η = 1.5 / (Π_z + Π_x‖W_F‖² + max|f''| ‖W_Fᵀ Π_x ε_x‖_∞)
 
-Before anything is read z is μ. The bracket bounds the largest curvature of F, so a step below 2 over it cannot raise
-F, however W_F grows.
+Inference begins at μ. The bracket bounds the largest curvature of F, so that a step shorter than 2 over it cannot raise
+F, however large W_F grows.
 
-Source: Millidge et al. 2024 (PLOS Comput Biol); Tang et al. 2023 (NeurIPS). Theirs carry the state itself on, through
-learned synapses, as ``settling`` does; here traces are carried on, for which no gradient through time is needed.
+Sources: Millidge et al. 2024 (PLOS Comput Biol); Tang et al. 2023 (NeurIPS). Their networks carry the state itself, as
+``settling`` does; this one carries traces, which need no gradient through time.
 """
 
 from __future__ import annotations
@@ -22,26 +22,43 @@ from asm_gym.memory.traces import DECAYS, advance
 from asm_gym.validation import check_number
 
 STRIDE = np.float32(1.5)
-"""Length of an inference step over the inverse of the curvature; from 2 on it would diverge."""
+"""Length of an inference step times the curvature; inference diverges from 2 on."""
 
 STILL = np.float32(1e-8)
-"""The energy has come to rest where no unit moves further in a step."""
+"""Inference ends when no unit moves further than this in a step."""
 
 
 class Weights(NamedTuple):
-    """The synapses. H hidden units, S senses, A motor, I = K (S + A + 1) traces; all float32."""
+    """The synapses of H hidden units, S senses, A motor and I = K (S + A + 1) traces; all float32."""
 
     W_C: Array  # (H, I) from the traces to the state
     W_F: Array  # (S + A, H) from the state to senses and action
     W_D: Array  # (S + A, I + A + 1) from the traces, the action and a constant 1 to senses and action
-    gains: Array  # (K,) g of the traces; not learned
+    gains: Array  # (K,) of the traces; not learned
+
+
+def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
+    """Return the shape of each array of ``Weights`` by name."""
+    H, N, traces = hidden, sensory + motor, len(DECAYS) * (sensory + motor + 1)
+    return {"W_C": (H, traces), "W_F": (N, H), "W_D": (N, traces + motor + 1), "gains": (len(DECAYS),)}
+
+
+def direct_synapses(sensory: int, motor: int) -> Array:
+    """Return the mask (S + A, I + A + 1) of W_D: 0 from an action to its own prediction, else 1."""
+    exists = np.ones(weight_shapes(1, sensory, motor)["W_D"], np.float32)
+    exists[sensory:, exists.shape[1] - motor - 1 : -1] = 0.0
+    return exists
 
 
 def iterations_within(budget: float, dt: float) -> int:
-    """Steps of inference for each row, which come every ``dt`` seconds, of a ``budget`` of steps a second.
+    """Return the inference steps for each row.
+
+    Args:
+        budget: inference steps a second.
+        dt: seconds between rows.
 
     Raises:
-        ValueError: it is less than one step for each row.
+        ValueError: the budget is less than one step for each row.
     """
     each = check_number("budget", budget, above=0.0) * dt
     if each < 1.0 - 1e-9:
@@ -50,54 +67,33 @@ def iterations_within(budget: float, dt: float) -> int:
     return int(each + 1e-9)
 
 
-def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
-    """The shape of each array in ``Weights``, by name."""
-    H, N, traces = hidden, sensory + motor, len(DECAYS) * (sensory + motor + 1)
-    return {"W_C": (H, traces), "W_F": (N, H), "W_D": (N, traces + motor + 1), "gains": (len(DECAYS),)}
-
-
-def direct_synapses(sensory: int, motor: int) -> Array:
-    """(S + A, I + A + 1) 1 where there is a synapse of W_D, 0 from an action to what predicts it."""
-    exists = np.ones(weight_shapes(1, sensory, motor)["W_D"], np.float32)
-    exists[sensory:, exists.shape[1] - motor - 1 : -1] = 0.0
-    return exists
-
-
 @kernel
 def expect(c: Array, W_C: Array) -> Array:
-    """μ_t (B, H), the state expected after the traces ``c`` (B, I)."""
+    """Return μ_t (B, H) from the traces ``c`` (B, I)."""
     return outward(c, W_C)
 
 
 def direct(c: Array, u: Array, W_D: Array) -> Array:
-    """(B, S + A) what is predicted past the state, from traces ``c`` (B, I) and ``u`` (B, A + 1), action and 1."""
+    """Return the prediction (B, S + A) past the state, from traces ``c`` (B, I) and action and 1 ``u`` (B, A + 1)."""
     found: Array = outward(np.hstack([c, u]), W_D)
     return found
 
 
 @kernel
 def sense(z: Array, W_F: Array) -> Array:
-    """(B, S + A), what ``z`` (B, H) adds to that."""
+    """Return what the state ``z`` (B, H) adds to it (B, S + A)."""
     return outward(activate(z), W_F)
 
 
 @kernel
 def infer(mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array, curvature: Scalar, iterations: int) -> Array:
-    """z_t (B, H): steps down the energy, from ``mu`` on, until it is still; arguments as in ``energy``.
+    """Return z_t (B, H) after steps down the energy from ``mu``; arguments as in ``energy_gradient``.
 
     Args:
         curvature: Π_z + max Π_x ‖W_F‖², spectral norm.
-        iterations: how many steps, at most.
+        iterations: largest number of steps.
     """
-    return infer_from(mu, mu, x, W_F, pi_z, pi_x, curvature, iterations)
-
-
-@kernel
-def infer_from(
-    start: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array, curvature: Scalar, iterations: int
-) -> Array:
-    """The same from another state (B, H) on: units that cannot jump begin where the row before left them."""
-    z = start.copy()
+    z = mu.copy()
     for _ in range(iterations):
         gradient, bend = energy_gradient(z, mu, x, W_F, pi_z, pi_x)
         farthest = np.float32(0)
@@ -128,11 +124,11 @@ def carry(
     iterations: int,
     context: bool,
 ) -> tuple[Array, Array]:
-    """f(μ_t) (B, H) and c_t (B, I): what is needed to watch. Only what is unseen must be inferred.
+    """Return f(μ_t) (B, H) and c_t (B, I); the state is inferred only where a sense is missing.
 
     Args:
         c, u, x, seen: (B, I), (B, A + 1), (B, S), (B, S) as in ``Network.follow``.
-        context: whether f(μ_t) is wanted; where it is not, and all is seen, it is left 0.
+        context: whether f(μ_t) is wanted; if not, and all senses are seen, it is 0.
     """
     B, S = x.shape
     rows = np.hstack((x, u))

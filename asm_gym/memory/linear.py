@@ -1,14 +1,13 @@
-"""The linear part of association, known in closed form: each group of senses given all else, as a Gaussian has it.
+"""The linear part of association in closed form: each group of senses given all else, as for a Gaussian.
 
-    C = E[(a_t - m)(a_t - m)ᵀ]     P = (C + λ I)⁻¹        a_t: the inputs of association, the changes among them
+    C = E[(a_t - m)(a_t - m)ᵀ]     P = (C + λ I)⁻¹        a_t: inputs of association, the changes among them
     Δ̂_g = m_g + D_g (a_t - m),     D_g = -P_gg⁻¹ P_g·      0 from g itself
 
 One inverse serves every group: D_g is the ridge regression of group g on everything else. λ is chosen for each sense by
-the error that it leaves in rows that C has not seen, and D then follows from all rows. From few rows it is given, and
-D reads the past and the command alone. ``learn_by_delta`` comes to D by local steps, as far as their number allows.
+its error on held-out rows; D is then computed from all rows. ``learn_by_delta`` approaches D by local steps.
 
-Sources: Besag 1975 (parts given the rest) and Lauritzen 1996 for conditionals of a Gaussian; Hoerl and Kennard 1970 for
-ridge regression.
+Sources: Besag 1975 and Lauritzen 1996 for conditionals of a Gaussian; Hoerl and Kennard 1970 for ridge regression;
+Widrow and Hoff 1960 for the delta rule.
 """
 
 from __future__ import annotations
@@ -28,23 +27,23 @@ PENALTIES = 10.0 ** np.arange(-8, 3)
 """λ, in units of the variance of a standardised input."""
 
 EXACT = 1e-8
-"""Mean squared error of a standardised change below which one penalty is as good as another."""
+"""Mean squared errors below this are equally good."""
 
 MOST_INPUTS = 8192
 """C of these takes 0.5 GiB, and its eigenvectors minutes."""
 
 FEW_PENALTY = 1e-4
-"""λ where rows are too few to choose it by: the last of them may all be of one skill, and then ask for far too much."""
+"""λ where rows are too few to choose it."""
 
 DELTA_RATE, DELTA_BATCH, DELTA_PASSES = 3e-3, 256, 200
-"""Of the delta rule: the largest change of a synapse in a step, rows of a step, passes over all rows."""
+"""Of the delta rule: step size, rows of a batch, passes over all rows."""
 
 HELD_OUT = 5
-"""One in so many rows, the last ones, shows what was learned from the others is worth."""
+"""The last one in so many rows is held out."""
 
 
 class Moments(NamedTuple):
-    """What rows have in common."""
+    """Mean and covariance of rows."""
 
     mean: Floats  # (I,)
     values: Floats  # (I,) eigenvalues of C
@@ -52,19 +51,19 @@ class Moments(NamedTuple):
 
 
 def gram(a: Floats) -> Floats:
-    """aᵀ a (I, I) for rows (N, I), by SciPy's BLAS: NumPy's takes four times as long on a processor newer than it."""
+    """Return aᵀ a (I, I) for rows (N, I). SciPy's BLAS is up to four times as fast as NumPy's on new processors."""
     upper: Floats = np.triu(dsyrk(1.0, a.T))
     return upper + np.triu(upper, 1).T
 
 
 def along(a: Floats, W: Floats) -> Floats:
-    """a @ W.T: (N, P) from (N, Q), by SciPy's BLAS too."""
+    """Return a @ W.T, (N, P) from (N, Q), by SciPy's BLAS."""
     found: Floats = dgemm(1.0, W.T, a.T, trans_a=True).T
     return found
 
 
 def moments(a: Array) -> Moments:
-    """Of rows (N, I)."""
+    """Return the moments of rows (N, I)."""
     centred = np.array(a, np.float64)
     mean = centred.mean(axis=0)
     centred -= mean
@@ -72,13 +71,13 @@ def moments(a: Array) -> Moments:
 
 
 def conditional(found: Moments, penalty: float, groups: NDArray[np.intp], changes: slice) -> Floats:
-    """D (X, I), of which the last column is what makes the means agree.
+    """Return D (X, I); its last column makes the means agree.
 
     Args:
-        found: of the inputs, of which the last is a constant 1.
+        found: moments of the inputs, the last of which is a constant 1.
         penalty: λ > 0.
-        groups: (X,) the group of each change, counted from 0.
-        changes: where the changes stand among the inputs.
+        groups: (X,) group number of each change, from 0.
+        changes: columns of the changes among the inputs.
     """
     places = np.arange(len(found.mean))[changes]  # (X,)
     P = (found.vectors / (np.maximum(found.values, 0.0) + penalty)) @ found.vectors.T
@@ -92,7 +91,7 @@ def conditional(found: Moments, penalty: float, groups: NDArray[np.intp], change
 
 
 def check_inputs(count: int) -> None:
-    """Raises ValueError where there are too many to weigh each against every other."""
+    """Refuse more inputs than can be weighed against each other. Raises ValueError."""
     if count > MOST_INPUTS:
         raise ValueError(
             f"every number of a stream is weighed against every other here, at most {MOST_INPUTS} of them (values, "
@@ -101,14 +100,14 @@ def check_inputs(count: int) -> None:
 
 
 def learn_linear(a: Array, groups: NDArray[np.intp], changes: slice) -> NDArray[np.float32]:
-    """D (X, I) from N rows (N, I) of whole episodes, one after another; the other arguments as in ``conditional``."""
-    fresh = np.asarray(tried_on(a), np.float64)
+    """Return D (X, I) learned from rows (N, I) of whole episodes; other arguments as in ``conditional``."""
+    fresh = np.asarray(held_out(a), np.float64)
     shown = moments(a[: max(len(a) - len(fresh), 1)])
     left = []
     for penalty in PENALTIES:
         error = fresh[:, changes] - along(fresh, conditional(shown, penalty, groups, changes))
         left.append(np.maximum(np.mean(error**2, axis=0), EXACT))
-    best = np.argmin(np.array(left)[::-1], axis=0)  # (X,) of equals the greatest, so counted from the end
+    best = np.argmin(np.array(left)[::-1], axis=0)  # (X,) counted from the end: of equals the largest
     everything, D = moments(a), np.zeros((len(groups), a.shape[1]))
     for n, penalty in enumerate(PENALTIES[::-1]):
         if np.any(best == n):
@@ -117,21 +116,21 @@ def learn_linear(a: Array, groups: NDArray[np.intp], changes: slice) -> NDArray[
 
 
 def learn_from_past(a: Array, changes: slice) -> NDArray[np.float32]:
-    """D (X, I) from few rows (N, I): no change reads what another sense does now, as if all were of one group."""
+    """Return D (X, I) learned from few rows (N, I), without synapses from other senses' present changes."""
     one_group = np.zeros(len(np.arange(a.shape[1])[changes]), np.intp)
     return conditional(moments(a), FEW_PENALTY, one_group, changes).astype(np.float32)
 
 
-def tried_on(a: Array) -> Array:
-    """The last rows, which what was learned from the others is tried on; all, where there are fewer than five."""
+def held_out(a: Array) -> Array:
+    """Return the last fifth of the rows; all of fewer than five."""
     return a[len(a) - len(a) // HELD_OUT :] if len(a) >= HELD_OUT else a
 
 
 def learn_by_delta(a: Array, changes: slice, exists: Array, rng: np.random.Generator) -> NDArray[np.float32]:
-    """D (X, I) from N rows (N, I) in random order, each synapse by what its own two ends do (Widrow and Hoff 1960).
+    """Return D (X, I) learned by the delta rule from rows (N, I) in random order.
 
     Args:
-        changes: where what is to be predicted stands among the inputs.
+        changes: columns of the changes among the inputs.
         exists: (X, I) 1 where there is a synapse.
     """
     D = np.zeros(exists.shape, np.float32)

@@ -1,19 +1,17 @@
-"""Motor association: the command that comes next, given how things stand.
+"""Motor association: predict the next command from the present situation.
 
-    m_t = [κ ⊙ v_t, 1]                             values of all that is no rate, standardised; κ: how finely
+    m_t = [κ ⊙ v_t, 1]                             standardised values of everything that is no rate; κ: resolution
     â_{t+1} = U f(V m_t) + D m_t
     ΔU ∝ ε f(h)ᵀ    ΔD ∝ ε mᵀ    ΔV ∝ ε_h mᵀ       ε = a_{t+1} - â_{t+1},  ε_h = f'(h) ⊙ Uᵀ ε
-    W ← (1 - ηλ) W                                 each synapse forgets
+    W ← (1 - ηλ) W                                 weight decay
 
-The command is one more group that is completed from the rest, by the rules of ``association``, with three
-differences. Errors are not bounded: where a gripper is to close, most rows around say that it is open, and bounded
-errors would find their median, with which the hand waits for ever. Neither rates nor the last command are read: they
-tell best what is commanded next, and whoever goes by them repeats himself, and never moves again once he stands
-still. And synapses forget: what lies about is the same through an episode, so that episodes would be known by their
-objects, and learned by heart.
+The rules are those of association with three differences. Errors are not bounded: bounded errors find the median, and
+where a gripper closes, most rows around it say open. Rates and the last command are not inputs: they predict the next
+command best, and a policy that copies them never moves again once it stands still. Weights decay, because objects stay
+in place during an episode, and episodes would otherwise be told apart by them and learned by heart.
 
-Sources: as ``association``; de Haan et al. 2019 (NeurIPS) for commands that are repeated; Krogh and Hertz 1991
-(NeurIPS) for forgetting.
+Sources: as ``association``; de Haan et al. 2019 (NeurIPS) for copied commands; Krogh and Hertz 1991 (NeurIPS) for
+weight decay.
 """
 
 from __future__ import annotations
@@ -26,14 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.episode import Episode
-from asm_gym.memory.association import association_change, complete, hidden_units
+from asm_gym.memory.association import complete, hidden_units
+from asm_gym.memory.association_learning import association_change
 from asm_gym.memory.energy import Array
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, StreamSpec
 
 UPDATES, PASSES = 12_000, 100
-"""Batches learned from at most, and passes over the steps at most."""
+"""Largest number of batches, and of passes over the rows."""
 
 BATCH = 256
 RATE = 3e-3
@@ -41,18 +40,18 @@ FORGETTING = 0.3
 """λ."""
 
 FINE = 8.0
-"""κ of where one thing is relative to another: a centimetre more or less decides there."""
+"""κ of relative positions of objects, where a centimetre decides."""
 
 PLACED = 4.0
-"""κ of where the hand is: things are put down at places that nothing else marks."""
+"""κ of the position of the hand: objects are put down at places that nothing else marks."""
 
 FARTHEST = 100.0
-"""What is further out counts as this far."""
+"""Inputs are clipped to this."""
 
 
 @lru_cache(maxsize=8)
 def fineness(spec: StreamSpec) -> NDArray[np.float64]:
-    """(D,) κ: how finely each number is read; 0 of commands and of what is measured per second."""
+    """Return κ (D,); 0 for commands and for what is measured per second."""
 
     def of(name: str, unit: str, group: str) -> float:
         if group == MOTOR or unit.endswith("/s"):
@@ -65,7 +64,7 @@ def fineness(spec: StreamSpec) -> NDArray[np.float64]:
 
 
 def situation(senses: StreamScaler, rows: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-    """m (B, I) of rows (B, D); 0 where a number is not finite."""
+    """Return m (B, I) of rows (B, D); 0 where a number is not finite."""
     kappa = fineness(senses.spec)
     read = np.flatnonzero(kappa)
     values = (kappa * (np.asarray(rows, np.float64) - senses.mean) / senses.spread)[:, read]
@@ -74,7 +73,7 @@ def situation(senses: StreamScaler, rows: NDArray[np.floating[Any]]) -> NDArray[
 
 
 class Motor(NamedTuple):
-    """The synapses, and the units of commands. I inputs, M hidden units, A motor."""
+    """The synapses of I inputs, M hidden units and A motor, and the scale of commands."""
 
     V: Array  # (M, I)
     U: Array  # (A, M)
@@ -83,18 +82,18 @@ class Motor(NamedTuple):
     spread: NDArray[np.float64]  # (A,)
 
     def command(self, m: Array) -> NDArray[np.float32]:
-        """â (B, A), in the units of the action, in the situations ``m`` (B, I)."""
+        """Return â (B, A), in the units of the action, in the situations ``m`` (B, I)."""
         expected = complete(hidden_units(m, self.V), m, self.U, self.D)
         return (self.mean + self.spread * expected).astype(np.float32)
 
     def named(self, senses: StreamScaler) -> dict[str, NDArray[Any]]:
-        """As a checkpoint keeps them, and κ, without which they mean something else."""
+        """Return the arrays of a checkpoint, with κ."""
         arrays = {**self._asdict(), "kappa": fineness(senses.spec)}
         return {f"motor_{name}": array for name, array in arrays.items()}
 
     @classmethod
     def found(cls, learned: Mapping[str, NDArray[Any]], senses: StreamScaler) -> Self | None:
-        """What ``named`` put there; None where it is not. Raises ValueError where it does not fit the senses."""
+        """Restore what ``named`` returned; None where it is absent. Raises ValueError where it does not fit."""
         if "motor_U" not in learned:
             return None
         units, motor = learned["motor_U"].shape[-1], len(senses.spec.motor)
@@ -115,13 +114,13 @@ class Motor(NamedTuple):
 
 
 def lessons(senses: StreamScaler, episodes: Sequence[Episode]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Situations (N, I), and what was to be commanded next in each (N, A).
+    """Return situations (N, I), and the next command in each (N, A).
 
-    That is what ``episode.actions`` says, which may differ from what was executed, where somebody disturbed it (DART:
-    Laskey et al. 2017, CoRL); where it says nothing, what the stream says.
+    The command is that of ``episode.actions``, which is the intended one where noise was added to what was executed
+    (DART: Laskey et al. 2017, CoRL); without actions, that of the stream.
 
     Raises:
-        ValueError: nothing is commanded in these streams.
+        ValueError: the streams have no commands.
     """
     motor = senses.spec.motor
     if not len(motor):
@@ -142,13 +141,14 @@ def learn_motor(
     updates: int = UPDATES,
     forgetting: float = FORGETTING,
 ) -> Motor:
-    """Synapses learned from N steps, in random order.
+    """Learn the synapses from N rows in random order.
 
     Args:
         m: (N, I) situations.
-        commands: (N, A) what was to be commanded next.
+        commands: (N, A) the next command in each.
         units: M.
-        updates: batches learned from, at most.
+        rng: draws initial weights and the order of rows.
+        updates: largest number of batches.
         forgetting: λ, in units of the learning rate.
 
     Raises:
@@ -164,8 +164,8 @@ def learn_motor(
     weights = V, np.zeros((A, units), np.float32), np.zeros((A, inputs), np.float32)
     synapses, plain = [Synapse(W) for W in weights], np.ones(A, np.float32)
     updates = max(1, min(updates, PASSES * len(m) // BATCH))
-    for n, chosen in zip(range(updates), shuffled(len(m), BATCH, rng), strict=False):
-        change, _ = association_change(m[chosen], wanted[chosen], plain, *weights, bound=np.inf)
+    for n, rows in zip(range(updates), shuffled(len(m), BATCH, rng), strict=False):
+        change, _ = association_change(m[rows], wanted[rows], plain, *weights, bound=np.inf)
         rate = cosine_decay(RATE, n / updates)
         for synapse, product in zip(synapses, change, strict=True):
             synapse.W *= np.float32(1.0 - forgetting * rate)

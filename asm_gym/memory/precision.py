@@ -1,13 +1,12 @@
-"""Precision that depends on context: how large an error is to be expected of each sense, here and now.
+"""Precision by context: the expected variance of each error, given the hidden units.
 
     log σ²_t = min(max(W_S f(h_t) + b_S, l), h)          ΔW_S ∝ (ε²/σ² - 1) f(h_t)ᵀ
 
-f(h) are the units that a prediction came from, ε is its error. The rule follows the gradient of the Gaussian log
-likelihood, and each synapse needs only its own two ends. It is applied to the finished weights, for the errors of
-weights still learning are larger than those that will be watched. l and h are how far nominal contexts went, so that
-what a fault does to the context excuses it no further.
+f(h) are the units that made the prediction, ε is its error. The rule is the gradient of the Gaussian log likelihood,
+and each synapse uses only its own two ends. It is learned after the other weights, on errors of rows that they have
+not learned. l and h are the limits of nominal contexts, so that a fault cannot excuse itself by an unusual context.
 
-Source: the maximum-likelihood precision of Friston 2005 (Phil. Trans. R. Soc. B), given a context.
+Source: Friston 2005 (Phil. Trans. R. Soc. B) for the maximum-likelihood precision.
 """
 
 from __future__ import annotations
@@ -24,22 +23,22 @@ SMALLEST, LARGEST = np.float32(-12.0), np.float32(8.0)
 """Bounds of log σ²: errors of 0.25 % of a channel's spread, and of 55 times its spread."""
 
 EXTREME = 0.0005
-"""Share of nominal rows beyond l, and beyond h."""
+"""Share of nominal rows below l, and above h."""
 
-SURPRISED = 30.0
-"""What ε²/σ² is cut off at while learning (5.5 σ), so that one contact does not undo what a thousand steps taught."""
+LARGEST_RATIO = 30.0
+"""Clips ε²/σ² while learning (5.5 σ), so that one contact does not undo a thousand steps."""
 
 PRECISION_EPOCHS = 20
 BATCH = 64
 BATCHES = 250
-"""In an epoch, at most: of many rows the batches are larger, which costs less a row."""
+"""Largest number of batches in an epoch; with many rows the batches are larger."""
 
 RATE = 1e-3
 
 
 @kernel
 def log_variance(f: Array, W_S: Array, b_S: Array, span_S: Array) -> Array:
-    """log σ² (B, X) in the context ``f`` (B, H), within ``span_S`` (2, X)."""
+    """Return log σ² (B, X) in the context ``f`` (B, H), within ``span_S`` (2, X)."""
     out = outward(f, W_S)
     for n in range(out.shape[0]):
         for i in range(out.shape[1]):
@@ -48,19 +47,19 @@ def log_variance(f: Array, W_S: Array, b_S: Array, span_S: Array) -> Array:
 
 
 def unbounded(size: int) -> Array:
-    """(2, X) of ``size`` X: all that log σ² may be."""
+    """Return the widest limits (2, X) for ``size`` X."""
     return np.repeat(np.array([[SMALLEST], [LARGEST]]), size, axis=1)
 
 
 def usual_span(f: Array, W_S: Array, b_S: Array) -> Array:
-    """(2, X) l and h, how far log σ² goes in nominal contexts (N, H)."""
+    """Return l and h (2, X), the limits of log σ² in nominal contexts (N, H)."""
     found: Array = np.quantile(log_variance(f, W_S, b_S, unbounded(len(b_S))), (EXTREME, 1.0 - EXTREME), axis=0)
     return found.astype(np.float32)
 
 
 def precision_change(f: Array, error: Array, W_S: Array, b_S: Array) -> tuple[Array, Array]:
-    """The local rule for ``W_S`` (X, H) and ``b_S`` (X,), from contexts ``f`` (B, H) and errors (B, X)."""
-    excess = np.minimum(error**2 * np.exp(-log_variance(f, W_S, b_S, unbounded(len(b_S)))), np.float32(SURPRISED))
+    """Return the change of ``W_S`` (X, H) and ``b_S`` (X,) for contexts ``f`` (B, H) and errors (B, X)."""
+    excess = np.minimum(error**2 * np.exp(-log_variance(f, W_S, b_S, unbounded(len(b_S)))), np.float32(LARGEST_RATIO))
     excess -= np.float32(1.0)
     return coincidence(excess, f), excess.mean(axis=0)
 
@@ -74,7 +73,7 @@ def learn_precision(
     tick: Callable[[], None] = lambda: None,
     rate: float = RATE,
 ) -> None:
-    """Fits ``W_S`` and ``b_S`` in place to the contexts ``f`` (N, H) and the errors (N, X) that came in them."""
+    """Fit ``W_S`` and ``b_S`` in place to contexts ``f`` (N, H) and the errors (N, X) in them."""
     W_S[:] = 0.0
     b_S[:] = np.clip(np.log(np.mean(error**2, axis=0) + 1e-12), SMALLEST, LARGEST)
     context, bias = Synapse(W_S), Synapse(b_S)

@@ -1,12 +1,12 @@
-"""Readout: what skill the memory's units say is running, for people to read; nothing depends on it.
+"""Readout: name the skill that is running from the memory's units; nothing else depends on it.
 
     r_t = [f(h_t), f(μ_t)]
     p_t = softmax(W_K r_t + b_K)             ΔW_K ∝ n_k (1_k - p_t) r_tᵀ
-    L_t = (1 - λ) L_{t-1} + log p_t          the skill named is that with the largest L
+    L_t = (1 - λ) L_{t-1} + log p_t          the named skill has the largest L
 
-h are the units of ``association``, which know the moment, and μ is the state of the temporal network, which knows what
-came before; n_k makes rare skills count as much as frequent ones. The delta rule is local. What
-single moments say adds up, and is forgotten, so that a change of skill is followed. Names come from whoever knows them.
+h are the units of ``association`` and know the moment; μ is the state of the temporal network and knows the past. n_k
+gives rare skills as much weight as frequent ones. The delta rule is local. L adds up evidence and forgets it, so that a
+change of skill is followed.
 
 Source: Wald and Wolfowitz 1948 for adding up log likelihoods.
 """
@@ -22,8 +22,6 @@ from asm_gym.memory.energy import Array, kernel, outward
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 
 UPDATES = 6000
-"""Batches learned from."""
-
 BATCH = 512
 RATE = 1e-2
 
@@ -31,11 +29,11 @@ KEPT = np.float32(0.9)
 """1 - λ."""
 
 SMALLEST = np.float32(1e-6)
-"""Lower bound of p where its logarithm is taken."""
+"""Smallest p whose logarithm is taken."""
 
 
 def certainty(units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
-    """p (B, K) for firing rates of units (B, M)."""
+    """Return p (B, K) for firing rates (B, M)."""
     drive = units @ W_K.T + b_K
     strength = np.exp(drive - drive.max(axis=1, keepdims=True))
     shares: NDArray[np.float32] = (strength / strength.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -44,16 +42,18 @@ def certainty(units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
 
 @kernel
 def add_up(L: Array, units: Array, state: Array, W_K: Array, b_K: Array) -> Array:
-    """L_t (B, K) from L_{t-1}, which is 0 before the first row; p as in ``certainty``.
+    """Return L_t (B, K) from L_{t-1}.
 
     Args:
+        L: (B, K), 0 before the first row.
         units: (B, M) f(h).
-        state: (B, H) f(μ), which a memory does not look at whose names were learned from ``units`` alone.
+        state: (B, H) f(μ); not used where W_K has M columns only.
+        W_K, b_K: (K, M + H) or (K, M), and (K,).
     """
-    told, M = np.empty((L.shape[0], W_K.shape[1]), units.dtype), units.shape[1]
-    told[:, :M] = units
-    told[:, M:] = state[:, : W_K.shape[1] - M]
-    drive, added = outward(told, W_K) + b_K, np.empty_like(L)
+    rates, M = np.empty((L.shape[0], W_K.shape[1]), units.dtype), units.shape[1]
+    rates[:, :M] = units
+    rates[:, M:] = state[:, : W_K.shape[1] - M]
+    drive, added = outward(rates, W_K) + b_K, np.empty_like(L)
     for n in range(L.shape[0]):
         strength = np.exp(drive[n] - drive[n].max())
         added[n] = KEPT * L[n] + np.log(strength / strength.sum() + SMALLEST)
@@ -67,22 +67,23 @@ def learn_readout(
     rng: np.random.Generator,
     updates: int = UPDATES,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """W_K (K, M) and b_K (K,) from N steps whose skill is known.
+    """Return W_K (K, M) and b_K (K,) learned from N rows whose skill is known.
 
     Args:
-        look: firing rates (B, M) of the steps of B indices; all of them at once might not fit.
+        look: returns the firing rates (B, M) of the rows of B indices, as all of them at once might not fit.
         skill: (N,) each below ``count``.
         count: K.
-        updates: batches learned from.
+        rng: draws the order of rows.
+        updates: number of batches.
     """
     W_K, b_K = np.zeros((count, look(np.arange(1)).shape[1]), np.float32), np.zeros(count, np.float32)
     weights, bias = Synapse(W_K), Synapse(b_K)
     rarity = (len(skill) / (count * np.bincount(skill, minlength=count))).astype(np.float32)  # (K,) n
-    for n, chosen in zip(range(updates), shuffled(len(skill), BATCH, rng), strict=False):
-        f = np.ascontiguousarray(look(chosen), np.float32)
-        error = np.eye(count, dtype=np.float32)[skill[chosen]] - certainty(f, W_K, b_K)
-        error *= rarity[skill[chosen], None]
+    for n, rows in zip(range(updates), shuffled(len(skill), BATCH, rng), strict=False):
+        f = np.ascontiguousarray(look(rows), np.float32)
+        error = np.eye(count, dtype=np.float32)[skill[rows]] - certainty(f, W_K, b_K)
+        error *= rarity[skill[rows], None]
         rate = cosine_decay(RATE, n / updates)
-        weights.learn(error.T @ f / np.float32(len(chosen)), rate)
+        weights.learn(error.T @ f / np.float32(len(rows)), rate)
         bias.learn(error.mean(axis=0), rate)
     return W_K, b_K

@@ -1,12 +1,9 @@
-"""Recall: a skill is expressed from a cue, along with the senses or from memory alone.
+"""Recall: express a skill from a cue, with the senses or from memory alone.
 
-    μ_t = W_C c_{t-1},   â_t = W_A f(μ_t) + D_A c_{t-1},   x̂_t = W_S f(μ_t) + D_S [c_{t-1}, a_t, 1]
-    online    a_t as commanded,   c_t takes up the true x_t, and where it is unseen what the rest of the row infers
-    offline   a_t = â_t,          c_t takes up x̂_t
+    online    every row is predicted, then read; a missing sense is inferred from the rest of the row
+    offline   the predictions stand in for the senses and the actions
 
-Offline the predictions stand in for what is not sensed. An x̂_t that is fed back is what μ_t predicts, so that its error
-is 0 and inference leaves the state where it is: z_t = μ_t is the fixed point, not a short cut. (W_S, W_A are rows of
-W_F, and D_S, D_A of W_D: see ``inference``.) The same holds of the network that settles, which carries z_t on.
+A prediction that is fed back has no error, so z_t = μ_t is the fixed point of inference offline.
 
 Sources: Tang, Barron and Bogacz 2023 (NeurIPS) for online and offline recall by temporal predictive coding; Mahajan et
 al. 2025 (Neural Computation 38(1)) for skills.
@@ -26,24 +23,25 @@ from asm_gym.scaling import StreamScaler
 from asm_gym.validation import check_number
 
 MOST_STEPS = 1_000_000
-"""Rows that are recalled at once."""
+"""Largest number of rows recalled at once."""
 
 
 class Recalled(NamedTuple):
-    """What was expected of T steps of B streams; standardised, float32."""
+    """Predictions of T rows of B streams; standardised, float32."""
 
-    senses: Array  # (T, B, S) x̂_t, expected before x_t was sensed
-    commands: Array  # (T, B, A) â_t, expected before a_t was commanded
-    hidden: Array  # (T, B, H) z_t, the state inferred
+    senses: Array  # (T, B, S) x̂_t, before x_t was sensed
+    commands: Array  # (T, B, A) â_t, before a_t was commanded
+    hidden: Array  # (T, B, H) z_t, the inferred state
     traces: Array  # (B, I) c_T, to carry on with
 
 
 def follow(network: TemporalNetwork, c: Array, senses: Array, commands: Array) -> Recalled:
-    """Online recall: every row is expected, then sensed.
+    """Recall online: predict every row, then read it.
 
     Args:
-        c: (B, I) the traces before the first row.
-        senses: (T, B, S) as ``ScaledRows`` have them; not a number where unseen.
+        network: the memory.
+        c: (B, I) the carried state before the first row.
+        senses: (T, B, S) standardised; NaN where missing.
         commands: (T, B, A + 1), the last one a constant 1.
     """
     steps = []
@@ -55,7 +53,7 @@ def follow(network: TemporalNetwork, c: Array, senses: Array, commands: Array) -
 
 
 def run_on(network: TemporalNetwork, c: Array, steps: int) -> Recalled:
-    """Offline recall: ``steps`` rows from the traces ``c`` (B, I) on, each from what was expected of those before."""
+    """Recall ``steps`` rows offline from the carried state ``c`` (B, I)."""
     made = []
     for _ in range(steps):
         made.append(network.run_on(c))
@@ -64,7 +62,7 @@ def run_on(network: TemporalNetwork, c: Array, steps: int) -> Recalled:
 
 
 def to_rows(reader: StreamScaler, recalled: Recalled) -> NDArray[np.float64]:
-    """What was expected, (T, B, D) in the units of the stream."""
+    """Return the predictions (T, B, D) in the units of the stream."""
     T, B, _ = recalled.senses.shape
     sensory, motor = reader.spec.sensory, reader.spec.motor
     standard = np.zeros((T, B, reader.spec.size))
@@ -77,9 +75,9 @@ def to_rows(reader: StreamScaler, recalled: Recalled) -> NDArray[np.float64]:
 def continued(
     network: TemporalNetwork, reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int
 ) -> NDArray[np.float64]:
-    """(steps, D) rows that come after a cue (T, D), in the units of the stream. Raises as ``check_cue`` does."""
+    """Return the (steps, D) rows after a cue (T, D), in the units of the stream. Raises as ``check_cue`` does."""
     rows, lag = check_cue(reader, cue, steps), reader.lag
-    # Every l-th row follows from those l apart: as many threads of rows, recalled side by side.
+    # Every l-th row follows from those l before: l interleaved streams, recalled side by side.
     reading = reader.read_episode(rows[len(rows) % lag :])
     senses, commands = (x.reshape(-1, lag, x.shape[1]) for x in (reading.senses, reading.commands))
     cued = follow(network, network.at_rest(lag), senses, commands)
@@ -88,7 +86,7 @@ def continued(
 
 
 def check_cue(reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
-    """The cue (T, D) to recall ``steps`` rows from. Raises ValueError unless it can be recalled from."""
+    """Return the cue (T, D) as floats. Raises ValueError unless ``steps`` rows can be recalled from it."""
     check_number("steps", steps, low=1, high=MOST_STEPS, whole=True)
     rows, least = np.asarray(cue, np.float64), 2 * reader.lag
     if rows.ndim != 2:

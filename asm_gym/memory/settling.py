@@ -1,16 +1,15 @@
-"""The temporal predictive coding network of the papers: its state is carried on, and settles on every row.
+"""The temporal predictive coding network of the papers: its state is carried on, and is inferred on every row.
 
-    μ_t = W_H f(z_{t-1}) + W_U [a_t, 1]                              the state expected, once an action is commanded
-    F = ½ Π_z ‖z - μ_t‖² + ½ Π_x ‖x_t - W_F f(z) - b_F‖²             z_t is where inference from μ_t on settles
-    x̂_t = W_F f(μ_t) + b_F                                           the senses expected before they were read
-    h_t = W_H f(z_{t-1}) + W_U [0, 1],   â_t = W_A f(h_t)            the action that belongs to the state
+    μ_t = W_H f(z_{t-1}) + W_U [a_t, 1]                              state expected for the commanded action
+    F = ½ Π_z ‖z - μ_t‖² + ½ Π_x ‖x_t - W_F f(z) - b_F‖²             z_t is where inference from μ_t ends
+    x̂_t = W_F f(μ_t) + b_F                                           senses expected before they are read
+    h_t = W_H f(z_{t-1}) + W_U [0, 1],   â_t = W_A f(h_t)            action that belongs to the state
 
-What is known of the past is in z alone, so that a row must be inferred before the next is expected: with few steps of
-inference the state lags behind the senses, with many it knows them as far as Π_x and Π_z weigh them. ``Network`` has
-traces in its place.
+The past is in z alone, so each row must be inferred before the next is expected. With few inference steps the state
+lags behind the senses.
 
-Source: Millidge et al. 2024 (PLOS Comput Biol) and Tang et al. 2023 (NeurIPS); the motor prediction is that of Mahajan
-et al. 2025 (Neural Computation 38(1)).
+Sources: Millidge et al. 2024 (PLOS Comput Biol) and Tang et al. 2023 (NeurIPS); Mahajan et al. 2025 (Neural
+Computation 38(1)) for the motor prediction.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, Scalar, activate, kernel, outward
+from asm_gym.memory.energy import Array, activate, outward
 from asm_gym.memory.inference import infer
 from asm_gym.memory.temporal import Step, TemporalNetwork
 
 
 class SettlingWeights(NamedTuple):
-    """The synapses. H hidden units, S senses, A motor; all float32."""
+    """The synapses of H hidden units, S senses and A motor; all float32."""
 
     W_H: Array  # (H, H) from the last state to the next
     W_U: Array  # (H, A + 1) from the commanded action and a constant 1 to the state
@@ -36,43 +35,13 @@ class SettlingWeights(NamedTuple):
 
 
 def settling_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
-    """The shape of each array in ``SettlingWeights``, by name."""
+    """Return the shape of each array of ``SettlingWeights`` by name."""
     H, S, A = hidden, sensory, motor
     return {"W_H": (H, H), "W_U": (H, A + 1), "W_F": (S, H), "b_F": (S,), "W_A": (A, H)}
 
 
-@kernel
-def settle(
-    z: Array,
-    u: Array,
-    x: Array,
-    seen: Array,
-    W_H: Array,
-    W_U: Array,
-    W_F: Array,
-    b_F: Array,
-    W_A: Array,
-    pi_z: Scalar,
-    pi_x: Scalar,
-    curvature: Scalar,
-    iterations: int,
-) -> tuple[Array, Array]:
-    """μ_t and z_t (B, H), in one call.
-
-    Args:
-        z, u, x, seen: (B, H), (B, A + 1), (B, S), (B, S) as in ``SettlingNetwork.follow``.
-        W_A: not needed; so that all weights can be handed over as they are.
-    """
-    mu = outward(activate(z), W_H)
-    mu += outward(u, W_U)
-    return mu, infer(mu, x - b_F, W_F, pi_z, pi_x * seen, curvature, iterations)
-
-
 class SettlingNetwork(TemporalNetwork):
-    """The temporal network whose state is carried on, and association beside it.
-
-    The arguments are those of ``TemporalNetwork``.
-    """
+    """The network whose state is carried on; arguments as in ``TemporalNetwork``."""
 
     weights: SettlingWeights
 
@@ -93,14 +62,12 @@ class SettlingNetwork(TemporalNetwork):
 
     def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
         mu, action = self._expected(c, u)
-        w = self.weights
-        precision = self.sensory_precision * seen
-        z = infer(mu, x - w.b_F, w.W_F, self.prior_precision, precision, self.curvature, self.iterations)
+        z = self._infer(mu, x, seen)
         return Step(mu, np.hstack([self._sense(mu), action]), z, z)
 
     def carry_on(self, c: Array, u: Array, x: Array, seen: Array) -> tuple[Array, Array]:
-        mu, z = settle(c, u, x, seen, *self.weights, *self.inference)
-        return activate(mu), z
+        mu = outward(activate(c), self.weights.W_H) + outward(u, self.weights.W_U)
+        return activate(mu), self._infer(mu, x, seen)
 
     def run_on(self, c: Array) -> Step:
         u = np.zeros((len(c), self.motor + 1), np.float32)
@@ -110,12 +77,18 @@ class SettlingNetwork(TemporalNetwork):
         return Step(mu, np.hstack([self._sense(mu), action]), mu, mu)
 
     def _sense(self, z: Array) -> Array:
-        """x̂ (B, S)."""
+        """Return x̂ (B, S)."""
         found: Array = outward(activate(z), self.weights.W_F) + self.weights.b_F
         return found
 
+    def _infer(self, mu: Array, x: Array, seen: Array) -> Array:
+        """Return z_t (B, H)."""
+        w, precision = self.weights, self.sensory_precision * seen
+        z: Array = infer(mu, x - w.b_F, w.W_F, self.prior_precision, precision, self.curvature, self.iterations)
+        return z
+
     def _expected(self, z: Array, u: Array) -> tuple[Array, Array]:
-        """μ_t (B, H) and â_t (B, A), which does not know the action."""
+        """Return μ_t (B, H), and â_t (B, A), which does not depend on the action."""
         w = self.weights
         carried = outward(activate(z), w.W_H)
         return carried + outward(u, w.W_U), outward(activate(carried + w.W_U[:, -1]), w.W_A)

@@ -1,11 +1,11 @@
-"""Traces: what was sensed and done, remembered over many spans of time.
+"""Traces: the past of senses and actions over many time scales.
 
     c^k_t = λ_k c^k_{t-1} + g_k r_t          r_t = [x_t, a_t, 1], standardised;  c_0 = 0
 
-λ runs from nothing, the row itself, to 0.995, half of which is left after 140 steps. A trace has no weight that is to
-be learned, so that no error has to travel back through time to teach it what to keep. g makes all of them vary alike.
+λ runs from 0, the row itself, to 0.995, which halves in 140 rows. A trace has no learned weight, so no error needs to
+travel back through time. g gives all traces the same mean square.
 
-Sources: de Vries and Principe 1992 (Neural Networks 5(4)) for a memory of leaky integrators; Shankar and Howard 2012
+Sources: de Vries and Principe 1992 (Neural Networks 5(4)) for leaky integrators as a memory; Shankar and Howard 2012
 (Neural Computation 24(1)) for a spectrum of them as a timeline of the past.
 """
 
@@ -22,12 +22,12 @@ DECAYS = np.array([0.0, 0.5, 0.75, 0.875, 0.9375, 0.97, 0.985, 0.995], np.float3
 """λ (K,)."""
 
 FAINTEST = 1e-3
-"""Smallest spread of a trace, for one that hardly varies."""
+"""Smallest root mean square of a trace that is scaled."""
 
 
 @kernel
 def advance(traces: Array, rows: Array, gains: Array) -> Array:
-    """c_t (B, K R) from c_{t-1} and the rows r_t (B, R)."""
+    """Return c_t (B, K R) from c_{t-1} and the rows r_t (B, R)."""
     B, R = rows.shape
     out = np.empty_like(traces)
     for n in range(B):
@@ -38,12 +38,12 @@ def advance(traces: Array, rows: Array, gains: Array) -> Array:
 
 
 def at_rest(batch: int, row: int) -> NDArray[np.float32]:
-    """c_0 of rows of ``row`` numbers."""
+    """Return c_0 of ``batch`` streams with rows of ``row`` numbers."""
     return np.zeros((batch, len(DECAYS) * row), np.float32)
 
 
 def fit_gains(episodes: Sequence[Array]) -> NDArray[np.float32]:
-    """g (K,): such that each trace of these rows, (T, R) an episode, has a mean square of 1."""
+    """Return g (K,) that give each trace of these episodes (T, R) a mean square of 1."""
     plain = np.float32(1) - DECAYS
     ordered = sorted(episodes, key=len, reverse=True)
     squares, width = np.zeros(len(DECAYS)), ordered[0].shape[1]

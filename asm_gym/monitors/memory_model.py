@@ -14,20 +14,19 @@ from numpy.typing import NDArray
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
+from asm_gym.memory.adaptation import followed, specialise
 from asm_gym.memory.association import Association, association_shapes, existing, hidden_units
+from asm_gym.memory.association_learning import FEEDBACK, LEARNED
 from asm_gym.memory.completion import Completion
-from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of
-from asm_gym.memory.feedback import FEEDBACK, LEARNED
+from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
 from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs
 from asm_gym.memory.marginalise import MOST_INPUTS, Kept, fewer_changes, fewer_settled, fewer_traces, moments
 from asm_gym.memory.motor import Motor, learn_motor, lessons, situation
-from asm_gym.memory.network import Network, train
-from asm_gym.memory.online import followed
+from asm_gym.memory.network import Network
 from asm_gym.memory.readout import add_up, learn_readout
 from asm_gym.memory.recall import continued
-from asm_gym.memory.specialise import specialise
 from asm_gym.memory.state import MemoryState, at_start, carry_on, newest, past, sure
 from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.base import Progress, Told
@@ -82,7 +81,7 @@ class MemoryModel(StreamModel):
         # Nothing came before the first ``lag`` rows, so that no change in them is known.
         trajectories = [Trajectory(r.senses[::lag], r.commands[::lag], r.inputs[lag:]) for r in readings]
         layout = senses.groups, senses.changes, self.hidden_size, self._units_each(senses)
-        how = FEEDBACK[self.feedback](), DYNAMICS[self.dynamics].learn
+        how = FEEDBACK[self.feedback](), self.dynamics
         trained = train(trajectories, *layout, self.schedule, rng, progress, *how)
         standard: dict[str, NDArray[Any]] = {"mean": senses.mean, "spread": senses.spread, "change": senses.change}
         standard["energy"] = trained.energy

@@ -19,8 +19,8 @@ from asm_gym.detection.detector import BOUND, GAINS
 from asm_gym.detection.events import Excuses
 from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.episode import Episode
+from asm_gym.memory.association_learning import FEEDBACK, LEARNED
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
-from asm_gym.memory.feedback import FEEDBACK, LEARNED
 from asm_gym.memory.inference import iterations_within
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.motor import Motor

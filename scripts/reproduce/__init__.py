@@ -30,7 +30,6 @@ STUDIES = {
     "harm": Study("harm avoided against success kept, under any policy"),
     "attack": Study("what who writes to the senses can hide"),
     "hours": Study("alarms an hour of a shipped memory, as promised?", needs_a_run=True),
-    "learning_curve": Study("detection by the number of episodes learned from", needs_a_run=True),
     "one_energy": Study("surprise, completion, reaction by one energy", needs_a_run=True),
     "parts": Study("who does what in the memory, by what rules", needs_a_run=True),
     "diagnosis": Study("what is wrong, of kinds of faults that were never seen", needs_a_run=True),

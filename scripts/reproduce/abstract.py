@@ -1,56 +1,63 @@
-"""The experiment of the abstract in one run: one network, six skills, no label, by traces and by settling.
+"""The experiment of the abstract: one network, six skills, no label, by traces and by settling.
 
-An arm of two links writes letters (``two_links``). A memory learns them by local rules and is told none of their names.
-Then it writes by its own motor prediction, in closed loop, after a cue of rows that belong to one of them:
+Claim: one network learns a repertoire by local rules, expresses and recognises each skill from context, is surprised by
+faults, and reacts to them by the same energy. An arm of two links writes letters (``two_links``). A memory learns them
+without their names, and after a cue of one of them writes on by its own motor prediction:
 
-    expressed    how far the hand is from the letter, and whether that letter is the nearest
-    named        whether the memory's state says which one it is; a readout is told the names, the memory is not
-    pushed       the joints are displaced while it writes: is it surprised, and does it go on better by lowest F
-    stuck        an encoder says the same from then on: is it surprised, at which sense, and does it go on without it
-    hurried      the same with one short step of inference a row
+    left alone   how far the hand is from the letter, and whether that letter is the nearest
+    pushed       the joints are displaced: is it surprised, and does it go on better by lowest F
+    stuck        an encoder sticks: is it surprised, at which sense, and does it go on without it
+    named        does the state tell the letter; only the readout is given the names
 
-A GRU trained through time on the same writings, with about as many weights, stands beside it.
+A GRU with about as many weights, trained through time on the same writings, stands beside it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 
 from asm_gym.episode import Episode
+from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.statistics import auroc
+from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.abstract_film import SHOWN, filmed
-from asm_gym.scripts.reproduce.abstract_report import TITLES, drawn, tables
-from asm_gym.scripts.reproduce.closed_loop import (
+from asm_gym.scripts.reproduce.expression import FREE, Backpropagated, Expresser, ExpressionMemory
+from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters, repertoire
+from asm_gym.scripts.reproduce.kit import Findings, Record, shown
+from asm_gym.scripts.reproduce.two_links import (
     CUE,
+    DT,
     EVENT,
-    RATE,
+    HAND,
+    SPEC,
     WAYS,
     WINDOW,
     Course,
-    Memorised,
-    Recurring,
-    written,
+    Floats,
+    MemoryDriver,
+    RecurrentDriver,
+    closed_loop,
+    demonstrations,
 )
-from asm_gym.scripts.reproduce.expression import FREE, Backpropagated, ExpressionMemory
-from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters, repertoire
-from asm_gym.scripts.reproduce.kit import Findings, Record
-from asm_gym.scripts.reproduce.speed_accuracy import SHORTER, asked
-from asm_gym.scripts.reproduce.two_links import DT, HAND, SPEC, Floats, demonstrations
 
-SETTINGS: dict[str, dict[str, Any]] = {
-    "traces": {"hidden_size": 144},
-    "settling": {"hidden_size": 112},
-}
+TITLES = {"traces": "traces", "settling": "settling", "gru": "GRU, BPTT"}
+UNITS = {"traces": 144, "settling": 112}
 GRU: dict[str, Any] = {"hidden": 64, "rate": 3e-2}
 """All have about as many weights through time, chosen on seeds 100 to 104."""
+
+RATE = 0.05
+"""False alarms asked for."""
+
+AROUND = slice(EVENT, EVENT + WINDOW)
 
 
 @dataclass(frozen=True)
@@ -60,28 +67,28 @@ class Config(kit.Config):
     skills: int = option(6, quick=2, check=partial(check_letters, least=2))
     """Letters."""
     writings: int = option(20, quick=6, least=2)
-    """How often each letter is written to learn from."""
+    """Writings of each letter to learn from."""
     tests: int = option(3, quick=1, least=1)
-    """How often each letter is to be expressed."""
+    """Times that each letter is to be expressed."""
     epochs: int = option(70, quick=10, least=1)
-    """Passes over them."""
+    """Passes over the writings."""
     updates: int = option(600, quick=20, least=1)
-    """How often the GRU learns from a batch."""
+    """Batches of the GRU."""
     calibration: int = fixed(16, quick=12, least=1)
     """Writings of each letter that set the threshold."""
 
 
-class Learned(NamedTuple):
-    """What learned the letters of one seed, and what is asked of it."""
+class Lessons(NamedTuple):
+    """The letters of one seed."""
 
     train: list[Episode]
     calibration: list[Episode]
     tests: list[Episode]
-    means: Floats  # (K, T, 2) the mean demonstration of each letter
+    means: Floats  # (K, T, 2) the mean path of each letter
 
 
-def lessons(seed: int, config: Config) -> Learned:
-    """The letters of a seed."""
+def lessons(seed: int, config: Config) -> Lessons:
+    """Draw the letters of a seed."""
     rng = np.random.default_rng(seed)
     letters = repertoire(config.skills, 2, rng)
     train, calibration, tests = (
@@ -89,97 +96,150 @@ def lessons(seed: int, config: Config) -> Learned:
     )
     names = [letter.name for letter in letters]
     means = np.stack([np.mean([e.stream[:, HAND] for e in train if e.info["skill"] == k], axis=0) for k in names])
-    return Learned(train, calibration, tests, means)
+    return Lessons(train, calibration, tests, means)
 
 
-def ended(course: Course, told: Learned, since: int = CUE) -> Record:
-    """How far the hand was from the letter [cm], and whether no other was nearer."""
-    truth = np.stack([e.stream[:, HAND] for e in told.tests], axis=1)
-    apart = np.linalg.norm(course.path[since:] - truth[since:], axis=2).mean()
-    to_each = np.linalg.norm(course.path[CUE:, :, None] - told.means[:, CUE:].transpose(1, 0, 2)[:, None], axis=3)
-    names = sorted({str(e.info["skill"]) for e in told.tests})
-    right = [names[k] == e.info["skill"] for k, e in zip(to_each.mean(axis=0).argmin(axis=1), told.tests, strict=True)]
-    return {"cm": float(apart), "right": float(np.mean(right))}
+def reached(course: Course, given: Lessons) -> Record:
+    """Return the distance from the letter [cm], whole and once there was time to react, and the share of right ones."""
+    truth = np.stack([e.stream[:, HAND] for e in given.tests], axis=1)
+    distance = np.linalg.norm(course.path - truth, axis=2)
+    to_each = np.linalg.norm(course.path[CUE:, :, None] - given.means[:, CUE:].transpose(1, 0, 2)[:, None], axis=3)
+    names = sorted({str(e.info["skill"]) for e in given.tests})
+    nearest = to_each.mean(axis=0).argmin(axis=1)
+    right = [names[k] == e.info["skill"] for k, e in zip(nearest, given.tests, strict=True)]
+    late = distance[EVENT + WINDOW // 2 :].mean()
+    return {"cm": float(distance[CUE:].mean()), "late_cm": float(late), "right": float(np.mean(right))}
 
 
-def online(model: Any, told: Learned, cue: int) -> Record:
-    """Where the hand is expected: in the next row, or after a cue from memory alone [cm]."""
-    rows = np.stack([e.stream for e in told.tests], axis=1).astype(np.float64)
+def predicted(model: Expresser, given: Lessons, cue: int) -> Record:
+    """Return the error of the hand [cm] in the next row, or after a cue from memory alone."""
+    rows = np.stack([e.stream for e in given.tests], axis=1).astype(np.float64)
     first = cue if cue < STEPS else 1
     found = model.express(rows, cue)[first:, :, HAND] - rows[first:, :, HAND]
     return {"cm": float(np.linalg.norm(found, axis=2).mean())}
 
 
+def noticed(courses: Mapping[str, Course], threshold: float) -> Record:
+    """Return what surprise and F tell of both events, against the same rows left alone."""
+    found: Record = {}
+    nominal = courses["left alone"]
+    for event in ("pushed", "stuck"):
+        for what in ("surprise", "energy"):
+            good, bad = (getattr(c, what)[AROUND].max(axis=0) for c in (nominal, courses[event]))
+            found[f"{event}, {what}"] = auroc(bad, good)
+        found[f"{event}, found"] = float((courses[event].surprise[AROUND] > threshold).any(axis=0).mean())
+    late = courses["stuck"]
+    named = [name for name, t in zip(late.attributed, late.alarm, strict=True) if t < len(late.path)]
+    found["attributed"] = float(np.mean([name == "encoder" for name in named])) if named else None
+    found["alarms"] = float((nominal.surprise > threshold).any(axis=0).mean())
+    return found
+
+
 def one(job: tuple[str, int], config: Config) -> tuple[list[Record], dict[str, Course]]:
-    """A memory of one dynamics, or a GRU, with one seed."""
+    """Measure a memory of one dynamics, or a GRU, with one seed."""
     name, seed = job
-    told = lessons(seed, config)
-    cues = np.stack([e.stream for e in told.tests], axis=1).astype(np.float64)
-    B, made = cues.shape[1], []
+    given = lessons(seed, config)
+    cues = np.stack([e.stream for e in given.tests], axis=1).astype(np.float64)
+    made: list[Record] = []
 
     def note(measure: str, **values: Any) -> None:
         made.append({"model": name, "seed": seed, "measure": measure, **values})
 
-    if name not in SETTINGS:
-        gru = Backpropagated.learned(told.train, "gru", rng=np.random.default_rng(seed), updates=config.updates, **GRU)
+    if name == "gru":
+        gru = Backpropagated.learned(given.train, "gru", rng=np.random.default_rng(seed), updates=config.updates, **GRU)
         with torch.no_grad():
-            course = written(Recurring(gru, B), cues, "left alone", seed)
-        note("next row", **online(gru, told, STEPS))
-        note("recalled", **online(gru, told, CUE))
-        note("left alone", **ended(course, told))
-        return made, {"left alone": course}
-    how = {"association_size": 64, "epochs": config.epochs, "free_running_probability": FREE, **SETTINGS[name]}
-    asm = NeuralASM(SPEC, dynamics=name, seed=seed, **how).fit(told.train).calibrate(told.calibration, RATE)
-    memory, energy = ExpressionMemory(asm.senses_, asm.model.network), asm.model.free_energy(told.calibration[::4])
-    for measure, cue in (("next row", STEPS), ("recalled", CUE)):
-        note(measure, **online(memory, told, cue))
-    short = asked(memory, 1, SHORTER[0])
-    note("next row, hurried", **online(short, told, STEPS))
+            course = closed_loop(RecurrentDriver(gru, cues.shape[1]), cues, WAYS[0], seed)
+        note("next row", **predicted(gru, given, STEPS))
+        note("recalled", **predicted(gru, given, CUE))
+        note(WAYS[0], **reached(course, given))
+        return made, {WAYS[0]: course}
+    sizes = {"hidden_size": UNITS[name], "association_size": 64}
+    asm = NeuralASM(SPEC, dynamics=name, seed=seed, epochs=config.epochs, free_running_probability=FREE, **sizes)
+    asm = asm.fit(given.train).calibrate(given.calibration, RATE)
+    memory, energy = ExpressionMemory(asm.senses_, asm.model.network), asm.model.free_energy(given.calibration[::4])
+    note("next row", **predicted(memory, given, STEPS))
+    note("recalled", **predicted(memory, given, CUE))
     courses = {}
     for way in WAYS:
-        drives = Memorised(asm, B)
-        if way == "hurried":
-            drives.asm = asm.with_budget(1 / DT)
-            drives.asm.model.network_ = short.network
-        course = courses[way] = written(drives, cues, way, seed, energy, asm.threshold)
-        note(way, **ended(course, told), **ended_late(course, told))
+        driver = MemoryDriver(asm, cues.shape[1])
+        courses[way] = closed_loop(driver, cues, way, seed, energy, asm.threshold)
+        note(way, **reached(courses[way], given))
     note("surprise", **noticed(courses, asm.threshold))
-    named = asm.name_skills(told.train)
+    named = asm.name_skills(given.train)
     for row in (CUE, EVENT, STEPS - 1):
-        right = [named.skills(e.stream[: row + 1])[-1] == e.info["skill"] for e in told.tests]
+        right = [named.skills(e.stream[: row + 1])[-1] == e.info["skill"] for e in given.tests]
         note("named", row=row, right=float(np.mean(right)))
-    for way in SHOWN:
-        courses[way].named = [str(name) for name in named.skills(courses[way].rows[:, 0])]
     return made, courses
 
 
-def ended_late(course: Course, told: Learned) -> Record:
-    """How far the hand was from the letter once there was time to react [cm]."""
-    return {"late_cm": ended(course, told, EVENT + WINDOW // 2)["cm"]}
+def tables(records: Sequence[Record], skills: int) -> list[Table]:
+    """Return what was expressed, noticed and named, and the difference from the GRU."""
+
+    def cells(value: str, models: Sequence[str] = tuple(TITLES), **where: Any) -> list[str]:
+        return [shown(records, value, model=m, **where) for m in models]
+
+    memories, head = tuple(UNITS), ("", *TITLES.values())
+    lines = [(f"{m} [cm]", *cells("cm", measure=m)) for m in ("next row", "recalled")]
+    lines += [(f"written, {way} [cm]", *cells("cm", measure=way)) for way in WAYS]
+    lines += [(f"written, {way}: share of right letters", *cells("right", measure=way)) for way in WAYS]
+    lines += [(f"{way}, from half a second after the event [cm]", *cells("late_cm", measure=way)) for way in WAYS]
+    labels = {"surprise": "AUROC of surprise", "energy": "AUROC of F", "found": "found within a second"}
+    keys = {f"{e}, {w}": f"{e}, {label}" for e in ("pushed", "stuck") for w, label in labels.items()}
+    keys |= {"attributed": "stuck: the encoders have the largest share", "alarms": "left alone: letters with an alarm"}
+    alarms = [(label, *cells(key, memories, measure="surprise")) for key, label in keys.items()]
+    rows = (CUE, EVENT, STEPS - 1)
+    named = [(f"after {r + 1} rows", *cells("right", memories, measure="named", row=r)) for r in rows]
+    asked = f"{skills} letters, cue of {CUE} rows; mean ± SD over seeds"
+    return [
+        Table(f"Expected, and written in closed loop: {asked}", head, lines),
+        behind(records),
+        Table("What is noticed", head[:3], alarms),
+        Table("Share of letters that the state names rightly", head[:3], named),
+    ]
 
 
-def noticed(courses: dict[str, Course], threshold: float) -> Record:
-    """What surprise and F tell of both events, against the same rows left alone; alarms within the window."""
-    found: Record = {}
-    within = slice(EVENT, EVENT + WINDOW)
-    calm = courses["left alone"]
-    for event in ("pushed", "stuck"):
-        for what in ("surprise", "energy"):
-            good, bad = (getattr(c, what)[within].max(axis=0) for c in (calm, courses[event]))
-            found[f"{event}, {what}"] = auroc(bad, good)
-        found[f"{event}, found"] = float((courses[event].surprise[within] > threshold).any(axis=0).mean())
-    late = courses["stuck"]
-    told = [name for name, t in zip(late.blamed, late.alarm, strict=True) if t < len(late.path)]
-    found["blamed"] = float(np.mean([name == "encoder" for name in told])) if told else None
-    found["alarms"] = float((calm.surprise > threshold).any(axis=0).mean())
-    return found
+def behind(records: Sequence[Record]) -> Table:
+    """Return how much further off each dynamics is than the GRU, over the same repertoires."""
+
+    def cell(model: str, measure: str) -> str:
+        found = kit.paired(records, "cm", {"model": model}, {"model": "gru"}, measure=measure)
+        verdict = "ahead" if found.high < 0 else "behind" if found.low > 0 else "within chance"
+        return f"{found.value:+.2f} ({found.low:+.2f} to {found.high:+.2f}), {verdict}"
+
+    lines = [(f"{m} [cm]", *(cell(name, m) for name in UNITS)) for m in ("next row", "recalled", WAYS[0])]
+    count = len({r["seed"] for r in records})
+    caption = f"Further off than the GRU, in the same {count} repertoires; 95 % intervals of the paired difference"
+    return Table(caption, ("", *(TITLES[name] for name in UNITS)), lines)
+
+
+def drawn(courses: Mapping[str, Mapping[str, Course]], truth: Floats) -> Figure:
+    """Draw a letter (T, 2) by each dynamics: the hand, surprise and F."""
+    with figure(height=5.6, width=11) as fig:
+        for axes, name in zip(fig.subplots(len(UNITS), 4, squeeze=False), UNITS, strict=True):
+            own = courses[name]
+            for ax, ways in zip(axes[:2], (WAYS[:3], (WAYS[0], *WAYS[3:])), strict=True):
+                ax.plot(*truth.T, color="#cccccc", linewidth=4, label="demonstrated")
+                for way in ways:
+                    colour, line, _ = look(WAYS.index(way))
+                    ax.plot(*own[way].path[CUE:, 0].T, color=colour, linestyle=line, label=way)
+                ax.plot(*own[WAYS[0]].path[EVENT, 0], "k.", markersize=6, label="the event")
+                ax.set(title=name, xlabel="x [cm]", ylabel="y [cm]", aspect="equal", adjustable="datalim")
+                ax.legend(fontsize=6)
+            for way in (WAYS[0], WAYS[1], WAYS[3]):
+                colour, line, _ = look(WAYS.index(way))
+                for ax, values in zip(axes[2:], (own[way].surprise, own[way].energy), strict=True):
+                    ax.plot(DT * np.arange(STEPS), values[:, 0], color=colour, linestyle=line)
+            axes[2].axhline(own[WAYS[0]].threshold, color="#888888", linewidth=1)
+            axes[2].set(title=f"{name}; line: threshold", xlabel="time [s]", ylabel="surprise", yscale="symlog")
+            axes[3].set(title=name, xlabel="time [s]", ylabel="F [nats]", yscale="symlog")
+    return fig
 
 
 def run(config: Config) -> Findings:
-    """Both dynamics and the GRU, for every seed."""
+    """Run both dynamics and the GRU for every seed."""
     jobs = [(m, s) for s in config.repetitions for m in TITLES]
     found = kit.each("learning and writing", partial(one, config=config), jobs, config)
     records = kit.together([own for own, _ in found])
     first = {name: courses for (name, seed), (_, courses) in zip(jobs, found, strict=True) if seed == config.seed}
     letter = lessons(config.seed, config).tests[0].stream[:, HAND].astype(np.float64)
-    return Findings(records, tables(records, config.skills), drawn(first, letter), film=filmed(first, letter))
+    return Findings(records, tables(records, config.skills), drawn(first, letter))

@@ -1,6 +1,6 @@
-"""Whatever expresses a skill from a cue, behind one call: the memory, and its rivals.
+"""Expression of a skill from a cue, by the memory and by its rivals, behind one call.
 
-express(streams, cue)      rows of which the first ``cue`` are read, and the rest expected from memory alone
+express(streams, cue)      the first ``cue`` rows are read, and the rest is expected from memory alone
 """
 
 from __future__ import annotations
@@ -16,43 +16,41 @@ from numpy.typing import NDArray
 from asm_gym.episode import Episode
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule, Trajectory
-from asm_gym.memory.network import Network, initial_weights
+from asm_gym.memory.network_learning import learn_traces
 from asm_gym.memory.recall import Recalled, follow, run_on, to_rows
-from asm_gym.memory.scheduled_sampling import learn
-from asm_gym.memory.temporal import TemporalNetwork, unassociated
-from asm_gym.memory.traces import fit_gains
+from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import recurrent
 
 Rows = NDArray[np.float64]
 
 FREE = 0.6
-"""``free_running_probability`` of ``NeuralASM``: how much of what follows a cue is learned from alone."""
+"""``free_running_probability`` of ``NeuralASM`` for recall."""
 
 
 class Expresser(Protocol):
-    """Knows skills."""
+    """A model that knows skills."""
 
     def express(self, streams: Rows, cue: int) -> Rows:
-        """What was expected of each row of B streams (T, B, D), knowing those before it up to the ``cue``-th."""
+        """Return the prediction (T, B, D) of each row of B streams (T, B, D), from rows before it up to ``cue``."""
         ...
 
 
 def read(reader: StreamScaler, streams: Rows) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """StreamScaler (T, B, S) and commands (T, B, A + 1) of streams (T, B, D)."""
+    """Return senses (T, B, S) and commands (T, B, A + 1), standardised, of streams (T, B, D)."""
     readings = [reader.read_episode(streams[:, n]) for n in range(streams.shape[1])]
     return np.stack([r.senses for r in readings], axis=1), np.stack([r.commands for r in readings], axis=1)
 
 
 def trajectories(reader: StreamScaler, episodes: Sequence[Episode]) -> list[Trajectory]:
-    """Episodes as a network reads them."""
+    """Return the episodes as a network reads them."""
     readings = [reader.read_episode(e.stream) for e in episodes]
     return [Trajectory(r.senses, r.commands, r.inputs) for r in readings]
 
 
 @dataclass(frozen=True)
 class ExpressionMemory:
-    """The temporal predictive coding network alone: nothing is judged here, so there is no association."""
+    """The temporal network without association."""
 
     reader: StreamScaler
     network: TemporalNetwork
@@ -68,24 +66,23 @@ class ExpressionMemory:
         gain: float = 1.0,
         dynamics: str = TRACES,
     ) -> ExpressionMemory:
-        """From whole episodes, no labels.
+        """Learn from whole episodes without labels.
 
         Args:
-            steps: in which its synapses change, with 64 episodes side by side.
-            gain: of traces' synapses onto the state before it learns; large ones make units that tell beginnings apart.
-            dynamics: one of ``DYNAMICS``, with its usual inference.
+            episodes: to learn from.
+            hidden: units.
+            rng: draws everything random.
+            steps: number of batches of 64 rows.
+            rate: learning rate.
+            gain: of the initial synapses from traces to the state.
+            dynamics: one of ``DYNAMICS``.
         """
         reader, how, size = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes]), DYNAMICS[dynamics], 64
         epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
         schedule = Schedule(epochs, size, rate, how.iterations, how.prior_precision, 1.0, FREE)
-        taught = trajectories(reader, episodes)
-        if dynamics != TRACES:
-            return cls(reader, how.learn(taught, hidden, schedule, rng, lambda: None).network)
-        weights = initial_weights(hidden, reader.size, len(reader.spec.motor), rng)
-        weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in taught])
-        weights.W_C[:] *= np.float32(gain)
-        learn(weights, taught, schedule, rng, lambda: None)
-        return cls(reader, Network(weights, unassociated(), how.iterations, how.prior_precision, 1.0))
+        asked = trajectories(reader, episodes), hidden, schedule, rng, _silent
+        trained = learn_traces(*asked, gain) if dynamics == TRACES else how.learn(*asked)
+        return cls(reader, trained.network)
 
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = read(self.reader, streams[:cue])
@@ -95,11 +92,15 @@ class ExpressionMemory:
             return rows
         return np.concatenate([rows, to_rows(self.reader, run_on(self.network, cued.traces, len(streams) - cue))])
 
-    def glimpse(self, streams: Rows, seen: NDArray[np.bool_]) -> Rows:
-        """What was expected of each row of B streams (T, B, D) of which only those ``seen`` (T,) are sensed."""
-        senses, commands = read(self.reader, streams)
-        senses[~seen] = np.nan
-        return to_rows(self.reader, follow(self.network, self.network.at_rest(streams.shape[1]), senses, commands))
+    def with_inference(self, iterations: int, shorter: int = 1) -> ExpressionMemory:
+        """Return a copy with other steps of inference a row, each ``shorter`` times shorter than usual."""
+        network = self.network.with_iterations(iterations)
+        network.curvature *= np.float32(shorter)  # the length of a step is its inverse
+        return ExpressionMemory(self.reader, network)
+
+
+def _silent() -> None:
+    """Report no progress."""
 
 
 @dataclass(frozen=True)
@@ -119,31 +120,24 @@ class Backpropagated:
         updates: int,
         noise: float = 0.3,
         rate: float = 1e-2,
-        truncated: bool = False,
     ) -> Backpropagated:
-        """From whole episodes; the other arguments are those of ``recurrent.train``."""
+        """Learn from whole episodes; the other arguments are those of ``recurrent.train``."""
         reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
-        learned = trajectories(reader, episodes)
-        return cls(reader, recurrent.train(learned, cell, hidden, updates, rng, noise, rate, truncated=truncated))
+        taught = trajectories(reader, episodes)
+        return cls(reader, recurrent.train(taught, cell, hidden, updates, rng, noise, rate))
 
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = recurrent.expected(self.network, *read(self.reader, streams), cue)
         return to_rows(self.reader, Recalled(senses, commands, commands, commands[-1]))
 
-    def glimpse(self, streams: Rows, seen: NDArray[np.bool_]) -> Rows:
-        """As ``ExpressionMemory.glimpse``."""
-        senses, commands = read(self.reader, streams)
-        made, told = recurrent.glimpsed(self.network, senses, commands, seen), commands[:, :, :-1]
-        return to_rows(self.reader, Recalled(made, told, told, told[-1]))
-
 
 @dataclass(frozen=True)
 class Hopfield:
-    """A modern continuous Hopfield network over windows of rows; it keeps every window it has seen.
+    """A modern continuous Hopfield network that keeps every window of rows.
 
         ξ = Σ_i softmax_i(-½ β ‖q - k_i‖²) v_i      q the last rows, k_i those of a window, v_i the row that followed
 
-    The distance is the scaled dot product for keys whose lengths differ. Source: Ramsauer et al. 2021 (ICLR).
+    Source: Ramsauer et al. 2021 (ICLR), with a distance because keys differ in length.
     """
 
     reader: StreamScaler
@@ -154,7 +148,7 @@ class Hopfield:
 
     @classmethod
     def learned(cls, episodes: Sequence[Episode], window: int = 5, beta: float = 100.0) -> Hopfield:
-        """Every window of ``window`` rows, with what followed it; the first windows reach back before the episode."""
+        """Keep every window of ``window`` rows with the row after it; the first windows begin with zeros."""
         reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
         keys, values = [], []
         for e in episodes:
@@ -171,8 +165,8 @@ class Hopfield:
         return squared
 
     def retrieve(self, query: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What follows windows (B, window · D): (B, D)."""
-        size = self.values.shape[1]  # as a mean over channels, β means the same for any stream
+        """Return the rows (B, D) after windows (B, window · D)."""
+        size = self.values.shape[1]  # a mean over channels gives β one meaning for every stream
         distance = np.sum(query**2, 1)[:, None] + self._lengths - 2 * query @ self.keys.T
         drive = -0.5 * self.beta * distance / size
         share = np.exp(drive - drive.max(axis=1, keepdims=True))
@@ -190,42 +184,25 @@ class Hopfield:
 
 
 def mean_demonstrations(train: Sequence[Episode], dims: int) -> NDArray[np.float64]:
-    """(K, T, P) of the skills, in order of name."""
+    """Return the mean path (K, T, P) of each skill, in order of name."""
     names = sorted({str(e.info["skill"]) for e in train})
     return np.stack([np.mean([e.stream[:, :dims] for e in train if e.info["skill"] == n], axis=0) for n in names])
 
 
 def recalled(model: Expresser, tests: Sequence[Episode], means: NDArray[np.float64], cue: int) -> tuple[float, float]:
-    """Mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
+    """Return the mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
 
     Args:
+        model: expresses the skills.
         tests: of one length.
-        means: (K, T, P) mean demonstration of each skill, in order of name.
-        cue: the whole length for online recall.
+        means: (K, T, P) mean path of each skill, in order of name.
+        cue: rows to read; the whole length for online recall.
     """
     streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)  # (T, B, D)
     dims, names = means.shape[2], sorted({str(e.info["skill"]) for e in tests})
     first = cue if cue < len(streams) else 1
     hand = model.express(streams, cue)[first:, :, :dims]  # (T', B, P)
     error = np.linalg.norm(hand - streams[first:, :, :dims], axis=2).mean()
-    apart = np.linalg.norm(hand[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None], axis=3).mean(axis=0)
-    right = [names[k] == e.info["skill"] for k, e in zip(apart.argmin(axis=1), tests, strict=True)]
+    distance = np.linalg.norm(hand[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None], axis=3).mean(axis=0)
+    right = [names[k] == e.info["skill"] for k, e in zip(distance.argmin(axis=1), tests, strict=True)]
     return float(error), float(np.mean(right))
-
-
-GLIMPSED = 10
-"""Rows that are sensed before senses come and go."""
-
-
-def between_glimpses(
-    model: ExpressionMemory | Backpropagated, tests: Sequence[Episode], dims: int, every: int
-) -> float:
-    """Mean distance [cm] of what is expected of rows that are not sensed, where one in ``every`` is.
-
-    Commands are known throughout.
-    """
-    streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)  # (T, B, D)
-    row = np.arange(len(streams))
-    seen = (row < GLIMPSED) | (row % every == 0)
-    apart = model.glimpse(streams, seen)[:, :, :dims] - streams[:, :, :dims]
-    return float(np.linalg.norm(apart[~seen], axis=2).mean())

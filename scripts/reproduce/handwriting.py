@@ -1,12 +1,12 @@
-"""Handwriting-like movements: letters of overlapping strokes, each with a lognormal speed.
+"""Handwriting: letters of overlapping strokes, each with a lognormal speed.
 
     v(t) = Σ_i D_i Λ(t - t_i; μ, σ_i) (cos φ_i(t) cos ψ_i, sin φ_i(t) cos ψ_i, sin ψ_i)
     φ_i(t) = θ_i + Δθ_i ½ (1 + erf((ln(t - t_i) - μ) / (√2 σ_i)))
 
-Λ is the density of the lognormal distribution; in two dimensions ψ = 0. A letter is drawn at random,
-and written a little differently each time.
+Λ is the density of the lognormal distribution; in two dimensions ψ = 0. A letter is drawn at random, and written a
+little differently each time.
 
-Source: the sigma-lognormal model of Plamondon, for its form O'Reilly and Plamondon 2009 (Pattern Recognition 42(12)).
+Source: the sigma-lognormal model, O'Reilly and Plamondon 2009 (Pattern Recognition 42(12)).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from asm_gym.episode import Episode
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 NAMES = string.ascii_lowercase + string.ascii_uppercase[:6]
-"""Of the letters; they look like none of the alphabet."""
+"""Names of the letters, which look like none of the alphabet."""
 
 STEPS = 60
 DT = 1.0 / STEPS
@@ -34,15 +34,15 @@ NOISE = 0.02
 """Standard deviation of the pen's sensed position [cm]; letters are about 5 cm large."""
 
 MU = -1.75
-"""Mean of the logarithm of a stroke's time [ln s]: it is fastest some 0.16 s after its onset."""
+"""Mean of the logarithm of a stroke's time [ln s]; it is fastest about 0.16 s after its onset."""
 
 WOBBLE = 0.04
-"""How much each stroke varies from writing to writing, as a share of its length and, in radians, its direction."""
+"""Variation of a stroke between writings, as a share of its length and in radians of its direction."""
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """One stroke: its length [cm], direction and turn [rad], rise out of the plane [rad], onset [s], and σ."""
+    """A stroke: length [cm], direction and turn [rad], rise out of the plane [rad], onset [s], and σ."""
 
     length: float
     direction: float
@@ -54,14 +54,14 @@ class Stroke:
 
 @dataclass(frozen=True)
 class Letter:
-    """A skill: strokes that follow each other before the last has ended."""
+    """A skill: overlapping strokes."""
 
     name: str
     strokes: tuple[Stroke, ...]
 
 
 def pen_spec(dims: int) -> StreamSpec:
-    """Of a pen in ``dims`` dimensions: where it is, and how fast it was told to go."""
+    """Return the stream of a pen in ``dims`` dimensions: its position and commanded velocity."""
     if dims not in (2, 3):
         raise ValueError(f"a pen moves in 2 or 3 dimensions, got {dims}")
     axes = tuple("xyz"[:dims])
@@ -70,7 +70,7 @@ def pen_spec(dims: int) -> StreamSpec:
 
 
 def repertoire(count: int, dims: int, rng: np.random.Generator) -> list[Letter]:
-    """``count`` letters drawn at random, four strokes each.
+    """Return ``count`` letters drawn at random, four strokes each.
 
     Raises:
         ValueError: there are none, or more than there are names.
@@ -80,14 +80,14 @@ def repertoire(count: int, dims: int, rng: np.random.Generator) -> list[Letter]:
 
 
 def check_letters(*counts: int, least: int = 1) -> None:
-    """Raises ValueError where no repertoire has so many letters, or fewer than it takes."""
+    """Raise ValueError for fewer letters than ``least``, or more than there are names."""
     for count in counts:
         if not least <= count <= len(NAMES):
             raise ValueError(f"a repertoire has {least} to {len(NAMES)} skills, got {count}")
 
 
 def velocity(letter: Letter, time: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(T, 3) of the pen at times (T,) [s] since the letter began, [cm/s]."""
+    """Return the velocity (T, 3) [cm/s] of the pen at times (T,) [s] since the letter began."""
     total = np.zeros((len(time), 3))
     for s in letter.strokes:
         since = np.maximum(time - s.onset, 1e-9)
@@ -100,7 +100,7 @@ def velocity(letter: Letter, time: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def written(letter: Letter, dims: int, rng: np.random.Generator, speed: float = 1.0, wobble: float = WOBBLE) -> Episode:
-    """The letter written once, ``speed`` times as fast as usual."""
+    """Write the letter once, ``speed`` times as fast as usual."""
     strokes = tuple(_wobbly(s, wobble, dims, rng) for s in letter.strokes)
     steps = round(STEPS / speed)
     fine = 8  # the position is the integral of the velocity, not of its samples
@@ -113,7 +113,7 @@ def written(letter: Letter, dims: int, rng: np.random.Generator, speed: float = 
 def copybook(
     letters: Sequence[Letter], each: int, dims: int, rng: np.random.Generator, speeds: Sequence[float] = (1.0,)
 ) -> list[Episode]:
-    """``each`` writings of every letter at every speed."""
+    """Write every letter ``each`` times at every speed."""
     return [written(letter, dims, rng, speed) for letter in letters for speed in speeds for _ in range(each)]
 
 

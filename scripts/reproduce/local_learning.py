@@ -1,42 +1,54 @@
-"""Local learning: the Hebbian changes against the exact gradient of backpropagation through time, and what each costs.
+"""Local learning: the Hebbian changes against the exact gradient of backpropagation through time.
 
-A memory learns letters by its local rules. On the way, with the weights held still, the local change summed along a
-batch is compared with three gradients of the same network: of the energy, of the error of predicting the next row, and
-of the error of running on alone after a cue, in which each prediction leads to the next. An angle below 90° lowers what
-the gradient descends. Then the same network learns from the same letters by either, and the time and the memory of a
-change are measured, by length of the episode.
+    E = Σ_t F_t(z_t),   z_t = the inferred state          L = ½ Σ_t Π_x ‖[x_t, a_t] - [x̂_t, â_t](μ_t)‖²
+    L_alone: the same along a stream that reads a cue and then runs on its own predictions
+    exact: the gradient of each, through all steps of inference and of time      local: Σ_t of the Hebbian changes
+
+Claim: along streams that are read, local changes are the gradient. Their traces hold what was sensed, which no weight
+changes, so that nothing would travel back through time. Along streams that run on alone there is something, and local
+changes leave it out. A memory learns letters by its local rules, and on the way the angles to the three gradients are
+measured, with the weights held still. Then the same network learns from the same letters by backpropagation.
 """
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
 
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
-from asm_gym.memory.inference import Weights
-from asm_gym.memory.learning import Batch, Learner, Schedule, Trajectory, batches, cosine_decay, side_by_side
-from asm_gym.memory.network import initial_weights
-from asm_gym.memory.scheduled_sampling import ScheduledSampling, one_after_another
-from asm_gym.memory.traces import fit_gains
+from asm_gym.memory.energy import STEEPEST
+from asm_gym.memory.inference import STRIDE, Weights, direct, direct_synapses, expect, infer, sense
+from asm_gym.memory.learning import Schedule, Trajectory, cosine_decay
+from asm_gym.memory.network_learning import TracesLearner, hebbian_change, initial_weights
+from asm_gym.memory.practice import Practice, one_after_another
+from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
 from asm_gym.scaling import StreamScaler
-from asm_gym.scripts.options import fixed, option
+from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.curves import curve, curves
+from asm_gym.scripts.reproduce.curves import curves
 from asm_gym.scripts.reproduce.expression import trajectories
-from asm_gym.scripts.reproduce.gradients import COMPARED, CUE, Changes, cosine, exact, local
 from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire
-from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds
+from asm_gym.scripts.reproduce.kit import Findings, Record
 from asm_gym.scripts.reproduce.recordings import wide_enough
+from asm_gym.scripts.reproduce.recurrent import Batch, batches, side_by_side
 from asm_gym.validation import check_number
+
+COMPARED = ("W_C", "W_F", "W_D")
+"""The synapses that are learned."""
+
+CUE = 10
+"""Rows that are read before a stream runs on alone."""
 
 TARGETS = {
     "energy": "gradient of the energy",
@@ -44,9 +56,13 @@ TARGETS = {
     "alone": f"gradient of the error alone, after a cue of {CUE}",
 }
 RATES = {"local": 3e-3, "backpropagation": 1e-2}
-"""Of a change per step, and of one per batch."""
+"""Learning rate of a change a row, and of one a batch."""
+
 PRIOR_PRECISION = 30.0
 """Π_z."""
+
+ITERATIONS = 5
+"""Inference steps of learning."""
 
 
 @dataclass(frozen=True)
@@ -64,196 +80,203 @@ class Config(kit.Config):
     iterations: tuple[int, ...] = option(
         (1, 5, 20, 60), quick=(1, 5), least=1, check=partial(check_number, "iterations", low=1, whole=True)
     )
-    """Steps of inference at which angles are measured; the memory learns with 5."""
-    lengths: tuple[int, ...] = fixed((30, 60, 120), quick=(30, 60))
-    """Steps of the episodes along which the costs of a change are measured."""
+    """Inference steps at which angles are measured after learning."""
 
 
-def usual(config: Config) -> int:
-    """Steps of inference at which angles are followed over learning."""
-    return 5 if 5 in config.iterations else max(config.iterations)
+class Changes(NamedTuple):
+    """One array for each of ``COMPARED``, with what it was derived from."""
+
+    arrays: dict[str, NDArray[np.float64]]
+    energy: float  # E, mean over the batch
+    error: float  # L, or L_alone
+
+
+def local(
+    weights: Weights, batch: Batch, iterations: int, alone: bool = False, pi_z: float = PRIOR_PRECISION
+) -> Changes:
+    """Return Σ_t of the Hebbian changes along a batch of episodes of one length, with the weights held still."""
+    w, curvature = weights, pi_z + float(np.linalg.norm(weights.W_F, 2)) ** 2
+    sensory = batch.senses.shape[2]
+    c = at_rest(batch.senses.shape[1], len(w.W_F) + 1)
+    total = {name: np.zeros(getattr(w, name).shape) for name in COMPARED}
+    energy = error = 0.0
+    for t, (x, u) in enumerate(zip(batch.senses, batch.commands, strict=True)):
+        mu, taken = expect(c, w.W_C), u
+        if alone and t >= CUE:
+            action = (direct(c, u, w.W_D) + sense(mu, w.W_F))[:, sensory:]
+            taken = np.hstack([action, u[:, -1:]])
+        past = direct(c, taken, w.W_D)
+        left = np.hstack([x, u[:, :-1]]) - past
+        z = infer(mu, left, w.W_F, pi_z, np.ones_like(left), curvature, iterations)
+        settled, missed = left - sense(z, w.W_F), left - sense(mu, w.W_F)
+        change = hebbian_change(c, taken, mu, z, settled, pi_z)
+        for name in COMPARED:
+            total[name] += getattr(change, name)
+        energy += 0.5 * float((pi_z * np.sum((z - mu) ** 2) + np.sum(settled**2)) / len(x))
+        error += 0.5 * float(np.sum(missed**2) / len(x))
+        expected = (past + sense(mu, w.W_F))[:, :sensory]
+        c = advance(c, np.hstack([expected if alone and t >= CUE else x, taken]), w.gains)
+    return Changes(total, energy, error)
+
+
+def exact(weights: Weights, batch: Batch, iterations: int, target: str, pi_z: float = PRIOR_PRECISION) -> Changes:
+    """Return the negative gradient of one of ``TARGETS``, by backpropagation through time."""
+    W = {name: torch.from_numpy(getattr(weights, name).copy()).requires_grad_() for name in COMPARED}
+    energy, error = _unrolled(W, weights.gains, batch, iterations, target, pi_z)
+    gradient = torch.autograd.grad(energy if target == "energy" else error, list(W.values()))
+    arrays = {n: -g.numpy().astype(np.float64) for n, g in zip(W, gradient, strict=True)}
+    return Changes(arrays, energy.item(), error.item())
+
+
+def _unrolled(
+    W: dict[str, Tensor], gains: NDArray[np.float32], batch: Batch, iterations: int, target: str, pi_z: float
+) -> tuple[Tensor, Tensor]:
+    """Return E and L, means over the batch; E is computed for its own gradient only."""
+    W_C, W_F = W["W_C"], W["W_F"]
+    S, A = batch.senses.shape[2], batch.commands.shape[2] - 1
+    W_D = W["W_D"] * torch.from_numpy(direct_synapses(S, A))
+    curvature = pi_z + float(torch.linalg.matrix_norm(W_F.detach(), 2)) ** 2
+    decays, g = torch.from_numpy(DECAYS)[:, None], torch.from_numpy(gains)[:, None]
+    c = torch.zeros(batch.senses.shape[1], len(DECAYS), S + A + 1)
+    energy, error = torch.zeros(()), torch.zeros(())
+    for t, (x, u) in enumerate(zip(torch.from_numpy(batch.senses), torch.from_numpy(batch.commands), strict=True)):
+        flat = c.flatten(1)
+        mu, taken, read = flat @ W_C.T, u, x
+        state = torch.tanh(mu) @ W_F.T
+        if target == "alone" and t >= CUE:
+            action = (torch.cat([flat, u], dim=1) @ W_D.T + state)[:, S:]
+            taken = torch.cat([action, u[:, -1:]], dim=1)
+        past = torch.cat([flat, taken], dim=1) @ W_D.T
+        left = torch.cat([x, u[:, :-1]], dim=1) - past
+        error = error + 0.5 * torch.sum((left - state) ** 2) / len(x)
+        if target == "energy":
+            z = mu
+            for _ in range(iterations):
+                f = torch.tanh(z)
+                feedback = (left - f @ W_F.T) @ W_F
+                bend = float(STEEPEST) * feedback.detach().abs().amax(dim=1, keepdim=True)
+                z = z - float(STRIDE) / (curvature + bend) * (pi_z * (z - mu) - (1 - f * f) * feedback)
+            settled = torch.sum((left - torch.tanh(z) @ W_F.T) ** 2)
+            energy = energy + 0.5 * (pi_z * torch.sum((z - mu) ** 2) + settled) / len(x)
+        elif target == "alone" and t >= CUE:
+            read = (past + state)[:, :S]
+        c = decays * c + g * torch.cat([read, taken], dim=1)[:, None]
+    return energy, error
+
+
+def cosine(a: Changes, b: Changes, names: Sequence[str] = COMPARED) -> float:
+    """Return the cosine between two changes of these arrays; 0 where one of them is 0."""
+    p, q = (np.concatenate([c.arrays[n].ravel() for n in names]) for c in (a, b))
+    length = float(np.linalg.norm(p) * np.linalg.norm(q))
+    return float(p @ q) / length if length > 0 else 0.0
 
 
 def checkpoints(epochs: int) -> list[int]:
-    """Epochs before which angles are measured: dense at first."""
+    """Return the epochs before which angles are measured, dense at first."""
     return sorted({0, *(round(epochs ** (k / 6)) for k in range(7)), epochs})
 
 
 def one_seed(seed: int, config: Config) -> list[Record]:
-    """Angles over learning, and the error that either way of learning reaches."""
+    """Measure angles during learning, and the error that each way of learning reaches."""
     torch.set_num_threads(1)
     rng = np.random.default_rng(seed)
     letters = repertoire(config.skills, 2, rng)
     train, tests = copybook(letters, config.writings, 2, rng), copybook(letters, 2, 2, rng)
     reader = StreamScaler.fit(train[0].spec, [e.stream for e in train])
-    learned, judged = trajectories(reader, train), side_by_side(trajectories(reader, tests))
+    taught, judged = trajectories(reader, train), side_by_side(trajectories(reader, tests))
     weights = initial_weights(config.hidden, reader.size, 2, rng)
-    weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in learned])
-    probe, start = side_by_side(learned[:: max(1, len(learned) // 16)]), Weights(*(w.copy() for w in weights))
+    weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in taught])
+    probe, start = side_by_side(taught[:: max(1, len(taught) // 16)]), Weights(*(w.copy() for w in weights))
     records: list[Record] = []
-    measured = checkpoints(config.epochs)
-    learner = Learner(weights, Schedule(config.epochs, 16, RATES["local"], 5, PRIOR_PRECISION, 1.0, 0.0), rng)
-    streams, moments = ScheduledSampling(learner, 16), one_after_another(learned, 16, rng)
-    steps = -(-sum(len(t.senses) for t in learned) // 16)
+    schedule = Schedule(config.epochs, 16, RATES["local"], ITERATIONS, PRIOR_PRECISION, 1.0, 0.0)
+    streams = Practice(TracesLearner(weights, schedule, rng), 16, rng)
+    moments, steps = one_after_another(taught, 16, rng), -(-sum(len(t.senses) for t in taught) // 16)
     for epoch in range(config.epochs + 1):
-        if epoch in measured:
-            last = epoch == config.epochs
-            records += angles(weights, probe, config.iterations if last else (usual(config),), seed, epoch)
-            records.append(_reached("local", weights, judged, seed, epoch))
+        if epoch in checkpoints(config.epochs):
+            counts = {ITERATIONS, *config.iterations} if epoch == config.epochs else {ITERATIONS}
+            records += angles(weights, probe, sorted(counts), epoch)
+            records.append(_reached("local", weights, judged, epoch))
         if epoch < config.epochs:
             streams.run(islice(moments, steps), cosine_decay(RATES["local"], epoch / config.epochs), 0.0)
-    return records + backpropagated(start, learned, judged, config, seed)
+    records += backpropagated(start, taught, judged, config, np.random.default_rng(seed))
+    return [{"seed": seed, **r} for r in records]
 
 
-def angles(weights: Weights, probe: Batch, iterations: Sequence[int], seed: int, epoch: int) -> list[Record]:
-    """Cosines between the local change and each gradient, of all synapses and of each array."""
+def angles(weights: Weights, probe: Batch, iterations: Sequence[int], epoch: int) -> list[Record]:
+    """Return the angles [°] between the local change and each gradient, of all synapses and of each array."""
     records = []
     for count in iterations:
-        read, alone = (local(weights, probe, count, PRIOR_PRECISION, alone) for alone in (False, True))
-        for target, theirs in exact(weights, probe, count, PRIOR_PRECISION).items():
-            ours = alone if target == "alone" else read
-            where = {"seed": seed, "epoch": epoch, "iterations": count, "target": target}
+        read, alone = (local(weights, probe, count, alone) for alone in (False, True))
+        for target in TARGETS:
+            theirs, ours = exact(weights, probe, count, target), alone if target == "alone" else read
             for name in (*COMPARED, "all"):
                 value = min(1.0, cosine(ours, theirs, COMPARED if name == "all" else (name,)))
-                records.append({**where, "array": name, "cosine": value, "degrees": math.degrees(math.acos(value))})
+                where = {"epoch": epoch, "iterations": count, "target": target, "array": name}
+                records.append({**where, "degrees": math.degrees(math.acos(value))})
     return records
 
 
 def backpropagated(
-    weights: Weights, learned: Sequence[Trajectory], judged: Batch, config: Config, seed: int
+    weights: Weights, taught: Sequence[Trajectory], judged: Batch, config: Config, rng: np.random.Generator
 ) -> list[Record]:
-    """The same network, from the same weights, by Adam on the exact gradient of the prediction error."""
-    rng, records = np.random.default_rng(seed), []
+    """Train the same network from the same weights by Adam on the exact gradient of the prediction error."""
+    records = []
     W = {name: torch.from_numpy(getattr(weights, name)) for name in COMPARED}  # shares memory with the weights
     adam = torch.optim.Adam(W.values(), RATES["backpropagation"])
     for epoch in range(config.epochs + 1):
         if epoch in checkpoints(config.epochs):
-            records.append(_reached("backpropagation", weights, judged, seed, epoch))
+            records.append(_reached("backpropagation", weights, judged, epoch))
         for group in adam.param_groups:
             group["lr"] = cosine_decay(RATES["backpropagation"], epoch / config.epochs)
-        for batch in batches(learned, 16, rng) if epoch < config.epochs else ():
-            gradient = exact(weights, batch, 5, PRIOR_PRECISION, ("error",))["error"].arrays
+        for batch in batches(taught, 16, rng) if epoch < config.epochs else ():
+            gradient = exact(weights, batch, ITERATIONS, "error").arrays
             for name, w in W.items():
                 w.grad = torch.from_numpy(-gradient[name].astype(np.float32))
             adam.step()
     return records
 
 
-def _reached(how: str, weights: Weights, judged: Batch, seed: int, epoch: int) -> Record:
-    """Mean squared error of a predicted number [variance of the stream]; inference as in learning."""
-    error = local(weights, judged, 5, PRIOR_PRECISION).error
+def _reached(how: str, weights: Weights, judged: Batch, epoch: int) -> Record:
+    """Return the mean squared error of a predicted number [variance of the stream]."""
     numbers = judged.senses[:, 0].size + judged.commands[:, 0, :-1].size
-    return {"seed": seed, "epoch": epoch, "learned_by": how, "mse": 2 * error / numbers}
-
-
-def costs(config: Config) -> list[Record]:
-    """Time and memory of one change, by length of the episode."""
-    torch.set_num_threads(1)
-    rng = np.random.default_rng(config.seed)
-    weights, records = initial_weights(config.hidden, 4, 2, rng), []
-    for length in config.lengths:
-        senses = rng.normal(size=(length, 16, 4)).astype(np.float32)
-        commands = rng.normal(size=(length, 16, 3)).astype(np.float32)
-        batch = Batch(senses, commands, np.full(length, 16))
-        ways: dict[str, Callable[[], Changes]] = {
-            "local": partial(local, weights, batch, 5, PRIOR_PRECISION),
-            "backpropagation": partial(_exact_error, weights, batch),
-        }
-        for how, change in ways.items():
-            saved, taken = change().saved, []
-            for _ in range(3):
-                since = time.perf_counter()
-                change()
-                taken.append(time.perf_counter() - since)
-            records.append(
-                {"seed": config.seed, "cost_of": how, "steps": length, "ms": 1e3 * min(taken), "bytes": saved}
-            )
-    return records
-
-
-def _exact_error(weights: Weights, batch: Batch) -> Changes:
-    return exact(weights, batch, 5, PRIOR_PRECISION, ("error",))["error"]
+    return {"epoch": epoch, "learned_by": how, "mse": 2 * local(weights, judged, ITERATIONS).error / numbers}
 
 
 def tables(records: Sequence[Record], config: Config) -> list[Table]:
-    """Angles over learning, by array, by iterations; errors; costs."""
-    epochs = checkpoints(config.epochs)
-
-    epochs_of = kit.by("epoch", epochs)
-    usually: Record = {"array": "all", "iterations": usual(config)}
-    targets = {label: {"target": t} for t, label in TARGETS.items()}
-    angles_of = partial(kit.grid, records=records, value="degrees", digits=0)
-    caption = (
-        f"Angle [°] between the local change and the exact one, before so many epochs, {usual(config)} iterations; "
-        "mean ± SD over seeds"
-    )
+    """Return angles over learning, by array and by inference steps; and errors."""
+    epochs = kit.by("epoch", checkpoints(config.epochs))
+    targets: dict[str, Record] = {label: {"target": t} for t, label in TARGETS.items()}
+    learning = {"array": "all", "iterations": ITERATIONS}
+    caption = "Angle [°] between the local change and the exact one, before so many epochs; mean ± SD over seeds"
+    arrays = {"target": "error", "iterations": ITERATIONS}
+    after, counts = {"array": "all", "epoch": config.epochs}, kit.by("iterations", config.iterations)
+    ways, error = kit.by("learned_by", RATES), "Mean squared error of the next row [variance], before so many epochs"
     return [
-        angles_of(caption, rows=targets, columns=epochs_of, **usually),
-        angles_of(
-            "Of each array, to the gradient of the prediction error",
-            rows=kit.by("array", COMPARED),
-            columns=epochs_of,
-            target="error",
-            iterations=usual(config),
-        ),
-        angles_of(
-            "By iterations, after learning",
-            rows=targets,
-            columns=kit.by("iterations", config.iterations),
-            array="all",
-            epoch=config.epochs,
-        ),
-        kit.grid(
-            "Mean squared error of the next row [variance], before so many epochs",
-            records,
-            "mse",
-            kit.by("learned_by", RATES),
-            epochs_of,
-            3,
-        ),
-        Table(
-            "A change along a batch of 16: time [ms] / kept for the way back [KiB], by steps",
-            ("", *(str(r["steps"]) for r in records if r.get("cost_of") == "local")),
-            [
-                (how, *(f"{r['ms']:.1f} / {r['bytes'] / 1024:.0f}" for r in records if r.get("cost_of") == how))
-                for how in RATES
-            ],
-        ),
+        kit.grid(caption, records, "degrees", targets, epochs, 0, **learning),
+        kit.grid("Of each array, to the second", records, "degrees", kit.by("array", COMPARED), epochs, 0, **arrays),
+        kit.grid("By inference steps, after learning", records, "degrees", targets, counts, 0, **after),
+        kit.grid(error, records, "mse", ways, epochs, 3),
     ]
 
 
 def drawn(records: Sequence[Record], config: Config) -> Figure:
-    """Angles, errors, costs."""
-    epochs = checkpoints(config.epochs)
-    where = {"array": "all", "iterations": usual(config)}
-    with figure(height=3.3, width=11) as fig:
-        axes = fig.subplots(1, 4)
-        targets = {label: {"target": t} for t, label in TARGETS.items()}
-        curves(axes[0], records, "degrees", ("epoch", epochs), targets, **where)
-        curves(
-            axes[1], records, "degrees", ("iterations", config.iterations), targets, array="all", epoch=config.epochs
-        )
-        for i, how in enumerate(RATES, len(TARGETS)):
-            curve(axes[2], epochs, [over_seeds(records, "mse", learned_by=how, epoch=e) for e in epochs], i, how)
-            own = [r for r in records if r.get("cost_of") == how]
-            curve(axes[3], [r["steps"] for r in own], [(r["bytes"] / 1024, 0.0) for r in own], i, how)
-        axes[0].set(xlabel="epochs", ylabel="angle to the local change [°]", ylim=(0, 95), xscale="symlog")
-        axes[1].set(xlabel="iterations of inference", ylim=(0, 95), xscale="log")
-        axes[2].set(xlabel="epochs", ylabel="error of the next row [variance]", yscale="log", xscale="symlog")
-        axes[3].set(xlabel="steps of the episode", ylabel="kept for the way back [KiB]", yscale="log")
-        for ax in axes[:2]:
-            ax.axhline(90, color="#999999", linewidth=1)
-        for ax in (axes[0], axes[2]):
-            ax.set_xlim(0, 1.2 * config.epochs)
-        ways = [ax.get_legend_handles_labels() for ax in (axes[0], axes[2])]
-        handles, labels = ([*first, *second] for first, second in zip(*ways, strict=True))
-        fig.legend(handles, labels, loc="outside upper center", ncols=5, fontsize=8)
+    """Draw angles and errors over learning."""
+    epochs = "epoch", checkpoints(config.epochs)
+    with figure(height=3.3, width=8) as fig:
+        left, right = fig.subplots(1, 2)
+        targets: dict[str, Record] = {label: {"target": t} for t, label in TARGETS.items()}
+        curves(left, records, "degrees", epochs, targets, array="all", iterations=ITERATIONS)
+        curves(right, records, "mse", epochs, kit.by("learned_by", RATES))
+        left.axhline(90, color="#999999", linewidth=1)
+        left.set(xlabel="epochs", ylabel="angle to the local change [°]", ylim=(0, 95), xscale="symlog")
+        right.set(xlabel="epochs", ylabel="error of the next row [variance]", yscale="log", xscale="symlog")
+        for ax in (left, right):
+            ax.legend(fontsize=7)
     return fig
 
 
 def run(config: Config) -> Findings:
-    """Every seed, then the costs."""
-    found = kit.each("learning both ways", partial(one_seed, config=config), config.repetitions, config)
-    with kit.stage("measuring costs"):
-        records = kit.together(found) + costs(config)
+    """Run every seed."""
+    work = partial(one_seed, config=config)
+    records = kit.together(kit.each("learning both ways", work, config.repetitions, config))
     return Findings(records, tables(records, config), drawn(records, config), {"rates": RATES})

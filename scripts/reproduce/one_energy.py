@@ -1,9 +1,10 @@
-"""One energy: surprise rises with it, and completing, reacting and learning descend it.
+"""One energy: surprise rises with it, and completion, reaction and learning descend it.
 
-F adds up what is unexpected to the network through time, to association and to the motor association
-(``asm_gym.memory.free_energy``). Faults: F against the surprise in use, on robosuite skills. Completion: missing senses
-by descending F, by the correlation memory in use, and as they were last. Reaction: a pen is displaced while it writes,
-and goes on by the motor association, or by the command that lets F be lowest over what it leads to.
+Claim: F, the sum of what is unexpected to the temporal network, to association and to the motor association
+(``asm_gym.memory.free_energy``), finds faults, completes missing senses, and chooses commands. Faults: F against the
+surprise in use, on robosuite skills. Completion: missing senses by descending F, by the correlation memory, and as they
+were last. Reaction: a pen is displaced while it writes, and goes on by the temporal network, by the motor association,
+or by the command that lets F be lowest.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.handwriting import DT, NOISE, copybook, repertoire
-from asm_gym.scripts.reproduce.kit import Findings, Record, shown
+from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds
 from asm_gym.scripts.reproduce.recordings import RunConfig, in_turn
 
 Floats = NDArray[np.float64]
@@ -40,11 +41,11 @@ MEAN_ROWS = 4
 
 PARTS = ("F", "time", "association", "motor", "in use")
 LOST = {"one encoder": ("encoder[3]",), "all encoders": tuple(f"encoder[{j}]" for j in range(7)), "wrist": ("wrist",)}
+COMPLETED_BY = ("last value", "correlation memory", "lowest F")
+COMMANDED_BY = ("temporal network", "motor association", "lowest F")
 CUE, PUSHED, LETTERS, WRITINGS = 15, 25, 4, 16
-DISPLACED = 1.0
-"""How far a pen is displaced [cm]."""
-
-DRIVES = "network through time", "motor association", "lowest F"
+DISPLACEMENT = 1.0
+"""Of the pen [cm]."""
 
 
 @dataclass(frozen=True)
@@ -57,22 +58,17 @@ class Config(RunConfig):
     """Letters that are written in closed loop."""
 
 
-def smoothed(values: Floats) -> Floats:
-    """(T,) the mean of the last rows."""
-    padded = np.concatenate([np.full(MEAN_ROWS - 1, values[0]), values])
-    return np.convolve(padded, np.full(MEAN_ROWS, 1.0 / MEAN_ROWS), "valid")
-
-
-def course(energy: FreeEnergy, episode: Episode) -> dict[str, Floats]:
-    """F of each row (T,), whole and by its parts; the first rows, of which nothing is known, are as the first known."""
+def by_part(energy: FreeEnergy, episode: Episode) -> dict[str, Floats]:
+    """Return F of each row (T,), whole and by its parts, smoothed; the first rows repeat the first known."""
     found = [energy.terms(m, row, energy.inferred(m, row)) for m, row in energy.moments(episode.stream)]
-    early = len(episode) - len(found)
+    early = len(episode) - len(found) + MEAN_ROWS - 1
     each = {"F": [t.total for t in found]} | {p: [getattr(t, p) for t in found] for p in PARTS[1:-1]}
-    return {part: smoothed(np.concatenate([np.full(early, own[0]), own])) for part, own in each.items()}
+    mean = np.full(MEAN_ROWS, 1.0 / MEAN_ROWS)
+    return {p: np.convolve(np.concatenate([np.full(early, own[0]), own]), mean, "valid") for p, own in each.items()}
 
 
 def faults_by(part: str, courses: dict[str, list[dict[str, Floats]]], roles: Roles, config: Config) -> list[Record]:
-    """What one part of F tells of faults, at a threshold of its own."""
+    """Measure what one part of F tells of faults, at a threshold of its own."""
     threshold = conformal_threshold(np.array([c[part].max() for c in courses["calibration"]]), config.false_alarm_rate)
 
     def judged(e: Episode, own: dict[str, Floats]) -> ScoredEpisode:
@@ -85,18 +81,19 @@ def faults_by(part: str, courses: dict[str, list[dict[str, Floats]]], roles: Rol
     for e, own in zip(roles["faulty"], courses["faulty"], strict=True):
         scored = judged(e, own)
         auroc = time_matched_auroc([scored], nominal, config.window)
-        made.append(
-            {
-                "part": part,
-                "auroc": None if np.isnan(auroc) else auroc,
-                "found": detected([scored], config.window).value,
-            }
-        )
+        found = detected([scored], config.window).value
+        made.append({"part": part, "auroc": None if np.isnan(auroc) else auroc, "found": found})
     return made
 
 
+def before(rows: Floats, t: int, c: Any, energy: FreeEnergy) -> Before:
+    """Return what was known before row ``t``."""
+    lag = energy.senses.lag
+    return Before(c, *(rows[None, max(0, t - k)] for k in (lag, 2 * lag, 1)))
+
+
 def completions(asm: NeuralASM, energy: FreeEnergy, episodes: Sequence[Episode]) -> list[Record]:
-    """Root mean square errors of what completes missing senses [rad, N, N m]."""
+    """Measure root mean square errors of completed senses [rad, N]."""
     completion = asm.model.completion_
     assert completion is not None
     made: list[Record] = []
@@ -107,20 +104,20 @@ def completions(asm: NeuralASM, energy: FreeEnergy, episodes: Sequence[Episode])
         first = np.flatnonzero(missing)[: sum(n.startswith("encoder") for n in names) or 3]  # angles, forces
         for e in episodes:
             truth, onset = e.stream.astype(np.float64), len(e) // 3
-            ways = {
-                "correlation memory": completion.complete(completion.filling(missing), completion.lift(truth)),
-                "last value": np.repeat(truth[onset - 1 : onset, missing], len(truth), axis=0),
-                "lowest F": carried(energy, truth, missing, onset)[:, missing],
-            }
+            filled = (
+                np.repeat(truth[onset - 1 : onset, missing], len(truth), axis=0),
+                completion.complete(completion.filling(missing), completion.lift(truth)),
+                lowest(energy, truth, missing, onset)[:, missing],
+            )
             own = np.isin(np.flatnonzero(missing), first)
-            for way, filled in ways.items():
-                off = (filled - truth[:, missing])[onset:, own]
-                made.append({"lost": lost, "way": way, "rmse": float(np.sqrt(np.mean(off**2)))})
+            for way, values in zip(COMPLETED_BY, filled, strict=True):
+                error = (values - truth[:, missing])[onset:, own]
+                made.append({"lost": lost, "way": way, "rmse": float(np.sqrt(np.mean(error**2)))})
     return made
 
 
-def carried(energy: FreeEnergy, truth: Floats, missing: NDArray[np.bool_], onset: int) -> Floats:
-    """(T, D) in which what is missing from ``onset`` on is where F is lowest, row after row."""
+def lowest(energy: FreeEnergy, truth: Floats, missing: NDArray[np.bool_], onset: int) -> Floats:
+    """Return rows (T, D) whose missing senses, from ``onset`` on, are where F is lowest, row after row."""
     rows, c = truth.copy(), energy.network.at_rest(1)
     for t in range(len(rows)):
         moment = before(rows, t, c, energy)
@@ -131,14 +128,8 @@ def carried(energy: FreeEnergy, truth: Floats, missing: NDArray[np.bool_], onset
     return rows
 
 
-def before(rows: Floats, t: int, c: Any, energy: FreeEnergy) -> Before:
-    """What was there before row ``t``."""
-    lag = energy.senses.lag
-    return Before(c, *(rows[None, max(0, t - k)] for k in (lag, 2 * lag, 1)))
-
-
 def written(energy: FreeEnergy, model: Episode, way: str, push: Floats) -> Floats:
-    """(T, 2) where the pen is, after a cue of the ``model``, and displaced once by ``push`` (2,) [cm]."""
+    """Return the pen (T, 2) after a cue of the ``model``, displaced once by ``push`` (2,) [cm]."""
     rng = np.random.default_rng(model.seed)
     rows, c = model.stream.astype(np.float64).copy(), energy.network.at_rest(1)
     pen = rows[CUE - 1, :2].copy()
@@ -153,36 +144,34 @@ def written(energy: FreeEnergy, model: Episode, way: str, push: Floats) -> Float
 
 
 def commanded(energy: FreeEnergy, moment: Before, way: str) -> Floats:
-    """(A,) by one of ``DRIVES``."""
-    if way == DRIVES[0]:
-        scaler, network = energy.senses, energy.network
-        told = network.run_on(moment.c).expected[0, scaler.size :].astype(np.float64)
-        motor = scaler.spec.motor
-        return np.asarray(scaler.mean[motor] + scaler.spread[motor] * told)
-    return energy.reaction(moment) if way == DRIVES[2] else energy.expected(moment)
+    """Return the command (A,) by one of ``COMMANDED_BY``."""
+    if way == COMMANDED_BY[0]:
+        scaler, motor = energy.senses, energy.senses.spec.motor
+        action = energy.network.run_on(moment.c).expected[0, scaler.size :].astype(np.float64)
+        return np.asarray(scaler.mean[motor] + scaler.spread[motor] * action)
+    return energy.reaction(moment) if way == COMMANDED_BY[2] else energy.expected(moment)
 
 
 def reactions(energy: FreeEnergy, models: Sequence[Episode], seed: int) -> list[Record]:
-    """How far letters are from those they go on from, with and without a displacement [cm]."""
+    """Measure how far letters are from those they go on from, with and without a displacement [cm]."""
     made, rng = [], np.random.default_rng(seed)
     for model in models:
         angle = rng.uniform(0.0, 2.0 * np.pi)
         for pushed in (False, True):
-            push = DISPLACED * pushed * np.array([np.cos(angle), np.sin(angle)])
-            for way in DRIVES:
-                off = written(energy, model, way, push)[PUSHED + 10 :] - model.stream[PUSHED + 10 :, :2]
-                error = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
-                made.append({"way": way, "pushed": pushed, "off": error})
+            push = DISPLACEMENT * pushed * np.array([np.cos(angle), np.sin(angle)])
+            for way in COMMANDED_BY:
+                error = written(energy, model, way, push)[PUSHED + 10 :] - model.stream[PUSHED + 10 :, :2]
+                made.append({"way": way, "pushed": pushed, "cm": float(np.sqrt(np.mean(np.sum(error**2, axis=1))))})
     return made
 
 
 def one(job: tuple[str, int], roles: Roles, config: Config) -> list[Record]:
-    """All of it, for one dynamics and one seed."""
+    """Measure everything for one dynamics and one seed."""
     dynamics, seed = job
     asm = NeuralASM(roles["fit"][0].spec, dynamics=dynamics, seed=seed).fit(roles["fit"]).learn_to_act(roles["fit"])
-    energy = asm.model.free_energy(roles["apart"])
+    energy = asm.model.free_energy(roles["spreads"])
     judged = {name: roles[name] for name in ("calibration", "nominal", "faulty")}
-    courses = {name: [course(energy, e) for e in own] for name, own in judged.items()}
+    courses = {name: [by_part(energy, e) for e in own] for name, own in judged.items()}
     for name, own in judged.items():
         for found, surprise in zip(courses[name], asm.score_episodes(own), strict=True):
             found["in use"] = surprise.value
@@ -198,76 +187,45 @@ def one(job: tuple[str, int], roles: Roles, config: Config) -> list[Record]:
 
 
 def tables(records: Sequence[Record], config: Config) -> list[Table]:
-    """Faults, completion, reaction."""
-    both = tuple(DYNAMICS)
-
-    def cells(value: str, digits: int, **where: Any) -> list[str]:
-        return [shown(records, value, digits, dynamics=d, **where) for d in both]
-
-    head = [f"{value}, {d}" for value in ("AUROC", "found", "nominal in alarm") for d in both]
-    rows = [(p, *(c for v in ("auroc", "found", "alarm") for c in cells(v, 2, part=p))) for p in PARTS]
-    rate = f"{100 * config.false_alarm_rate:g} %"
-    made = [
-        Table(
-            f"Faults in {config.window:g} s, {rate} of nominal episodes may alarm: F, its parts, the surprise in use",
-            ("", *head),
-            rows,
-        )
-    ]
-    ways = "last value", "correlation memory", "lowest F"
-    rows = [(lost, way, *cells("rmse", 4, lost=lost, way=way)) for lost in LOST for way in ways]
-    made.append(
-        Table("Senses missing from a third of an episode on: error [rad, N]", ("missing", "completed by", *both), rows)
-    )
-    rows = [
-        ("displaced by 1 cm" if pushed else "left alone", way, *cells("off", 3, pushed=pushed, way=way))
+    """Return faults, completion and reaction."""
+    both, parts = kit.by("dynamics", DYNAMICS), kit.by("part", PARTS)
+    rate = f"{100 * config.false_alarm_rate:g} % of nominal episodes may alarm"
+    values = {"auroc": "AUROC", "found": f"Found in {config.window:g} s", "alarm": "Nominal episodes in alarm"}
+    made = [kit.grid(f"{label} by F and its parts; {rate}", records, v, parts, both) for v, label in values.items()]
+    lost: dict[str, Record] = {f"{x} by {way}": {"lost": x, "way": way} for x in LOST for way in COMPLETED_BY}
+    made.append(kit.grid("Error of completed senses [rad, N]", records, "rmse", lost, both, 4))
+    ways: dict[str, Record] = {
+        f"{'displaced' if pushed else 'left alone'}, {way}": {"pushed": pushed, "way": way}
         for pushed in (False, True)
-        for way in DRIVES
-    ]
-    made.append(
-        Table(
-            "A pen in closed loop: distance from the letter, from ten rows after the push on [cm]",
-            ("pen", "command", *both),
-            rows,
-        )
-    )
-    return made
+        for way in COMMANDED_BY
+    }
+    return [*made, kit.grid("Distance of a pen from the letter after a push [cm]", records, "cm", ways, both, 3)]
 
 
 def drawn(records: Sequence[Record]) -> Figure:
-    """AUROC of each part, what is completed relative to the last value, and how far off a pen is."""
-    completed = [(lost, way) for lost in LOST for way in ("correlation memory", "lowest F")]
-
-    def against_last(d: str, lost: str, way: str) -> float:
-        own, last = (kit.over_seeds(records, "rmse", dynamics=d, lost=lost, way=w).mean for w in (way, "last value"))
-        return own / last
-
-    with figure(height=3.4, width=11) as fig:
-        axes = fig.subplots(1, 3)
+    """Draw the AUROC of each part, and how far off a displaced pen is."""
+    with figure(height=3.4, width=8) as fig:
+        axes = fig.subplots(1, 2)
         for i, d in enumerate(DYNAMICS):
             panels = (
-                (PARTS, [kit.over_seeds(records, "auroc", dynamics=d, part=p).mean for p in PARTS]),
-                ([f"{lost}, {way}" for lost, way in completed], [against_last(d, *c) for c in completed]),
-                (DRIVES, [kit.over_seeds(records, "off", dynamics=d, pushed=True, way=w).mean for w in DRIVES]),
+                (PARTS, [over_seeds(records, "auroc", dynamics=d, part=p).mean for p in PARTS]),
+                (COMMANDED_BY, [over_seeds(records, "cm", dynamics=d, pushed=True, way=w).mean for w in COMMANDED_BY]),
             )
             for ax, (names, found) in zip(axes, panels, strict=True):
                 ax.barh(np.arange(len(names)) + 0.38 * (i - 0.5), found, 0.36, color=look(i)[0], label=d)
                 ax.set_yticks(range(len(names)), names, fontsize=8)
-                ax.invert_yaxis() if i == 0 else None
         axes[0].set(xlabel="AUROC of faults", xlim=(0.4, 1.0))
-        axes[1].set(xlabel="error of completion / that of the last value", xscale="log")
-        axes[1].axvline(1.0, color="#444444", linewidth=1)
-        axes[2].set(xlabel="off the letter after a push [cm]")
-        fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, fontsize=8)
+        axes[1].set(xlabel="off the letter after a push [cm]")
+        axes[0].legend(fontsize=8)
     return fig
 
 
 def run(config: Config) -> Findings:
-    """For both dynamics and every seed."""
+    """Run both dynamics and every seed."""
     roles = dict(config.roles)
     roles["faulty"] = [e for e in roles["faulty"] if len(e) > (e.labelled.onset or 0)]
-    healthy = in_turn(roles["calibration"], 0)  # of each task some whose rows τ is from, and no threshold
-    roles["apart"], roles["calibration"] = healthy[: len(healthy) // 5], healthy[len(healthy) // 5 :]
+    healthy = in_turn(roles["calibration"], 0)  # a fifth sets τ, and no threshold
+    roles["spreads"], roles["calibration"] = healthy[: len(healthy) // 5], healthy[len(healthy) // 5 :]
     jobs = [(d, seed) for d in DYNAMICS for seed in config.repetitions]
     records = kit.together(kit.each("learning and judging", partial(one, roles=roles, config=config), jobs, config))
     return Findings(records, tables(records, config), drawn(records))

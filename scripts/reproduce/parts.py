@@ -30,8 +30,8 @@ from asm_gym.evaluation.scoring import detectability_of, fitted, judged
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.faults.suite import SEVERITIES
+from asm_gym.memory.association_learning import FEEDBACK, LEARNED
 from asm_gym.memory.dynamics import TRACES
-from asm_gym.memory.feedback import FEEDBACK, LEARNED
 from asm_gym.memory.precision import unbounded
 from asm_gym.monitors import CalibratedMonitor, NeuralASM
 from asm_gym.monitors.base import Progress

@@ -1,0 +1,305 @@
+"""Studies of the memory: their instruments against oracles, and the direction of each claim on small data."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+
+from asm_gym import NeuralASM
+from asm_gym.memory.inference import Weights, direct_synapses, iterations_within
+from asm_gym.memory.network_learning import initial_weights
+from asm_gym.scripts.reproduce import sequences, speed_accuracy, tracking
+from asm_gym.scripts.reproduce.expression import (
+    Backpropagated,
+    ExpressionMemory,
+    Hopfield,
+    mean_demonstrations,
+    recalled,
+)
+from asm_gym.scripts.reproduce.handwriting import (
+    DT,
+    NOISE,
+    STEPS,
+    Letter,
+    Stroke,
+    copybook,
+    repertoire,
+    velocity,
+    written,
+)
+from asm_gym.scripts.reproduce.local_learning import COMPARED, cosine, exact, local
+from asm_gym.scripts.reproduce.recurrent import Batch, batches, side_by_side
+from asm_gym.scripts.reproduce.tracking import A, C, converged, informed, kalman, recording, squared, tracked
+from asm_gym.scripts.reproduce.two_links import (
+    COMMAND,
+    CUE,
+    ENCODERS,
+    EVENT,
+    HAND,
+    PUSH,
+    SPEC,
+    MemoryDriver,
+    closed_loop,
+    demonstrations,
+    hand,
+    joints,
+)
+from asm_gym.scripts.reproduce.two_links import DT as ARM_DT
+from tests.problems import trajectory
+
+STROKE = Stroke(length=4.0, direction=0.3, turn=1.5, rise=0.0, onset=-0.05, sigma=0.3)
+
+
+def test_a_stroke_ends_at_its_chord_and_is_fastest_at_the_mode_of_its_lognormal():
+    time = (np.arange(200_000) + 0.5) * 2e-5
+    end = (velocity(Letter("a", (STROKE,)), time) * 2e-5).sum(axis=0)
+    # ∫_0^1 exp(i (θ + Δθ u)) du = (exp(i (θ + Δθ)) - exp(i θ)) / (i Δθ)
+    chord = 4.0 * (np.exp(1j * 1.8) - np.exp(1j * 0.3)) / (1j * 1.5)
+    np.testing.assert_allclose(end, [chord.real, chord.imag, 0.0], atol=1e-3)
+    time = np.linspace(0.01, 1.0, 100_000)
+    speed = np.linalg.norm(velocity(Letter("a", (STROKE,)), time), axis=1)
+    assert time[speed.argmax()] == pytest.approx(-0.05 + math.exp(-1.75 - 0.3**2), abs=1e-4)
+
+
+def test_the_pen_goes_where_its_commands_take_it_at_any_speed():
+    episode = written(repertoire(1, 3, np.random.default_rng(0))[0], 3, np.random.default_rng(1))
+    gone = episode.stream[:, :3] - np.cumsum(episode.stream[:, 3:], axis=0) * DT
+    assert episode.stream.shape == (STEPS, 6)
+    assert gone.std() == pytest.approx(NOISE, rel=0.2)
+    letter = repertoire(1, 2, np.random.default_rng(0))[0]
+    slow, fast = (written(letter, 2, np.random.default_rng(1), speed, wobble=0.0) for speed in (1.0, 2.0))
+    assert len(fast) == len(slow) / 2
+    np.testing.assert_allclose(fast.stream[:, :2], slow.stream[1::2, :2], atol=6 * NOISE)
+
+
+def letters_of(count: int, each: int = 6) -> tuple[list, list]:
+    rng = np.random.default_rng(0)
+    letters = repertoire(count, 2, rng)
+    return copybook(letters, each, 2, rng), copybook(letters, 3, 2, rng)
+
+
+def test_a_hopfield_network_completes_what_it_stored_and_answers_with_the_mean_when_cold():
+    train, _ = letters_of(3, each=1)
+    streams = np.stack([e.stream for e in train], axis=1).astype(np.float64)
+    made = Hopfield.learned(train, beta=1e5).express(streams, 10)
+    np.testing.assert_allclose(made[1:], streams[1:], atol=1e-4)
+    cold = Hopfield.learned(train, beta=0.0)
+    np.testing.assert_allclose(cold.retrieve(np.ones((1, 20)))[0], cold.values.mean(axis=0), atol=1e-9)
+
+
+@pytest.mark.parametrize("cell", ["gru", "lstm"])
+def test_a_recurrent_rival_offline_reads_its_own_predictions(cell):
+    train, tests = letters_of(2)
+    model = Backpropagated.learned(train, cell, 16, np.random.default_rng(0), updates=5)
+    streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)
+    offline, row = model.express(streams, 20), np.arange(STEPS)[:, None, None]
+    np.testing.assert_allclose(offline[:20], model.express(streams, STEPS)[:20], atol=1e-5)
+    np.testing.assert_array_equal(offline, model.express(np.where(row < 20, streams, 9.0), 20))
+
+
+def test_batches_hold_every_episode_once_and_let_short_ones_end():
+    rng = np.random.default_rng(0)
+    episodes = [
+        trajectory(rng.normal(size=(20 + n % 3, 5)).astype(np.float32), np.ones((20 + n % 3, 1), np.float32))
+        for n in range(11)
+    ]
+    made = batches(episodes, 4, rng)
+    assert sum(b.active.sum() for b in made) == sum(len(t.senses) for t in episodes)
+    assert max(b.senses.shape[1] for b in made) == 4
+    batch = side_by_side(episodes[:3])  # 20, 21 and 22 rows
+    assert list(batch.active[-3:]) == [3, 2, 1]
+    np.testing.assert_array_equal(batch.senses[:, 0], episodes[2].senses)
+
+
+def test_the_memory_recalls_each_letter_from_its_cue():
+    train, tests = letters_of(2, each=8)
+    memory = ExpressionMemory.learned(train, 32, np.random.default_rng(0), 4000)
+    error, right = recalled(memory, tests, mean_demonstrations(train, 2), 20)
+    streams = np.stack([e.stream for e in tests], axis=1)
+    still = np.linalg.norm(streams[20:, :, :2] - streams[19, :, :2], axis=2).mean()
+    assert right >= 5 / 6
+    assert error < 0.5 * still
+
+
+def test_traces_need_no_inference_and_a_settling_state_does():
+    config = speed_accuracy.Config(skills=2, hidden=32, writings=4, steps=2000, iterations=(1, 5, 30, 100))
+    found = {}
+    for dynamics in ("traces", "settling"):
+        rng = np.random.default_rng(0)
+        records = speed_accuracy.by_iterations(repertoire(2, 2, rng), config, rng, dynamics)
+        found[dynamics] = {(r["iterations"], r["shorter"]): r["next_cm"] for r in records}
+    assert len(set(found["traces"].values())) == 1  # to the bit: nothing is inferred
+    settling = [found["settling"][at] for at in ((1, 20), (5, 20), (30, 20), (100, 1))]
+    assert all(later < sooner for sooner, later in itertools.pairwise(settling))
+    assert settling[0] > 1.3 * settling[-1]
+
+
+def small_batch(steps: int) -> tuple[Weights, Batch]:
+    rng = np.random.default_rng(0)
+    senses, commands = (rng.normal(size=(steps, 4, n)).astype(np.float32) for n in (5, 3))
+    weights = initial_weights(7, 5, 2, rng)
+    weights.W_F[:] = rng.normal(size=weights.W_F.shape)
+    weights.W_D[:] = 0.1 * rng.normal(size=weights.W_D.shape) * direct_synapses(5, 2)
+    return weights, Batch(senses, commands, np.full(steps, 4))
+
+
+def test_the_differentiated_network_is_the_memory_and_its_gradient_that_of_finite_differences():
+    weights, batch = small_batch(14)
+    read, alone = (local(weights, batch, 8, alone, pi_z=1.0) for alone in (False, True))
+    gradient = {target: exact(weights, batch, 8, target, pi_z=1.0) for target in ("energy", "error", "alone")}
+    assert gradient["energy"].energy == pytest.approx(read.energy, rel=1e-4)
+    assert gradient["error"].error == pytest.approx(read.error, rel=1e-4)
+    assert gradient["alone"].error == pytest.approx(alone.error, rel=1e-4)
+    for name, index in (("W_C", (2, 3)), ("W_F", (1, 4)), ("W_D", (0, 2)), ("W_D", (6, 5))):
+        for target in ("error", "alone"):
+            ends = []
+            for step in (0.01, -0.01):
+                moved = getattr(weights, name).copy()
+                moved[index] += step
+                ends.append(local(weights._replace(**{name: moved}), batch, 8, target == "alone", 1.0).error)
+            slope = (ends[0] - ends[1]) / 0.02
+            assert -gradient[target].arrays[name][index] == pytest.approx(slope, rel=0.05, abs=0.02)
+
+
+def test_the_local_change_is_the_gradient_of_the_energy_and_of_the_error_for_a_firm_prior():
+    weights, batch = small_batch(6)
+    ours, theirs = local(weights, batch, 400, pi_z=1.0), exact(weights, batch, 400, "energy", 1.0)
+    for name in COMPARED:
+        np.testing.assert_allclose(ours.arrays[name], theirs.arrays[name], atol=1e-3)
+    weights, batch = small_batch(20)
+    angles = []
+    for pi_z in (1.0, 100.0):
+        angles.append(cosine(local(weights, batch, 50, pi_z=pi_z), exact(weights, batch, 50, "error", pi_z)))
+        alone = local(weights, batch, 50, alone=True, pi_z=pi_z), exact(weights, batch, 50, "alone", pi_z)
+        assert 0.2 < cosine(*alone) < 0.999  # the way back through time is left out
+    assert 0.5 < angles[0] < angles[1]
+    assert angles[1] > 0.999
+
+
+@pytest.fixture(scope="module")
+def run():
+    return recording(1500, np.random.default_rng(0))
+
+
+def test_the_kalman_filter_is_as_far_off_as_the_riccati_equation_says(run):
+    prior = solve_discrete_are(A.T, C.T, np.eye(3), np.eye(3))
+    after = prior - prior @ C.T @ np.linalg.inv(C @ prior @ C.T + np.eye(3)) @ C @ prior
+    found, expected = kalman(run)
+    assert squared(found, run.states) == pytest.approx(np.trace(after) / 3, rel=0.1)
+    new = run.observed - expected
+    assert squared(new, 0 * new) == pytest.approx(np.trace(C @ prior @ C.T + np.eye(3)) / 3, rel=0.1)
+    assert tracking.usual_variance() == pytest.approx(np.trace(prior) / 3)
+
+
+def test_inference_comes_nearer_to_the_kalman_filter_step_by_step_and_ends_at_the_closed_form(run):
+    best, end = kalman(run)[0], converged(run)
+    found = {n: tracked(informed(n), run) for n in (1, 2, 4, 10, 1000)}
+    errors = [squared(x, run.states) for x in found.values()]
+    assert all(later < sooner for sooner, later in itertools.pairwise(errors[:4]))
+    assert squared(found[1000], end) < 1e-4
+    assert squared(best, run.states) < squared(end, run.states) < 2 * squared(best, run.states)
+    assert squared(converged(run, tracking.usual_variance()), run.states) < squared(end, run.states)
+
+
+def test_a_network_predicts_the_next_observation_nearly_as_the_kalman_filter_does():
+    rng, config = np.random.default_rng(0), tracking.Config(updates=8000)
+    network, spread = tracking.learned([recording(tracking.LEARNED_STEPS, rng) for _ in range(64)], config, rng)
+    errors = [
+        (squared(tracking.observations(network, spread, r)[200:], r.observed[200:]), squared(kalman(r)[1], r.observed))
+        for r in (recording(tracking.LEARNED_STEPS, rng) for _ in range(8))
+    ]
+    ours, best = np.mean(errors, axis=0)
+    assert best < ours < 1.25 * best
+
+
+def test_a_settling_network_recalls_patterns_that_come_twice_and_one_layer_does_not():
+    config, rng = sequences.Config(updates=1500), np.random.default_rng(0)
+    sequence = sequences.patterns(3, 100, 0.0, rng)[list(sequences.REPEATED["A B C B A"])]
+    found = sequences.by_network(sequence, "settling", config, rng)
+    assert sequences.recalled(found, sequence)[0] == 1.0
+    for other in (sequences.by_one_layer(sequence), sequences.by_correlation(sequence)):
+        assert sequences.recalled(other, sequence)[0] < 1.0  # B is followed by C and by A
+
+
+def test_similar_patterns_confuse_correlation_only():
+    rng = np.random.default_rng(0)
+    made = sequences.patterns(200, 400, 0.5, rng)
+    assert np.mean(made[:100] * made[100:]) == pytest.approx(0.25, abs=0.05)  # b²
+    sequence = sequences.patterns(16, 100, 0.5, rng)
+    assert sequences.recalled(sequences.by_one_layer(sequence), sequence)[0] == 1.0
+    assert sequences.recalled(sequences.by_correlation(sequence), sequence)[0] < 0.5
+    off = sequence.copy()
+    off[3, :10] *= -1
+    assert sequences.recalled(off, sequence) == (14 / 15, pytest.approx(4 * 10 / 1500))
+
+
+@pytest.fixture(scope="module")
+def arm():
+    rng = np.random.default_rng(0)
+    two = repertoire(2, 2, rng)
+    return demonstrations(two, 12, rng), demonstrations(two, 4, rng)
+
+
+def test_a_budget_of_inference_is_so_many_steps_a_row_and_at_least_one():
+    assert [iterations_within(b, 0.05) for b in (20, 39, 40, 100.0)] == [1, 1, 2, 5]
+    with pytest.raises(ValueError, match=r"budget of 19 .* 20 rows a second"):
+        iterations_within(19, 0.05)
+    with pytest.raises(ValueError, match=r"^budget must be .* above 0, got 0"):
+        iterations_within(0, 0.05)
+
+
+def test_the_arm_is_where_its_joints_and_its_commands_say(arm):
+    for e in arm[1]:
+        rows = e.stream.astype(np.float64)
+        assert np.abs(hand(rows[:, ENCODERS]) - rows[:, HAND]).max() < 0.25  # the noise of both
+        moved = rows[0, ENCODERS] + ARM_DT * np.cumsum(rows[1:, COMMAND], axis=0)
+        assert np.abs(moved - rows[1:, ENCODERS]).max() < 0.01
+        np.testing.assert_allclose(hand(joints(rows[:, HAND])), rows[:, HAND], atol=1e-9)
+
+
+class Replay:
+    """Commands what was commanded in the demonstrations."""
+
+    def __init__(self, cues):
+        self.cues, self.t, self.attribution = cues, 0, np.zeros(cues.shape[1:])
+
+    def command(self):
+        return self.cues[self.t][:, COMMAND]
+
+    def read(self, rows):
+        self.t += 1
+        self.last = rows
+        return np.zeros(len(rows))
+
+
+def test_replayed_commands_write_the_letter_unless_something_happens(arm):
+    cues = np.stack([e.stream for e in arm[1]], axis=1).astype(np.float64)
+    paths = {}
+    for way in ("left alone", "pushed", "stuck"):
+        driver = Replay(cues)
+        paths[way] = closed_loop(driver, cues, way, 0).path
+    assert np.linalg.norm(paths["left alone"] - cues[:, :, HAND], axis=2).max() < 0.3
+    np.testing.assert_array_equal(paths["pushed"][:EVENT], paths["left alone"][:EVENT])
+    moved = np.abs(joints(paths["pushed"][EVENT + 2 :]) - joints(paths["left alone"][EVENT + 2 :]))
+    np.testing.assert_allclose(moved, PUSH, atol=1e-6)
+    np.testing.assert_allclose(driver.last[:, 0], joints(cues[EVENT - 1, :, HAND])[:, 0], atol=0.02)
+
+
+def test_a_memory_writes_its_letters_and_is_surprised_by_a_push(arm):
+    asm = NeuralASM(SPEC, 32, 32, epochs=400, free_running_probability=0.6).fit(arm[0]).calibrate(arm[0], 0.1)
+    cues = np.stack([e.stream for e in arm[1]], axis=1).astype(np.float64)
+    energy = asm.model.free_energy(arm[1])
+    alone, pushed = (
+        closed_loop(MemoryDriver(asm, 8), cues, way, 0, energy, asm.threshold) for way in ("left alone", "pushed")
+    )
+    truth = cues[CUE:, :, HAND]
+    off = np.linalg.norm(alone.path[CUE:] - truth, axis=2).mean()
+    assert off < 0.5 * np.linalg.norm(truth - truth[0], axis=2).mean()
+    assert (pushed.alarm < EVENT + 10).all()
+    for what in ("surprise", "energy"):
+        nominal, found = (getattr(c, what)[EVENT : EVENT + 5].max(axis=0) for c in (alone, pushed))
+        assert found.min() > nominal.max()

@@ -1,0 +1,441 @@
+"""The temporal network by traces: inference, learning, recall and readout, against their oracles."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from asm_gym.memory.dynamics import train
+from asm_gym.memory.energy import activate, energy_gradient, feedback, outward
+from asm_gym.memory.inference import STRIDE, direct, direct_synapses, infer
+from asm_gym.memory.learning import Synapse, Trajectory, cosine_decay, power_iteration
+from asm_gym.memory.network import Network
+from asm_gym.memory.network_learning import TracesLearner, hebbian_change, initial_weights, learn_traces
+from asm_gym.memory.practice import LONGEST_CUE, RECALL_UPDATES, UPDATES, Practice, one_after_another, passes
+from asm_gym.memory.readout import KEPT, add_up, certainty, learn_readout
+from asm_gym.memory.recall import follow, run_on
+from asm_gym.memory.temporal import unassociated
+from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
+from asm_gym.monitors import NeuralASM
+from tests.problems import CHANGES, energy, problem, schedule, some_association, some_rows, trajectory
+from tests.streams import sine_episodes, sine_spec
+
+H, S, A = 7, 4, 2
+
+
+def test_activation_is_tanh():
+    z = np.linspace(-30, 30, 100_001, dtype=np.float32)[None]
+    np.testing.assert_allclose(activate(z), np.tanh(z), atol=5e-7)
+
+
+@pytest.mark.parametrize("batch", [1, 2, 7])
+@pytest.mark.parametrize("senses", [1, 4, 11])
+def test_products_along_synapses_and_back_are_matrix_products(batch, senses):
+    rng = np.random.default_rng(0)
+    a, W = rng.normal(size=(batch, 6)), rng.normal(size=(senses, 6))
+    np.testing.assert_allclose(outward(a, W), a @ W.T, rtol=1e-12)
+    x, pi = rng.normal(size=(batch, senses)), rng.uniform(size=(batch, senses))
+    np.testing.assert_allclose(feedback(a, x, W, pi), (pi * (x - a @ W.T)) @ W, rtol=1e-12, atol=1e-12)
+
+
+def test_energy_gradient_is_that_of_finite_differences():
+    z, *rest = problem(0, dtype=np.float64)
+    gradient, _ = energy_gradient(z, *rest)
+    for index in np.ndindex(z.shape):
+        step = np.zeros_like(z)
+        step[index] = 1e-5
+        slope = (energy(z + step, *rest) - energy(z - step, *rest))[index[0]] / 2e-5
+        assert gradient[index] == pytest.approx(slope, rel=1e-5, abs=1e-5)
+
+
+def test_bend_bounds_the_curvature_that_the_activation_adds():
+    z, mu, x, W_F, pi_z, pi_x = problem(3, batch=1, dtype=np.float64)
+    _, bend = energy_gradient(z, mu, x, W_F, pi_z, pi_x)
+    hessian = np.zeros((z.shape[1], z.shape[1]))
+    for j in range(z.shape[1]):
+        step = np.zeros_like(z)
+        step[0, j] = 1e-4
+        up, _ = energy_gradient(z + step, mu, x, W_F, pi_z, pi_x)
+        down, _ = energy_gradient(z - step, mu, x, W_F, pi_z, pi_x)
+        hessian[j] = (up - down)[0] / 2e-4
+    curvature = pi_z + pi_x.max() * np.linalg.norm(W_F, 2) ** 2 + bend[0]
+    assert np.linalg.eigvalsh((hessian + hessian.T) / 2)[-1] <= curvature
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10**6), weight=st.floats(0.01, 30.0), reach=st.floats(0.01, 100.0))
+def test_energy_never_rises_during_inference(seed, weight, reach):
+    _, mu, x, W_F, pi_z, pi_x = problem(seed, dtype=np.float64)
+    W_F, x = W_F * weight, x * reach
+    curvature = pi_z + pi_x.max() * np.linalg.norm(W_F, 2) ** 2
+    energies = [energy(infer(mu, x, W_F, pi_z, pi_x, curvature, k), mu, x, W_F, pi_z, pi_x) for k in range(15)]
+    assert (np.diff(energies, axis=0) / (1.0 + energies[0])).max() <= 1e-6
+
+
+def test_converged_inference_is_the_closed_form_where_the_activation_is_linear():
+    _, mu, x, W_F, pi_z, _ = problem(1, dtype=np.float64)
+    mu, x = mu * 1e-3, x * 1e-3  # small enough that tanh(z) = z to 1e-6
+    pi_x = np.full_like(x, 2.0)
+    z = infer(mu, x, W_F, pi_z, pi_x, pi_z + 2.0 * np.linalg.norm(W_F, 2) ** 2, 3000)
+    # Π_z (z - μ) = W_Fᵀ Π_x (x - W_F z)
+    exact = np.linalg.solve(pi_z * np.eye(8) + 2.0 * W_F.T @ W_F, (pi_z * mu + 2.0 * x @ W_F).T).T
+    np.testing.assert_allclose(z, exact, atol=1e-7)
+
+
+def test_inference_is_gradient_descent_that_unseen_senses_do_not_move():
+    _, mu, x, W_F, pi_z, pi_x = problem(2, dtype=np.float64)
+    z = mu.copy()
+    for _ in range(6):
+        f = np.tanh(z)
+        back = (pi_x * (x - f @ W_F.T)) @ W_F
+        bend = 0.77 * np.abs(back).max(axis=1, keepdims=True)
+        z = z - float(STRIDE) / (9.0 + bend) * (pi_z * (z - mu) - (1 - f**2) * back)
+    np.testing.assert_allclose(infer(mu, x, W_F, pi_z, pi_x, 9.0, 6), z, atol=1e-5)
+    seen, other = np.ones_like(x), x.copy()
+    seen[:, 1], other[:, 1] = 0, 77.0
+    a, b = (infer(mu, v, W_F, pi_z, seen, 20.0, 5) for v in (x, other))
+    assert a.tobytes() == b.tobytes()
+
+
+def test_no_action_predicts_itself():
+    exists = direct_synapses(5, 2)
+    W_D = np.ones_like(exists) * exists
+    c = np.zeros((1, W_D.shape[1] - 3), np.float32)
+    still, moving = (direct(c, np.array([[a, a, 1.0]], np.float32), W_D) for a in (0.0, 7.0))
+    np.testing.assert_array_equal(still[:, 5:], moving[:, 5:])
+    assert (still[:, :5] != moving[:, :5]).all()
+
+
+def test_a_trace_is_the_exponentially_weighted_sum_of_all_rows():
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(30, 2, 3)).astype(np.float32)
+    gains = rng.uniform(0.1, 1.0, len(DECAYS)).astype(np.float32)
+    traces = at_rest(2, 3)
+    for row in rows:
+        traces = advance(traces, row, gains)
+    weights = DECAYS[:, None].astype(float) ** np.arange(len(rows))[::-1]  # (K, T); 0⁰ is 1
+    expected = np.einsum("kt,tbr->bkr", weights, rows) * gains[:, None]
+    np.testing.assert_allclose(traces, expected.reshape(2, -1), atol=1e-4)
+
+
+def test_gains_give_every_trace_a_mean_square_of_one():
+    rng = np.random.default_rng(1)
+    episodes = [np.cumsum(rng.normal(size=(T, 4)), axis=0).astype(np.float32) for T in (60, 20, 90)]
+    gains, squares = fit_gains(episodes), []
+    for rows in episodes:
+        traces = at_rest(1, 4)
+        for row in rows:
+            traces = advance(traces, row[None], gains)
+            squares.append(traces.reshape(len(DECAYS), 4) ** 2)
+    np.testing.assert_allclose(np.mean(squares, axis=(0, 2)), 1.0, rtol=1e-3)
+    assert np.isfinite(fit_gains([np.zeros((5, 2), np.float32)])).all()
+
+
+def test_hebbian_changes_are_the_slope_of_the_energy():
+    rng = np.random.default_rng(0)
+    z, _, x, W_F, pi_z, _ = problem(5, batch=1, dtype=np.float64)
+    traces = len(DECAYS) * 6
+    W_C, W_D = rng.normal(size=(8, traces)), rng.normal(size=(5, traces + 1))  # no actions: u is the constant 1
+    c, u, pi_x = rng.normal(size=(1, traces)), np.ones((1, 1)), 0.5 * np.ones_like(x)
+
+    def total(W_C, W_F, W_D):
+        return energy(z, c @ W_C.T, x - np.hstack([c, u]) @ W_D.T, W_F, pi_z, pi_x)[0]
+
+    error = 0.5 * (x - np.tanh(z) @ W_F.T - np.hstack([c, u]) @ W_D.T)
+    change = hebbian_change(c, u, c @ W_C.T, z, error, pi_z)
+    weights = {"W_C": W_C, "W_F": W_F, "W_D": W_D}
+    for name, W in weights.items():
+        delta = getattr(change, name)
+        slope = (total(**{**weights, name: W + 1e-6 * delta}) - total(**weights)) / 1e-6
+        assert slope == pytest.approx(-np.sum(delta**2), rel=1e-3)  # ΔW = -∂F/∂W
+
+
+def test_with_a_firm_prior_the_local_change_is_the_gradient_of_the_prediction_error():
+    # Whittington and Bogacz 2017: with Π_z large, Π_z (z - μ) is what backpropagation sends to the state.
+    rng = np.random.default_rng(1)
+    W_C, W_F = rng.normal(size=(8, len(DECAYS) * 6)) / 7, rng.normal(size=(5, 8))
+    c, x, pi_z = rng.normal(size=(3, len(DECAYS) * 6)), rng.normal(size=(3, 5)), 1e4
+    mu = c @ W_C.T
+    z = infer(mu, x, W_F, pi_z, np.ones_like(x), pi_z + np.linalg.norm(W_F, 2) ** 2, 50)
+    change = hebbian_change(c, np.ones((3, 1)), mu, z, x - np.tanh(z) @ W_F.T, pi_z)
+    f = np.tanh(mu)
+    upstream = (1 - f**2) * ((x - f @ W_F.T) @ W_F)
+    np.testing.assert_allclose(change.W_C, upstream.T @ c / 3, rtol=0.02, atol=0.01)
+
+
+def test_a_synapse_steps_as_adam_does_along_a_cosine():
+    rng = np.random.default_rng(0)
+    synapse = Synapse(np.ones((2, 3), np.float32))
+    W, m, s = np.ones((2, 3)), 0.0, 0.0
+    for t, c in enumerate(rng.normal(size=(5, 2, 3)).astype(np.float32), start=1):
+        synapse.learn(c, 0.01)
+        m, s = 0.9 * m + 0.1 * c, 0.999 * s + 0.001 * c**2
+        W = W + 0.01 * (m / (1 - 0.9**t)) / (np.sqrt(s / (1 - 0.999**t)) + 1e-8)
+    np.testing.assert_allclose(synapse.W, W, rtol=1e-5)
+    assert [cosine_decay(2.0, p) for p in (0.0, 0.5, 1.0)] == pytest.approx([2.0, 1.0, 0.0])
+
+
+def test_power_iteration_finds_the_spectral_norm():
+    W, v = np.random.default_rng(0).normal(size=(5, 9)).astype(np.float32), np.ones(9, np.float32)
+    for _ in range(200):
+        squared, v = power_iteration(W, v)
+    assert squared == pytest.approx(np.linalg.norm(W, 2) ** 2, rel=1e-4)
+
+
+def sines(count: int, motor: int = 2) -> list[Trajectory]:
+    rng = np.random.default_rng(0)
+    out = []
+    for n in range(count):
+        T = 20 + n % 3
+        time = np.arange(T)[:, None] * rng.uniform(0.1, 0.3, size=5)
+        commands = np.concatenate([rng.normal(size=(T, motor)), np.ones((T, 1))], axis=1)
+        out.append(trajectory(np.sin(time).astype(np.float32), commands.astype(np.float32)))
+    return out
+
+
+def test_very_many_episodes_are_passed_over_less_often():
+    episodes = sines(4)
+    steps = sum(len(t.senses) for t in episodes) / 4
+    assert passes(episodes, schedule(epochs=40)) == 40
+    many = schedule(epochs=10**6)
+    assert passes(episodes, many) * steps == pytest.approx(UPDATES, rel=0.01)
+    alone = many._replace(free_running_probability=0.6)
+    assert passes(episodes, alone) * steps == pytest.approx(RECALL_UPDATES, rel=0.01)
+
+
+def test_learning_lowers_the_energy_and_is_reproducible():
+    episodes = sines(12)
+    first, again = (
+        learn_traces(episodes, 32, schedule(epochs=15), np.random.default_rng(7), lambda: None) for _ in range(2)
+    )
+    assert first.energy[-1] < 0.6 * first.energy[0]  # two of seven numbers are noise
+    pairs = zip(first.network.weights, again.network.weights, strict=True)
+    assert all(a.tobytes() == b.tobytes() for a, b in pairs)
+
+
+@pytest.mark.parametrize("motor", [0, 2])
+def test_the_motor_prediction_learns_a_repeated_action(motor):
+    episodes = sines(13, motor)
+    for t in episodes if motor else ():
+        t.commands[:, 0] = np.sin(0.4 * np.arange(len(t.commands)))
+    how, rng = schedule(epochs=30, iterations=20), np.random.default_rng(0)
+    trained = train(episodes[:12], np.arange(5), CHANGES, 32, 20, how, rng)
+    network, (episode, c, predicted) = trained.network, (episodes[12], trained.network.at_rest(1), [])
+    assert network.motor == motor
+    for x, u in zip(episode.senses, episode.commands, strict=True):
+        step = network.follow(c, u[None], x[None], np.ones((1, len(x)), np.float32))
+        c = step.traces
+        predicted.append(step.expected[0, 5:])
+    if motor:
+        told = episode.commands[:, :2]
+        error = np.mean((np.array(predicted) - told) ** 2, axis=0) / told.var(axis=0)
+        assert error[0] < 0.5 < 0.8 < error[1]  # the second action is noise
+
+
+def test_a_bit_that_was_seen_long_ago_is_recalled():
+    rng, delay = np.random.default_rng(0), 12
+    episodes = []
+    for n in range(24):
+        senses = 0.05 * rng.standard_normal((delay + 4, 2))
+        senses[0, 0], senses[delay:, 1] = (1.0 if n % 2 else -1.0,) * 2
+        episodes.append(trajectory(senses.astype(np.float32), np.ones((delay + 4, 1), np.float32)))
+    how = schedule(epochs=100, batch_size=8, learning_rate=5e-3, prior_precision=30.0)
+    network, right = learn_traces(episodes, 32, how, rng, lambda: None).network, []
+    for episode in episodes:
+        cued = follow(network, network.at_rest(1), episode.senses[:delay, None], episode.commands[:delay, None])
+        right.append(run_on(network, cued.traces, 1).senses[0, 0, 1] * episode.senses[0, 0])
+    assert min(right) > 0
+    assert np.mean(right) > 0.4
+
+
+def test_learning_has_the_energy_and_the_prediction_of_the_network():
+    rng = np.random.default_rng(0)
+    w = initial_weights(16, 5, 2, rng)
+    episode = sines(1)[0]
+    network = Network(w, some_association(rng, 13, 6, 5), 10, 1.0, 1.0)
+    c, u, x = network.at_rest(1), episode.commands[:1], episode.senses[:1]
+    step = network.follow(c, u, x, np.ones_like(x))
+    left = np.hstack([x, u[:, :-1]]) - direct(c, u, w.W_D)
+    expected, total = TracesLearner(w, schedule(), rng).step(c, u, x, rate=0.0)
+    assert total == pytest.approx(energy(step.z, step.mu, left, w.W_F, 1.0, np.ones_like(left)).sum(), rel=1e-3)
+    np.testing.assert_allclose(expected, step.expected, atol=1e-5)
+
+
+def network(scale: float = 1.0, iterations: int = 20) -> Network:
+    rng = np.random.default_rng(0)
+    weights = initial_weights(H, S, A, rng)
+    weights.W_F[:] = scale * rng.normal(size=weights.W_F.shape)
+    weights.W_D[:] = 0.1 * rng.normal(size=weights.W_D.shape) * direct_synapses(S, A)
+    return Network(weights, unassociated(), iterations, 1.0, 1.0)
+
+
+def test_offline_recall_without_a_state_is_the_power_of_its_matrix():
+    net = network(scale=0.0)  # what is left is linear: r_t = P c_{t-1} + p,  c_t = Λ c_{t-1} + G [r_t, 1]
+    w = net.weights
+    size, R = w.W_C.shape[1], S + A + 1
+    D, to_senses = w.W_D[:, :size].astype(float), w.W_D[:S, size : size + A].astype(float)
+    P, p = D.copy(), w.W_D[:, -1].astype(float)
+    P[:S] += to_senses @ D[S:]
+    p[:S] += to_senses @ p[S:]
+    take_up = np.kron(w.gains[:, None].astype(float), np.eye(R))  # (size, R)
+    M = np.diag(np.repeat(DECAYS.astype(float), R)) + take_up[:, : S + A] @ P
+    c = 0.1 * np.random.default_rng(2).normal(size=(2, size)).astype(np.float32)
+    recalled, state = run_on(net, c, 12), c.astype(float)
+    for t in range(12):
+        row = np.hstack([recalled.senses[t], recalled.commands[t]])
+        np.testing.assert_allclose(row, state @ P.T + p, rtol=2e-3, atol=1e-4)
+        state = state @ M.T + take_up @ np.append(p, 1.0)
+    np.testing.assert_allclose(recalled.traces, state, rtol=2e-3, atol=1e-4)
+
+
+def test_carrying_on_is_the_part_of_following_that_a_monitor_needs():
+    net, (senses, commands) = network(), some_rows(3, 3, S, A)
+    for seen in (np.ones((3, S), np.float32), np.array([[1, 0, 1, 1]] * 3, np.float32)):
+        step = net.follow(net.at_rest(3), commands[0], senses[0], seen)
+        expected, traces = net.carry_on(net.at_rest(3), commands[0], senses[0], seen)
+        np.testing.assert_allclose(expected, np.tanh(step.mu), atol=1e-6)
+        np.testing.assert_array_equal(traces, step.traces)
+        np.testing.assert_allclose(net.predict(net.at_rest(3), commands[0]), step.expected, atol=1e-6)
+
+
+def test_online_recall_of_a_row_does_not_know_its_senses():
+    net, (senses, commands) = network(), some_rows(6, 3, S, A)
+    other = senses.copy()
+    other[4] += 10.0
+    a, b = (follow(net, net.at_rest(3), x, commands) for x in (senses, other))
+    np.testing.assert_array_equal(a.senses[:5], b.senses[:5])
+    assert np.abs(a.senses[5] - b.senses[5]).max() > 0.1
+
+
+def test_running_on_is_following_the_own_predictions():
+    net, (senses, commands) = network(scale=0.3, iterations=50), some_rows(5, 3, S, A)
+    c = follow(net, net.at_rest(3), senses, commands).traces
+    alone = run_on(net, c, 8)
+    fed_back = np.concatenate([alone.commands, np.ones((8, 3, 1), np.float32)], axis=2)
+    along = follow(net, c, alone.senses, fed_back)
+    np.testing.assert_allclose(along.senses, alone.senses, atol=1e-3)
+    np.testing.assert_allclose(along.traces, alone.traces, atol=1e-3)
+
+
+def test_a_missing_sense_is_inferred_from_the_others():
+    # Two senses that always agree: where one is missing, the other tells it.
+    rng = np.random.default_rng(0)
+    rows = rng.choice([-1.0, 1.0], size=(40, 30, 1)).repeat(2, axis=2).astype(np.float32)
+    episodes = [Trajectory(r, np.ones((30, 1), np.float32), r) for r in rows]
+    net = learn_traces(episodes, 16, schedule(epochs=40, batch_size=8), rng, lambda: None).network.with_iterations(50)
+    for r in rows[:20]:
+        step = net.follow(net.at_rest(1), np.ones((1, 1), np.float32), r[:1], np.array([[1.0, 0.0]], np.float32))
+        assert step.traces.reshape(len(DECAYS), 3)[0, 1] * r[0, 1] > 0  # the fastest trace is the row itself
+
+
+def phases(count: int) -> list[Trajectory]:
+    senses, commands = some_rows(40, count, S, A)
+    return [Trajectory(senses[: 30 + n, n], commands[: 30 + n, n], senses[: 30 + n, n]) for n in range(count)]
+
+
+def test_streams_play_whole_episodes_at_different_phases():
+    episodes = phases(3)
+    moments = list(itertools.islice(one_after_another(episodes, 5, np.random.default_rng(0)), 200))
+    assert len({int(np.argmax([m.begins[n, 0] for m in moments])) for n in range(5)}) >= 4
+    for n in range(5):
+        begins = [t for t, m in enumerate(moments) if m.begins[n, 0]]
+        for start, stop in itertools.pairwise(begins):
+            rows = np.stack([m.senses[n] for m in moments[start:stop]])
+            assert any(e.senses.shape == rows.shape and (e.senses == rows).all() for e in episodes)
+
+
+@pytest.mark.parametrize("free", [0.0, 1.0])
+def test_after_the_cue_the_traces_take_up_predictions(free):
+    episode, weights, rng = phases(1)[0], network().weights, np.random.default_rng(0)
+    streams = Practice(TracesLearner(weights, schedule(iterations=20), rng), 1, rng)
+    moments = one_after_another([episode], 1, np.random.default_rng(0))
+    streams.run([next(m for m in moments if m.begins.all())], 0.0, free)
+    length = int(streams.cue[0, 0])
+    assert 1 <= length < LONGEST_CUE
+    streams.run(itertools.islice(moments, len(episode.senses) - 1), 0.0, free)
+    net = Network(weights, unassociated(), 20, 1.0, 1.0)
+    read = len(episode.senses) if free == 0.0 else length
+    cued = follow(net, net.at_rest(1), episode.senses[:read, None], episode.commands[:read, None])
+    traces = run_on(net, cued.traces, len(episode.senses) - read).traces if free else cued.traces
+    np.testing.assert_allclose(streams.state, traces, rtol=1e-3, atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def asm() -> NeuralASM:
+    memory = NeuralASM(sine_spec(), 64, 10, iterations=10, epochs=80, free_running_probability=0.95)
+    return memory.fit(sine_episodes(24, steps=(60, 60)))
+
+
+def test_recall_is_in_the_units_of_the_stream_and_better_than_standing_still(asm, tmp_path):
+    errors, spread = [], asm.senses_.spread[asm.spec.sensory]
+    for episode in sine_episodes(10, seed=9, steps=(60, 60)):
+        true = episode.stream[20:35, asm.spec.sensory]
+        recalled = asm.model.recall(episode.stream[:20], 15)[:, asm.spec.sensory]
+        errors.append([np.mean(((x - true) / spread) ** 2) for x in (recalled, true[:1] + 0 * true)])
+    recalled, held = np.mean(errors, axis=0)
+    assert recalled < 0.6 * held
+    asm.save(tmp_path / "a.asm")
+    cue = sine_episodes(1, seed=3)[0].stream[:10]
+    np.testing.assert_array_equal(NeuralASM.load(tmp_path / "a.asm").model.recall(cue, 6), asm.model.recall(cue, 6))
+
+
+@pytest.mark.parametrize(
+    ("rows", "steps", "message"),
+    [
+        (np.zeros((1, 14)), 5, "at least 2 rows long.*got 1"),
+        (np.zeros(14), 5, r"shape \(T, 14\), got \(14,\)"),
+        (np.zeros((5, 13)), 5, r"14 numbers a step.*\(5, 13\)"),
+        (np.full((5, 14), np.nan), 5, r"cue row 0, joint_position\[0\] must be finite, got nan"),
+        (np.zeros((5, 14)), 0, "steps must be a whole number in .*, got 0"),
+        (np.zeros((5, 14)), 10**10, "steps must be a whole number in .*, got 10000000000"),
+    ],
+)
+def test_a_cue_that_cannot_be_recalled_from_is_refused(asm, rows, steps, message):
+    with pytest.raises(ValueError, match=message):
+        asm.model.recall(rows, steps)
+
+
+def test_a_broken_episode_is_refused_before_it_is_learned():
+    episode = sine_episodes(1)[0]
+    stream = episode.stream.copy()
+    stream[3, 2] = np.nan
+    with pytest.raises(ValueError, match="must be finite, got nan"):
+        NeuralASM(sine_spec(), free_running_probability=0.5).fit([replace(episode, stream=stream)])
+
+
+def test_evidence_for_a_skill_adds_up_and_is_forgotten():
+    rng = np.random.default_rng(0)
+    L, units, state = (rng.normal(size=(4, n)).astype(np.float32) for n in (2, 3, 5))
+    W_K, b_K = rng.normal(size=(2, 8)).astype(np.float32), rng.normal(size=2).astype(np.float32)
+    p = certainty(np.hstack([units, state]), W_K, b_K)
+    drive = np.hstack([units, state]) @ W_K.T + b_K
+    np.testing.assert_allclose(p, np.exp(drive) / np.exp(drive).sum(axis=1, keepdims=True), atol=1e-5)
+    np.testing.assert_allclose(add_up(L, units, state, W_K, b_K), KEPT * L + np.log(p + 1e-6), atol=1e-4)
+    alone = [add_up(L, units, s, W_K[:, :3].copy(), b_K) for s in (state, -state)]
+    np.testing.assert_array_equal(*alone)
+
+
+def test_a_skill_that_only_the_state_tells_is_named_in_the_end():
+    rng = np.random.default_rng(1)
+
+    def streams():
+        skill = np.arange(200) % 2
+        units = rng.normal(size=(200, 20, 3)).astype(np.float32)
+        state = (0.5 * (2 * skill[:, None, None] - 1) + rng.normal(size=(200, 20, 2))).astype(np.float32)
+        return units, state, skill
+
+    units, state, skill = streams()
+    rates = np.concatenate([units, state], axis=2).reshape(-1, 5)
+    W_K, b_K = learn_readout(rates.__getitem__, np.repeat(skill, 20), 2, rng, updates=300)
+    units, state, skill = streams()
+    L, right = np.zeros((200, 2), np.float32), []
+    for t in range(20):
+        L = add_up(L, units[:, t], state[:, t], W_K, b_K)
+        right.append(np.mean(L.argmax(axis=1) == skill))
+    assert right[-1] > 0.95
+    assert right[-1] > right[0] + 0.1
