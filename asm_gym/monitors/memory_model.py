@@ -43,7 +43,7 @@ class MemoryModel(StreamModel):
         hidden_size: H, hidden units of the temporal network.
         association_size: hidden units of association, shared out among the groups of senses.
         schedule: how to learn and to infer.
-        feedback: how errors come back to the hidden units of association, one of ``memory.feedback.FEEDBACK``.
+        feedback: how errors come back to the hidden units of association, a name of ``association_learning.FEEDBACK``.
         dynamics: how what was is carried on, one of ``memory.dynamics.DYNAMICS``.
 
     Attributes:

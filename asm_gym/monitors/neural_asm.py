@@ -83,7 +83,7 @@ class NeuralASM(CalibratedMonitor):
         urdf: text of the arm's body model, as ``body_model.read_urdf`` reads it: torques are then expected from what
             its links weigh, and from their inertia.
         seed: of the initial weights and of the order of the episodes.
-        feedback: how errors come back to the hidden units of association, one of ``memory.feedback.FEEDBACK``.
+        feedback: how errors come back to the hidden units of association, a name of ``association_learning.FEEDBACK``.
         dynamics: how the temporal network carries on what was: ``"traces"`` of what was sensed and done, or
             ``"settling"``, the temporal predictive coding network of the papers, whose state is inferred on every row.
 

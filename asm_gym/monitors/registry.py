@@ -27,7 +27,6 @@ DETECTIONS: dict[str, Any] = {
     "moving_mean": "asm_gym.detection.scores:MovingMean",
     "largest": "asm_gym.detection.scores:Largest",
     "per_dimension": "asm_gym.detection.scores:PerDimension",
-    "band": "asm_gym.detection.functional_band:FunctionalBand",
     "latent_threshold": "asm_gym.monitors.baselines.lstm_vae:LatentThreshold",
 }
 """The class of each detection, or where it stands."""

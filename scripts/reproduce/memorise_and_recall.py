@@ -61,6 +61,10 @@ LARGE, LARGE_RATE = 256, 3e-2
 """From so many units on a GRU diverges by its rate, and learns by this."""
 
 
+LABELS = ("offline error [cm]", "online error [cm]", "offline error [cm]", "share of right skills")
+"""Of the figure's panels."""
+
+
 @dataclass(frozen=True)
 class Config(kit.Config):
     """Recall from a cue."""
@@ -170,7 +174,7 @@ def drawn(records: Sequence[Record], config: Config) -> Figure:
         curves(axes[1], records, "error_cm", sizes, models, cue=STEPS, **own)
         for ax, value in zip(axes[2:], ("error_cm", "right"), strict=True):
             curves(ax, records, value, cues, models, skills=middle(config), **own)
-        for ax, label in zip(axes, ("offline error [cm]", "online error [cm]", "offline error [cm]", "right skill")):
+        for ax, label in zip(axes, LABELS, strict=True):
             ax.set(ylabel=label, ylim=0, xlabel="cue [rows]")
         for ax in axes[:2]:
             ax.set(xlabel="skills in the repertoire", xscale="log")

@@ -3,9 +3,8 @@
     RND      ‖f(x) - g(x)‖²              g random and fixed, f trained to follow it on nominal rows
     logpZO   ‖z(x)‖²                     z where the flow dx/ds = v(x, s), s from 0 to 1, carries x; N(0, I) if nominal
 
-There each is averaged over the last five rows, and calibrated by a band in time. Under its plain name each has one
-threshold on that mean (``moving_mean``), whenever it is; ``logpzo+band`` and ``rnd+band`` have the band, which is not
-told which task is running and is one for all of them. Source: Xu et al. 2025 (RSS), “Can we
+There each is averaged over the last five rows, and calibrated by a band in time. Here it has one threshold on that
+mean (``moving_mean``). Source: Xu et al. 2025 (RSS), “Can we
 detect failures without failure data? Uncertainty-aware runtime failure detection for imitation learning policies”;
 Burda et al. 2019 (ICLR) for distillation, Lipman et al. 2023 (ICLR) for the flow. There an embedding of images and the
 action is scored; here the sensorimotor row: values, changes and the action.
