@@ -25,13 +25,13 @@ from asm_gym.data.logs import LogLayout, read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.selection import (
     SHORTEST_S,
-    declared_by_all,
-    divided,
-    divided_in_time,
+    complete_parts,
     normal_episodes,
     pieces,
-    unbroken,
-    unmarked,
+    split_at_random,
+    split_in_time,
+    with_shared_noise,
+    without_marked_rows,
 )
 from asm_gym.data.sources import is_live, lines_from
 from asm_gym.detection import conformal_episodes
@@ -163,7 +163,7 @@ def recorded(args: Args, say: Callable[[str], None]) -> Args:
 def parted(args: Args, logs: list[list[Episode]]) -> tuple[list[Episode], list[Episode]]:
     """Those to learn from, and those to calibrate on. Raises ValueError where they are too few for the promise."""
     if args.in_time or (args.asked.per == HOUR and args.split is not None):
-        fitting, calibration = divided_in_time(logs, args.calibration_share)
+        fitting, calibration = split_in_time(logs, args.calibration_share)
         if args.asked.per == EPISODE and len(calibration) < (needed := conformal_episodes(args.false_alarm_rate)):
             raise ValueError(
                 f"a false-alarm rate of {args.false_alarm_rate:g} needs {needed} pieces to calibrate on, got "
@@ -173,8 +173,8 @@ def parted(args: Args, logs: list[list[Episode]]) -> tuple[list[Episode], list[E
         episodes = [part for log in logs for part in log]
         if args.asked.per == EPISODE:
             check_count(args, episodes)
-            return divided(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
-        fitting, calibration = divided(episodes, ANY_EPISODE, args.calibration_share, args.seed)
+            return split_at_random(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
+        fitting, calibration = split_at_random(episodes, ANY_EPISODE, args.calibration_share, args.seed)
     args.asked.check_hours(hours_of(calibration))
     return fitting, calibration
 
@@ -272,14 +272,14 @@ def fit(args: Args, console: Console) -> None:
         )
         with noted() as notes:
             logs = read_logs(args.data, layout)
-            kept = normal_episodes(logs if args.split is None else unmarked(logs), progress=progress)
+            kept = normal_episodes(logs if args.split is None else without_marked_rows(logs), progress=progress)
     gone = ", ".join(f"{count} {why}" for why, count in kept.left_out.items())
     if not kept.episodes:
         hint = "; --keep-failures learns from those that failed" if "failed" in kept.left_out else ""
         hint = hint or ("; --split 5 learns from between the marked rows of a log" if args.split is None else "")
         raise ValueError(f"{args.data} holds no normal episode: {gone or 'it is empty'}{hint}")
-    bridged = [replace(e, stream=filled(e.stream, e.spec.dt, args.bridge)) for e in declared_by_all(kept.episodes)]
-    named = [(name, part) for name, e in zip(kept.logs, bridged, strict=True) for part in unbroken(e)]
+    bridged = [replace(e, stream=filled(e.stream, e.spec.dt, args.bridge)) for e in with_shared_noise(kept.episodes)]
+    named = [(name, part) for name, e in zip(kept.logs, bridged, strict=True) for part in complete_parts(e)]
     whole = [[e] if args.split is None else pieces(e, args.split) for _, e in named]
     fitting, calibration = parted(args, whole)
     fitting = fitting[: args.most]

@@ -1,4 +1,4 @@
-"""What a log is, before anything is learned from it: its clock, its channels, and what would be done about each.
+"""What a log is, before anything is learned from it: its clock, its channels, and what is done with each.
 
 A table of channels: unit, range, noise, resolution, how often one repeats itself, what is missing; and a picture of
 them all. Exit code 1: it cannot be read as it is.
@@ -7,7 +7,6 @@ them all. Exit code 1: it cannot be read as it is.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -48,70 +47,62 @@ class Args:
 
 
 def inspect(args: Args, console: Console) -> int:
-    """Reads, prints a table a log, and draws a picture of each."""
+    """Read, print a table a log, and draw a picture of each."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     layout = LogLayout(None, args.rate, columns=args.columns, join=args.join)
-    code = DONE
     with noted() as notes:
-        shown = [
-            inspected(name, columns, args.rate) for name, columns in islice(read_tables(args.log, layout), args.logs)
-        ]
-    for found in shown:
-        for line in table(found):
+        tables = islice(read_tables(args.log, layout), args.logs)
+        found = [inspected(name, columns, args.rate) for name, columns in tables]
+    for log in found:
+        picture = figures.save(figures.log_figure(log), args.out / f"{Path(log.name).stem or 'log'}.png")
+        for line in [*table(log), *(f"- {remark}" for remark in log.remarks()), f"Wrote {picture}"]:
             say(line)
-        for line in found.remarks():
-            say(f"- {line}")
-        file = figures.save(figures.log_figure(found), args.out / f"{Path(found.name).stem or 'log'}.png")
-        say(f"Wrote {file}")
-        if found.clock.trouble:
-            code = BAD_NEWS
-    for line in notes:
-        say(f"Note: {line}.")
-    for other in shown[1:]:
-        differences(shown[0], other, say)
-    return code
+    for line in [*(f"Note: {note}." for note in notes), *(differences(found[0], other) for other in found[1:])]:
+        if line:
+            say(line)
+    return BAD_NEWS if any(log.clock.trouble for log in found) else DONE
 
 
-def table(found: Inspection) -> list[str]:
-    """A line a channel, however narrow the console: a table with borders folded away what matters."""
-    clock = found.clock
+def table(log: Inspection) -> list[str]:
+    """Return a line a channel, however narrow the console: a table with borders would fold away what matters."""
+    clock = log.clock
     rate = f"{clock.rate:.6g} Hz, jitter {100 * clock.jitter:.1f} %" if clock.rate else "no rate"
-    caption = f"{found.name}: {clock.rows} rows, {in_time(clock.seconds)}, {rate}, {len(clock.gaps)} gaps"
-    rows = [HEADINGS, *(tuple(map(str, cells(channel))) for channel in found.channels)]
+    caption = f"{log.name}: {clock.rows} rows, {in_time(clock.seconds)}, {rate}, {len(clock.gaps)} gaps"
+    rows = [HEADINGS, *map(cells, log.channels)]
     used = [k for k in range(len(HEADINGS)) if any(row[k] for row in rows[1:])]
     widths = {k: max(len(row[k]) for row in rows) for k in used}
     return [caption, *("  ".join(row[k].ljust(widths[k]) for k in used).rstrip() for row in rows)]
 
 
-def cells(channel: ChannelFound) -> Sequence[object]:
-    """What is printed of one."""
-    read = channel.rows > 0
+def cells(channel: ChannelFound) -> tuple[str, ...]:
+    """Return the cells of a channel's line."""
     return (
         channel.name,
         channel.unit,
         channel.role,
-        f"{channel.low:.4g}" if read else "",
-        f"{channel.high:.4g}" if read else "",
-        f"{channel.noise:.2g}" if channel.noise else "0",
+        f"{channel.low:.4g}" if channel.rows else "",
+        f"{channel.high:.4g}" if channel.rows else "",
+        f"{channel.noise:.2g}",
         f"{channel.resolution:.2g}" if channel.resolution else "",
         f"{100 * channel.repeats:.0f} %",
-        channel.missing or "",
+        str(channel.missing or ""),
         channel.treatment(),
     )
 
 
-def differences(first: Inspection, other: Inspection, say: partial[None]) -> None:
-    """Says where two logs of a folder could not be learned from together."""
+def differences(first: Inspection, other: Inspection) -> str:
+    """Say why two logs of a folder could not be learned from together; empty where they can."""
     mine, theirs = ({c.name for c in f.channels if c.role in ("sense", "command")} for f in (first, other))
     if mine != theirs:
-        odd = sorted(mine ^ theirs)
-        say(f"{other.name} has other columns than {first.name}: {', '.join(odd[:6])}; --join makes one log of them")
-    elif first.clock.rate and other.clock.rate and abs(first.clock.rate / other.clock.rate - 1) > 0.01:
-        say(f"{other.name} comes at {other.clock.rate:.5g} Hz and {first.name} at {first.clock.rate:.5g}: say --rate")
+        odd = ", ".join(sorted(mine ^ theirs)[:6])
+        return f"{other.name} has other columns than {first.name}: {odd}; --join makes one log of them"
+    if first.clock.rate and other.clock.rate and abs(first.clock.rate / other.clock.rate - 1) > 0.01:
+        return f"{other.name} comes at {other.clock.rate:.5g} Hz and {first.name} at {first.clock.rate:.5g}: say --rate"
+    return ""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Inspects, and returns the exit code."""
+    """Inspect, and return the exit code."""
     return run("inspect", Args, inspect, argv, __doc__)
 
 

@@ -1,4 +1,4 @@
-"""Which pieces are unlike the others, and what to expect of a kind of move that was not learned from."""
+"""Name the pieces of logs that are unlike the others, and say what to expect of a kind of move that was not learned."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from asm_gym.detection import alarms_in
 from asm_gym.episode import Episode
 
-APART = 2.0
+LEAST_RATIO = 2.0
 """Pieces are unlike the others where the least of their maxima is so many times the greatest of all others."""
 
 FEW = 0.25
@@ -30,47 +30,45 @@ class Part(NamedTuple):
 
 
 def kind_of(log: str) -> str:
-    """The folder that a log lies in, or the log where there is none."""
+    """Return the folder that a log lies in, or the log where there is none."""
     folder = PurePath(log).parent
     return log if folder == PurePath(".") else folder.as_posix()
 
 
 def unlike(maxima: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Places of the maxima (n,) that stand apart above all others, greatest first; none where there is no such gap."""
+    """Return the places of the maxima (n,) that are far above all others, greatest first."""
     order = np.argsort(maxima)[::-1]
     for k in range(int(FEW * len(maxima)), 0, -1):
-        if maxima[order[k - 1]] >= APART * maxima[order[k]]:
+        if maxima[order[k - 1]] >= LEAST_RATIO * maxima[order[k]]:
             return order[:k]
     return order[:0]
 
 
 def about_pieces(parts: Sequence[Part], maxima: NDArray[np.float64]) -> list[str]:
-    """What is worth saying of those that set the threshold, a line each."""
+    """Return a line about the pieces that set the threshold and are unlike the others; none where there are none."""
     odd = unlike(maxima)
     if not len(odd):
         return []
     named = ", ".join(f"{parts[k].log} from {parts[k].start:.0f} s ({maxima[k]:.3g})" for k in odd[:LISTED])
-    others = np.delete(maxima, odd).max()
     return [
-        f"{len(odd)} of {len(maxima)} pieces are unlike the others, none of which is over {others:.3g}: {named}"
-        f"{', …' if len(odd) > LISTED else ''}; look whether they are healthy; "
-        "record more of their kind, or ask for a rate that may alarm there"
+        f"{len(odd)} of {len(maxima)} pieces are unlike the others, none of which is over "
+        f"{np.delete(maxima, odd).max():.3g}: {named}{', …' if len(odd) > LISTED else ''}; look whether they are "
+        "healthy; record more of their kind, or ask for a rate that may alarm there"
     ]
 
 
 def left_out(
     fitting: Sequence[Part], calibration: Sequence[Part], learn: Callable[[list[Episode], list[Episode]], Any]
 ) -> Mapping[str, str]:
-    """What alarms each kind raises in a memory that has learned from all others, in words by kind.
+    """Return, by kind, the alarms that it raises in a memory that has learned from all others, in words.
 
     Args:
         fitting: learned from.
         calibration: that set the threshold.
         learn: makes the memory of both.
     """
-    kinds = dict.fromkeys(kind_of(part.log) for part in (*fitting, *calibration))
     said = {}
-    for kind in kinds:
+    for kind in dict.fromkeys(kind_of(part.log) for part in (*fitting, *calibration)):
         others = [[p.episode for p in parts if kind_of(p.log) != kind] for parts in (fitting, calibration)]
         own = [p.episode for p in (*fitting, *calibration) if kind_of(p.log) == kind]
         try:
@@ -78,13 +76,10 @@ def left_out(
         except ValueError as error:
             said[kind] = f"cannot be left out: {error}"
             continue
-        values = [monitor.score(episode).value for episode in own]
-        dt, rows = own[0].spec.dt, sum(map(len, own))
-        alarms = sum(alarms_in(value, monitor.threshold, dt) for value in values)
-        over = sum(int((value > monitor.threshold).sum()) for value in values)
-        worst = max(float(value.max()) for value in values) / monitor.threshold
+        dt, ratios = own[0].spec.dt, [monitor.score(episode).value / monitor.threshold for episode in own]
+        every = np.concatenate(ratios)
         said[kind] = (
-            f"{alarms} alarms in {rows * dt / 60:.3g} min, {100 * over / rows:.1f} % of the time in alarm, "
-            f"{worst:.2g} thresholds at most"
+            f"{sum(alarms_in(ratio, 1.0, dt) for ratio in ratios)} alarms in {len(every) * dt / 60:.3g} min, "
+            f"{100 * np.mean(every > 1.0):.1f} % of the time in alarm, {every.max():.2g} thresholds at most"
         )
     return said

@@ -16,7 +16,7 @@ from rich.console import Console
 from asm_gym.data.commands import REACTS, feedback
 from asm_gym.data.inspection import inspected
 from asm_gym.data.logs import Log
-from asm_gym.data.selection import declared_by_all, divided, divided_in_time, normal_episodes, pieces
+from asm_gym.data.selection import normal_episodes, pieces, split_at_random, split_in_time, with_shared_noise
 from asm_gym.data.text import read_text
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.alarms import traces_of
@@ -73,20 +73,20 @@ def test_long_logs_are_cut_into_pieces_of_one_length():
 
 def test_episodes_that_calibrate_are_not_learned_from_and_both_are_drawn_by_the_seed():
     episodes = [Episode.from_table(log(n)) for n in range(40)]
-    fitting, calibration = divided(episodes, 0.05, 0.5, seed=1)
+    fitting, calibration = split_at_random(episodes, 0.05, 0.5, seed=1)
     assert len(calibration) == 20
     assert sorted(map(id, fitting + calibration)) == sorted(map(id, episodes))
-    assert divided(episodes, 0.05, 0.5, seed=1)[1] == calibration
-    assert divided(episodes, 0.05, 0.5, seed=2)[1] != calibration
+    assert split_at_random(episodes, 0.05, 0.5, seed=1)[1] == calibration
+    assert split_at_random(episodes, 0.05, 0.5, seed=2)[1] != calibration
 
 
 def test_the_head_of_a_log_is_learned_from_and_its_tail_calibrated_on():
     log = Episode.from_table({"q": np.arange(100.0)}, rate=10.0)
-    fitting, calibration = divided_in_time([pieces(log, 1.0)], 0.5)
+    fitting, calibration = split_in_time([pieces(log, 1.0)], 0.5)
     assert [int(e.stream[0, 0]) for e in fitting] == [0, 10, 20, 30, 40]
     assert [int(e.stream[0, 0]) for e in calibration] == [60, 70, 80, 90]
     with pytest.raises(ValueError, match="too few"):
-        divided_in_time([pieces(log, 10.0)], 0.5)
+        split_in_time([pieces(log, 10.0)], 0.5)
 
 
 def test_noise_is_declared_by_all_logs_and_not_by_the_first():
@@ -96,7 +96,7 @@ def test_noise_is_declared_by_all_logs_and_not_by_the_first():
 
     first = log(0.0, 0)
     others = [Episode.from_stream(log(0.1, n).stream, first.spec) for n in range(1, 5)]
-    (spec,) = {e.spec for e in declared_by_all([first, *others])}
+    (spec,) = {e.spec for e in with_shared_noise([first, *others])}
     assert first.spec.channels[0].noise < 1e-3
     assert spec.channels[0].noise == pytest.approx(0.1, rel=0.15)
 

@@ -1,10 +1,10 @@
-"""Short gaps: numbers that are missing for a moment, which are bridged, and for longer, which is an alarm.
+"""Bridge numbers that are missing for a moment; for longer, they are an alarm.
 
     spent_i    + dt while number i is missing, - 0.1 dt while it is there, at least 0     [s]
     bridged    spent_i <= ``seconds`` for all that are missing in a row
 
-A memory runs on without a number that is not there, expecting what it knows; a row that is bridged is not judged. What
-is missing now and then counts in the end: a cable that is loose is no short gap.
+A memory runs on without a missing number and expects what it predicts; a row that is bridged is not judged. A number
+that is missing again and again counts in the end: a loose cable is no short gap.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SURPRISING, MISSING, NOT_FINITE, LATE = "surprise", "missing data", "not finite"
 
 
 class Bridge:
-    """Says of rows as they come which are bridged.
+    """Tell of rows as they come which are bridged.
 
     Args:
         seconds: that a number may be missing; 0 bridges nothing.
@@ -38,39 +38,38 @@ class Bridge:
         self._spent = np.zeros(size)
 
     def over(self, missing: NDArray[np.bool_]) -> bool:
-        """Whether the next row (D,) lacks something, and not for longer than may be."""
+        """Tell whether the next row (D,) lacks a number, and none for longer than it may be missing."""
         paid = np.maximum(self._spent - PAID_BACK * self.dt, 0.0)
         self._spent = np.where(missing, self._spent + self.dt, paid)
         return bool(missing.any() and (self._spent[missing] <= self.seconds * (1 + 1e-9)).all())
 
 
 def bridged(stream: NDArray[np.floating[Any]], dt: float, seconds: float) -> NDArray[np.bool_]:
-    """(T,) which rows of a recording (T, D) a bridge of so many seconds goes over."""
+    """Return which rows (T,) of a recording (T, D) a bridge of so many seconds goes over."""
     bridge = Bridge(seconds, dt, stream.shape[1])
     return np.array([bridge.over(missing) for missing in np.isnan(stream)], np.bool_)
 
 
 def filled(stream: NDArray[np.float32], dt: float, seconds: float) -> NDArray[np.float32]:
-    """A recording (T, D) to learn from: gaps of at most so many seconds lie on the line between their neighbours."""
+    """Return a recording (T, D) with gaps of at most so many seconds interpolated between their neighbours."""
     most, out = int(seconds / dt + 1e-9), stream.copy()
     for column in out.T:
-        missing = np.isnan(column)
-        for start, stop in spans(missing):
+        for start, stop in spans(np.isnan(column)):
             if start and stop < len(column) and stop - start <= most:
-                ends = (start - 1, stop)
-                column[start:stop] = np.interp(np.arange(start, stop), ends, column[list(ends)])
+                ends = [start - 1, stop]
+                column[start:stop] = np.interp(np.arange(start, stop), ends, column[ends])
     return out
 
 
 def reason(row: NDArray[np.floating[Any]]) -> str:
-    """Why a row (D,) whose surprise is over the threshold is an alarm."""
+    """Say why a row (D,) whose surprise is over the threshold is an alarm."""
     if np.isnan(row).any():
         return MISSING
     return SURPRISING if np.isfinite(row).all() else NOT_FINITE
 
 
 def blamed(row: NDArray[np.floating[Any]], shares: NDArray[np.floating[Any]]) -> int | None:
-    """The number of a row (D,) that an alarm points to, by their shares (D,); none where all of the row is missing."""
+    """Return the number of a row (D,) that an alarm points to, by their shares (D,); None where all are missing."""
     if np.isnan(row).all():
         return None
     broken = ~np.isfinite(row)

@@ -1,4 +1,4 @@
-"""What a log is: its clock and its channels, and what would be done about each before anything is learned from it."""
+"""Describe a log before anything is learned from it: its clock, its channels, and what is done with each."""
 
 from __future__ import annotations
 
@@ -20,19 +20,30 @@ FEW_VALUES = 8
 JITTERS = 0.1
 """Share of a period that steps spread by from which on a clock jitters."""
 
+LISTED = 6
+"""Names in a remark."""
+
+TREATMENT = {
+    "clock": "tells the rate; no channel",
+    "label": "rows it marks are not learned from; no channel",
+    "counter": "counts rows; no channel",
+    "command": "commanded, by its name: fit takes it so",
+}
+"""What is done with columns that are no senses."""
+
 
 @dataclass(frozen=True)
 class ClockFound:
-    """When rows were sensed.
+    """The clock of a log.
 
     Attributes:
-        column: that says so; empty where none does.
-        rate: rows a second in the mean, gaps left out [Hz]; 0 where nobody knows.
+        column: its name; empty where there is none.
+        rate: rows a second in the mean, gaps left out [Hz]; 0 where it is unknown.
         jitter: standard deviation of a step that is no gap, as a share of the period.
         gaps: (G, 2) from when to when nothing came [s].
         rows: how many.
         seconds: from the first to the last row.
-        trouble: what forbids reading it, in a line; empty where nothing does.
+        trouble: why it cannot be read, in a line; empty where it can.
     """
 
     column: str
@@ -53,11 +64,12 @@ class ChannelFound:
         unit: as the log says; empty where it does not.
         role: sense, command, clock, label or counter.
         low, high: its range.
-        noise: standard deviation of what is white in it.
+        noise: standard deviation of its white noise.
         resolution: its steps; 0 where it has none.
-        repeats: share of rows that say the same as the one before.
+        repeats: share of rows that are equal to the one before.
         missing: rows without a number.
         values: how many different ones.
+        rows: how many.
     """
 
     name: str
@@ -77,28 +89,19 @@ class ChannelFound:
         return self.values <= 1
 
     def treatment(self) -> str:
-        """What is done about it."""
+        """Say what is done with it."""
         if self.role != "sense":
-            return {
-                "clock": "tells the rate; no channel",
-                "label": "rows it marks are not learned from; no channel",
-                "counter": "counts rows; no channel",
-                "command": "commanded, by its name: fit takes it so",
-            }[self.role]
-        said = []
+            return TREATMENT[self.role]
         if self.missing == self.rows:
             return "holds no number: leave it out"
-        if self.constant:
-            said.append("never moves: any change is news")
-        elif self.values < FEW_VALUES:
-            said.append(f"hardly moves: {self.values} values; its spread has a floor")
-        if self.missing:
-            said.append("missing numbers: bridged, or cut there")
-        if self.resolution and self.repeats > 0.02 and not self.constant:
-            said.append("repeats itself at rest: healthy")
-        if "deg" in self.unit or "°" in self.unit:
-            said.append("a memory of radians reads it too")
-        return "; ".join(said) or "read as it is"
+        said = {
+            "never moves: any change is news": self.constant,
+            f"hardly moves: {self.values} values; its spread has a floor": 1 < self.values < FEW_VALUES,
+            "missing numbers: bridged, or cut there": self.missing > 0,
+            "repeats itself at rest: healthy": bool(self.resolution) and self.repeats > 0.02 and not self.constant,
+            "a memory of radians reads it too": "deg" in self.unit or "°" in self.unit,
+        }
+        return "; ".join(words for words, holds in said.items() if holds) or "read as it is"
 
 
 @dataclass(frozen=True)
@@ -108,9 +111,9 @@ class Inspection:
     Attributes:
         name: where it was found.
         clock: when its rows were sensed.
-        channels: what it holds.
+        channels: of its columns of numbers.
         words: columns of words, which are left out.
-        times: (T,) [s], or row numbers where nobody knows.
+        times: (T,) [s], or row numbers without a clock.
         columns: the numbers, by name.
     """
 
@@ -122,8 +125,8 @@ class Inspection:
     columns: Mapping[str, NDArray[Any]] = field(repr=False)
 
     def remarks(self) -> list[str]:
-        """What is worth saying of the whole, a line each."""
-        clock, said = self.clock, []
+        """List what a user should know of the whole, a line each."""
+        clock, said = self.clock, list[str]()
         if clock.trouble:
             said.append(f"cannot be read: {clock.trouble}")
         elif not clock.column and not clock.rate:
@@ -132,26 +135,24 @@ class Inspection:
             apart = f"{1e3 / clock.rate:.3g} ms apart"
             said.append(f"the clock jitters by {100 * clock.jitter:.0f} % of a step: rows are put {apart}")
         if len(clock.gaps):
-            longest = float(np.diff(clock.gaps, axis=1).max())
+            longest = in_time(float(np.diff(clock.gaps, axis=1).max()))
             said.append(
-                f"{len(clock.gaps)} gaps in the clock, the longest {in_time(longest)}: "
+                f"{len(clock.gaps)} gaps in the clock, the longest {longest}: "
                 "those up to --bridge are filled, the log is cut at others"
             )
-        roles = [c.role for c in self.channels]
-        if "command" not in roles:
-            said.append(
-                "no command by name: the memory learns without what was asked of the arm, unless fit --action says"
-            )
+        if all(c.role != "command" for c in self.channels):
+            said.append("no command by name: the memory learns without the arm's commands, unless fit --action says")
         still = [c.name for c in self.channels if c.constant and c.role == "sense"]
         if still:
-            said.append(f"{len(still)} channels never move: {', '.join(still[:6])}{', …' if len(still) > 6 else ''}")
+            more = ", …" if len(still) > LISTED else ""
+            said.append(f"{len(still)} channels never move: {', '.join(still[:LISTED])}{more}")
         if self.words:
-            said.append(f"columns of words are left out: {', '.join(self.words[:6])}")
+            said.append(f"columns of words are left out: {', '.join(self.words[:LISTED])}")
         return said
 
 
 def in_time(seconds: float) -> str:
-    """As people say it."""
+    """Return a duration in the unit that people would use."""
     for unit, least in (("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * least:
             return f"{seconds / least:.3g} {unit}"
@@ -159,43 +160,40 @@ def in_time(seconds: float) -> str:
 
 
 def inspected(name: str, columns: Mapping[str, NDArray[Any]], rate: float | None = None) -> Inspection:
-    """What a table holds.
+    """Describe a table.
 
     Args:
+        name: where it was found.
         columns: (T,) or (T, k) each, as read from a file.
         rate: rows a second [Hz], where its clock does not say.
     """
-    flat: dict[str, NDArray[Any]] = {}
-    for column, values in columns.items():
-        if values.ndim == 2:
-            flat |= {f"{column}[{k}]": values[:, k] for k in range(values.shape[1])}
-        else:
-            flat[column] = values
-    rows = max(map(len, flat.values()), default=0)
-    clock, times = _clock(flat, rows, rate)
-    words = [n for n, v in flat.items() if v.dtype.kind not in "biuf" and not is_clock(n) and not is_label(n)]
+    flat = {
+        f"{column}[{k}]" if values.ndim == 2 else column: part
+        for column, values in columns.items()
+        for k, part in enumerate(values.T if values.ndim == 2 else [values])
+    }
+    clock, times = _clock(flat, rate or 0.0)
     numbers = {n: v for n, v in flat.items() if v.dtype.kind in "biuf"}
-    found = [_channel(n, v) for n, v in numbers.items()]
-    found += [_channel(n, np.zeros(0)) for n, v in flat.items() if n not in numbers and n not in words]
-    return Inspection(name, clock, found, words, times, numbers)
+    words = [n for n in flat if n not in numbers and not is_clock(n) and not is_label(n)]
+    channels = [_channel(n, v) for n, v in numbers.items()]
+    channels += [_channel(n, np.zeros(0)) for n in flat if n not in numbers and n not in words]
+    return Inspection(name, clock, channels, words, times, numbers)
 
 
-def _clock(
-    columns: Mapping[str, NDArray[Any]], rows: int, rate: float | None
-) -> tuple[ClockFound, NDArray[np.float64]]:
+def _clock(columns: Mapping[str, NDArray[Any]], rate: float) -> tuple[ClockFound, NDArray[np.float64]]:
+    rows = max(map(len, columns.values()), default=0)
     nothing, count = np.zeros((0, 2)), np.arange(rows, dtype=np.float64)
     clock = clock_among(columns)
     if clock is None:
-        known = rate or 0.0
-        return ClockFound("", known, 0.0, nothing, rows, rows / known if known else 0.0), count / (known or 1.0)
+        return ClockFound("", rate, 0.0, nothing, rows, rows / rate if rate else 0.0), count / (rate or 1.0)
     try:
         times = clock.seconds(columns[clock.column])
         kept = times[distinct(times)]
         dt = period(kept)
+        if dt is None:
+            raise ValueError("one row")
     except ValueError as error:
         return ClockFound(clock.column, 0.0, 0.0, nothing, rows, 0.0, str(error)), count
-    if dt is None:
-        return ClockFound(clock.column, 0.0, 0.0, nothing, rows, 0.0, "one row"), count
     steps = np.diff(kept)
     wide = steps > FAR * max(dt, float(np.quantile(steps, 0.9)))
     gaps = np.stack([kept[:-1][wide], kept[1:][wide]], axis=1)
@@ -205,28 +203,22 @@ def _clock(
 
 def _channel(column: str, values: NDArray[Any]) -> ChannelFound:
     name, known = bare_name(column), values[np.isfinite(values)]
-    role = _role(column, values)
+    is_role = {
+        "clock": is_clock(column),
+        "label": is_label(name),
+        "counter": is_counter(name, values),
+        "command": is_command(name),
+    }
     return ChannelFound(
         name,
-        unit_of(column),
-        role,
-        float(known.min()) if len(known) else float("nan"),
-        float(known.max()) if len(known) else float("nan"),
-        noise_of(values),
-        resolution(values),
-        float(np.mean(values[1:] == values[:-1])) if len(values) > 1 else 0.0,
-        int(len(values) - len(known)),
-        len(np.unique(known)),
-        len(values),
+        unit=unit_of(column),
+        role=next((role for role, holds in is_role.items() if holds), "sense"),
+        low=float(known.min()) if len(known) else float("nan"),
+        high=float(known.max()) if len(known) else float("nan"),
+        noise=noise_of(values),
+        resolution=resolution(values),
+        repeats=float(np.mean(values[1:] == values[:-1])) if len(values) > 1 else 0.0,
+        missing=len(values) - len(known),
+        values=len(np.unique(known)),
+        rows=len(values),
     )
-
-
-def _role(column: str, values: NDArray[Any]) -> str:
-    name = bare_name(column)
-    if is_clock(column):
-        return "clock"
-    if is_label(name):
-        return "label"
-    if is_counter(name, values):
-        return "counter"
-    return "command" if is_command(name) else "sense"

@@ -1,4 +1,4 @@
-"""What of recordings a memory of what is normal can be learned from, and which part of that sets its threshold."""
+"""Select the recordings that a memory of normal operation learns from, and those that set its threshold."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from asm_gym.data.logs import Log
 from asm_gym.detection import conformal_episodes
@@ -18,7 +19,6 @@ from asm_gym.spec import MOTOR
 
 SHORTEST_S = 0.5
 """Least length of a part between lost rows that is worth learning from [s]."""
-
 
 AROUND_S = 5.0
 """How near to marked rows nothing is learned from [s]: what led to a stop is no normal motion."""
@@ -33,7 +33,7 @@ class NormalEpisodes(NamedTuple):
 
 
 def normal_episodes(logs: Iterable[Log], progress: Callable[[int, int], object] | None = None) -> NormalEpisodes:
-    """The normal episodes among ``logs``."""
+    """Return the normal episodes among ``logs``."""
     kept = NormalEpisodes([], Counter(), [])
     for n, (name, episode) in enumerate(logs, 1):
         if progress is not None:
@@ -47,16 +47,17 @@ def normal_episodes(logs: Iterable[Log], progress: Callable[[int, int], object] 
 
 
 def _abnormal(episode: Episode) -> str:
-    """What is not normal about an episode, in a word or two; empty where nothing is."""
-    if episode.faults.any() or (episode.label is not None and episode.label.role == "faulty"):
+    """Why an episode is not normal, in a word or two; empty where it is."""
+    role = episode.label.role if episode.label is not None else ""
+    if episode.faults.any() or role == "faulty":
         return "with a fault"
-    if episode.label is not None and episode.label.role == "harmless":
+    if role == "harmless":
         return "under a harmless variation"
     return "" if episode.success else "failed"
 
 
-def unmarked(logs: Iterable[Log]) -> Iterator[Log]:
-    """The same, but of long logs from elsewhere what lies between the rows that a label marks, and not near those."""
+def without_marked_rows(logs: Iterable[Log]) -> Iterator[Log]:
+    """Yield logs, and of those from elsewhere the parts that are not near rows that a label marks."""
     for log in logs:
         episode = log.episode
         if episode.spec.source != "table" or not episode.faults.any():
@@ -64,16 +65,27 @@ def unmarked(logs: Iterable[Log]) -> Iterator[Log]:
             continue
         near = round(AROUND_S / episode.spec.dt)
         close = np.convolve(episode.faults, np.ones(2 * near + 1), "same") > 0.5
-        least = max(2, round(SHORTEST_S / episode.spec.dt))
-        for start, stop in spans(~close):
-            if stop - start >= least:
-                yield Log(
-                    log.name, replace(episode, stream=episode.stream[start:stop], faults=episode.faults[start:stop])
-                )
+        for start, stop in _long_spans(~close, episode.spec.dt):
+            part = replace(episode, stream=episode.stream[start:stop], faults=episode.faults[start:stop])
+            yield Log(log.name, part)
 
 
-def declared_by_all(episodes: list[Episode]) -> list[Episode]:
-    """The same, of logs, with the noise of each channel as all of them show it, and not as the first one does."""
+def complete_parts(episode: Episode) -> list[Episode]:
+    """Return the parts of an episode between lost numbers; those under half a second are left out."""
+    known = np.isfinite(episode.stream).all(axis=1)
+    if known.all():
+        return [episode]
+    parts = [slice(start, stop) for start, stop in _long_spans(known, episode.spec.dt)]
+    return [Episode.from_stream(episode.stream[part], episode.spec, success=True) for part in parts]
+
+
+def _long_spans(mask: NDArray[np.bool_], dt: float) -> list[tuple[int, int]]:
+    least = max(2, round(SHORTEST_S / dt))
+    return [(start, stop) for start, stop in spans(mask) if stop - start >= least]
+
+
+def with_shared_noise(episodes: list[Episode]) -> list[Episode]:
+    """Return episodes of logs whose spec holds the median noise of all of them, and not that of the first."""
     spec = episodes[0].spec
     if spec.source != "table" or len(episodes) == 1:
         return episodes
@@ -87,24 +99,14 @@ def declared_by_all(episodes: list[Episode]) -> list[Episode]:
 
 
 def pieces(episode: Episode, seconds: float) -> list[Episode]:
-    """An episode cut into pieces of one length; a rest that is shorter is left out."""
+    """Cut an episode into pieces of one length; a rest that is shorter is left out."""
     rows = max(1, round(seconds / episode.spec.dt))
     ends = range(rows, len(episode) + 1, rows)
     return [Episode.from_stream(episode.stream[n - rows : n], episode.spec, success=True) for n in ends]
 
 
-def unbroken(episode: Episode) -> list[Episode]:
-    """The parts of an episode between rows that were lost, in whole or in part; those under half a second left out."""
-    known = np.isfinite(episode.stream).all(axis=1)
-    if known.all():
-        return [episode]
-    least = max(2, round(SHORTEST_S / episode.spec.dt))
-    parts = [slice(start, stop) for start, stop in spans(known) if stop - start >= least]
-    return [Episode.from_stream(episode.stream[part], episode.spec, success=True) for part in parts]
-
-
-def divided_in_time(logs: list[list[Episode]], calibration_share: float) -> tuple[list[Episode], list[Episode]]:
-    """The same, of pieces of long logs in order: the head of each log, and its tail, with one piece between left out.
+def split_in_time(logs: list[list[Episode]], calibration_share: float) -> tuple[list[Episode], list[Episode]]:
+    """Split the pieces of long logs into heads to learn from and tails to calibrate on, a piece between left out.
 
     Pieces of one log that follow each other are alike: shuffled, those that set the threshold would lie between those
     that were learned from, and promise too much.
@@ -122,12 +124,13 @@ def divided_in_time(logs: list[list[Episode]], calibration_share: float) -> tupl
     return fitting, calibration
 
 
-def divided(
+def split_at_random(
     episodes: list[Episode], false_alarm_rate: float, calibration_share: float, seed: int
 ) -> tuple[list[Episode], list[Episode]]:
-    """Those to learn from, and those to calibrate on.
+    """Split episodes into those to learn from and those to calibrate on.
 
     Args:
+        episodes: all of them.
         false_alarm_rate: that the threshold is to promise.
         calibration_share: of the episodes, in (0, 1), that are not learned from.
         seed: of which are which.

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.selection import pieces, unbroken
+from asm_gym.data.selection import complete_parts, pieces
 from asm_gym.detection.scores import Largest
 from asm_gym.episode import Episode, spans
 from asm_gym.evaluation.tables import Table
@@ -131,7 +131,7 @@ def on_an_arm(job: Job, folder: Path) -> list[Record]:
     whole = arm.episode(folder)
     effort = whole.stream[:, whole.spec.slices["effort"]]
     ranges = np.quantile(effort, 0.95, axis=0) - np.quantile(effort, 0.05, axis=0)
-    cut = [piece for part in unbroken(whole) for piece in pieces(part, PIECE_S)]
+    cut = [piece for part in complete_parts(whole) for piece in pieces(part, PIECE_S)]
     tested, learned, calibration = parted(len(cut), job)
     monitor = fitted(job, [cut[i] for i in learned], arm.body(folder) if job.monitor in WITH_BODY else "")
     threshold = max(float(s.value.max()) for s in monitor.score_episodes([cut[i] for i in calibration]))
