@@ -16,10 +16,9 @@ def test_every_kind_of_the_suite_has_a_class_and_nothing_else_has():
     assert list(CLASSES)[class_of("harmless")] == "unknown"
 
 
-def rows_of(classes, kinds, episodes, located=True):
+def rows_of(classes, kinds, episodes):
     n = len(classes)
-    zeros, where = np.zeros((n, 2)), np.full((n, len(CLASSES)), located)
-    return Examples(zeros, np.asarray(classes), np.asarray(kinds), np.asarray(episodes), np.zeros(n, int), where)
+    return Examples(np.zeros((n, 2)), np.asarray(classes), np.asarray(kinds), np.asarray(episodes), np.zeros(n, int))
 
 
 def test_families_kinds_and_episodes_count_alike_however_many_rows_they_have():
@@ -36,7 +35,6 @@ def test_what_is_believed_is_the_mean_of_an_episodes_diagnoses_and_a_half_sure_o
     made = asked(lambda evidence: told, rows, "seeds", 0)
     assert [r["p"] for r in made] == [1.0, 0.5, pytest.approx(2 / 3), 1.0]
     assert [r["right"] for r in made] == [False, False, True, True]
-    assert [r["part"] for r in made] == [r["right"] for r in made]
     vague = np.full((1, len(CLASSES)), 1 / len(CLASSES))
     (one,) = asked(lambda evidence: vague, rows.of(np.arange(4) == 3), "seeds", 0)
     assert one["unknown"]

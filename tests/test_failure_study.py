@@ -7,12 +7,20 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from asm_gym.episode import Episode
-from asm_gym.evaluation.statistics import Share
 from asm_gym.monitors import Surprise
 from asm_gym.policies.network import NetworkPolicy
-from asm_gym.scripts.reproduce import failure_rivals
-from asm_gym.scripts.reproduce.failure import AGENTS, Config, Watched, early, in_order, labels, order, separated, ways
-from asm_gym.scripts.reproduce.failure_rivals import entropy, inconsistency, reversals, scored
+from asm_gym.scripts.reproduce import failure
+from asm_gym.scripts.reproduce.failure import (
+    AGENTS,
+    Config,
+    Watched,
+    entropy,
+    inconsistency,
+    labels,
+    scored,
+    separated,
+    table,
+)
 from asm_gym.scripts.reproduce.weakened import Weakened
 from asm_gym.spec import Channel, StreamSpec
 
@@ -39,24 +47,10 @@ def test_failures_are_told_from_successes_by_rank_and_nothing_is_said_where_all_
     assert np.isnan(separated([w for w in WATCHED if w.failed], 1).value)
 
 
-def test_the_tables_count_what_was_known_by_when_and_in_which_order():
-    (row,) = early({"one": WATCHED}, Config()).rows
+def test_the_table_counts_what_was_known_by_when():
+    (row,) = table({"one": WATCHED}, Config()).rows
     assert row[2].startswith("0.889 (")
     assert row[4:] == ("1 of 3", "2 of 3", "1 of 2")
-    table = ways({"one": WATCHED})
-    assert table.headings[1:] == ("as it is, 1 of 3 failed", "weakened, 1 of 2 failed", "disturbed, 1 of 1 failed")
-    assert [cell[:5] for cell in table.rows[0][1:]] == ["1.000", "1.000", ""]
-    assert order({"one": WATCHED}).rows[0][1:] == ("1 of 2", "0 of 1", "1 of 1", "1 of 2", "no")
-
-
-def test_the_order_is_that_of_failures_above_successes_and_of_what_is_new_above_what_is_known():
-    def shares(*found):
-        return [Share(k, 10 if k >= 0 else 0) for k in found]
-
-    assert in_order(shares(1, 1, 2, 2))
-    assert in_order(shares(1, 1, -1, 2))
-    for wrong in ((2, 1, 3, 3), (1, 2, 2, 3), (1, 2, 4, 3), (1, 3, -1, 2)):
-        assert not in_order(shares(*wrong))
 
 
 SPEC = StreamSpec((Channel("sense", 1), Channel("action", 4, group="action")), dt=0.1)
@@ -65,13 +59,6 @@ SPEC = StreamSpec((Channel("sense", 1), Channel("action", 4, group="action")), d
 def commanded(actions):
     """An episode (T, 5) in which these actions (T, 4) are commanded."""
     return Episode.from_stream(np.hstack([np.zeros((len(actions), 1)), actions]), SPEC, success=True)
-
-
-def test_reversals_count_turns_of_the_hand_in_the_last_second_alone():
-    forth, back = [1.0, 0.1, 0.0, 1.0], [-1.0, 0.1, 0.0, 1.0]
-    found = reversals(commanded(np.array([forth] * 4 + [back, forth] * 2 + [forth] * 12)))
-    np.testing.assert_allclose(found[[3, 4, 7]], [0.0, 1 / 5, 4 / 8])
-    np.testing.assert_allclose(found[[9, 13, 19]], [4 / 10, 4 / 10, 0.0])
 
 
 def test_inconsistency_adds_up_and_entropy_is_that_of_a_gaussian_in_closed_form():
@@ -101,7 +88,7 @@ class Novelty:
 
 
 def test_two_signals_alarm_where_both_are_over_their_thresholds_and_never_where_one_is(monkeypatch):
-    monkeypatch.setattr(failure_rivals, "make_monitor", lambda name, spec, seed: Novelty())
+    monkeypatch.setattr(failure, "make_monitor", lambda name, spec, seed: Novelty())
     rng = np.random.default_rng(0)
 
     def acted(sense, wildness):

@@ -1,89 +1,64 @@
-"""Alarms an hour of a shipped memory: set on healthy hours of the corpus, and counted in others.
+"""False alarms per hour of a shipped memory, in healthy hours of policies and tasks that it never met.
 
-The threshold is set on the experts' episodes of those tasks that the memory babbled in, but for those that told its
-ceilings. It is examined under agents, and in tasks, that it never met. Only episodes that solved the task count as
-healthy, hits and all: what the senses excuse is a knock or a stop, and counted apart.
+Only episodes that solved the task count as healthy. Surprise that a knock or a stop explains is counted apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
-from asm_gym.detection.hourly import Blocks, hourly_threshold
 from asm_gym.evaluation.corpus import Corpus
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.detection_tables import kept_rate
 from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
-from asm_gym.evaluation.recordings import NOMINAL_ROLES
-from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.evaluation.statistics import Rate, Share
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.pretraining.exam import SEVERITIES, Alarms, Exam, Marks, examine, usual_force
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.kit import Findings, Record
+from asm_gym.scripts.reproduce.kit import Findings
 
 PROMISES = (10.0, 5.0, 3.0, 1.0)
-"""False alarms an hour."""
-FOUND = SEVERITIES, ("mild",)
-"""Severities of faults that are counted together; mild ones are hardly to be seen."""
+"""False alarms per hour that a threshold promises."""
 EXPERT = "scripted"
 
 
 @dataclass(frozen=True)
 class Config(kit.Config):
-    """Alarms an hour of a shipped memory, as promised and as they come."""
+    """False alarms per hour of a shipped memory, promised and counted."""
 
     seeds: int = option(1, least=1)
-    """The corpus is one: there is nothing to repeat."""
+    """Not used: there is one corpus."""
     corpus: Path = option(Path("runs/corpus"), metavar="FOLDER")
-    """What asm-gym corpus has recorded."""
+    """Folder of asm-gym corpus."""
     memory: str = option("panda", metavar="NAME")
-    """A shipped memory, of the arm that the corpus was recorded with."""
-
-
-class Setting(NamedTuple):
-    """Where thresholds come from, and what they are by the alarms an hour that they promise."""
-
-    name: str
-    thresholds: dict[float, float]
+    """Shipped memory, of the arm of the corpus."""
 
 
 def run(config: Config) -> Findings:
-    """Calibrates and examines."""
-    corpus, memory = Corpus.open(config.corpus), NeuralASM.pretrained(config.memory)
-    known = tuple(memory.about["tasks"])
-    shipped = Setting("as shipped", {r: memory.threshold_at(false_alarms_per_hour=r) for r in PROMISES})
-    with kit.stage("calibrating on healthy hours"):
-        nominal = corpus.episodes(*NOMINAL_ROLES, policies=(EXPERT,), tasks=known)
-        healthy = [episode for episode in nominal if episode.success and not memory.knows(episode)]
-        hours = sum(len(e) * e.spec.dt for e in healthy) / 3600
-        memory.calibrate(healthy, false_alarms_per_hour=PROMISES[0])
-    anew = {r: memory.threshold_at(false_alarms_per_hour=r) for r in PROMISES if r * hours >= 1.0}
-    settings = [shipped, Setting(f"from {hours:.1f} hours of {len(healthy)} episodes, whatever the task", anew)]
-    marks = examined(corpus, memory, known)
-    return Findings(
-        records(marks, settings),
-        [
-            kept(marks, [*settings, at_last(marks)]),
-            *(each(marks, setting) for setting in settings if setting.thresholds),
-            missed(marks, shipped),
-        ],
-    )
+    """Examine the memory at its shipped thresholds."""
+    memory = NeuralASM.pretrained(config.memory)
+    marks = examined(Corpus.open(config.corpus), memory)
+    thresholds = {r: memory.threshold_at(false_alarms_per_hour=r) for r in PROMISES}
+    records = [
+        {"promised": promised, "exam": m.name, "alarms": rate.k, "hours": rate.hours, "seed": config.seed}
+        for promised, threshold in thresholds.items()
+        for m in marks
+        for rate in [hourly_alarms(m.at(threshold).solved)]
+    ]
+    return Findings(records, [kept_table(marks, thresholds), exams_table(marks, thresholds)])
 
 
-def examined(corpus: Corpus, memory: NeuralASM, known: Sequence[str]) -> list[Marks]:
-    """What the memory makes of every policy and task that it has not met."""
-    places = dict.fromkeys((e.policy, e.label.task) for e in corpus.entries)
+def examined(corpus: Corpus, memory: NeuralASM) -> list[Marks]:
+    """Return the memory's marks in every policy and task that it has not met."""
+    exams = dict.fromkeys((e.policy, e.label.task) for e in corpus.entries)
     marks = []
     with kit.stage("examining") as tell:
-        for n, (policy, task) in enumerate(places):
-            tell(n, len(places))
-            if policy == EXPERT and task in known:
+        for n, (policy, task) in enumerate(exams):
+            tell(n, len(exams))
+            if policy == EXPERT and task in memory.about["tasks"]:
                 continue
             own = list(corpus.episodes(policies=(policy,), tasks=(task,)))
             usual = usual_force(list(corpus.episodes("nominal", policies=(EXPERT,), tasks=(task,))[:100]))
@@ -91,92 +66,38 @@ def examined(corpus: Corpus, memory: NeuralASM, known: Sequence[str]) -> list[Ma
     return marks
 
 
-def at_last(marks: Sequence[Marks]) -> Setting:
-    """What these hours themselves would set: how much is found where so many alarms come, whatever was promised."""
-    solved = [t for m in marks for t in m.solved]
-    blocks = Blocks.of([t.surprise for t in solved], solved[0].dt)
-    rates = {r: hourly_threshold(blocks, r) for r in PROMISES if r * blocks.total >= 1.0}
-    return Setting("from these very hours, which promises nothing", rates)
-
-
-def together(marks: Sequence[Marks], threshold: float) -> tuple[Alarms, Rate, list[Share]]:
-    """In all examinations at this threshold: events, alarms for nothing, and faults found of each of ``FOUND``."""
-    there = [m.at(threshold) for m in marks]
-    healthy = [t for m in there for t in m.solved]
-    faulty = [t for m in there for t in m.metrics.faulty]
-    shares = [found([t for t in faulty if t.severity in severities]) for severities in FOUND]
-    return Alarms.of(healthy), hourly_alarms(healthy), shares
-
-
-def found(faulty: Sequence[ScoredEpisode]) -> Share:
-    """Of these faults, within the window."""
-    return DetectionMetrics("", list(faulty), [], WINDOW_S).detected
-
-
-def kept(marks: Sequence[Marks], settings: Sequence[Setting]) -> Table:
-    """A row for each promise."""
+def kept_table(marks: Sequence[Marks], thresholds: Mapping[float, float]) -> Table:
+    """Return a row for each promise: alarms that came, and faults found."""
     rows = []
-    for setting in settings:
-        for promised, threshold in setting.thresholds.items():
-            events, alarms, shares = together(marks, threshold)
-            cells = kept_rate(alarms, promised), f"{events.knock.value:.1f}", f"{events.stop.value:.1f}"
-            each = (f"{percent(share)} of {share.n}" for share in shares)
-            rows.append((setting.name, f"{promised:g}", f"{threshold:.3g}", *cells, *each))
+    for promised, threshold in thresholds.items():
+        at = [m.at(threshold) for m in marks]
+        healthy, faulty = [t for m in at for t in m.solved], [t for m in at for t in m.metrics.faulty]
+        alarms = Alarms.of(healthy)
+        shares = [
+            DetectionMetrics("", [t for t in faulty if t.severity in severities], [], WINDOW_S).detected
+            for severities in (SEVERITIES, ("mild",))
+        ]
+        cells = kept_rate(alarms.fault, promised), f"{alarms.knock.value:.1f}", f"{alarms.stop.value:.1f}"
+        rows.append((f"{promised:g}", f"{threshold:.3g}", *cells, *(f"{percent(s)} of {s.n}" for s in shares)))
     hours = sum(len(t) * t.dt for m in marks for t in m.solved) / 3600
-    return Table(
-        f"Alarms an hour in {hours:.2f} healthy hours of policies and tasks that the memory never met, by what was "
-        "promised; 95 % Poisson intervals; one that comes back within a minute is counted once. Broken: the interval "
-        f"lies above. Faults that an ideal observer could see, of each severity, found within {WINDOW_S:g} s.",
-        (
-            "threshold",
-            "promised",
-            "",
-            "faults that are none",
-            "knocks",
-            "stops",
-            *(f"{' and '.join(s)} found" for s in FOUND),
-        ),
-        rows,
+    caption = (
+        f"Alarms per hour in {hours:.2f} healthy hours of policies and tasks that the memory never met, with 95 % "
+        "Poisson intervals; alarms within a minute count once. Broken: the interval lies above the promise. Found: "
+        f"faults that an ideal observer could see, within {WINDOW_S:g} s."
     )
+    found = (f"{' and '.join(SEVERITIES)} found", "mild found")
+    return Table(caption, ("promised", "threshold", "false alarms", "knocks", "stops", *found), rows)
 
 
-def each(marks: Sequence[Marks], setting: Setting) -> Table:
-    """A row for each policy and task."""
+def exams_table(marks: Sequence[Marks], thresholds: Mapping[float, float]) -> Table:
+    """Return a row for each policy and task: false alarms at each promise."""
     rows = []
     for m in marks:
         hours = sum(len(t) * t.dt for t in m.solved) / 3600
-        rates = (kept_rate(hourly_alarms(m.at(q).solved), r) for r, q in setting.thresholds.items())
+        rates = (kept_rate(hourly_alarms(m.at(q).solved), r) for r, q in thresholds.items())
         rows.append((m.name, f"{len(m.solved)} of {len(m.solved) + len(m.failed)}", f"{hours:.2f}", *rates))
-    promised = (f"promised {r:g}" for r in setting.thresholds)
     return Table(
-        f"Faults an hour that are none, of each policy and task, at thresholds {setting.name}. A promise for all of "
-        "them promises nothing of one.",
-        ("", "solved", "hours", *promised),
+        "False alarms per hour of each policy and task. A promise for all of them promises nothing of one.",
+        ("", "solved", "hours", *(f"promised {r:g}" for r in thresholds)),
         rows,
     )
-
-
-def missed(marks: Sequence[Marks], setting: Setting) -> Table:
-    """A row for each kind of fault, the hardest first."""
-    faults = {r: [t for m in marks for t in m.at(q).metrics.faulty] for r, q in setting.thresholds.items()}
-    kinds = dict.fromkeys(t.kind for own in faults.values() for t in own)
-    shares = {kind: [found([t for t in own if t.kind == kind]) for own in faults.values()] for kind in kinds}
-    rows = [
-        (kind, str(own[0].n), *(percent(share) for share in own))
-        for kind, own in sorted(shares.items(), key=lambda item: [share.value for share in item[1]])
-    ]
-    promised = (f"promised {r:g}" for r in setting.thresholds)
-    return Table(
-        f"Faults found of each kind, at thresholds {setting.name}, of all severities.", ("", "faults", *promised), rows
-    )
-
-
-def records(marks: Sequence[Marks], settings: Sequence[Setting]) -> list[Record]:
-    """Every count."""
-    return [
-        {"threshold": s.name, "promised": r, "exam": m.name, "alarms": rate.k, "hours": rate.hours}
-        for s in settings
-        for r, q in s.thresholds.items()
-        for m in marks
-        for rate in [hourly_alarms(m.at(q).solved)]
-    ]
