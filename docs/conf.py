@@ -33,7 +33,7 @@ apidoc_modules = [
         "path": "../asm_gym",
         "destination": "reference/api",
         "follow_links": True,
-        "separate_modules": False,
+        "exclude_patterns": ["../asm_gym/scripts*"],
         "module_first": True,
     }
 ]
