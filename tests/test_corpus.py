@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,19 +127,6 @@ def test_parts_of_the_memory_are_judged_by_it(pushed, tmp_path):
     assert all(float(r["auroc"]) > 0.9 for r in rows)  # a push of three metres is plain to every part
     with pytest.raises(ValueError, match="learned traces, transported traces"):
         parts_study.Config(corpus=pushed, ways=("none",))
-
-
-def test_of_the_memory_whole_each_kind_is_counted_over_all_seeds(pushed, tmp_path):
-    asked = ["--corpus", str(pushed), "--tasks", "Lift", "--ways", "learned traces", "--whole", "--seeds", "2"]
-    assert reproduce(["parts", *asked, "--quick", "--workers", "1", "--out", str(tmp_path / "out")]) == 0
-    rows = list(csv.DictReader((tmp_path / "out/parts.csv").open()))
-    assert [(r["part"], r["seed"]) for r in rows] == [("all", "0"), ("all", "1")]
-    found = [float(r["at 50 %"]) for r in rows]
-    assert min(found) >= 50  # of four pushes, by fits of a few updates
-    text = (tmp_path / "out/parts.md").read_text()
-    assert re.search(r"\| push \|  \|  \| \d+ % \|", text)
-    with pytest.raises(ValueError, match="Reach"):
-        parts_study.Config(corpus=pushed, tasks=("Reach",))
 
 
 @pytest.fixture

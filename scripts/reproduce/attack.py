@@ -76,7 +76,7 @@ class Forging(gym.Wrapper[Any, Any, Any, Any]):
         self._steps += 1
         if self._steps > ONSET:
             info = {**info, "stream": self._forge(info["stream"].copy(), self._steps - ONSET)}
-        return *rest, info  # type: ignore[return-value]
+        return *rest, info
 
 
 def forging(attack: Attack, spec: StreamSpec, recorded: NDArray[np.float32], chain: Any) -> Forge:
