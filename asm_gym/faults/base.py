@@ -68,7 +68,7 @@ def within(default: Any, *, low: float | None = None, high: float | None = None,
     return field(default=default, metadata={"low": low, "high": high, "above": above})
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field, within))
+@dataclass_transform(frozen_default=True, kw_only_default=True)
 @dataclass(frozen=True, kw_only=True)
 class Fault(ABC):
     """Something that goes wrong for a while.
