@@ -10,15 +10,24 @@ import asm_gym  # noqa: F401
 from asm_gym import collect
 from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS
-from asm_gym.policies.scripted.base import ObservationReader, Style, grasping, gripping, has_settled, rotation
-from asm_gym.policies.scripted.door import _about
+from asm_gym.policies.scripted.base import ObservationReader, Style, has_settled, move_arm
+from asm_gym.policies.scripted.geometry import (
+    UP,
+    Pose,
+    about,
+    grasping,
+    gripping,
+    matrix,
+    pointing_down,
+    rotation,
+)
 from asm_gym.policies.scripted.handover import Hammer, Meeting
-from asm_gym.policies.scripted.two_arms import Hand, move_arm
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.seeds import episode_seeds
 from tests.rates import attempt, failures, room_to_the_stops, too_few
 
 QUICK = [
+    "Lift",
     "Stack",
     "Door",
     "Wipe",
@@ -109,6 +118,27 @@ def test_speed_and_noise_change_the_course():
     env.close()
 
 
+def test_rotations_are_made_orthonormal_again():
+    exact = matrix(np.array([0.1, 0.2, 0.3, np.sqrt(1 - 0.14)]))
+    noisy = rotation(np.concatenate([exact[:, 0], exact[:, 1]]) + 1e-3 * np.arange(6))
+    np.testing.assert_allclose(noisy.T @ noisy, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(noisy, exact, atol=0.02)
+    assert np.linalg.det(noisy) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("degrees", [0, 30, 44, 46, 80, 135])
+def test_fingers_close_along_the_nearest_side_of_a_cube(degrees):
+    angle = np.radians(degrees)
+    cube = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    hand = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+    target = pointing_down(hand, cube)
+    np.testing.assert_allclose(target[:, 2], [0, 0, -1])
+    assert np.linalg.det(target) == pytest.approx(1.0)
+    sides = np.abs(cube.T @ target[:, 1])
+    assert sides.max() == pytest.approx(1.0)
+    assert hand[:, 1] @ target[:, 1] >= np.cos(np.pi / 4) - 1e-9  # never turned further than half a quarter
+
+
 def test_a_grasp_takes_the_nearest_of_equal_directions():
     hand = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # fingers close along -y
     target = gripping(hand, np.array([0.1, 1.0, 0.0]))
@@ -135,7 +165,7 @@ def test_a_hand_is_not_turned_through_the_stops_of_its_last_joint(wrist, turn, f
     expert = make_policy("scripted", env, seed=0)
     monkeypatch.setattr(expert, "_wrist", lambda observation: wrist)
     down = np.diag([1.0, -1.0, -1.0])
-    turned = expert._turning(None, down, _about([0.0, 0.0, 1.0], turn) @ down)
+    turned = expert._turning(None, down, about(UP, turn) @ down)
     assert np.arctan2(turned[1, 0], turned[0, 0]) == pytest.approx(first)
     env.close()
 
@@ -146,12 +176,12 @@ def test_a_nut_is_held_so_that_the_last_joint_has_room_all_along(heading, monkey
     expert = make_policy("scripted", env, seed=0)
     observation, _ = env.reset(seed=0)
     data = env.unwrapped.simulation.data
-    hand = rotation(expert._read(observation, "hand_orientation"))
-    turned = _about([0.0, 0.0, 1.0], heading)
-    monkeypatch.setattr(expert, "pose", lambda observation, name: (np.array([-0.1, 0.1, 0.85]), turned))
+    hand = expert.read.hand(observation).turned
+    turned = about(UP, heading)
+    monkeypatch.setattr(expert, "pose", lambda observation, name: Pose(np.array([-0.1, 0.1, 0.85]), turned))
     task = expert.next_task(observation)
     # Where nothing but the last joint turned the hand: the arm's bearing, small here, is left out.
-    place = _about([0.0, 0.0, 1.0], task.headings[0] - heading) @ turned
+    place = about(UP, task.headings[0] - heading) @ turned
     for held in (turned, place):
         closing = held @ task.closing
         turn = np.arctan2(closing[1], closing[0]) - np.arctan2(hand[1, 1], hand[0, 1])
@@ -162,7 +192,7 @@ def test_a_nut_is_held_so_that_the_last_joint_has_room_all_along(heading, monkey
 
 @pytest.mark.parametrize("length", [0.1, 0.15, 0.2, 0.25])  # those that robosuite draws from [m]
 def test_both_hands_find_room_on_a_handle(length):
-    hammer = Hammer.seen(np.array([1.0, 2.0, 3.0]), np.eye(3), length)
+    hammer = Hammer.seen(Pose(np.array([1.0, 2.0, 3.0]), np.eye(3)), length)
     giving, taking = hammer.grips()
     assert giving[2] - taking[2] >= 0.07  # a palm is 6 cm thick
     assert max(abs(hammer.giving), abs(hammer.taking)) <= length / 2 - 0.01  # half a finger
@@ -189,13 +219,6 @@ def test_a_reader_for_one_of_two_robots_finds_its_hand_and_what_belongs_to_none(
     env.close()
 
 
-def test_a_rotation_about_an_axis_keeps_it():
-    axis = np.array([0.6, 0.0, 0.8])
-    turn = _about(axis, 0.7)
-    np.testing.assert_allclose(turn @ axis, axis, atol=1e-12)
-    assert np.trace(turn) == pytest.approx(1 + 2 * np.cos(0.7))
-
-
 @pytest.mark.parametrize(
     ("joints", "velocity", "since", "settled"),
     [
@@ -213,8 +236,8 @@ def test_fingers_that_turn_are_waited_for_until_they_stand_still(joints, velocit
 
 def test_an_arm_that_stands_turned_is_commanded_in_its_own_frame():
     left = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # its x axis is the world's y
-    hand = Hand(np.zeros(3), np.eye(3))
+    hand = Pose(np.zeros(3), np.eye(3))
     forwards = move_arm(left, hand, np.array([0.0, 0.02, 0.01]), np.eye(3), speed=1.0)
     np.testing.assert_allclose(forwards, [0.4, 0, 0.2, 0, 0, 0], atol=1e-12)
-    rolled = move_arm(left, hand, np.zeros(3), _about([0.0, 1.0, 0.0], 0.1), speed=1.0)
+    rolled = move_arm(left, hand, np.zeros(3), about([0.0, 1.0, 0.0], 0.1), speed=1.0)
     np.testing.assert_allclose(rolled, [0, 0, 0, np.sin(0.1) / 0.5, 0, 0], atol=1e-12)

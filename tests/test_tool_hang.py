@@ -10,8 +10,8 @@ import pytest
 
 import asm_gym  # noqa: F401
 from asm_gym.policies.scripted import hanging, tool_hang
-from asm_gym.policies.scripted.door import _about
-from asm_gym.policies.scripted.hanging import Pose, Scene
+from asm_gym.policies.scripted.geometry import Pose, about, carried
+from asm_gym.policies.scripted.hanging import Scene
 from asm_gym.policies.scripted.tool_hang import ToolHangExpert
 
 
@@ -26,7 +26,7 @@ def env() -> Any:
 @pytest.fixture
 def scene(env: Any) -> Scene:
     observation, _ = env.reset(seed=0)
-    return ToolHangExpert(env, seed=0)._look(observation)
+    return ToolHangExpert(env, seed=0).look(observation)
 
 
 def test_it_knows_where_the_model_has_tip_hook_hole_and_ring(env: Any, scene: Scene) -> None:
@@ -79,11 +79,11 @@ def test_what_the_hand_holds_goes_where_it_is_carried() -> None:
 
     def pose() -> Pose:
         axis = rng.standard_normal(3)
-        return Pose(rng.standard_normal(3), _about(axis / np.linalg.norm(axis), rng.uniform(0, 3)))
+        return Pose(rng.standard_normal(3), about(axis / np.linalg.norm(axis), rng.uniform(0, 3)))
 
     hand, thing, goal = pose(), pose(), pose()
     own = rng.standard_normal(3)
-    target = hanging.carried(hand, thing, own, goal.at, goal.turned)
+    target = carried(hand, thing, own, goal.at, goal.turned)
     # A thing that is held keeps its pose in the hand.
     held = Pose(hand.turned.T @ (thing.at - hand.at), hand.turned.T @ thing.turned)
     moved = Pose(target.point(held.at), target.turned @ held.turned)
@@ -104,7 +104,7 @@ def hung(along: float, below: float, lean: float) -> Scene:
     """The ring is so far from the corner along the bar and below it, its tool points down; the rod leans."""
     tool = np.stack([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]], axis=1)
     middle = np.array([-along, 0.0, -below])
-    turn = _about([0.0, 1.0, 0.0], lean)
+    turn = about([0.0, 1.0, 0.0], lean)
     frame = Pose(np.zeros(3), turn)
     return Scene(frame, frame, Pose(turn @ (middle - tool @ hanging.RING), turn @ tool), np.zeros(3))
 
@@ -130,9 +130,9 @@ def test_what_hangs_is_left_alone(env: Any) -> None:
     _, state = expert.predict(observation)
     scene = hung(0.05, 0.006, 0.0)
     for phase in (tool_hang.REACH, tool_hang.DESCEND):
-        reaching = state._replace(thing=tool_hang.TOOL, phase=phase)
-        assert tool_hang._advance(reaching, scene, settled=True).phase == tool_hang.RETREAT
-        assert tool_hang._advance(reaching._replace(thing=tool_hang.FRAME), scene, settled=True).phase == phase
-    retreating = state._replace(thing=tool_hang.TOOL, phase=tool_hang.RETREAT, since=30)
-    assert tool_hang._advance(retreating, scene, settled=True).phase == tool_hang.RETREAT
-    assert tool_hang._advance(retreating, hung(0.095, 0.3, 0.0), settled=True).phase == tool_hang.REACH
+        reaching = state._replace(plan=tool_hang.TOOL, phase=phase)
+        assert expert.advance(reaching, scene).phase == tool_hang.RETREAT
+        assert expert.advance(reaching._replace(plan=tool_hang.FRAME), scene).phase == phase
+    retreating = state._replace(plan=tool_hang.TOOL, phase=tool_hang.RETREAT, since=30)
+    assert expert.advance(retreating, scene).phase == tool_hang.RETREAT
+    assert expert.advance(retreating, hung(0.095, 0.3, 0.0)).phase == tool_hang.REACH

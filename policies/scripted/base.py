@@ -1,23 +1,21 @@
-"""What scripted experts share: reading an observation by name, moving the hand, and varying as people do."""
+"""What scripted experts share: reading an observation by name, phases of a plan, and varying as people do."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.policies.scripted.geometry import Pose, Vector, matrix, move, rotation
 from asm_gym.validation import check_number
 
-Vector = NDArray[np.float64]
-
-# What one unit of action moves the hand's set-point by, in robosuite's OSC_POSE: 5 cm, 0.5 rad.
-_METRES, _RADIANS = 0.05, 0.5
 OPEN, CLOSE = -1.0, 1.0
+ARMS = 2
 _OVER = 0.006  # how far aside of its target a careful hand goes straight down [m]
 _STILL = 0.1  # below this a gripper's joints have come to rest [rad/s]
 
@@ -44,11 +42,11 @@ class Style:
         check_number("speed", self.speed, above=0)
 
     def pace(self, usual: float, rng: np.random.Generator) -> float:
-        """The speed of one episode, where ``usual`` is the expert's own."""
+        """Return the speed of one episode, where ``usual`` is the expert's own."""
         return usual * self.speed * float(np.clip(1 + self.speed_spread * rng.standard_normal(), 0.5, 1.5))
 
     def drifted(self, drift: Vector, rng: np.random.Generator) -> Vector:
-        """The next action noise after ``drift``: an AR(1) process that forgets in about 4 steps."""
+        """Return the next action noise after ``drift``: an AR(1) process that forgets in about 4 steps."""
         rho = 0.78
         step: Vector = rho * drift + self.noise * np.sqrt(1 - rho**2) * rng.standard_normal(len(drift))
         return step
@@ -72,32 +70,62 @@ class ObservationReader:
             start += size
 
     def __call__(self, observation: Any, name: str) -> Vector:
+        """Return the numbers of a channel."""
         own = f"{self._robot}_{name}"
         name = own if own in self._slices else name
         part = observation[self._slices[name]] if self._flat else observation[name]
         return np.asarray(part, dtype=np.float64)
 
+    def hand(self, observation: Any, prefix: str = "") -> Pose:
+        """Return the pose of a hand."""
+        turned = rotation(self(observation, f"{prefix}hand_orientation"))
+        return Pose(self(observation, f"{prefix}hand_position"), turned)
 
-class Expert:
-    """What every scripted expert has.
+    def pose(self, observation: Any, name: str) -> Pose:
+        """Return the pose of an object."""
+        return Pose(self(observation, f"{name}_pos"), matrix(self(observation, f"{name}_quat")))
+
+
+class State(NamedTuple):
+    """Where an expert stands in one episode."""
+
+    phase: int  # of its plan
+    since: int  # steps spent in the phase
+    speed: float  # action units
+    spread: Vector  # how this episode's way-points differ from the plan [m]
+    plan: Any  # what else was decided at the beginning
+    anchor: Any  # the hand, or hands, when the phase began
+    drift: Vector  # correlated action noise
+
+
+class Expert(ABC):
+    """A scripted expert: phases of a plan, each with the command it gives and the condition that ends it.
 
     Args:
-        env: tells where things stand in the observation, and in the room where the observation does not say.
+        env: one of the expert's task.
         seed: of the noise and of the style drawn for each episode.
         style: how much it varies.
     """
+
+    pace: ClassVar[float]
+    """Usual hand speed [action units]."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
         self.env = env
         self.style = style or Style()
         self.np_random = np.random.default_rng(seed)
-        self._read = ObservationReader(env)
-        self._careful = set(env.unwrapped.robots) != {"Panda"}  # type: ignore[attr-defined]
+        self.read = ObservationReader(env)
+        inner: Any = env.unwrapped
+        size = int(np.prod(env.action_space.shape or ()))
+        self.moves = np.setdiff1d(np.arange(size), inner.gripper_actions)
+        """Indices of the action that move arms."""
+        self._careful = set(inner.robots) != {"Panda"}
         """Plans have the Panda's pace; other arms drift further from their course."""
 
-
-class PhasedExpert(Expert, ABC):
-    """An expert whose state says in which phase of its plan it is, since when, and how its noise has drifted."""
+    @property
+    def robosuite(self) -> Any:
+        """The environment underneath."""
+        return self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
 
     def predict(
         self,
@@ -106,20 +134,76 @@ class PhasedExpert(Expert, ABC):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], Any]:
-        """The action (A,); ``deterministic`` leaves the action noise out, not the style."""
+        """Return the action (A,) and the next state; ``deterministic`` leaves the action noise out, not the style."""
         if state is None or (episode_start is not None and np.any(episode_start)):
-            state = self._begin(observation)
+            state = self.begin(observation)
         state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
-        command, state = self._act(observation, state, np.zeros_like(state.drift) if deterministic else state.drift)
+        scene = self.look(observation)
+        state = self.advance(state, scene)
+        command = self.act(state, scene, np.zeros_like(state.drift) if deterministic else state.drift)
         return np.clip(command, -1.0, 1.0).astype(np.float32), state
 
     @abstractmethod
-    def _begin(self, observation: Any) -> Any:
-        """Where an episode stands before its first step: a NamedTuple with ``since`` and ``drift``."""
+    def begin(self, observation: Any) -> State:
+        """Draw the style of an episode, and return its first state."""
+
+    def start(self, speed: float, spread: Any = 0.0, plan: Any = None, noises: int = 7, anchor: Any = None) -> State:
+        """Return a first state; ``noises`` is how many numbers of the action are noisy."""
+        return State(0, 0, speed, spread, plan, np.zeros(3) if anchor is None else anchor, np.zeros(noises))
 
     @abstractmethod
-    def _act(self, observation: Any, state: Any, noise: Vector) -> tuple[Vector, Any]:
-        """The command (A,) with ``noise`` where it belongs, and where the episode then stands."""
+    def look(self, observation: Any) -> Any:
+        """Return the scene; it has the ``hand``, or the ``hands``."""
+
+    @abstractmethod
+    def next_phase(self, state: State, scene: Any) -> int:
+        """Return the phase that follows; the present one while its work is not done."""
+
+    @abstractmethod
+    def command(self, state: State, scene: Any) -> Vector:
+        """Return the action (A,) that the phase asks for, without noise."""
+
+    def advance(self, state: State, scene: Any) -> State:
+        """Return the state in the next phase."""
+        phase = self.next_phase(state, scene)
+        return state if phase == state.phase else self.entered(state, scene, phase)
+
+    def entered(self, state: State, scene: Any, phase: int) -> State:
+        """Return the state at the beginning of a phase."""
+        return state._replace(phase=phase, since=0, anchor=scene.hand.at)
+
+    def act(self, state: State, scene: Any, noise: Vector) -> Vector:
+        """Return the action (A,) with noise in the numbers that move arms."""
+        command = self.command(state, scene)
+        command[self.moves] += noise[self.moves]
+        return command
+
+
+class TwoArmExpert(Expert):
+    """An expert with two arms: its scene has ``hands``, a pose of each."""
+
+    def hands(self, observation: Any) -> tuple[Pose, Pose]:
+        """Return the poses of both hands."""
+        first, second = (self.read.hand(observation, f"robot{i}_") for i in range(ARMS))
+        return first, second
+
+    def bases(self) -> Vector:
+        """Return (2, 3, 3) orientations of the arms' bases, in whose frames their controllers take commands."""
+        return np.stack([np.array(robot.base_ori, np.float64) for robot in self.robosuite.robots])
+
+    def places(self) -> Vector:
+        """Return (2, 3) positions of the arms' bases [m]."""
+        return np.stack([np.array(robot.base_pos, np.float64) for robot in self.robosuite.robots])
+
+    def entered(self, state: State, scene: Any, phase: int) -> State:
+        """Return the state at the beginning of a phase."""
+        return state._replace(phase=phase, since=0, anchor=np.stack([hand.at for hand in scene.hands]))
+
+
+def move_arm(base: Vector, hand: Pose, target: Vector, turned: Vector, speed: float, gain: float = 1.0) -> Vector:
+    """Return the command (6,), in the frame of its ``base`` (3, 3), that moves a hand towards a pose in the world."""
+    command = move(hand, target, turned, speed, gain)
+    return np.concatenate([base.T @ command[:3], base.T @ command[3:]])
 
 
 def has_settled(velocity: Vector, since: int, usual: int) -> bool:
@@ -136,86 +220,11 @@ def has_settled(velocity: Vector, since: int, usual: int) -> bool:
     return (since >= 2 * usual and float(np.abs(velocity).max()) < _STILL) or since >= 5 * usual
 
 
-def rotation(columns: Vector) -> Vector:
-    """(3, 3) rotation from its first two columns (6,), made orthonormal again after sensor noise."""
-    x = columns[:3] / np.linalg.norm(columns[:3])
-    y = columns[3:] - (x @ columns[3:]) * x
-    y /= np.linalg.norm(y)
-    return np.stack([x, y, np.cross(x, y)], axis=1)
-
-
-def matrix(quaternion: Vector) -> Vector:
-    """(3, 3) rotation from a unit quaternion (x, y, z, w)."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def pointing_down(hand: Vector, object_rotation: Vector | None = None) -> Vector:
-    """(3, 3) the rotation nearest ``hand`` (3, 3) whose fingers point down and close along a side of the object."""
-    if object_rotation is None:
-        return gripping(hand, None)
-    # The side that lies flattest gives the object's heading; a cube looks the same every quarter turn.
-    side = object_rotation[:, int(np.abs(object_rotation[2]).argmin())]
-    return gripping(hand, side, np.pi / 2)
-
-
-def gripping(hand: Vector, closing: Vector | None, turns: float = np.pi) -> Vector:
-    """(3, 3) the rotation nearest ``hand`` (3, 3) whose fingers point down and close along ``closing``.
-
-    Args:
-        closing: (3,) in the world; the hand's own direction where None.
-        turns: after how much of a turn the direction is as good again [rad].
-    """
-    own = hand[:2, 1]  # fingers move along the hand's y axis
-    yaw = np.arctan2(own[1], own[0])
-    if closing is not None:
-        heading = np.arctan2(closing[1], closing[0])
-        yaw = heading + np.round((yaw - heading) / turns) * turns
-    y = np.array([np.cos(yaw), np.sin(yaw), 0.0])
-    z = np.array([0.0, 0.0, -1.0])
-    return np.stack([np.cross(y, z), y, z], axis=1)
-
-
-def grasping(hand: Vector, approach: Vector, closing: Vector) -> Vector:
-    """(3, 3) the rotation nearest ``hand`` (3, 3) whose fingers point along ``approach`` and close along ``closing``.
-
-    Both are unit vectors (3,) at right angles.
-    """
-    y = closing * (1.0 if hand[:, 1] @ closing > 0 else -1.0)
-    return np.stack([np.cross(y, approach), y, approach], axis=1)
-
-
-def move(
-    position: Vector, target: Vector, hand: Vector, target_rotation: Vector, speed: float, gain: float = 1.0
-) -> Vector:
-    """(6,) the hand's command: towards a pose, at no more than ``speed`` (in action units).
-
-    The controller covers about a third of what it is asked for in one step, so a ``gain`` of 2 does not overshoot.
-    """
-    step = gain * (target - position) / _METRES
-    norm = np.linalg.norm(step)
-    if norm > speed:
-        step *= speed / norm
-    turn = 0.5 * np.cross(hand, target_rotation, axis=0).sum(axis=1) / _RADIANS
-    return np.concatenate([step, np.clip(turn, -0.5, 0.5)])
-
-
 def over_first(position: Vector, target: Vector) -> Vector:
-    """(3,) how much higher than its target a careful hand goes while it is not over it, lest a finger comes down on it.
+    """Return how much higher (3,) than its target a careful hand goes beside it, lest a finger comes down on it.
 
     Args:
         position, target: (3,) of the hand [m].
     """
     astray = float(np.linalg.norm((position - target)[:2]))
     return np.array([0.0, 0.0, np.clip(4 * (astray - _OVER), 0.0, 0.06)])
-
-
-def turn_left(hand: Vector, target: Vector) -> float:
-    """The angle between two orientations [rad]."""
-    return float(np.arccos(np.clip((np.trace(hand.T @ target) - 1) / 2, -1.0, 1.0)))

@@ -8,20 +8,8 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from asm_gym.policies.scripted.base import (
-    CLOSE,
-    OPEN,
-    PhasedExpert,
-    Style,
-    Vector,
-    gripping,
-    has_settled,
-    matrix,
-    move,
-    over_first,
-    rotation,
-    turn_left,
-)
+from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State, Style, has_settled, over_first
+from asm_gym.policies.scripted.geometry import Pose, Vector, about_vertical, angle_between, gripping, move, wrapped, yaw
 
 REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT = range(8)
 
@@ -60,23 +48,21 @@ class CarryTask(NamedTuple):
     haste: float = 1.0
 
 
-class CarryState(NamedTuple):
-    """Where one episode stands."""
+class CarryScene(NamedTuple):
+    """What is observed."""
 
-    phase: int
-    since: int  # steps spent in the phase
-    speed: float  # action units
-    spread: Vector  # (3,) how this episode's way-points differ from the plan [m]
-    task: CarryTask | None
-    anchor: Vector  # (3,) where the hand was when the phase began [m]
-    drift: Vector  # correlated action noise
+    observation: Any
+    hand: Pose
+    fingers: Vector  # velocities of the gripper's joints
 
 
-class CarryExpert(PhasedExpert):
-    """An expert that carries objects one after the other; the arguments are those of ``PhasedExpert``."""
+class CarryExpert(Expert):
+    """An expert that carries objects one after the other; the plan of its state is the task at hand, None at the end.
+
+    The arguments are those of ``Expert``.
+    """
 
     pace = 0.55
-    """Hand speed in action units."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
         super().__init__(env, seed, style)
@@ -84,139 +70,124 @@ class CarryExpert(PhasedExpert):
 
     @abstractmethod
     def next_task(self, observation: Any) -> CarryTask | None:
-        """What to carry next; None where everything is done."""
+        """Return what to carry next; None where everything is done."""
 
-    def _act(self, observation: Any, state: CarryState, noise: Vector) -> tuple[Vector, CarryState]:
-        hand_at = self._read(observation, "hand_position")
-        hand = rotation(self._read(observation, "hand_orientation"))
-        state = self._advance(state, observation, hand_at, hand)
-        command = self._command(state, observation, hand_at, hand)
-        command[:6] += noise[:6]
-        return command, state
+    def begin(self, observation: Any) -> State:
+        speed = self.style.pace(self.pace, self.np_random)
+        spread = self.style.spread * self.np_random.standard_normal(3)
+        return self.start(speed, spread, self.next_task(observation))
 
-    def _begin(self, observation: Any) -> CarryState:
-        style, rng = self.style, self.np_random
-        pace = style.pace(self.pace, rng)
-        spread = style.spread * rng.standard_normal(3)
-        return CarryState(REACH, 0, pace, spread, self.next_task(observation), np.zeros(3), np.zeros(7))
+    def look(self, observation: Any) -> CarryScene:
+        return CarryScene(observation, self.read.hand(observation), self.read(observation, "gripper_velocity"))
 
-    def pose(self, observation: Any, name: str) -> tuple[Vector, Vector]:
-        """(3,) position and (3, 3) rotation of an object."""
-        return self._read(observation, f"{name}_pos"), matrix(self._read(observation, f"{name}_quat"))
+    def pose(self, observation: Any, name: str) -> Pose:
+        """Return the pose of an object."""
+        return self.read.pose(observation, name)
 
-    def _advance(self, state: CarryState, observation: Any, hand_at: Vector, hand: Vector) -> CarryState:
-        """The phase that comes next, where this one has done its work."""
-
-        def to(phase: int) -> CarryState:
-            return state._replace(phase=phase, since=0, anchor=hand_at)
-
-        task, phase = state.task, state.phase
-        if task is None:
+    def advance(self, state: State, scene: CarryScene) -> State:
+        if state.plan is None:
             return state
-        at, turned = self.pose(observation, task.name)
-        fingers = self._read(observation, "gripper_velocity")
-        grip = at + turned @ task.grip
-        off = hand_at - grip
-        lost = np.linalg.norm(off) > 0.05
-        if phase == REACH:
-            aligned = turn_left(hand, self._grasp(task, hand, turned)) < 0.15
-            above = np.linalg.norm(off[:2] - state.spread[:2] * 0.3) < 0.02 and abs(off[2] - task.clearance) < 0.03
-            return to(DESCEND) if above and aligned else state
-        if phase == DESCEND:
-            if np.linalg.norm(off) < 0.011 or (state.since > 30 and np.linalg.norm(off) < 0.02):
-                return to(GRASP)
-            return to(REACH) if state.since > 60 or np.linalg.norm(off[:2]) > 0.06 else state
-        if phase == GRASP:
-            return to(RAISE) if has_settled(fingers, state.since, 7) else state
-        if phase in (RAISE, CARRY, LOWER) and lost:
-            return to(RETREAT)  # and see where it falls: it may be where it belongs
-        place = task.place + np.array([0.0, 0.0, task.over])
-        # Whoever cannot get nearer, at the end of his reach, makes do with less in time.
-        fit = task.fit * (1 + state.since / 60) if self._careful else task.fit
-        if phase == RAISE:
-            return to(CARRY) if at[2] > place[2] - 0.03 or state.since > 60 else state
-        if phase == CARRY:
-            fits = abs(_to_fit(task.headings, turned)) < task.heading_fit
-            there = np.linalg.norm(at[:2] - task.place[:2]) < fit
-            return to(LOWER) if there and fits else state
-        if phase == LOWER:
-            if np.linalg.norm(at[:2] - task.place[:2]) > task.fit * (2.5 if self._careful else 1.0) + 0.02:
-                return to(CARRY)
-            if at[2] < task.place[2] + 0.006 or (state.since > 50 and at[2] < task.place[2] + 0.03):
-                return to(RELEASE)
-            return to(CARRY) if state.since > 60 else state  # it stands on something: up, and once more
-        if phase == RELEASE:
-            return to(RETREAT) if has_settled(fingers, state.since, 6) else state
-        if state.since >= 14:
-            task = self.next_task(observation)
-            if task is not None:
-                return to(REACH)._replace(task=task)
-        return state
+        if state.phase == RETREAT:
+            task = self.next_task(scene.observation) if state.since >= 14 else None
+            return state if task is None else self.entered(state, scene, REACH)._replace(plan=task)
+        return super().advance(state, scene)
 
-    def _command(self, state: CarryState, observation: Any, hand_at: Vector, hand: Vector) -> Vector:
-        """(7,) towards what the phase asks for."""
-        task, phase = state.task, state.phase
+    def next_phase(self, state: State, scene: CarryScene) -> int:
+        task, phase, since = state.plan, state.phase, state.since
+        at, turned = thing = self.pose(scene.observation, task.name)
+        off = scene.hand.at - thing.point(task.grip)
+        far, beside = np.linalg.norm(off), np.linalg.norm(at[:2] - task.place[:2])
+        if phase == REACH:
+            aligned = angle_between(scene.hand.turned, self._grasp(task, scene.hand.turned, turned)) < 0.15
+            above = np.linalg.norm(off[:2] - state.spread[:2] * 0.3) < 0.02 and abs(off[2] - task.clearance) < 0.03
+            return DESCEND if above and aligned else REACH
+        if phase == DESCEND:
+            if far < 0.011 or (since > 30 and far < 0.02):
+                return GRASP
+            return REACH if since > 60 or np.linalg.norm(off[:2]) > 0.06 else DESCEND
+        if phase == GRASP:
+            return RAISE if has_settled(scene.fingers, since, 7) else GRASP
+        if phase in (RAISE, CARRY, LOWER) and far > 0.05:
+            return RETREAT  # and see where it falls: it may be where it belongs
+        if phase == RAISE:
+            return CARRY if at[2] > task.place[2] + task.over - 0.03 or since > 60 else RAISE
+        if phase == CARRY:
+            # An arm that cannot get nearer, at the end of its reach, makes do with less in time.
+            fit = task.fit * (1 + since / 60) if self._careful else task.fit
+            fits = abs(_turn_to_fit(task.headings, turned)) < task.heading_fit
+            return LOWER if beside < fit and fits else CARRY
+        if phase == LOWER:
+            if beside > task.fit * (2.5 if self._careful else 1.0) + 0.02:
+                return CARRY
+            if at[2] < task.place[2] + 0.006 or (since > 50 and at[2] < task.place[2] + 0.03):
+                return RELEASE
+            return CARRY if since > 60 else LOWER  # it stands on something: up, and once more
+        return RETREAT if has_settled(scene.fingers, since, 6) else RELEASE
+
+    def command(self, state: State, scene: CarryScene) -> Vector:
+        task, phase, hand, speed = state.plan, state.phase, scene.hand, state.speed
         if task is None:
             return np.append(np.zeros(6), OPEN)
-        at, turned = self.pose(observation, task.name)
-        grip = at + turned @ task.grip
-        held = self._turning(observation, hand, self._held(task, hand, turned))
+        at, turned = thing = self.pose(scene.observation, task.name)
+        down = gripping(hand.turned, None)
         if phase in (REACH, DESCEND):
-            aligned = self._turning(observation, hand, self._grasp(task, hand, turned))
-            above = np.array([0.0, 0.0, task.clearance]) + 0.3 * state.spread
-            target = grip + above if phase == REACH else grip
+            grip = thing.point(task.grip)
+            aligned = self._turning(scene.observation, hand.turned, self._grasp(task, hand.turned, turned))
+            target = grip + (np.array([0.0, 0.0, task.clearance]) + 0.3 * state.spread) if phase == REACH else grip
             # From afar, first high: the way may lead over a wall or another object.
-            if phase == REACH and np.linalg.norm((grip - hand_at)[:2]) > 0.1:
-                target = np.array([target[0], target[1], max(target[2], min(hand_at[2], target[2] + 0.1))])
+            if phase == REACH and np.linalg.norm((grip - hand.at)[:2]) > 0.1:
+                target = np.array([target[0], target[1], max(target[2], min(hand.at[2], target[2] + 0.1))])
             if phase == DESCEND and self._careful:
-                target = target + over_first(hand_at, grip)
-            speed = state.speed * (task.haste if phase == DESCEND else 1.0)
-            return np.append(move(hand_at, target, hand, aligned, speed, self._gain), OPEN)
+                target = target + over_first(hand.at, grip)
+            haste = task.haste if phase == DESCEND else 1.0
+            return np.append(move(hand, target, aligned, speed * haste, self._gain), OPEN)
         if phase == GRASP:
-            gain = self._gain if self._careful else 1.0
-            return np.append(move(hand_at, state.anchor, hand, gripping(hand, None), state.speed, gain), CLOSE)
+            return np.append(move(hand, state.anchor, down, speed, self._gain if self._careful else 1.0), CLOSE)
+        # From here on the object is moved, and the hand with it.
+        held = hand._replace(at=at)
         goal = task.place + np.array([0.0, 0.0, task.over])
         if phase == RAISE:
             wanted = np.array([at[0], at[1], goal[2] + 0.3 * state.spread[2]])
-            return np.append(move(at, wanted, hand, gripping(hand, None), state.speed), CLOSE)
-        if phase == CARRY:
-            return np.append(move(at, goal, hand, held, state.speed, self._gain), CLOSE)
-        if phase == LOWER:
-            place = self._lower(task, at) if self._careful or task.fit <= _EXACT else task.place
-            return np.append(move(at, place, hand, held, 0.6 * state.speed, self._gain), CLOSE)
+            return np.append(move(held, wanted, down, speed), CLOSE)
+        if phase in (CARRY, LOWER):
+            fitting = self._turning(scene.observation, hand.turned, self._held(task, hand.turned, turned))
+            if phase == LOWER:
+                goal = self._lower(task, at) if self._careful or task.fit <= _EXACT else task.place
+            share = 1.0 if phase == CARRY else 0.6
+            return np.append(move(held, goal, fitting, share * speed, self._gain), CLOSE)
         up = state.anchor + np.array([0.0, 0.0, 0.0 if phase == RELEASE else 0.12])
-        return np.append(move(hand_at, up, hand, gripping(hand, None), state.speed), OPEN)
+        return np.append(move(hand, up, down, speed), OPEN)
 
     @staticmethod
     def _lower(task: CarryTask, at: Vector) -> Vector:
-        """(3,) where an object is to go next on its way down: the further from over its place, the less down."""
+        """Return where (3,) an object is to go next on its way down: the further from over its place, the less down."""
         astray = float(np.linalg.norm((at - task.place)[:2]))
         down = 0.025 * float(np.clip(1.5 - 0.5 * astray / task.fit, 0.0, 1.0))
         return np.array([*task.place[:2], max(task.place[2], at[2] - down)])
 
-    def _at_ease(self, task: CarryTask, observation: Any) -> CarryTask:
-        """The task with one of its two grasps and one of its headings: those that leave the last joint room.
+    def at_ease(self, task: CarryTask, observation: Any) -> CarryTask:
+        """Return the task with one of its two grasps and one of its headings: those that leave the last joint room.
 
         Of a hand that points down, the last joint turns back with the hand and onwards with the arm's bearing. Of
         grasps that leave room enough, the one is chosen that turns it least.
         """
         if task.closing is None:
             return task
-        at, turned = self.pose(observation, task.name)
-        hand = rotation(self._read(observation, "hand_orientation"))
-        env = self.env.unwrapped
-        robot = env.robosuite_env.robots[0]  # type: ignore[attr-defined]
-        most = env.simulation.model.jnt_range[robot._ref_joint_indexes[-1], 1] - _ROOM  # type: ignore[attr-defined]
+        thing = self.pose(observation, task.name)
+        turned = thing.turned
+        hand = self.read.hand(observation)
+        robot, model = self.robosuite.robots[0], self.env.unwrapped.simulation.model  # type: ignore[attr-defined]
+        most = model.jnt_range[robot._ref_joint_indexes[-1], 1] - _ROOM
         now, base = self._wrist(observation), robot.base_pos
-        along = now + _yaw(hand[:, 1]) - _yaw(self._read(observation, "hand_position") - base)
-        heading = _yaw(turned[:, 0])
+        along = now + yaw(hand.turned[:, 1]) - yaw(hand.at - base)
+        heading = yaw(turned[:, 0])
 
         def strain(choice: tuple[Vector, float]) -> tuple[float, float]:
             """How far the last joint comes beyond where it has room, and how far it turns in all [rad]."""
             closing, wanted = choice
             fitting = about_vertical(wanted - heading) @ turned
-            grasp = _wrapped(along - _yaw(turned @ closing) + _yaw(at + turned @ task.grip - base))
-            place = _wrapped(along - _yaw(fitting @ closing) + _yaw(task.place + fitting @ task.grip - base))
+            grasp = wrapped(along - yaw(turned @ closing) + yaw(thing.point(task.grip) - base))
+            place = wrapped(along - yaw(fitting @ closing) + yaw(task.place + fitting @ task.grip - base))
             return max(abs(grasp) - most, abs(place) - most, 0.0), abs(grasp - now) + abs(place - grasp)
 
         choices = [(c, h) for c in (task.closing, -task.closing) for h in task.headings or (heading,)]
@@ -224,51 +195,34 @@ class CarryExpert(PhasedExpert):
         return task._replace(closing=closing, turns=2 * np.pi, headings=(wanted,) if task.headings else ())
 
     def _turning(self, observation: Any, hand: Vector, target: Vector) -> Vector:
-        """(3, 3) where to turn the hand first on its way to ``target``: not through the last joint's stops.
+        """Return how (3, 3) to turn the hand first on its way to ``target``: not through the last joint's stops.
 
         The shortest turn may lead there where it is nearly half a one.
         """
         down = gripping(hand, None)
-        left = _wrapped(_yaw(target[:, 1]) - _yaw(down[:, 1]))
+        left = wrapped(yaw(target[:, 1]) - yaw(down[:, 1]))
         if abs(left) <= _AHEAD:
             return target
         wrist = self._wrist(observation)
-        left = wrist - _wrapped(wrist - left)
+        left = wrist - wrapped(wrist - left)
         first: Vector = about_vertical(float(np.clip(left, -_AHEAD, _AHEAD))) @ down
         return first
 
     def _wrist(self, observation: Any) -> float:
-        """Angle of the arm's last joint [rad]."""
-        return float(self._read(observation, "joint_position")[-1])
+        """Return the angle of the arm's last joint [rad]."""
+        return float(self.read(observation, "joint_position")[-1])
 
     @staticmethod
     def _grasp(task: CarryTask, hand: Vector, turned: Vector) -> Vector:
-        """(3, 3) how to hold the hand for grasping."""
+        """Return how (3, 3) to hold the hand for grasping."""
         return gripping(hand, None if task.closing is None else turned @ task.closing, task.turns)
 
     def _held(self, task: CarryTask, hand: Vector, turned: Vector) -> Vector:
-        """(3, 3) how to hold the hand so that the object in it comes to fit its place."""
-        return about_vertical(_to_fit(task.headings, turned)) @ gripping(hand, None)
+        """Return how (3, 3) to hold the hand so that the object in it comes to fit its place."""
+        return about_vertical(_turn_to_fit(task.headings, turned)) @ gripping(hand, None)
 
 
-def _to_fit(headings: tuple[float, ...], turned: Vector) -> float:
-    """The smallest turn about the vertical that gives an object one of the ``headings`` [rad]; 0 without any."""
-    heading = _yaw(turned[:, 0])
-    left = [_wrapped(h - heading) for h in headings]
+def _turn_to_fit(headings: tuple[float, ...], turned: Vector) -> float:
+    """Return the smallest turn about the vertical that gives an object one of the ``headings`` [rad]; 0 without any."""
+    left = [wrapped(h - yaw(turned[:, 0])) for h in headings]
     return float(min(left, key=abs, default=0.0))
-
-
-def _yaw(direction: Vector) -> float:
-    """Angle of a direction (3,) about the vertical [rad]."""
-    return float(np.arctan2(direction[1], direction[0]))
-
-
-def _wrapped(angle: float) -> float:
-    """The same angle in [-π, π) [rad]."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
-def about_vertical(angle: float) -> Vector:
-    """(3, 3) rotation about the vertical [rad]."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

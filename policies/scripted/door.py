@@ -6,14 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from asm_gym.policies.scripted.base import (
-    CLOSE,
-    OPEN,
-    PhasedExpert,
-    Vector,
-    move,
-    rotation,
-)
+from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State
+from asm_gym.policies.scripted.geometry import UP, Pose, Vector, about, angle_between, move
 
 REACH, APPROACH, GRASP, TURN, PULL, REST = range(6)
 
@@ -24,7 +18,7 @@ _ROLL = 0.8  # how far to roll the hand at once [rad]
 _OPENED = 0.36  # [rad]; the task asks for 0.3
 
 
-class Hardware(NamedTuple):
+class _Hardware(NamedTuple):
     """The door as it stood closed: what the observation does not say."""
 
     hinge: Vector  # (3,) a point on the hinge's axis, which is vertical
@@ -34,45 +28,42 @@ class Hardware(NamedTuple):
     normal: Vector  # (3,) out of the door, towards the robot
     sign: float  # of the latch's joint, where the handle goes down
 
+    def grip_at(self, turned: float, opened: float) -> Vector:
+        """Return where (3,) to hold the handle, when it is pressed and the door is open by these angles [rad]."""
+        held = self.pivot + about(self.axis, turned) @ (self.grip - self.pivot)
+        grip: Vector = self.hinge + about(UP, opened) @ (held - self.hinge)
+        return grip
 
-class DoorState(NamedTuple):
-    """Where one episode stands."""
+    def held(self, turned: float) -> Vector:
+        """Return the hand (3, 3) on the handle of the closed door.
 
-    phase: int
-    since: int  # steps spent in the phase
-    speed: float  # action units
-    spread: Vector  # (3,) how this episode's way-points differ from the plan [m]
-    hardware: Hardware
-    anchor: Vector  # (3,) where the hand was when the phase began [m]
-    drift: Vector  # (7,) correlated action noise
+        Its y axis points down: pressing the handle turns it back. The other way up it turns further, until the Panda's
+        last joint meets its stop.
+        """
+        z, y = -self.normal, np.array([0.0, 0.0, -1.0])
+        held: Vector = about(self.axis, turned) @ np.stack([np.cross(y, z), y, z], axis=1)
+        return held
 
 
-class DoorExpert(PhasedExpert):
-    """A scripted expert for Door."""
+class _Scene(NamedTuple):
+    hand: Pose
+    turned: float  # how far the handle is pressed [rad]
+    opened: float  # how far the door is open [rad]
 
-    def _act(self, observation: Any, state: DoorState, noise: Vector) -> tuple[Vector, DoorState]:
-        hand_at = self._read(observation, "hand_position")
-        hand = rotation(self._read(observation, "hand_orientation"))
-        turned = state.hardware.sign * float(self._read(observation, "handle_qpos")[0])
-        opened = float(self._read(observation, "hinge_qpos")[0])
-        left = _between(hand, self._facing(state, turned, opened))
-        state = self._advance(state, hand_at, turned, opened, left)
-        target, grip = self._target(state, turned, opened)
-        facing = self._facing(state, turned, opened)
-        if state.phase == REACH:
-            facing = self._rolling(state, hand, facing)
-        command = np.append(move(hand_at, target, hand, facing, state.speed, gain=2.0), grip)
-        command[:6] += noise[:6]
-        return command, state
 
-    def _begin(self, observation: Any) -> DoorState:
+class DoorExpert(Expert):
+    """A scripted expert for Door; the plan of its state is the door's hardware."""
+
+    pace = 0.4
+
+    def begin(self, observation: Any) -> State:
         style, rng = self.style, self.np_random
-        speed = style.pace(0.4, rng)
+        speed = style.pace(self.pace, rng)
         spread = 0.3 * style.spread * rng.standard_normal(3)
-        return DoorState(REACH, 0, speed, spread, self._look(spread[0]), np.zeros(3), np.zeros(7))
+        return self.start(speed, spread, self._hardware(spread[0]))
 
-    def _look(self, along: float) -> Hardware:
-        """The door as it stands at the beginning of an episode, closed; the grip is moved ``along`` the handle [m]."""
+    def _hardware(self, along: float) -> _Hardware:
+        """Return the door as it stands at the beginning, closed; the grip is moved ``along`` the handle [m]."""
         simulation = self.env.unwrapped.simulation  # type: ignore[attr-defined]
         model, data = simulation.model, simulation.data
         hinge, latch = model.joint("Door_hinge").id, model.joint("Door_latch_joint").id
@@ -83,102 +74,73 @@ class DoorExpert(PhasedExpert):
         sign = -float(np.sign(np.cross(axis, middle - pivot)[2]))
         grip = middle + (0.025 + along) * outwards
         normal = frame[:, 1] * np.sign(frame[:, 1] @ (middle - pivot))
-        return Hardware(data.xanchor[hinge].copy(), pivot.copy(), sign * axis, grip, normal, sign)
+        return _Hardware(data.xanchor[hinge].copy(), pivot.copy(), sign * axis, grip, normal, sign)
 
-    def _advance(self, state: DoorState, hand_at: Vector, turned: float, opened: float, left: float) -> DoorState:
-        """The phase that comes next; ``left`` is how far the hand is from facing the door [rad]."""
-        off = hand_at - self._grip(state.hardware, turned, opened)
+    def look(self, observation: Any) -> _Scene:
+        turned, opened = (float(self.read(observation, name)[0]) for name in ("handle_qpos", "hinge_qpos"))
+        return _Scene(self.read.hand(observation), turned, opened)
+
+    def next_phase(self, state: State, scene: _Scene) -> int:
+        hardware, phase, since = state.plan, state.phase, state.since
+        turned, opened = hardware.sign * scene.turned, scene.opened
+        off = scene.hand.at - hardware.grip_at(turned, opened)
         far = float(np.linalg.norm(off))
-
-        def to(phase: int) -> DoorState:
-            return state._replace(phase=phase, since=0, anchor=hand_at)
-
-        before = off - _BEFORE * state.hardware.normal
-        if state.phase == REACH and np.linalg.norm(before) < 0.02 and left < 0.15:
-            return to(APPROACH)
-        if state.phase == APPROACH and (far < 0.012 or (state.since > 25 and far < 0.025)):
-            return to(GRASP)
-        if state.phase == APPROACH and state.since > 60:
-            return to(REACH)
-        if state.phase == GRASP and state.since >= 7:
-            return to(TURN)
-        if state.phase in (TURN, PULL) and far > 0.07:  # slipped off
-            return to(REACH)
-        if state.phase == TURN and turned > _TURNED - 0.1:
-            return to(PULL)
-        if state.phase == PULL and opened > _OPENED - 0.02:
-            return to(REST)
-        return state
-
-    def _target(self, state: DoorState, turned: float, opened: float) -> tuple[Vector, float]:
-        hardware, phase = state.hardware, state.phase
-        grip = self._grip(hardware, turned, opened)
         if phase == REACH:
-            return grip + _BEFORE * hardware.normal, OPEN
+            left = angle_between(scene.hand.turned, self._facing(state, scene))
+            return APPROACH if np.linalg.norm(off - _BEFORE * hardware.normal) < 0.02 and left < 0.15 else REACH
         if phase == APPROACH:
-            return grip, OPEN
+            if far < 0.012 or (since > 25 and far < 0.025):
+                return GRASP
+            return REACH if since > 60 else APPROACH
         if phase == GRASP:
-            return state.anchor, CLOSE
-        if phase == TURN:
-            return self._grip(hardware, min(turned + 0.4, _PRESSED), opened), CLOSE
-        if phase == PULL:
-            return self._grip(hardware, _PRESSED, min(opened + 0.12, _OPENED + 0.04)), CLOSE
-        return state.anchor, CLOSE
+            return TURN if since >= 7 else GRASP
+        if phase in (TURN, PULL) and far > 0.07:  # slipped off
+            return REACH
+        if phase == TURN and turned > _TURNED - 0.1:
+            return PULL
+        if phase == PULL and opened > _OPENED - 0.02:
+            return REST
+        return phase
 
-    @classmethod
-    def _facing(cls, state: DoorState, turned: float, opened: float) -> Vector:
-        """(3, 3) the hand in front of the door, fingers above and below the handle; it turns with what it holds."""
-        held = cls._held(state.hardware, turned if state.phase >= TURN else 0.0)
-        facing: Vector = _about([0.0, 0.0, 1.0], opened) @ held
+    def command(self, state: State, scene: _Scene) -> Vector:
+        hardware, phase, facing = state.plan, state.phase, self._facing(state, scene)
+        turned, opened = hardware.sign * scene.turned, scene.opened
+        if phase == REACH:
+            target = hardware.grip_at(turned, opened) + _BEFORE * hardware.normal
+            facing = self._rolling(hardware, scene.hand.turned, facing)
+        elif phase == APPROACH:
+            target = hardware.grip_at(turned, opened)
+        elif phase == TURN:
+            target = hardware.grip_at(min(turned + 0.4, _PRESSED), opened)
+        elif phase == PULL:
+            target = hardware.grip_at(_PRESSED, min(opened + 0.12, _OPENED + 0.04))
+        else:
+            target = state.anchor
+        return np.append(move(scene.hand, target, facing, state.speed, gain=2.0), OPEN if phase < GRASP else CLOSE)
+
+    @staticmethod
+    def _facing(state: State, scene: _Scene) -> Vector:
+        """Return the hand (3, 3) before the door, fingers above and below the handle; it turns with what it holds."""
+        held = state.plan.held(state.plan.sign * scene.turned if state.phase >= TURN else 0.0)
+        facing: Vector = about(UP, scene.opened) @ held
         return facing
 
     @staticmethod
-    def _held(hardware: Hardware, turned: float) -> Vector:
-        """(3, 3) the hand on the handle of a closed door. Its y axis points down: pressing the handle turns it back.
-
-        The other way up it turns further, until the Panda's last joint meets its stop.
-        """
-        z = -hardware.normal
-        y = np.array([0.0, 0.0, -1.0])
-        held: Vector = _about(hardware.axis, turned) @ np.stack([np.cross(y, z), y, z], axis=1)
-        return held
-
-    @classmethod
-    def _rolling(cls, state: DoorState, hand: Vector, facing: Vector) -> Vector:
-        """(3, 3) where to turn first on the way to ``facing``: rolled a little, by the way back that pressing takes.
+    def _rolling(hardware: _Hardware, hand: Vector, facing: Vector) -> Vector:
+        """Return where (3, 3) to turn first on the way to ``facing``: rolled a little, the way back of pressing.
 
         The shortest turn is nearly half a one, and may lead any way round.
         """
-        pressed = cls._held(state.hardware, _TURNED)
+        pressed = hardware.held(_TURNED)
         left = _roll(hand, pressed) + _roll(pressed, facing)
-        first: Vector = facing @ _about([0.0, 0.0, 1.0], left - np.clip(left, -_ROLL, _ROLL))
+        first: Vector = facing @ about(UP, left - np.clip(left, -_ROLL, _ROLL))
         return first
-
-    @staticmethod
-    def _grip(hardware: Hardware, turned: float, opened: float) -> Vector:
-        """(3,) where to hold the handle, when it is pressed and the door is open by these angles [rad]."""
-        held = hardware.pivot + _about(hardware.axis, turned) @ (hardware.grip - hardware.pivot)
-        grip: Vector = hardware.hinge + _about([0.0, 0.0, 1.0], opened) @ (held - hardware.hinge)
-        return grip
-
-
-def _between(a: Vector, b: Vector) -> float:
-    """The angle between two orientations [rad]."""
-    return float(np.arccos(np.clip((np.trace(a.T @ b) - 1) / 2, -1.0, 1.0)))
 
 
 def _roll(hand: Vector, to: Vector) -> float:
-    """How far the hand is rolled from another orientation, about its z axis, once that points the same way [rad]."""
+    """Return the hand's roll from another orientation about its z axis, once that points the same way [rad]."""
     axis = np.cross(hand[:, 2], to[:, 2])
     sine = float(np.linalg.norm(axis))
-    tilt = _about(axis / sine, float(np.arctan2(sine, hand[:, 2] @ to[:, 2]))) if sine > 1e-9 else np.eye(3)
+    tilt = about(axis / sine, float(np.arctan2(sine, hand[:, 2] @ to[:, 2]))) if sine > 1e-9 else np.eye(3)
     across = to.T @ tilt @ hand[:, 1]
     return float(np.arctan2(-across[0], across[1]))
-
-
-def _about(axis: Any, angle: float) -> Vector:
-    """(3, 3) rotation about a unit ``axis`` by ``angle`` [rad] (Rodrigues)."""
-    x, y, z = axis
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turn: Vector = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
-    return turn

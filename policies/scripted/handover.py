@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from asm_gym.policies.scripted.base import CLOSE, OPEN, PhasedExpert, Style, Vector, grasping, gripping, matrix
-from asm_gym.policies.scripted.two_arms import ARMS, Hand, Hands, move_arm
+from asm_gym.policies.scripted.base import ARMS, CLOSE, OPEN, State, Style, TwoArmExpert, move_arm
+from asm_gym.policies.scripted.geometry import UP, Pose, Vector, grasping, gripping
 
 REACH, DESCEND, GRASP, RAISE, OFFER, MEET, TAKE, LET_GO, PART = range(9)
 
@@ -23,7 +23,6 @@ _BEFORE = 0.1  # from where the second hand comes to the handle [m]
 _HELD = 0.02  # how wide the fingers stay open around a handle, at least [m]; it is 3 to 4 cm thick
 _MEETING = 1.15  # height of the hammer where it changes hands [m]
 _LEAN = np.pi / 4
-_UP = np.array([0.0, 0.0, 1.0])
 
 
 class Hammer(NamedTuple):
@@ -36,15 +35,15 @@ class Hammer(NamedTuple):
     taking: float  # the same of the second
 
     def grips(self) -> Vector:
-        """(2, 3) where the two hands hold it [m]."""
+        """Return (2, 3) where the two hands hold it [m]."""
         return self.at + np.outer([self.giving, self.taking], self.along)
 
     @classmethod
-    def seen(cls, at: Vector, turned: Vector, length: float) -> Hammer:
-        """One with a handle of ``length`` [m] whose frame is ``turned`` (3, 3)."""
+    def seen(cls, pose: Pose, length: float) -> Hammer:
+        """Return a hammer with a handle of ``length`` [m]."""
         free = length / 2 - _FINGER
         giving = min(free, _APART + 0.006 - free)
-        return cls(at, turned[:, 2], turned[:, 0], giving, max(-free, giving - _APART))
+        return cls(pose.at, pose.turned[:, 2], pose.turned[:, 0], giving, max(-free, giving - _APART))
 
 
 class Meeting(NamedTuple):
@@ -55,19 +54,24 @@ class Meeting(NamedTuple):
 
     @classmethod
     def between(cls, first: Vector, second: Vector, height: float) -> Meeting:
-        """Half-way between two arms that stand at ``first`` and ``second`` (3,) [m]."""
+        """Return the place half-way between two arms that stand at ``first`` and ``second`` (3,) [m]."""
         forth = (second - first) * [1.0, 1.0, 0.0]
         middle = (first + second) / 2
         return cls(np.array([middle[0], middle[1], height]), forth / np.linalg.norm(forth))
 
+    @property
+    def side(self) -> Vector:
+        """(3,) level unit vector across, along which the hammer is held."""
+        return np.cross(self.forth, UP)
+
     def giving(self, hand: Vector) -> Vector:
-        """(3, 3) how the first hand offers the hammer."""
-        approach = np.sin(_LEAN) * self.forth - np.cos(_LEAN) * _UP
-        return grasping(hand, approach, np.cos(_LEAN) * self.forth + np.sin(_LEAN) * _UP)
+        """Return how (3, 3) the first hand offers the hammer."""
+        approach = np.sin(_LEAN) * self.forth - np.cos(_LEAN) * UP
+        return grasping(hand, approach, np.cos(_LEAN) * self.forth + np.sin(_LEAN) * UP)
 
     def taking(self, along: Vector) -> Vector:
-        """(3, 3) how the second hand takes a hammer that lies ``along`` (3,), with its wrist far from its limit."""
-        approach = -np.sin(_LEAN) * self.forth - np.cos(_LEAN) * _UP
+        """Return how (3, 3) the second hand takes a hammer that lies ``along`` (3,), its wrist far from its limit."""
+        approach = -np.sin(_LEAN) * self.forth - np.cos(_LEAN) * UP
         approach = approach - (approach @ along) * along
         approach /= np.linalg.norm(approach)
         across = np.cross(approach, along)
@@ -75,25 +79,17 @@ class Meeting(NamedTuple):
         return np.stack([np.cross(across, approach), across, approach], axis=1)
 
 
-class HandoverState(NamedTuple):
-    """Where one episode stands."""
-
-    phase: int
-    since: int  # steps spent in the phase
-    speed: float  # action units
-    spread: Vector  # (3,) how this episode's way-points differ from the plan [m]
-    over: float  # how far above the handle the first hand comes from [m]
-    meeting: Meeting
-    bases: Vector  # (2, 3, 3) how the arms stand in the room
-    anchors: Vector  # (2, 3) where the hands were when the phase began [m]
-    drift: Vector  # (14,) correlated action noise
+class _Scene(NamedTuple):
+    hands: tuple[Pose, Pose]
+    hammer: Hammer
+    held: bool  # the second hand has something between its fingers
 
 
-class HandoverExpert(PhasedExpert):
-    """A scripted expert for TwoArmHandover.
+class HandoverExpert(TwoArmExpert):
+    """A scripted expert for TwoArmHandover; the plan of its state is the meeting.
 
     Args:
-        env, seed, style: as for ``PhasedExpert``.
+        env, seed, style: as for ``Expert``.
         name: of the hammer, as observations call it.
         over: how far above the handle to come from [m].
         pace: hand speed in action units.
@@ -109,132 +105,108 @@ class HandoverExpert(PhasedExpert):
         pace: float = 0.5,
     ) -> None:
         super().__init__(env, seed, style)
-        self._hands = Hands(env)
         self._name, self._over, self._pace = name, over, pace
 
-    def _act(self, observation: Any, state: HandoverState, noise: Vector) -> tuple[Vector, HandoverState]:
-        hands = self._hands.look(observation)
-        hammer = self.hammer(observation)
-        holds = float(np.abs(self._read(observation, "robot1_gripper_opening")).sum()) > _HELD
-        state = _advance(state, hands, hammer, holds)
-        command = np.zeros((ARMS, 7))
-        for i, (at, turn, grip) in enumerate((_give(state, hands[0], hammer), _take(state, hammer))):
-            command[i, :6] = move_arm(state.bases[i], hands[i], at, turn, state.speed, gain=2.0)
-            command[i, 6] = grip
-        command[:, :6] += noise.reshape(ARMS, 7)[:, :6]
-        return command.reshape(-1), state
+    def begin(self, observation: Any) -> State:
+        speed = self.style.pace(self._pace, self.np_random)
+        spread = self.style.spread * np.clip(self.np_random.standard_normal(3), -2, 2)
+        first, second = self.places()
+        meeting = Meeting.between(first, second, _MEETING)
+        meeting = meeting._replace(at=meeting.at + spread)
+        return self.start(speed, spread, meeting, noises=7 * ARMS, anchor=np.zeros((ARMS, 3)))
+
+    def look(self, observation: Any) -> _Scene:
+        held = float(np.abs(self.read(observation, "robot1_gripper_opening")).sum()) > _HELD
+        return _Scene(self.hands(observation), self.hammer(observation), held)
 
     def hammer(self, observation: Any) -> Hammer:
-        """The hammer as it is observed; its length is the model's."""
-        env = self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
-        (model,) = (thing for thing in env.model.mujoco_objects if thing.name == self._name)
-        turned = matrix(self._read(observation, f"{self._name}_quat"))
-        return Hammer.seen(self._read(observation, f"{self._name}_pos"), turned, model.handle_length)
+        """Return the hammer as it is observed; its length is the model's."""
+        (model,) = (thing for thing in self.robosuite.model.mujoco_objects if thing.name == self._name)
+        return Hammer.seen(self.read.pose(observation, self._name), model.handle_length)
 
-    def _begin(self, observation: Any) -> HandoverState:
-        style, rng = self.style, self.np_random
-        speed = style.pace(self._pace, rng)
-        spread = style.spread * np.clip(rng.standard_normal(3), -2, 2)
-        first, second = self._hands.places()
-        meeting = Meeting.between(first, second, _MEETING)
-        return HandoverState(
-            phase=REACH,
-            since=0,
-            speed=speed,
-            spread=spread,
-            over=self._over,
-            meeting=meeting._replace(at=meeting.at + spread),
-            bases=self._hands.bases(),
-            anchors=np.zeros((ARMS, 3)),
-            drift=np.zeros(7 * ARMS),
-        )
+    def next_phase(self, state: State, scene: _Scene) -> int:
+        phase, since, hammer, meeting = state.phase, state.since, scene.hammer, state.plan
+        at = np.stack([hand.at for hand in scene.hands])  # (2, 3)
+        off = at - hammer.grips()  # (2, 3)
+        far = np.linalg.norm(off, axis=1)  # (2,)
+        if phase == REACH:
+            aligned = abs(scene.hands[0].turned[:, 1] @ hammer.across) > np.cos(0.15)
+            return DESCEND if aligned and np.linalg.norm(off[0] - self._above(state)) < 0.025 else REACH
+        if phase == DESCEND:
+            if far[0] < 0.009 or (since > 30 and far[0] < 0.015):
+                return GRASP
+            return REACH if since > 60 else DESCEND
+        if phase == GRASP:
+            return RAISE if since >= 8 else GRASP
+        if phase in (RAISE, OFFER, MEET) and far[0] > 0.06:  # lost it
+            return REACH
+        if phase == RAISE:
+            return OFFER if at[0, 2] - state.anchor[0, 2] > self._over + 0.05 or since > 60 else RAISE
+        if phase == OFFER:
+            offered = abs(hammer.along @ meeting.side) > np.cos(0.8)
+            there = np.linalg.norm(hammer.grips().mean(axis=0) - meeting.at) < 0.02
+            before = np.linalg.norm(at[1] - _before(meeting, hammer)) < 0.025
+            return MEET if offered and there and before else OFFER
+        if phase == MEET:
+            if far[1] < 0.01 or (since > 30 and far[1] < 0.02):
+                return TAKE
+            return OFFER if since > 60 else MEET
+        if phase == TAKE and since >= 8:
+            return LET_GO if scene.held else OFFER
+        return PART if phase == LET_GO and since >= 6 else phase
+
+    def command(self, state: State, scene: _Scene) -> Vector:
+        command = np.zeros((ARMS, 7))
+        goals = self._give(state, scene), self._take(state, scene)
+        for i, (base, hand, (at, turned, grip)) in enumerate(zip(self.bases(), scene.hands, goals, strict=True)):
+            command[i, :6] = move_arm(base, hand, at, turned, state.speed, gain=2.0)
+            command[i, 6] = grip
+        return command.reshape(-1)
+
+    def _above(self, state: State) -> Vector:
+        """Return (3,) from the grip to where the first hand comes down from [m]."""
+        above: Vector = self._over * UP + 0.3 * state.spread
+        return above
+
+    def _give(self, state: State, scene: _Scene) -> tuple[Vector, Vector, float]:
+        """Return position (3,), orientation (3, 3) and grip that the first hand is to have."""
+        phase, hammer, hand, meeting = state.phase, scene.hammer, scene.hands[0], state.plan
+        grip, anchor = hammer.grips()[0], state.anchor[0]
+        down = gripping(hand.turned, hammer.across)
+        if phase == REACH:
+            return grip + self._above(state), down, OPEN
+        if phase == DESCEND:
+            return grip, down, OPEN
+        if phase == GRASP:
+            return anchor, gripping(hand.turned, None), CLOSE
+        if phase == RAISE:
+            # Little by little, and with the head drawn in: a bin's wall would turn the hammer between its fingers.
+            drawn = anchor - _DRAWN_IN * hammer.along
+            return np.array([*drawn[:2], hand.at[2] + 0.02]), down, CLOSE
+        offering = meeting.giving(hand.turned)
+        if phase in (OFFER, MEET):
+            return hand.at + meeting.at - hammer.grips().mean(axis=0), offering, CLOSE
+        if phase == TAKE:
+            return anchor, offering, CLOSE
+        return anchor - (0.15 if phase == PART else 0.0) * hand.turned[:, 2], offering, OPEN
+
+    def _take(self, state: State, scene: _Scene) -> tuple[Vector, Vector, float]:
+        """Return position (3,), orientation (3, 3) and grip that the second hand is to have."""
+        phase, hammer, meeting = state.phase, scene.hammer, state.plan
+        if phase <= RAISE:
+            waiting = meeting.taking(meeting.side)
+            return meeting.at - 0.2 * waiting[:, 2], waiting, OPEN
+        taking = meeting.taking(hammer.along)
+        if phase == OFFER:
+            return _before(meeting, hammer), taking, OPEN
+        if phase == MEET:
+            return hammer.grips()[1], taking, OPEN
+        # Alone with it, the hand stays as it is: the hammer may turn between its fingers.
+        return state.anchor[1], meeting.taking(meeting.side) if phase == PART else taking, CLOSE
 
 
-def _advance(state: HandoverState, hands: tuple[Hand, Hand], hammer: Hammer, holds: bool) -> HandoverState:
-    """The phase that comes next; ``holds``: the second hand has something between its fingers."""
-    at = np.stack([hand.at for hand in hands])  # (2, 3)
-
-    def to(phase: int) -> HandoverState:
-        return state._replace(phase=phase, since=0, anchors=at)
-
-    off = at - hammer.grips()  # (2, 3)
-    far = np.linalg.norm(off, axis=1)  # (2,)
-    phase, since = state.phase, state.since
-    if phase == REACH:
-        aligned = abs(hands[0].turned[:, 1] @ hammer.across) > np.cos(0.15)
-        above = np.linalg.norm(off[0] - _above(state)) < 0.025
-        return to(DESCEND) if aligned and above else state
-    if phase == DESCEND:
-        if far[0] < 0.009 or (since > 30 and far[0] < 0.015):
-            return to(GRASP)
-        return to(REACH) if since > 60 else state
-    if phase == GRASP:
-        return to(RAISE) if since >= 8 else state
-    if phase in (RAISE, OFFER, MEET) and far[0] > 0.06:  # lost it
-        return to(REACH)
-    if phase == RAISE:
-        return to(OFFER) if at[0, 2] - state.anchors[0, 2] > state.over + 0.05 or since > 60 else state
-    if phase == OFFER:
-        offered = abs(hammer.along @ np.cross(state.meeting.forth, _UP)) > np.cos(0.8)
-        there = np.linalg.norm(hammer.grips().mean(axis=0) - state.meeting.at) < 0.02
-        before = np.linalg.norm(at[1] - _before(state, hammer)) < 0.025
-        return to(MEET) if offered and there and before else state
-    if phase == MEET:
-        if far[1] < 0.01 or (since > 30 and far[1] < 0.02):
-            return to(TAKE)
-        return to(OFFER) if since > 60 else state
-    if phase == TAKE and since >= 8:
-        return to(LET_GO) if holds else to(OFFER)
-    if phase == LET_GO and since >= 6:
-        return to(PART)
-    return state
-
-
-def _above(state: HandoverState) -> Vector:
-    """(3,) from the grip to where the first hand comes down from [m]."""
-    above: Vector = state.over * _UP + 0.3 * state.spread
-    return above
-
-
-def _before(state: HandoverState, hammer: Hammer) -> Vector:
-    """(3,) from where the second hand comes to the free end, once the hammer is where they meet [m]."""
-    end = state.meeting.at + (hammer.taking - hammer.giving) / 2 * hammer.along
-    before: Vector = end - _BEFORE * state.meeting.taking(hammer.along)[:, 2]
+def _before(meeting: Meeting, hammer: Hammer) -> Vector:
+    """Return (3,) from where the second hand comes to the free end, once the hammer is where they meet [m]."""
+    end = meeting.at + (hammer.taking - hammer.giving) / 2 * hammer.along
+    before: Vector = end - _BEFORE * meeting.taking(hammer.along)[:, 2]
     return before
-
-
-def _give(state: HandoverState, hand: Hand, hammer: Hammer) -> tuple[Vector, Vector, float]:
-    """(3,) where the first hand is to go, (3, 3) how it is to be held, and its grip."""
-    grip, anchor = hammer.grips()[0], state.anchors[0]
-    down = gripping(hand.turned, hammer.across)
-    if state.phase == REACH:
-        return grip + _above(state), down, OPEN
-    if state.phase == DESCEND:
-        return grip, down, OPEN
-    if state.phase == GRASP:
-        return anchor, gripping(hand.turned, None), CLOSE
-    if state.phase == RAISE:
-        # Little by little, and with the head drawn in: a bin's wall would turn the hammer between its fingers.
-        in_ = anchor - _DRAWN_IN * hammer.along
-        return np.array([*in_[:2], hand.at[2] + 0.02]), gripping(hand.turned, hammer.across), CLOSE
-    offering = state.meeting.giving(hand.turned)
-    if state.phase in (OFFER, MEET):
-        return hand.at + state.meeting.at - hammer.grips().mean(axis=0), offering, CLOSE
-    if state.phase == TAKE:
-        return anchor, offering, CLOSE
-    return anchor - (0.15 if state.phase == PART else 0.0) * hand.turned[:, 2], offering, OPEN
-
-
-def _take(state: HandoverState, hammer: Hammer) -> tuple[Vector, Vector, float]:
-    """(3,) where the second hand is to go, (3, 3) how it is to be held, and its grip."""
-    if state.phase <= RAISE:
-        waiting = state.meeting.taking(np.cross(state.meeting.forth, _UP))
-        return state.meeting.at - 0.2 * waiting[:, 2], waiting, OPEN
-    taking = state.meeting.taking(hammer.along)
-    if state.phase == OFFER:
-        return _before(state, hammer), taking, OPEN
-    if state.phase == MEET:
-        return hammer.grips()[1], taking, OPEN
-    # Alone with it, the hand stays as it is: the hammer may turn between its fingers.
-    alone = state.meeting.taking(np.cross(state.meeting.forth, _UP))
-    return state.anchors[1], alone if state.phase == PART else taking, CLOSE

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from asm_gym.policies.scripted.base import Vector
+from asm_gym.policies.scripted.geometry import Pose, Vector
 
 # The frame's own frame: origin in the corner, z along the rod away from the tip, x along the bar away from the hook.
 FRAME_GRIP = np.array([0.0, -0.006, -0.048])  # higher, and the palm would stand on the hook [m]
@@ -34,61 +34,45 @@ ROOM = 0.009  # from the bar's middle to the ring's, where the bar is in the rin
 TILTED = 0.1  # a rod that leans further is being pushed over [rad]
 
 
-class Pose(NamedTuple):
-    """Where a thing is."""
-
-    at: Vector  # (3,) [m]
-    turned: Vector  # (3, 3)
-
-    def point(self, own: Vector) -> Vector:
-        """(3,) in the world, of a point (3,) in its own frame."""
-        return self.at + self.turned @ own
-
-
 class Scene(NamedTuple):
-    """What is seen."""
+    """What is observed."""
 
     hand: Pose
     frame: Pose
     tool: Pose
     hole: Vector  # (3,) under the tube, at the height of the base's middle [m]
+    fingers: Vector = np.zeros(2)  # velocities of the gripper's joints
 
 
 def steepness(scene: Scene) -> float:
-    """How far down from the bar's direction the tool points [rad]."""
+    """Return how far down from the bar's direction the tool points [rad]."""
     handle = scene.frame.turned.T @ scene.tool.turned[:, 0]
     return float(np.arctan2(-handle[2], -handle[0]))
 
 
 def course(scene: Scene, steep: float) -> Vector:
-    """(3,) where the ring's middle is to be when the tool points ``steep`` [rad] down."""
+    """Return where (3,) the ring's middle is to be when the tool points ``steep`` [rad] down."""
     along, above = np.interp(steep, STEEP, ALONG), np.interp(steep, STEEP, ABOVE)
     return scene.frame.point(np.array([-HOOK - along, 0.0, above]))
 
 
 def astray(scene: Scene) -> float:
-    """How far the ring's middle is from its course round the hook [m]."""
+    """Return how far the ring's middle is from its course round the hook [m]."""
     return float(np.linalg.norm(scene.tool.point(RING) - course(scene, steepness(scene))))
 
 
 def tilt(scene: Scene) -> float:
-    """How far the frame's rod is from upright [rad]."""
+    """Return how far the frame's rod is from upright [rad]."""
     return float(np.arccos(np.clip(scene.frame.turned[2, 2], -1.0, 1.0)))
 
 
 def is_round(scene: Scene) -> bool:
-    """The ring is round the bar, between hook and corner, and the tool points down."""
+    """Whether the ring is round the bar, between hook and corner, and the tool points down."""
     along, aside, above = scene.frame.turned.T @ (scene.tool.point(RING) - scene.frame.at)
     inside = -HOOK < along < -0.005 and np.hypot(aside, above) < ROOM
     return bool(inside and steepness(scene) > STEEP[2])
 
 
 def hangs(scene: Scene) -> bool:
-    """The ring is round the bar of a frame that stands."""
+    """Whether the ring is round the bar of a frame that stands."""
     return is_round(scene) and tilt(scene) < TILTED
-
-
-def carried(hand: Pose, thing: Pose, own: Vector, goal: Vector, turned: Vector) -> Pose:
-    """How to hold the hand so that the thing in it is ``turned`` (3, 3), and a point of its ``own`` at the ``goal``."""
-    turn = turned @ thing.turned.T
-    return Pose(goal + turn @ (hand.at - thing.point(own)), turn @ hand.turned)

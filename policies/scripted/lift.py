@@ -6,84 +6,70 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from asm_gym.policies.scripted.base import (
-    CLOSE,
-    OPEN,
-    PhasedExpert,
-    Vector,
-    has_settled,
-    matrix,
-    move,
-    over_first,
-    pointing_down,
-    rotation,
-)
+from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State, has_settled, over_first
+from asm_gym.policies.scripted.geometry import Pose, Vector, move, pointing_down
 
 REACH, DESCEND, GRASP, LIFT = range(4)
 
 
-class _State(NamedTuple):
-    """Where one episode stands."""
-
-    phase: int
-    since: int  # steps spent in the phase
-    speed: float  # action units
+class _Plan(NamedTuple):
     hover: Vector  # (3,) way-point above the cube, relative to it [m]
     goal: Vector  # (3,) where to carry it, relative to where it was grasped [m]
     depth: float  # how far below the cube's centre to grasp [m]
-    grasped_at: Vector  # (3,) [m]
-    drift: Vector  # (7,) correlated action noise
 
 
-class LiftExpert(PhasedExpert):
+class _Scene(NamedTuple):
+    hand: Pose
+    cube: Pose
+    fingers: Vector  # velocities of the gripper's joints
+
+
+class LiftExpert(Expert):
     """A scripted expert for Lift."""
 
-    def _act(self, observation: Any, state: _State, noise: Vector) -> tuple[Vector, _State]:
-        hand_at = self._read(observation, "hand_position")
-        hand = rotation(self._read(observation, "hand_orientation"))
-        cube_at = self._read(observation, "cube_pos")
-        cube = matrix(self._read(observation, "cube_quat"))
+    pace = 0.45
 
-        state = self._advance(state, hand_at, cube_at, self._read(observation, "gripper_velocity"))
-        target, grip = self._target(state, cube_at)
-        if self._careful and state.phase == DESCEND:
-            target = target + over_first(hand_at, cube_at)
-        aligned = pointing_down(hand, cube if state.phase <= DESCEND else None)
-        command = np.append(move(hand_at, target, hand, aligned, state.speed), grip)
-        command[:6] += noise[:6]
-        return command, state
-
-    def _begin(self, observation: Any) -> _State:
+    def begin(self, observation: Any) -> State:
         style, rng = self.style, self.np_random
         deep = 0.0 if self._careful else 0.005  # fingers of other arms are longer, and come down on the table
-        return _State(
-            phase=REACH,
-            since=0,
-            speed=style.pace(0.45, rng),
+        speed = style.pace(self.pace, rng)
+        plan = _Plan(
             hover=np.array([0.0, 0.0, 0.07]) + style.spread * rng.standard_normal(3),
             goal=np.array([0.0, 0.0, 0.13]) + style.spread * rng.standard_normal(3),
             depth=float(np.clip(deep + 0.3 * style.spread * rng.standard_normal(), 0.0, 2 * deep)),
-            grasped_at=np.zeros(3),
-            drift=np.zeros(7),
         )
+        return self.start(speed, plan=plan)
 
-    def _advance(self, state: _State, hand_at: Vector, cube_at: Vector, fingers: Vector) -> _State:
-        offset = hand_at - cube_at
-        if state.phase == REACH and np.linalg.norm(offset - state.hover) < 0.02:
-            return state._replace(phase=DESCEND, since=0)
-        if state.phase == DESCEND and abs(offset[2] + state.depth) < 0.008 and np.linalg.norm(offset[:2]) < 0.015:
-            return state._replace(phase=GRASP, since=0, grasped_at=hand_at)
-        if state.phase == GRASP and has_settled(fingers, state.since, 6):
-            return state._replace(phase=LIFT, since=0)
-        if state.phase == LIFT and np.linalg.norm(offset) > 0.05:  # lost it
-            return state._replace(phase=REACH, since=0)
-        return state
+    def look(self, observation: Any) -> _Scene:
+        fingers = self.read(observation, "gripper_velocity")
+        return _Scene(self.read.hand(observation), self.read.pose(observation, "cube"), fingers)
 
-    def _target(self, state: _State, cube_at: Vector) -> tuple[Vector, float]:
-        if state.phase == REACH:
-            return cube_at + state.hover, OPEN
-        if state.phase == DESCEND:
-            return cube_at - [0.0, 0.0, state.depth], OPEN
-        if state.phase == GRASP:
-            return state.grasped_at, CLOSE
-        return state.grasped_at + state.goal, CLOSE
+    def next_phase(self, state: State, scene: _Scene) -> int:
+        phase, offset = state.phase, scene.hand.at - scene.cube.at
+        aside = np.linalg.norm(offset[:2])
+        if phase == REACH and np.linalg.norm(offset - state.plan.hover) < 0.02:
+            return DESCEND
+        if phase == DESCEND and abs(offset[2] + state.plan.depth) < 0.008 and aside < 0.015:
+            return GRASP
+        if phase == GRASP and has_settled(scene.fingers, state.since, 6):
+            return LIFT
+        if phase == LIFT and np.linalg.norm(offset) > 0.05:  # lost it
+            return REACH
+        return phase
+
+    def entered(self, state: State, scene: _Scene, phase: int) -> State:
+        # While it lifts, the anchor stays where the cube was grasped.
+        return super().entered(state, scene, phase)._replace(anchor=state.anchor if phase == LIFT else scene.hand.at)
+
+    def command(self, state: State, scene: _Scene) -> Vector:
+        phase, plan, cube = state.phase, state.plan, scene.cube
+        if phase == REACH:
+            target = cube.at + plan.hover
+        elif phase == DESCEND:
+            target = cube.at - [0.0, 0.0, plan.depth]
+            if self._careful:
+                target = target + over_first(scene.hand.at, cube.at)
+        else:
+            target = state.anchor + (plan.goal if phase == LIFT else 0.0)
+        aligned = pointing_down(scene.hand.turned, cube.turned if phase <= DESCEND else None)
+        return np.append(move(scene.hand, target, aligned, state.speed), OPEN if phase <= DESCEND else CLOSE)

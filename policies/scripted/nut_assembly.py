@@ -17,8 +17,8 @@ class NutAssemblyExpert(CarryExpert):
     pace = 0.5
 
     def next_task(self, observation: Any) -> CarryTask | None:
-        """A nut that is not around its peg; None where all are."""
-        env = self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
+        """Return a nut that is not around its peg; None where all are."""
+        env = self.robosuite
         for i, nut in enumerate(env.nuts):
             if env.single_object_mode and i != env.nut_id:
                 continue
@@ -40,10 +40,10 @@ class NutAssemblyExpert(CarryExpert):
                     heading_fit=0.06 if square else 0.2,
                     fit=0.005,
                 )
-                return self._at_ease(task, observation)
+                return self.at_ease(task, observation)
         return None
 
     def _headings(self) -> tuple[float, ...]:
-        """Where the handle of a round nut may point: a Panda's elbow reaches its stop sooner than others'."""
+        """Return where the handle of a round nut may point: a Panda's elbow reaches its stop sooner than others'."""
         aside = np.pi / 2 if self._careful else 0.5
         return np.pi - aside, np.pi, np.pi + aside

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 
-from asm_gym.policies.scripted.base import PhasedExpert, Style, Vector, grasping, matrix
-from asm_gym.policies.scripted.two_arms import ARMS, Hands, move_arm
+from asm_gym.policies.scripted.base import ARMS, State, TwoArmExpert, move_arm
+from asm_gym.policies.scripted.geometry import UP, Pose, Vector, grasping, matrix
 
 TURN, ALIGN, INSERT = range(3)
 
@@ -20,97 +19,83 @@ _BEFORE = 0.26  # from the hole to the peg's middle, a whole peg away, where nei
 _THROUGH = 0.04  # the same when it is in [m]
 _BELOW = 0.17  # from the hand down its plate to the middle of the hole [m]
 _STEEP = np.pi / 4  # how far down the peg points [rad]
-_UP = np.array([0.0, 0.0, 1.0])
 
 
-class PegInHoleState(NamedTuple):
-    """Where one episode stands."""
-
-    phase: int
-    since: int  # steps spent in the phase
-    speed: float  # action units
+class _Plan(NamedTuple):
     plate: Vector  # (3,) where to hold the hand with the plate [m]
     through: float  # from the hole to the peg's middle at the end [m]
-    bases: Vector  # (2, 3, 3) how the arms stand in the room
     course: Vector  # (3,) unit vector along which the peg goes in
     side: Vector  # (3,) unit vector across it, level
-    drift: Vector  # (12,) correlated action noise
 
 
-class PegInHoleExpert(PhasedExpert):
+class _Scene(NamedTuple):
+    hands: tuple[Pose, Pose]
+    middle: Vector  # (3,) of the peg [m]
+    axis: Vector  # (3,) along the peg
+    centre: Vector  # (3,) of the hole [m]
+    normal: Vector  # (3,) of the plate
+
+
+class PegInHoleExpert(TwoArmExpert):
     """A scripted expert for TwoArmPegInHole."""
 
-    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
-        super().__init__(env, seed, style)
-        self._hands = Hands(env)
+    pace = 0.4
 
-    def _act(self, observation: Any, state: PegInHoleState, noise: Vector) -> tuple[Vector, PegInHoleState]:
-        peg, plate = self._hands.look(observation)
-        hole_at, hole = self._read(observation, "hole_pos"), matrix(self._read(observation, "hole_quat"))
-        middle = hole_at - self._read(observation, "peg_to_hole")  # (3,) of the peg
-        axis = matrix(self._read(observation, "peg_quat"))[:, 2]
-        centre = hole_at + _CENTRE * hole[:, 0]
+    def begin(self, observation: Any) -> State:
+        style, rng = self.style, self.np_random
+        first, second = self.places()
+        forth = (second - first) / np.linalg.norm(second - first)  # level
+        side = np.cross(forth, UP)
+        course = np.cos(_STEEP) * forth - np.sin(_STEEP) * UP
+        centre = (first + second) / 2 + 0.05 * forth + 0.15 * UP
+        plate = centre + _BELOW * np.cross(side, course)
+        speed = style.pace(self.pace, rng)
+        plate = plate + 2 * style.spread * np.clip(rng.standard_normal(3), -2, 2)
+        through = _THROUGH + float(np.clip(style.spread * rng.standard_normal(), -0.03, 0.03))
+        return self.start(speed, plan=_Plan(plate, through, course, side), noises=6 * ARMS)
 
-        off = centre - middle
-        along = float(off @ state.course)
-        astray = float(np.linalg.norm(off - along * state.course))
-        turned = abs(float(hole[:, 2] @ state.course)) > 0.98
-        aligned = turned and float(axis @ state.course) > 0.98
-        state = _advance(state, along, astray, turned, aligned)
+    def look(self, observation: Any) -> _Scene:
+        hole = self.read.pose(observation, "hole")
+        middle = hole.at - self.read(observation, "peg_to_hole")
+        axis = matrix(self.read(observation, "peg_quat"))[:, 2]
+        return _Scene(self.hands(observation), middle, axis, hole.at + _CENTRE * hole.turned[:, 0], hole.turned[:, 2])
 
-        goal = centre - _ahead(state, along, astray) * state.course
-        pointing = np.stack([np.cross(state.side, state.course), state.side, state.course], axis=1)
+    def next_phase(self, state: State, scene: _Scene) -> int:
+        phase, course = state.phase, state.plan.course
+        along, astray = _off(state, scene)
+        turned = abs(float(scene.normal @ course)) > 0.98
+        aligned = turned and float(scene.axis @ course) > 0.98
+        if phase == TURN and turned:
+            return ALIGN
+        if phase == ALIGN and aligned and astray < 0.015 and abs(along - _BEFORE) < 0.03:
+            return INSERT
+        # Short of the plate or stuck on its rim, out again: half a peg is 0.13 m long.
+        if phase == INSERT and along > 0.14 and (astray > 0.04 or state.since > 80):
+            return ALIGN
+        return phase
+
+    def command(self, state: State, scene: _Scene) -> Vector:
+        (peg, plate), plan, speed, bases = scene.hands, state.plan, state.speed, self.bases()
+        along, astray = _off(state, scene)
         if state.phase == TURN:  # out of the plate's way
-            goal, pointing = middle - 0.02 * state.course, peg.turned
-        command = np.concatenate(
+            goal, pointing = scene.middle - 0.02 * plan.course, peg.turned
+        else:
+            # The further it is astray, the less it advances.
+            advanced = max(plan.through, along - 0.03 * float(np.clip(1.5 - astray / 0.02, 0.0, 1.0)))
+            goal = scene.centre - (_BEFORE if state.phase == ALIGN else advanced) * plan.course
+            pointing = np.stack([np.cross(plan.side, plan.course), plan.side, plan.course], axis=1)
+        # The plate's normal is its hand's y axis.
+        facing = grasping(plate.turned, np.cross(plan.course, plan.side), plan.course)
+        return np.concatenate(
             [
-                move_arm(state.bases[0], peg, peg.at + goal - middle, pointing, state.speed, gain=1.5),
-                move_arm(state.bases[1], plate, state.plate, _facing(plate.turned, state), state.speed, gain=1.5),
+                move_arm(bases[0], peg, peg.at + goal - scene.middle, pointing, speed, gain=1.5),
+                move_arm(bases[1], plate, plan.plate, facing, speed, gain=1.5),
             ]
         )
-        command += noise
-        return command, state
-
-    def _begin(self, observation: Any) -> PegInHoleState:
-        style, rng = self.style, self.np_random
-        first, second = self._hands.places()
-        forth = (second - first) / np.linalg.norm(second - first)  # level
-        side = np.cross(forth, _UP)
-        course = np.cos(_STEEP) * forth - np.sin(_STEEP) * _UP
-        centre = (first + second) / 2 + 0.05 * forth + 0.15 * _UP
-        plate = centre + _BELOW * np.cross(side, course)
-        return PegInHoleState(
-            phase=TURN,
-            since=0,
-            speed=style.pace(0.4, rng),
-            plate=plate + 2 * style.spread * np.clip(rng.standard_normal(3), -2, 2),
-            through=_THROUGH + float(np.clip(style.spread * rng.standard_normal(), -0.03, 0.03)),
-            bases=self._hands.bases(),
-            course=course,
-            side=side,
-            drift=np.zeros(6 * ARMS),
-        )
 
 
-def _advance(state: PegInHoleState, along: float, astray: float, turned: bool, aligned: bool) -> PegInHoleState:
-    """The phase that comes next: in once both face each other, and out again where the peg missed the hole."""
-    if state.phase == TURN and turned:
-        return state._replace(phase=ALIGN, since=0)
-    if state.phase == ALIGN and aligned and astray < 0.015 and abs(along - _BEFORE) < 0.03:
-        return state._replace(phase=INSERT, since=0)
-    # Short of the plate or stuck on its rim: half a peg is 0.13 m long.
-    if state.phase == INSERT and along > 0.14 and (astray > 0.04 or state.since > 80):
-        return state._replace(phase=ALIGN, since=0)
-    return state
-
-
-def _ahead(state: PegInHoleState, along: float, astray: float) -> float:
-    """How far before the hole the peg's middle should be now [m]: the further it is astray, the less it advances."""
-    if state.phase == ALIGN:
-        return _BEFORE
-    return max(state.through, along - 0.03 * float(np.clip(1.5 - astray / 0.02, 0.0, 1.0)))
-
-
-def _facing(hand: Vector, state: PegInHoleState) -> Vector:
-    """(3, 3) the rotation nearest ``hand`` that turns the plate, whose normal is the hand's y axis, to face the peg."""
-    return grasping(hand, np.cross(state.course, state.side), state.course)
+def _off(state: State, scene: _Scene) -> tuple[float, float]:
+    """Return how far the peg's middle is before the hole, along its course and across [m]."""
+    off = scene.centre - scene.middle
+    along = float(off @ state.plan.course)
+    return along, float(np.linalg.norm(off - along * state.plan.course))

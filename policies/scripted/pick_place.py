@@ -8,8 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from asm_gym.policies.scripted.base import Style, Vector
-from asm_gym.policies.scripted.carry import CarryExpert, CarryTask, about_vertical
+from asm_gym.policies.scripted.base import Style
+from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
+from asm_gym.policies.scripted.geometry import Vector, about_vertical, matrix
 
 _WALL = 0.09  # how high above the bins' floor the fingertips stay clear of the walls' tops with the palm [m]
 _REACH = 0.8  # further from its base than this a Panda's hand comes down with its elbow at its stop [m]
@@ -44,8 +45,8 @@ class PickPlaceExpert(CarryExpert):
 
     def next_task(self, observation: Any) -> CarryTask | None:
         """The nearest object that is not in its bin; None where all are."""
-        env = self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
-        hand = self._read(observation, "hand_position")
+        env = self.robosuite
+        hand = self.read(observation, "hand_position")
         left = []
         for i, thing in enumerate(env.objects):
             if env.single_object_mode and i != env.object_id:
@@ -83,7 +84,7 @@ class PickPlaceExpert(CarryExpert):
             fit=0.03,
             haste=1.0 if room >= _SPARE else _SLOWLY,
         )
-        return self._at_ease(task, observation)
+        return self.at_ease(task, observation)
 
     @staticmethod
     def _headings(closing: Vector, reach: Vector) -> tuple[float, ...]:
@@ -149,14 +150,7 @@ class PickPlaceExpert(CarryExpert):
         model = self.env.unwrapped.simulation.model  # type: ignore[attr-defined]
         body = model.body(f"{name}_main").id
         (geom,) = (g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_group[g] == 0)
-        w, x, y, z = model.geom_quat[geom]
-        turn = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        turn = matrix(model.geom_quat[geom][[1, 2, 3, 0]])
         half: Vector = np.abs(turn) @ model.geom_aabb[geom, 3:]
         return half
 

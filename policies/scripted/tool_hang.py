@@ -13,18 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from asm_gym.policies.scripted.base import (
-    CLOSE,
-    OPEN,
-    PhasedExpert,
-    Vector,
-    grasping,
-    has_settled,
-    matrix,
-    move,
-    rotation,
-    turn_left,
-)
+from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State, has_settled
+from asm_gym.policies.scripted.geometry import Pose, Vector, angle_between, carried, grasping, move
 from asm_gym.policies.scripted.hanging import (
     FRAME_GRIP,
     HOLE,
@@ -39,10 +29,8 @@ from asm_gym.policies.scripted.hanging import (
     TOOL_GRIP,
     TUBE,
     UPRIGHT,
-    Pose,
     Scene,
     astray,
-    carried,
     course,
     hangs,
     is_round,
@@ -73,60 +61,53 @@ class Goal(NamedTuple):
     gain: float = 2.0
 
 
-class ToolHangState(NamedTuple):
-    """Where one episode stands."""
+class ToolHangExpert(Expert):
+    """A scripted expert for ToolHang, on the Panda; the plan of its state is the thing at hand, ``FRAME`` or ``TOOL``.
 
-    thing: int
-    phase: int
-    since: int  # steps spent in the phase
-    speed: float  # action units
-    spread: Vector  # (3,) how this episode's way-points differ from the plan [m]
-    anchor: Pose  # the hand when the phase began
-    drift: Vector  # (6,) correlated action noise
+    Its anchor is the hand's pose when the phase began.
+    """
 
+    pace = 0.6
 
-class ToolHangExpert(PhasedExpert):
-    """A scripted expert for ToolHang, on the Panda."""
-
-    def _act(self, observation: Any, state: ToolHangState, noise: Vector) -> tuple[Vector, ToolHangState]:
-        scene = self._look(observation)
-        state = _advance(state, scene, has_settled(self._read(observation, "gripper_velocity"), state.since, 10))
-        goal = _goal(state, scene)
-        speed = goal.pace * state.speed
-        command = move(scene.hand.at, goal.hand.at, scene.hand.turned, goal.hand.turned, speed, goal.gain)
-        # A hand that goes slowly is steadier: its noise grows with the command (Harris and Wolpert 1998).
-        command += goal.pace * noise
-        return np.append(command, goal.grip), state
-
-    def _begin(self, observation: Any) -> ToolHangState:
+    def begin(self, observation: Any) -> State:
         style, rng = self.style, self.np_random
-        speed, spread = style.pace(0.6, rng), style.spread * np.clip(rng.standard_normal(3), -2, 2)
-        return ToolHangState(FRAME, REACH, 0, speed, spread, self._look(observation).hand, np.zeros(6))
+        speed, spread = style.pace(self.pace, rng), style.spread * np.clip(rng.standard_normal(3), -2, 2)
+        return self.start(speed, spread, FRAME, noises=6, anchor=self.read.hand(observation))
 
-    def _look(self, observation: Any) -> Scene:
-        def pose(name: str) -> Pose:
-            return Pose(self._read(observation, f"{name}_pos"), matrix(self._read(observation, f"{name}_quat")))
+    def look(self, observation: Any) -> Scene:
+        frame, tool, base = (self.read.pose(observation, name) for name in ("frame", "tool", "base"))
+        fingers = self.read(observation, "gripper_velocity")
+        return Scene(self.read.hand(observation), frame, tool, base.point(HOLE), fingers)
 
-        hand = Pose(self._read(observation, "hand_position"), rotation(self._read(observation, "hand_orientation")))
-        return Scene(hand, pose("frame"), pose("tool"), pose("base").point(HOLE))
+    def next_phase(self, state: State, scene: Scene) -> int:
+        settled = has_settled(scene.fingers, state.since, 10)
+        return (_grasped if state.phase <= RAISE else _placed)(state, scene, settled)
+
+    def advance(self, state: State, scene: Scene) -> State:
+        after = super().advance(state, scene)
+        if state.phase == RETREAT and state.plan == FRAME and (_left(state, scene)[0] < 0.02 or state.since > 40):
+            return self.entered(state, scene, REACH)._replace(plan=TOOL)
+        return after
+
+    def entered(self, state: State, scene: Scene, phase: int) -> State:
+        return state._replace(phase=phase, since=0, anchor=scene.hand)
+
+    def command(self, state: State, scene: Scene) -> Vector:
+        goal = _goal(state, scene)
+        command = move(scene.hand, goal.hand.at, goal.hand.turned, goal.pace * state.speed, goal.gain)
+        return np.append(command, goal.grip)
+
+    def act(self, state: State, scene: Scene, noise: Vector) -> Vector:
+        # A hand that goes slowly is steadier: its noise grows with the command (Harris and Wolpert 1998).
+        return super().act(state, scene, _goal(state, scene).pace * noise)
 
 
-def _advance(state: ToolHangState, scene: Scene, settled: bool) -> ToolHangState:
-    """The phase that comes next, where this one has done its work; ``settled``: the fingers have closed or opened."""
-    thing, phase = state.thing, (_grasped if state.phase <= RAISE else _placed)(state, scene, settled)
-    if state.phase == RETREAT and thing == FRAME and (_left(state, scene)[0] < 0.02 or state.since > 40):
-        thing, phase = TOOL, REACH
-    if (thing, phase) == (state.thing, state.phase):
-        return state
-    return state._replace(thing=thing, phase=phase, since=0, anchor=scene.hand)
-
-
-def _grasped(state: ToolHangState, scene: Scene, settled: bool) -> int:
-    """The phase that follows one of those up to ``RAISE``."""
+def _grasped(state: State, scene: Scene, settled: bool) -> int:
+    """Return the phase that follows one of those up to ``RAISE``."""
     phase = state.phase
-    if state.thing == TOOL and hangs(scene):
+    if state.plan == TOOL and hangs(scene):
         return RETREAT  # by itself: whoever takes hold of it again would knock it off
-    far = float(np.linalg.norm(scene.hand.at - _grasp(state.thing, scene).at))
+    far = float(np.linalg.norm(scene.hand.at - _grasp(state.plan, scene).at))
     if phase == REACH:
         left, turn = _left(state, scene)
         return DESCEND if left < 0.015 and turn < 0.1 else REACH
@@ -141,14 +122,14 @@ def _grasped(state: ToolHangState, scene: Scene, settled: bool) -> int:
     return CARRY if scene.hand.at[2] > _RAISED else RAISE
 
 
-def _placed(state: ToolHangState, scene: Scene, settled: bool) -> int:
-    """The phase that follows one of those from ``CARRY`` on."""
+def _placed(state: State, scene: Scene, settled: bool) -> int:
+    """Return the phase that follows one of those from ``CARRY`` on."""
     phase, since = state.phase, state.since
     if phase == RELEASE:
         return RETREAT if settled else RELEASE
     if phase == RETREAT:
-        return RETREAT if state.thing == FRAME or since < 20 or hangs(scene) else REACH
-    if np.linalg.norm(scene.hand.at - _grasp(state.thing, scene).at) > _LOST:
+        return RETREAT if state.plan == FRAME or since < 20 or hangs(scene) else REACH
+    if np.linalg.norm(scene.hand.at - _grasp(state.plan, scene).at) > _LOST:
         return REACH
     left, turn = _left(state, scene)
     if phase == CARRY:
@@ -163,7 +144,7 @@ def _placed(state: ToolHangState, scene: Scene, settled: bool) -> int:
             return CARRY  # it slipped off the hook
         enough = STEEP[-1] - 0.06 if since < 30 else STEEP[-2]  # a tool that slips in the hand turns no further
         return RELEASE if steep > enough else TURN
-    if state.thing == TOOL:
+    if state.plan == TOOL:
         if tilt(scene) > TILTED:
             return CARRY
         if left < 0.002 or (since > 40 and astray(scene) < 0.005):
@@ -174,23 +155,23 @@ def _placed(state: ToolHangState, scene: Scene, settled: bool) -> int:
     return CARRY if since > 120 else LOWER
 
 
-def _left(state: ToolHangState, scene: Scene) -> tuple[float, float]:
-    """How far the hand is from its goal: [m], [rad]."""
+def _left(state: State, scene: Scene) -> tuple[float, float]:
+    """Return how far the hand is from its goal: [m], [rad]."""
     goal = _goal(state, scene).hand
-    return float(np.linalg.norm(goal.at - scene.hand.at)), turn_left(scene.hand.turned, goal.turned)
+    return float(np.linalg.norm(goal.at - scene.hand.at)), angle_between(scene.hand.turned, goal.turned)
 
 
-def _goal(state: ToolHangState, scene: Scene) -> Goal:
-    """What the hand is to do now."""
+def _goal(state: State, scene: Scene) -> Goal:
+    """Return what the hand is to do now."""
     phase, anchor = state.phase, state.anchor
     if phase == REACH:
-        grasp = _grasp(state.thing, scene)
+        grasp = _grasp(state.plan, scene)
         at = grasp.at - _BEFORE * grasp.turned[:, 2] + 0.3 * state.spread
         if np.linalg.norm((at - scene.hand.at)[:2]) > 0.1:
             at = np.array([*at[:2], _CLEAR])
         return Goal(Pose(at, grasp.turned), OPEN)
     if phase == DESCEND:
-        return Goal(_grasp(state.thing, scene), OPEN, 0.6)
+        return Goal(_grasp(state.plan, scene), OPEN, 0.6)
     if phase == GRASP:
         return Goal(anchor, CLOSE)
     if phase == RAISE:
@@ -198,11 +179,11 @@ def _goal(state: ToolHangState, scene: Scene) -> Goal:
     if phase in (RELEASE, RETREAT):
         back = 0.0 if phase == RELEASE else _BACK
         return Goal(Pose(anchor.at - back * anchor.turned[:, 2], anchor.turned), OPEN, 0.5)
-    return _stand(state, scene) if state.thing == FRAME else _hang(state, scene)
+    return _stand(state, scene) if state.plan == FRAME else _hang(state, scene)
 
 
 def _grasp(thing: int, scene: Scene) -> Pose:
-    """How to hold the hand for grasping."""
+    """Return how to hold the hand for grasping."""
     if thing == TOOL:
         turned = scene.tool.turned
         return Pose(scene.tool.point(TOOL_GRIP), grasping(scene.hand.turned, -turned[:, 2], turned[:, 1]))
@@ -212,8 +193,8 @@ def _grasp(thing: int, scene: Scene) -> Pose:
     return Pose(scene.frame.point(FRAME_GRIP), np.stack([np.cross(-x, approach), -x, approach], axis=1))
 
 
-def _stand(state: ToolHangState, scene: Scene) -> Goal:
-    """The frame upright over the tube, or on its way down."""
+def _stand(state: State, scene: Scene) -> Goal:
+    """Return the goal of the frame: upright over the tube, or on its way down."""
     tip = scene.frame.point(TIP)
     height = float(tip[2] - scene.hole[2])
     if state.phase == CARRY:
@@ -221,7 +202,7 @@ def _stand(state: ToolHangState, scene: Scene) -> Goal:
         goal = scene.hole + np.array([0.0, 0.0, over])
         near = np.linalg.norm(goal - tip) < 0.03
         hand = carried(scene.hand, scene.frame, TIP, goal, UPRIGHT)
-        if turn_left(scene.hand.turned, hand.turned) > _TURNING:
+        if angle_between(scene.hand.turned, hand.turned) > _TURNING:
             # Near its base the arm would fold up in turning, and its wrist come to its stops.
             hand = Pose(np.array([max(state.anchor.at[0], _OUT), state.anchor.at[1], _CLEAR]), hand.turned)
         return Goal(hand, CLOSE, 0.5 if near else 1.0)
@@ -236,8 +217,8 @@ def _stand(state: ToolHangState, scene: Scene) -> Goal:
     return Goal(carried(scene.hand, scene.frame, TIP, goal, UPRIGHT), CLOSE, 0.5)
 
 
-def _hang(state: ToolHangState, scene: Scene) -> Goal:
-    """The ring over the hook, or lowered on to it, or turned about the bar's end."""
+def _hang(state: State, scene: Scene) -> Goal:
+    """Return the goal of the ring: over the hook, or lowered on to it, or turned about the bar's end."""
     steep = float(STEEP[0])
     if state.phase == TURN:
         steep = float(np.clip(steepness(scene) + min(_AHEAD * state.speed, 0.2), *STEEP[[0, -1]]))

@@ -11,10 +11,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.base import Expert, ObservationReader, Style, Vector, gripping, move
-from asm_gym.policies.scripted.carry import CARRY, RAISE, RETREAT, CarryExpert, CarryState, CarryTask
-from asm_gym.policies.scripted.handover import PART, HandoverExpert, HandoverState
-from asm_gym.policies.scripted.two_arms import Hands
+from asm_gym.policies.scripted.base import ObservationReader, State, Style
+from asm_gym.policies.scripted.carry import CARRY, RAISE, RETREAT, CarryExpert, CarryScene, CarryTask
+from asm_gym.policies.scripted.geometry import Pose, Vector, flattest_side, gripping, move
+from asm_gym.policies.scripted.handover import PART, HandoverExpert
 
 _DEEP = 0.22  # how far above a bin's floor to come from: its walls are 15 cm high [m]
 _WITHDRAWN = 15  # after how many steps the first hand is out of the second's way
@@ -36,38 +36,39 @@ class Carrier(CarryExpert):
     def __init__(self, env: gym.Env[Any, Any], seed: int, style: Style, arm: int) -> None:
         super().__init__(env, seed, style)
         self._careful, self._gain = True, 3.0  # near its own base, an arm drifts towards it
-        self._arm = arm
-        self._hands = Hands(env)
-        self._read = ObservationReader(env, f"robot{arm}")
+        self._arm, self.moves = arm, np.arange(6)
+        self.read = ObservationReader(env, f"robot{arm}")
 
-    def _command(self, state: CarryState, observation: Any, hand_at: Vector, hand: Vector) -> Vector:
-        """(7,) towards what the phase asks for, in the frame of the arm's base."""
-        base = self._hands.bases()[self._arm]
-        command = super()._command(state, observation, hand_at, hand)
+    @property
+    def base(self) -> Vector:
+        """(3, 3) orientation of the arm's base, in whose frame its controller takes commands."""
+        return np.array(self.robosuite.robots[self._arm].base_ori, np.float64)
+
+    def command(self, state: State, scene: CarryScene) -> Vector:
+        command, base, hand = super().command(state, scene), self.base, scene.hand
         if state.phase == RAISE:  # straight up, little by little: the walls of a bin are near
-            up = np.array([*state.anchor[:2], hand_at[2] + 0.03])
-            command[:6] = move(hand_at, up, hand, gripping(hand, None), state.speed, self._gain)
+            up = np.array([*state.anchor[:2], hand.at[2] + 0.03])
+            command[:6] = move(hand, up, gripping(hand.turned, None), state.speed, self._gain)
         return np.concatenate([base.T @ command[:3], base.T @ command[3:6], command[6:]])
 
     def _held(self, task: CarryTask, hand: Vector, turned: Vector) -> Vector:
-        """(3, 3) how to hold the hand on its way: with the wrist in the middle, where it turns both ways."""
-        return gripping(hand, -self._hands.bases()[self._arm][:, 1], 2 * np.pi)
+        # With the wrist in the middle, where it turns both ways.
+        return gripping(hand, -self.base[:, 1], 2 * np.pi)
 
     @staticmethod
-    def is_done(state: CarryState) -> bool:
+    def is_done(state: State) -> bool:
         """Whether everything is where it belongs, and the hand has left it."""
-        return state.task is None or (state.phase == RETREAT and state.since > 14)
+        return state.plan is None or (state.phase == RETREAT and state.since > 14)
 
 
 class LidCarrier(Carrier):
     """Puts the lid of the start bin on the table."""
 
     def next_task(self, observation: Any) -> CarryTask | None:
-        """The lid, until it is off."""
-        env = self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
+        """Return the lid, until it is off."""
+        env = self.robosuite
         start = env.sim.data.body_xpos[env.sim.model.body_name2id(env.transport.start_bin.root_body)]
-        at, _ = self.pose(observation, "lid_handle")
-        if np.linalg.norm((at - start)[:2]) > 0.25:
+        if np.linalg.norm((self.pose(observation, "lid_handle").at - start)[:2]) > 0.25:
             return None
         return CarryTask(
             name="lid_handle",
@@ -84,16 +85,15 @@ class TrashCarrier(Carrier):
     """Throws the trash into its bin."""
 
     def next_task(self, observation: Any) -> CarryTask | None:
-        """The trash, until it is in its bin."""
+        """Return the trash, until it is in its bin."""
         at, turned = self.pose(observation, "trash")
-        trash_bin = self._read(observation, "trash_bin_pos")
+        trash_bin = self.read(observation, "trash_bin_pos")
         if np.linalg.norm((at - trash_bin)[:2]) < 0.14:
             return None
-        side = turned[:, int(np.abs(turned[2]).argmin())]  # the one that lies flattest gives the cube's heading
         return CarryTask(
             name="trash",
             grip=np.zeros(3),
-            closing=turned.T @ side,
+            closing=turned.T @ flattest_side(turned),
             turns=np.pi / 2,
             clearance=_DEEP,
             place=trash_bin + np.array([0.0, 0.0, 0.17]),
@@ -116,15 +116,15 @@ class PayloadCarrier(Carrier):
         super().__init__(env, seed, style, arm)
         self._handover = handover
 
-    def pose(self, observation: Any, name: str) -> tuple[Vector, Vector]:
-        """(3,) middle of the whole hammer, which has to fit between the walls, and its (3, 3) rotation."""
+    def pose(self, observation: Any, name: str) -> Pose:
+        """Return the pose of the whole hammer, which has to fit between the walls."""
         at, turned = super().pose(observation, name)
-        return at + _OFF_MIDDLE * turned[:, 2], turned
+        return Pose(at + _OFF_MIDDLE * turned[:, 2], turned)
 
     def next_task(self, observation: Any) -> CarryTask | None:
-        """The hammer, until it is in the bin."""
+        """Return the hammer, until it is in the bin."""
         at, _ = self.pose(observation, "payload")
-        target = self._read(observation, "target_bin_pos")
+        target = self.read(observation, "target_bin_pos")
         if np.linalg.norm((at - target)[:2]) < 0.14 and at[2] < target[2] + 0.05:
             return None
         return CarryTask(
@@ -138,30 +138,34 @@ class PayloadCarrier(Carrier):
             fit=0.04,
         )
 
-    def take_over(self, observation: Any) -> CarryState:
-        """Where an episode stands in which the hand already has the hammer."""
-        return self._begin(observation)._replace(phase=CARRY)
+    def take_over(self, observation: Any) -> State:
+        """Return a first state in which the hand already has the hammer."""
+        return self.begin(observation)._replace(phase=CARRY)
 
 
 class TransportState(NamedTuple):
-    """Where one episode stands in each of its four parts; None before a part begins."""
+    """The states of an episode's four parts; None before a part begins."""
 
-    lid: CarryState | None = None
-    trash: CarryState | None = None
-    handover: HandoverState | None = None
-    payload: CarryState | None = None
+    lid: State | None = None
+    trash: State | None = None
+    handover: State | None = None
+    payload: State | None = None
 
 
-class TransportExpert(Expert):
-    """A scripted expert for TwoArmTransport."""
+class TransportExpert:
+    """A scripted expert for TwoArmTransport.
+
+    Args:
+        env, seed, style: as for ``Expert``.
+    """
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
-        super().__init__(env, seed, style)
-        seeds = [int(s) for s in self.np_random.integers(2**31, size=4)]
-        self._lid = LidCarrier(env, seeds[0], self.style, arm=0)
-        self._trash = TrashCarrier(env, seeds[1], self.style, arm=1)
-        self._handover = HandoverExpert(env, seeds[2], self.style, name="payload", over=_DEEP, pace=_PACE)
-        self._payload = PayloadCarrier(env, seeds[3], self.style, arm=1, handover=self._handover)
+        style = style or Style()
+        seeds = [int(s) for s in np.random.default_rng(seed).integers(2**31, size=4)]
+        self._lid = LidCarrier(env, seeds[0], style, arm=0)
+        self._trash = TrashCarrier(env, seeds[1], style, arm=1)
+        self._handover = HandoverExpert(env, seeds[2], style, name="payload", over=_DEEP, pace=_PACE)
+        self._payload = PayloadCarrier(env, seeds[3], style, arm=1, handover=self._handover)
 
     def predict(
         self,
@@ -170,6 +174,7 @@ class TransportExpert(Expert):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], TransportState]:
+        """Return the action (14,) and the next state."""
         if state is None or (episode_start is not None and np.any(episode_start)):
             state = TransportState()
         first, lid = self._lid.predict(observation, state.lid, deterministic=deterministic)

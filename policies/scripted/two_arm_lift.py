@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 
-from asm_gym.policies.scripted.base import CLOSE, OPEN, PhasedExpert, Style, Vector, gripping, matrix
-from asm_gym.policies.scripted.two_arms import ARMS, Hand, Hands, move_arm
+from asm_gym.policies.scripted.base import ARMS, CLOSE, OPEN, State, TwoArmExpert, move_arm
+from asm_gym.policies.scripted.geometry import Pose, Vector, gripping, matrix
 
 REACH, DESCEND, GRASP, LIFT, LOWER = range(5)
 
@@ -17,98 +16,75 @@ _DEPTH = 0.01  # how far below the bars' middle to grasp them: held by the finge
 _UP = 0.15  # how high to lift [m]; the task asks for 0.1
 
 
-class TwoArmLiftState(NamedTuple):
-    """Where one episode stands."""
-
-    phase: int
-    since: int  # steps spent in the phase
-    speed: float  # action units
-    spread: Vector  # (2, 3) how this episode's way-points differ from the plan [m]
-    height: float  # how high to lift [m]
-    bases: Vector  # (2, 3, 3) how the arms stand in the room
-    anchors: Vector  # (2, 3) where the hands were when the phase began [m]
-    drift: Vector  # (14,) correlated action noise
+class _Scene(NamedTuple):
+    hands: tuple[Pose, Pose]
+    handles: Vector  # (2, 3) [m]
+    across: Vector  # (3,) from one handle's bar to the other's
 
 
-class TwoArmLiftExpert(PhasedExpert):
-    """A scripted expert for TwoArmLift."""
+class TwoArmLiftExpert(TwoArmExpert):
+    """A scripted expert for TwoArmLift; the plan of its state is how high to lift [m]."""
 
-    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
-        super().__init__(env, seed, style)
-        self._hands = Hands(env)
+    pace = 0.45
 
-    def _act(self, observation: Any, state: TwoArmLiftState, noise: Vector) -> tuple[Vector, TwoArmLiftState]:
-        hands = self._hands.look(observation)
-        handles = np.stack([self._read(observation, f"handle{i}_xpos") for i in range(ARMS)])  # (2, 3)
-        across = matrix(self._read(observation, "pot_quat"))[:, 1]  # from one handle's bar to the other's
-        state = self._advance(state, hands, handles, across)
-        targets, grip = self._targets(state, handles, np.stack([hand.at for hand in hands]))
-        command = np.zeros((ARMS, 7))
-        for i, hand in enumerate(hands):
-            held = gripping(hand.turned, across)
-            command[i, :6] = move_arm(state.bases[i], hand, targets[i], held, state.speed, gain=1.5)
-        command = command.reshape(-1)
-        command += noise
-        command[6::7] = grip
-        return command, state
-
-    def _begin(self, observation: Any) -> TwoArmLiftState:
+    def begin(self, observation: Any) -> State:
         style, rng = self.style, self.np_random
-        return TwoArmLiftState(
-            phase=REACH,
-            since=0,
-            speed=style.pace(0.45, rng),
-            spread=style.spread * rng.standard_normal((ARMS, 3)),
-            height=_UP + float(np.clip(style.spread * rng.standard_normal(), -0.02, 0.05)),
-            bases=self._hands.bases(),
-            anchors=np.zeros((ARMS, 3)),
-            drift=np.zeros(7 * ARMS),
-        )
+        speed = style.pace(self.pace, rng)
+        spread = style.spread * rng.standard_normal((ARMS, 3))
+        height = _UP + float(np.clip(style.spread * rng.standard_normal(), -0.02, 0.05))
+        return self.start(speed, spread, height, noises=7 * ARMS)
 
-    @staticmethod
-    def _advance(state: TwoArmLiftState, hands: tuple[Hand, Hand], handles: Vector, across: Vector) -> TwoArmLiftState:
-        """The phase that comes next: one hand waits for the other."""
-        at = np.stack([hand.at for hand in hands])  # (2, 3)
+    def look(self, observation: Any) -> _Scene:
+        handles = np.stack([self.read(observation, f"handle{i}_xpos") for i in range(ARMS)])
+        return _Scene(self.hands(observation), handles, matrix(self.read(observation, "pot_quat"))[:, 1])
 
-        def to(phase: int) -> TwoArmLiftState:
-            return state._replace(phase=phase, since=0, anchors=at)
-
-        off = at - handles
+    def next_phase(self, state: State, scene: _Scene) -> int:
+        # One hand waits for the other.
+        phase, since = state.phase, state.since
+        off = np.stack([hand.at for hand in scene.hands]) - scene.handles
         far = np.linalg.norm(off + np.array([0.0, 0.0, _DEPTH]), axis=1)  # (2,)
-        if state.phase == REACH:
-            aligned = all(abs(hand.turned[:, 1] @ across) > np.cos(0.15) for hand in hands)
+        if phase == REACH:
+            aligned = all(abs(hand.turned[:, 1] @ scene.across) > np.cos(0.15) for hand in scene.hands)
             over = np.linalg.norm(off - _above(state), axis=1)
-            return to(DESCEND) if aligned and (over < 0.025).all() else state
-        if state.phase == DESCEND:
-            if (far < 0.009).all() or (state.since > 30 and (far < 0.015).all()):
-                return to(GRASP)
-            return to(REACH) if state.since > 60 else state
-        if state.phase == GRASP:
-            return to(LIFT) if state.since >= 8 else state
-        if state.phase == LIFT and (far > 0.04).any():  # lost a handle
-            return to(LOWER)
-        if state.phase == LOWER and state.since > 30:
-            return to(REACH)
-        return state
+            return DESCEND if aligned and (over < 0.025).all() else REACH
+        if phase == DESCEND:
+            if (far < 0.009).all() or (since > 30 and (far < 0.015).all()):
+                return GRASP
+            return REACH if since > 60 else DESCEND
+        if phase == GRASP:
+            return LIFT if since >= 8 else GRASP
+        if phase == LIFT and (far > 0.04).any():  # lost a handle
+            return LOWER
+        return REACH if phase == LOWER and since > 30 else phase
+
+    def command(self, state: State, scene: _Scene) -> Vector:
+        targets, command = self._targets(state, scene), np.zeros((ARMS, 7))
+        for i, (base, hand) in enumerate(zip(self.bases(), scene.hands, strict=True)):
+            held = gripping(hand.turned, scene.across)
+            command[i, :6] = move_arm(base, hand, targets[i], held, state.speed, gain=1.5)
+        command[:, 6] = OPEN if state.phase < GRASP else CLOSE
+        return command.reshape(-1)
 
     @staticmethod
-    def _targets(state: TwoArmLiftState, handles: Vector, at: Vector) -> tuple[Vector, float]:
-        """(2, 3) where the hands are to go, and whether they are to hold."""
+    def _targets(state: State, scene: _Scene) -> Vector:
+        """Return where (2, 3) the hands are to go."""
         if state.phase == REACH:
-            return handles + _above(state), OPEN
+            return scene.handles + _above(state)
         if state.phase == DESCEND:
-            return handles - [0.0, 0.0, _DEPTH], OPEN
-        if state.phase == GRASP:
-            return state.anchors, CLOSE
+            return scene.handles - [0.0, 0.0, _DEPTH]
+        anchor: Vector = state.anchor
+        up = 0.0
         if state.phase == LIFT:
-            # Whoever is ahead waits: a pot that tilts turns in their fingers.
-            risen = float(np.min(at[:, 2] - state.anchors[:, 2]))
-            return state.anchors + np.array([0.0, 0.0, min(state.height, risen + 0.03)]), CLOSE
-        # What one hand still holds comes down slowly, before both let go and try again.
-        return state.anchors - np.array([0.0, 0.0, 0.01 * min(state.since, 15)]), CLOSE
+            # The hand that is ahead waits: a pot that tilts turns in their fingers.
+            risen = min(float(hand.at[2] - start[2]) for hand, start in zip(scene.hands, anchor, strict=True))
+            up = min(state.plan, risen + 0.03)
+        if state.phase == LOWER:
+            # What one hand still holds comes down slowly, before both let go and try again.
+            up = -0.01 * min(state.since, 15)
+        return anchor + np.array([0.0, 0.0, up])
 
 
-def _above(state: TwoArmLiftState) -> Vector:
-    """(2, 3) from the handles to where the hands come down from [m]."""
+def _above(state: State) -> Vector:
+    """Return (2, 3) from the handles to where the hands come down from [m]."""
     above: Vector = np.array([0.0, 0.0, _OVER]) + 0.3 * state.spread
     return above

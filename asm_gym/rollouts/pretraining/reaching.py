@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from asm_gym.policies.scripted.base import CLOSE, OPEN, ObservationReader, Vector, move, rotation
+from asm_gym.policies.scripted.base import CLOSE, OPEN, ObservationReader
+from asm_gym.policies.scripted.geometry import Vector, move
 
 AROUND = (-0.25, -0.4, -0.12), (0.25, 0.4, 0.25)
 """Range of places, relative to where the hand begins [m]."""
@@ -57,12 +58,12 @@ class Reaching:
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], Aim]:
         """Return the next action (7,)."""
-        at, hand = self._read(observation, "hand_position"), rotation(self._read(observation, "hand_orientation"))
+        hand = self._read.hand(observation)
         if state is None:
-            state = self._next(at, hand)
-        elif not state.left or np.linalg.norm(state.place - at) < ARRIVED:
+            state = self._next(hand.at, hand.turned)
+        elif not state.left or np.linalg.norm(state.place - hand.at) < ARRIVED:
             state = self._next(state.began, state.upright)
-        action = move(at, state.place, hand, state.turned, self._speed)
+        action = move(hand, state.place, state.turned, self._speed)
         return np.append(action, state.grip).astype(np.float32), state._replace(left=state.left - 1)
 
     def _next(self, began: Vector, upright: Vector) -> Aim:

@@ -1,0 +1,131 @@
+"""Rotations of hands and objects, and commands that move a hand towards a pose."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+UP = np.array([0.0, 0.0, 1.0])
+METRES, RADIANS = 0.05, 0.5
+"""What one unit of action moves the hand's set-point by, in robosuite's OSC_POSE."""
+
+
+class Pose(NamedTuple):
+    """Position and orientation of a hand or an object."""
+
+    at: Vector  # (3,) [m]
+    turned: Vector  # (3, 3)
+
+    def point(self, own: Vector) -> Vector:
+        """Return a point (3,) of the object's own frame in the world."""
+        return self.at + self.turned @ own
+
+
+def rotation(columns: Vector) -> Vector:
+    """Return a rotation (3, 3) from its first two columns (6,), made orthonormal again after sensor noise."""
+    x = columns[:3] / np.linalg.norm(columns[:3])
+    y = columns[3:] - (x @ columns[3:]) * x
+    y /= np.linalg.norm(y)
+    return np.stack([x, y, np.cross(x, y)], axis=1)
+
+
+def matrix(quaternion: Vector) -> Vector:
+    """Return a rotation (3, 3) from a unit quaternion (x, y, z, w)."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def about(axis: Any, angle: float) -> Vector:
+    """Return the rotation (3, 3) about a unit ``axis`` by ``angle`` [rad] (Rodrigues)."""
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turn: Vector = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
+    return turn
+
+
+def about_vertical(angle: float) -> Vector:
+    """Return the rotation (3, 3) about the vertical [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def yaw(direction: Vector) -> float:
+    """Return the angle of a direction (3,) about the vertical [rad]."""
+    return float(np.arctan2(direction[1], direction[0]))
+
+
+def wrapped(angle: float) -> float:
+    """Return the same angle in [-π, π) [rad]."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def angle_between(a: Vector, b: Vector) -> float:
+    """Return the angle between two orientations (3, 3) [rad]."""
+    return float(np.arccos(np.clip((np.trace(a.T @ b) - 1) / 2, -1.0, 1.0)))
+
+
+def flattest_side(turned: Vector) -> Vector:
+    """Return the axis (3,) of an orientation (3, 3) that lies flattest."""
+    side: Vector = turned[:, int(np.abs(turned[2]).argmin())]
+    return side
+
+
+def pointing_down(hand: Vector, cube: Vector | None = None) -> Vector:
+    """Return the rotation nearest ``hand`` (3, 3) whose fingers point down and close along a side of the cube."""
+    # A cube looks the same every quarter turn.
+    return gripping(hand, None) if cube is None else gripping(hand, flattest_side(cube), np.pi / 2)
+
+
+def gripping(hand: Vector, closing: Vector | None, turns: float = np.pi) -> Vector:
+    """Return the rotation nearest ``hand`` (3, 3) whose fingers point down and close along ``closing``.
+
+    Args:
+        closing: (3,) in the world; the hand's own direction where None.
+        turns: after how much of a turn the direction is as good again [rad].
+    """
+    own = hand[:2, 1]  # fingers move along the hand's y axis
+    angle = np.arctan2(own[1], own[0])
+    if closing is not None:
+        heading = np.arctan2(closing[1], closing[0])
+        angle = heading + np.round((angle - heading) / turns) * turns
+    y = np.array([np.cos(angle), np.sin(angle), 0.0])
+    z = np.array([0.0, 0.0, -1.0])
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def grasping(hand: Vector, approach: Vector, closing: Vector) -> Vector:
+    """Return the rotation nearest ``hand`` (3, 3) whose fingers point along ``approach`` and close along ``closing``.
+
+    Both are unit vectors (3,) at right angles.
+    """
+    y = closing * (1.0 if hand[:, 1] @ closing > 0 else -1.0)
+    return np.stack([np.cross(y, approach), y, approach], axis=1)
+
+
+def move(hand: Pose, target: Vector, turned: Vector, speed: float, gain: float = 1.0) -> Vector:
+    """Return the hand's command (6,) towards a pose, at no more than ``speed`` (in action units).
+
+    The controller covers about a third of what it is asked for in one step, so a ``gain`` of 2 does not overshoot.
+    """
+    step = gain * (target - hand.at) / METRES
+    norm = np.linalg.norm(step)
+    if norm > speed:
+        step *= speed / norm
+    turn = 0.5 * np.cross(hand.turned, turned, axis=0).sum(axis=1) / RADIANS
+    return np.concatenate([step, np.clip(turn, -0.5, 0.5)])
+
+
+def carried(hand: Pose, thing: Pose, own: Vector, goal: Vector, turned: Vector) -> Pose:
+    """Return the hand's pose at which the object in it is ``turned`` (3, 3), a point of its ``own`` at the ``goal``."""
+    turn = turned @ thing.turned.T
+    return Pose(goal + turn @ (hand.at - thing.point(own)), turn @ hand.turned)
