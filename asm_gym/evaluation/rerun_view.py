@@ -1,13 +1,13 @@
-"""A recording for Rerun's viewer: senses and what was expected of them, surprise, threshold, cause, and camera.
+"""Write a recording for Rerun's viewer: senses and predictions, surprise, threshold, cause, and camera.
 
     senses/<channel>/sensed, expected, low, high     each number; the band is two standard deviations wide on each side
     surprise, threshold                              what an alarm is raised by
     shares/<channel>                                 what each channel adds to surprise
-    log                                              when an alarm began, and what the cause seems to be
+    log                                              when an alarm began, and its cause
     camera                                           where there is one
     robot                                            its links as lines [m], where the simulator is at hand
 
-Open it by ``rerun FILE.rrd``. Expectations are those of the memory's completion, each sense from all others.
+Open it by ``rerun FILE.rrd``. Predictions are those of the memory's completion, each sense from all others.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -28,23 +27,21 @@ from asm_gym.spec import StreamSpec
 BAND = 2.0
 """Standard deviations."""
 
-TIMELINE = "time"
-
 
 @runtime_checkable
 class Completes(Protocol):
-    """A model that says what each sense should be."""
+    """A model that predicts each sense from all others."""
 
     completion_: Completion | None
 
 
 class LiveView:
-    """Writes a recording row by row; closing it, or leaving its context, completes the file.
+    """Write a recording row by row; closing it, or leaving its context, completes the file.
 
     Args:
         path: of the ``.rrd`` file; in place of what is there.
         spec: of the stream.
-        model: of the memory, for its expectations; None, or one that has none, for senses alone.
+        model: of the memory, for its predictions; None, or one that has none, for senses alone.
         channels: names of those that are drawn; all by default.
 
     Raises:
@@ -62,32 +59,28 @@ class LiveView:
         self.path, self.spec = Path(path), spec
         self._drawn = [c for c in spec.channels if channels is None or c.name in channels]
         self._completion = model.completion_ if isinstance(model, Completes) else None
-        self._before: NDArray[np.float64] | None = None
-        self._alarm = False
-        self._scenes: set[str] = set()  # that were seen: a log of rows has neither robot nor camera
+        self._scenes: dict[str, Any] = {}  # view of the robot and the camera, once there is one
+        self.begin()
         self.path.parent.mkdir(parents=True, exist_ok=True)
         os.environ.setdefault("RERUN_FLUSH_TICK_SECS", "1")  # read by the next line: by default 0.008, a chunk a row
         self._stream = self._rr.RecordingStream("asm-gym")
-        self._stream.save(self.path, default_blueprint=self._arranged())
+        self._stream.save(self.path, default_blueprint=self._blueprint())
         for channel in self._drawn:
             for what in ("sensed", "expected", "low", "high") if self._completion else ("sensed",):
                 names = [f"{label} {what}" for label in channel.labels]
                 self._stream.log(f"senses/{channel.name}/{what}", self._rr.SeriesLines(names=names), static=True)
 
-    def _arranged(self) -> Any:
-        """How the viewer shows it at first: surprise with its threshold, each channel, and scenes that were seen."""
+    def _blueprint(self) -> Any:
+        """How the viewer shows it at first."""
         views = require("rerun.blueprint", what="a live view")
-        kinds = {"robot": views.Spatial3DView, "camera": views.Spatial2DView}
-        scenes = [kind(name=name, origin=f"/{name}") for name, kind in kinds.items() if name in self._scenes]
-        # Dozens of names would cover the lines; pointing at one says which it is.
-        bare = views.PlotLegend(visible=False)
+        bare = views.PlotLegend(visible=False)  # dozens of names would cover the lines
         senses = [views.TimeSeriesView(name=c.name, origin=f"/senses/{c.name}", plot_legend=bare) for c in self._drawn]
         return views.Blueprint(
             views.Grid(
                 views.TimeSeriesView(name="surprise", origin="/", contents=["/surprise", "/threshold"]),
                 views.TimeSeriesView(name="shares", origin="/shares", plot_legend=bare),
                 views.TextLogView(name="log", origin="/log"),
-                *scenes,
+                *self._scenes.values(),
                 *senses,
             )
         )
@@ -95,12 +88,13 @@ class LiveView:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def begin(self) -> None:
-        """A new episode: nothing came before."""
-        self._before, self._alarm = None, False
+        """Begin a new episode."""
+        self._before: NDArray[np.float64] | None = None
+        self._alarm = False
 
     def row(
         self,
@@ -113,19 +107,22 @@ class LiveView:
         picture: NDArray[np.uint8] | None = None,
         links: NDArray[np.float64] | None = None,
     ) -> None:
-        """One row (D,) and what was made of it.
+        """Write one row and its surprise.
 
         Args:
             seconds: when it was sensed.
+            row: (D,) senses and actions.
+            surprise: of the row.
+            threshold: that an alarm is over.
             shares: (D,) what each number adds to surprise.
-            cause: of an alarm, as ``info["asm"]["cause"]`` says it.
+            cause: of an alarm, as in ``info["asm"]["cause"]``.
             picture: (H, W, 3).
             links: (n, 2, 3) both ends of each link of the robot [m].
         """
         rr, log = self._rr, self._stream.log
-        self._stream.set_time(TIMELINE, duration=seconds)
+        self._stream.set_time("time", duration=seconds)
         sensed = np.asarray(row, np.float64)
-        lines = {"sensed": sensed} | self._expected(sensed)
+        lines = {"sensed": sensed} | self._predicted(sensed)
         for channel in self._drawn:
             place = self.spec.slices[channel.name]
             for what, values in lines.items():
@@ -135,23 +132,24 @@ class LiveView:
         log("threshold", rr.Scalars(threshold))
         alarm = bool(surprise > threshold)
         if alarm and not self._alarm:
-            said = f"alarm: {self.spec.labels[int(np.argmax(shares))]}, {surprise / threshold:.2f} thresholds"
-            log("log", rr.TextLog(said + _named(cause), level="WARN"))
+            what = f"alarm: {self.spec.labels[int(np.argmax(shares))]}, {surprise / threshold:.2f} thresholds"
+            log("log", rr.TextLog(what + _in_words(cause or {}), level="WARN"))
         self._alarm = alarm
         if picture is not None:
-            self._show("camera", rr.Image(picture))
+            self._show("camera", "Spatial2DView", rr.Image(picture))
         if links is not None:
-            self._show("robot", rr.LineStrips3D(links))
+            self._show("robot", "Spatial3DView", rr.LineStrips3D(links))
 
-    def _show(self, name: str, scene: Any) -> None:
-        """Logs a scene, and gives it its place when it is first seen."""
+    def _show(self, name: str, view: str, scene: Any) -> None:
+        """Log a scene, and give it a view when it is first seen."""
         if name not in self._scenes:
-            self._scenes.add(name)
-            self._stream.send_blueprint(self._arranged())
+            views = require("rerun.blueprint", what="a live view")
+            self._scenes[name] = getattr(views, view)(name=name, origin=f"/{name}")
+            self._stream.send_blueprint(self._blueprint())
         self._stream.log(name, scene)
 
-    def _expected(self, row: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """Expectation and band of every number (D,); of actions, which nobody expects, what they are."""
+    def _predicted(self, row: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+        """Prediction and band of every number (D,); actions are their own prediction."""
         before, self._before = self._before, row
         memory = self._completion
         if memory is None:
@@ -164,13 +162,13 @@ class LiveView:
         return {"expected": expected, "low": expected - band, "high": expected + band}
 
     def close(self) -> None:
-        """Completes the file."""
+        """Complete the file."""
         self._stream.flush()
         self._stream.disconnect()
 
 
-def _named(cause: Mapping[str, Any] | None) -> str:
-    """What seems to have gone wrong; empty where nobody knows."""
-    if cause is None or cause.get("family") in (None, "", "unknown"):
+def _in_words(cause: Mapping[str, Any]) -> str:
+    """The cause of an alarm; empty where it is unknown."""
+    if cause.get("family") in (None, "", "unknown"):
         return ""
     return f"; {' '.join(filter(None, (cause['family'], cause.get('part'))))}, {cause.get('probability', 0.0):.0%}"
