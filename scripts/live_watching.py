@@ -14,7 +14,7 @@ from rich.console import Console
 
 from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
 from asm_gym.data.live import Row, RowReader, SourceDied
-from asm_gym.data.resampling import ClockWentBack
+from asm_gym.data.pace import ClockWentBack
 from asm_gym.detection.events import KNOCK, NO_EVENT, STOP
 from asm_gym.scripts.command import BAD_NEWS, DONE
 from asm_gym.spec import StreamSpec

@@ -1,119 +1,104 @@
-"""Topics of ROS 2 over DDS, published by another process with types of its own."""
+"""Topics of ROS 2 over DDS, published with types of their own."""
 
 from __future__ import annotations
 
 import io
 import json
 import os
+import threading
+import time
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from asm_gym.data.live import SourceDied
 from asm_gym.data.sources import lines_from
-from asm_gym.scripts.live_watching import follow
-from tests import dds_arm as dds
+from tests.dds_types import Header, JointState, Text, Time
 from tests.needs import needs
 
-needs("cyclonedds")
+domain, pub, topic = (needs(f"cyclonedds.{part}") for part in ("domain", "pub", "topic"))
+
+NAMES = ["shoulder", "elbow"]
+RATE = 200.0
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(monkeypatch):
+def elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(100 + os.getpid() % 100))
 
 
 @pytest.fixture
-def publisher():
-    made = []
+def publish() -> Iterator[Callable[..., None]]:
+    """Publishes messages on a topic at 200 Hz, for so many seconds, in a thread."""
+    over, threads = threading.Event(), []
 
-    def start(*options, topic="/joint_states"):
-        made.append(dds.publisher(topic, *options))
-        return made[-1]
+    def start(name: str, message: Callable[[int], object], seconds: float = 5.0) -> None:
+        participant = domain.DomainParticipant(int(os.environ["ROS_DOMAIN_ID"]))
+        writer = pub.DataWriter(participant, topic.Topic(participant, f"rt{name}", type(message(0))))
+
+        def run() -> None:
+            for k in range(int(seconds * RATE)):
+                writer.write(message(k))
+                if over.wait(1 / RATE):
+                    return
+
+        threads.append(threading.Thread(target=run))
+        threads[-1].start()
 
     yield start
-    for one in made:
-        one.kill()
-        one.communicate()
+    over.set()
+    for thread in threads:
+        thread.join()
 
 
-@pytest.fixture(scope="module")
-def monitor():
-    return dds.fitted("kalman+evidence")
+def joints(k: int) -> JointState:
+    stamp = 1000 + k / RATE
+    numbers = [float(k), float(-k)]
+    return JointState(Header(Time(int(stamp), round(1e9 * (stamp % 1))), ""), NAMES, numbers, numbers, [])
 
 
-def lines(topics="/joint_states", silence=1.0):
+def lines(topics: str = "/joint_states", silence: float = 0.5) -> Iterator[str]:
     return lines_from(f"dds:{topics}", io.StringIO(), silence)
 
 
-def test_joints_are_read_by_the_names_that_a_bag_gives_them(publisher):
-    publisher("--seconds", "5", "--clock", "1000")
+def test_joints_are_read_by_the_names_that_a_bag_gives_them(publish):
+    publish("/joint_states", joints)
     rows = [json.loads(line) for _, line in zip(range(20), lines(), strict=False)]
-    assert set(rows[0]) == {"time", *dds.episode(0, 0.1).spec.labels}
-    steps = np.diff([row["time"] for row in rows])
-    np.testing.assert_allclose(steps, 1 / dds.RATE, rtol=1e-4)
-    rng = np.random.default_rng(0)
-    assert 1000 <= rows[0]["time"] < 1010
-    torque = [rows[0][f"joint_states.effort[{n}]"] for n in dds.NAMES]
-    q, v = ([rows[0][f"joint_states.{k}[{n}]"] for n in dds.NAMES] for k in ("position", "velocity"))
-    weight = 3 * np.sin(q) + 0.5 * np.tanh(np.array(v) / 0.05) + 0.2 * np.array(v)
-    assert np.abs(weight - torque).max() < 6 * 0.05  # of one moment; of another one it is off by newton metres
-    assert dds.arm(0, rng).shape == (3, 7)
+    kinds = ("position", "velocity")
+    assert set(rows[0]) == {"time", *(f"joint_states.{kind}[{name}]" for kind in kinds for name in NAMES)}
+    np.testing.assert_allclose(np.diff([row["time"] for row in rows]), 1 / RATE, rtol=1e-4)
+    for row in rows:
+        k = round((row["time"] - 1000) * RATE)
+        assert (row["joint_states.position[shoulder]"], row["joint_states.velocity[elbow]"]) == (k, -k)
 
 
-def test_a_fault_is_an_alarm_within_two_rows(monitor):
-    found = dds.watched(monitor, "/joint_states", 8.0, 3.0)
-    assert found["faults"] == found["found within two rows"] == 2
+def test_a_row_holds_the_newest_of_other_topics_and_nothing_of_one_that_fell_silent(publish):
+    publish("/joint_states", joints, 4.0)
+    publish("/gripper", lambda k: JointState(Header(Time(0, 0), ""), ["finger"], [7.0], [], []), 1.0)
+    found = lines("/joint_states,/gripper")
+    until, held = time.monotonic() + 3.0, []
+    while time.monotonic() < until:
+        held.append(json.loads(next(found)).get("gripper.position[finger]"))
+    assert 7.0 in held
+    assert held[-1] is None
 
 
-def test_a_source_that_dies_is_an_alarm_and_is_watched_again_when_it_is_back(publisher, monitor):
-    said, second = io.StringIO(), []
-    publisher("--seconds", "2")
-
-    def again():
-        if not second:  # one, however often it is tried
-            second.append(publisher("--seconds", "3"))
-        return lines()
-
-    assert follow(lines(), monitor, Console(file=said, width=200), 0.0, again, 8.0) == 1
-    out = said.getvalue()
-    assert out.count("the source has died, nothing came for 1 s: an alarm") >= 2
-    assert "the source is back after" in out
-    assert out.index("has died") < out.index("is back")
+def test_a_topic_that_falls_silent_has_died(publish):
+    publish("/joint_states", joints, 0.5)
+    with pytest.raises(SourceDied, match=r"nothing came for 0\.5 s"):
+        list(lines())
 
 
-@pytest.mark.parametrize(
-    ("rate", "message"),
-    [
-        (250, "the memory reads 500: they are not judged, an alarm"),
-        (1000, "are read at 500, by their clock"),
-    ],
-)
-def test_another_rate_is_said(publisher, monitor, rate, message):
-    said = io.StringIO()
-    publisher("--seconds", "3", "--rate", str(rate))
-    follow(lines(), monitor, Console(file=said, width=200))
-    assert message in said.getvalue()
-
-
-def test_a_topic_of_another_type_or_that_nobody_publishes_is_one_line(publisher):
-    publisher("--text", "--seconds", "20", topic="/speech")
+def test_a_topic_of_another_type_or_that_nobody_publishes_is_one_line(publish, monkeypatch):
+    monkeypatch.setattr("asm_gym.data.ros2_dds.CONNECT_S", 1.0)
+    publish("/speech", lambda k: Text("good morning"))
     with pytest.raises(ValueError, match=r"/speech is of std_msgs::msg::dds_::String_; read are sensor_msgs"):
         next(lines("/speech"))
     with pytest.raises(OSError, match=r"nobody publishes /joint_states; there are /speech"):
         next(lines())
     with pytest.raises(ValueError, match="dds takes topics"):
         next(lines(""))
-
-
-def test_a_topic_that_falls_silent_has_died(publisher):
-    publisher("--seconds", "1")
-    with pytest.raises(SourceDied, match="nothing came for 1 s"):
-        list(lines())
-
-
-def test_a_domain_that_is_no_number_is_refused(monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", "seven")
     with pytest.raises(ValueError, match="ROS_DOMAIN_ID must be a number, got 'seven'"):
         next(lines())

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from asm_gym.data.live import SourceDied
-from asm_gym.data.resampling import NEWEST, ClockWentBack, Pace
+from asm_gym.data.pace import NEWEST, ClockWentBack, Pace
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.live_watching import follow
 from asm_gym.spec import Channel, StreamSpec

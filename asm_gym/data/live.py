@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.clock import Clock, clock_among
 from asm_gym.data.names import label_of
-from asm_gym.data.resampling import ClockWentBack, Pace
+from asm_gym.data.pace import ClockWentBack, Pace
 from asm_gym.data.text import Dialect, flat_row, header_of
 from asm_gym.data.units import bare_name, factor
 from asm_gym.files import regular_file
