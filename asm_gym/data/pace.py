@@ -1,9 +1,9 @@
 """Follow the rate of a live source by its clock, and tell which rows a memory of another rate reads.
 
-    own      median step of the newest 32 rows [s]
-    right    dt/1.5 <= own <= 1.5 dt    every row is read; (step / dt) - 1 rows were lost before it
-    faster   own < dt/1.5               rows are read dt apart, and those between passed over
-    slower   own > 1.5 dt               nothing is judged: a memory of short steps cannot judge longer ones
+own      median step of the newest 32 rows [s]
+right    dt/1.5 <= own <= 1.5 dt    every row is read; (step / dt) - 1 rows were lost before it
+faster   own < dt/1.5               rows are read dt apart, and those between passed over
+slower   own > 1.5 dt               nothing is judged: a memory of short steps cannot judge longer ones
 """
 
 from __future__ import annotations
@@ -68,9 +68,12 @@ class Pace:
     def _judge(self, own: float) -> None:
         kind = FASTER if own < self.dt / RESAMPLED else SLOWER if own > self.dt * RESAMPLED else RIGHT
         if kind != self.kind:
-            self.change = f"rows come at {1 / own:.4g} a second" + {
-                RIGHT: " again",
-                FASTER: f", and are read at {1 / self.dt:.4g}, by their clock",
-                SLOWER: f", and the memory reads {1 / self.dt:.4g}: they are not judged, an alarm",
-            }[kind]
+            self.change = (
+                f"rows come at {1 / own:.4g} a second"
+                + {
+                    RIGHT: " again",
+                    FASTER: f", and are read at {1 / self.dt:.4g}, by their clock",
+                    SLOWER: f", and the memory reads {1 / self.dt:.4g}: they are not judged, an alarm",
+                }[kind]
+            )
         self.kind = kind
