@@ -1,14 +1,12 @@
 """Recording into Minari datasets, going on after a kill, and reading what others recorded."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import gymnasium as gym
 import h5py
@@ -20,7 +18,6 @@ from minari.dataset.minari_storage import MinariStorage
 
 from asm_gym import collect
 from asm_gym.data.datasets import read_dataset, write_dataset
-from asm_gym.episode import load_episode, save_episode
 from asm_gym.files import UNFINISHED
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy, rollout
@@ -128,18 +125,6 @@ def test_bad_arguments_are_refused_before_anything_runs(arguments, message, tmp_
     assert main(["collect", *arguments, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-def test_episode_files_give_back_what_was_saved_and_refuse_others(tmp_path):
-    (episode,) = sine_episodes(1)
-    assert_same(load_episode(save_episode(tmp_path / "one.npz", episode)), episode)
-    whole = (tmp_path / "one.npz").read_bytes()
-    (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
-    at = whole.index(b"PK\x01\x02") + 6  # which version of zip it takes to read the first member
-    (tmp_path / "new.npz").write_bytes(whole[:at] + bytes([234]) + whole[at + 1 :])
-    for name in ("half", "new"):
-        with pytest.raises(ValueError, match=rf"{name}\.npz is damaged"):
-            load_episode(tmp_path / f"{name}.npz")
 
 
 class _Sines(gym.Env):
@@ -272,16 +257,6 @@ def test_no_name_leads_out_of_the_root_and_nothing_of_others_is_removed(tmp_path
     write_dataset(root, "ours", episodes[:1], _Sines(), {})
     assert len(read_dataset(root / "ours")) == 1
     assert sorted(p.name for p in root.iterdir()) == ["link", "mine", "mine.txt", "ours"]
-
-
-def test_a_full_disk_is_a_line_and_leaves_the_dataset_that_was_there(tmp_path, monkeypatch):
-    episodes = _observed(sine_episodes(2))
-    write_dataset(tmp_path, "ours", episodes, _Sines(), {})
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=10**6))
-    with pytest.raises(OSError, match="MB are needed there, and 1 MB are free"):
-        write_dataset(tmp_path, "ours", episodes[:1], _Sines(), {})
-    assert len(read_dataset(tmp_path)) == 2
-    assert [p.name for p in tmp_path.iterdir()] == ["ours"]
 
 
 @pytest.mark.usefixtures("small_disk")

@@ -1,6 +1,5 @@
 """One file format of single episodes: what goes in comes out, and damage is noticed."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,38 +40,11 @@ def test_what_was_saved_is_loaded(episode, tmp_path):
     assert_same(load_episode(save_episode(tmp_path / "deep" / "one.npz", episode)), episode)
 
 
-def test_kinds_severities_and_seeds_lie_side_by_side():
+def test_a_label_names_a_file_and_an_episode_without_one_says_so():
     assert LABEL.path == Path("episodes/Lift/faulty/push-mild-7.npz")
-    labels = [
-        EpisodeLabel("Lift", r, k, s, i)
-        for r in ("fit", "faulty")
-        for k in ("a", "")
-        for s in ("mild", "")
-        for i in (1, 2)
-    ]
-    assert len({label.path for label in labels}) == len(labels)
-
-
-def test_what_was_found_out_while_recording_does_not_tell_labels_apart():
-    assert replace(LABEL, affected_channels=frozenset()) == LABEL
-    assert hash(replace(LABEL, affected_channels=frozenset())) == hash(LABEL)
-    assert replace(LABEL, seed=8) != LABEL
-
-
-def test_an_episode_without_a_label_says_so():
     assert EPISODE.labelled is LABEL
     with pytest.raises(ValueError, match="has no label"):
         Episode(X, SPEC).labelled  # noqa: B018 (a property that raises)
-
-
-def test_nothing_half_written_is_left(tmp_path, monkeypatch):
-    def full(*_, **__):
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(OSError, match="No space"):
-        save_episode(tmp_path / "one.npz", EPISODE)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_damaged_file_is_named(tmp_path):

@@ -1,31 +1,22 @@
-"""Rows as they come: from pipes, growing files and UDP, and what is said when they stop coming."""
+"""Rows as they come: sources that are followed, lines that are read, their rate, and short gaps."""
 
 from __future__ import annotations
 
 import io
-import itertools
 import json
 import os
 import socket
 import threading
 import time
-import tracemalloc
-from functools import partial
 
 import numpy as np
 import pytest
-from rich.console import Console
 
+from asm_gym.data.gaps import Bridge, blamed, bridged, filled, reason
 from asm_gym.data.live import RowReader, SourceDied
+from asm_gym.data.pace import NEWEST, ClockWentBack, Pace
 from asm_gym.data.sources import is_live, lines_from
-from asm_gym.detection.events import EVENTS, KNOCK
-from asm_gym.evaluation.alarms import excused_in
-from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.monitors import make_monitor
-from asm_gym.scripts.cli import main
-from asm_gym.scripts.watch import follow
 from asm_gym.spec import MOTOR, Channel, StreamSpec
-from tests.streams import swing
 
 SPEC = StreamSpec((Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02)
 ROWS = np.arange(40.0).reshape(10, 4)
@@ -50,6 +41,17 @@ def test_rows_that_are_missing_by_their_time_are_counted():
     assert [lost for _, lost in read(csv_lines(0.02 * np.array(kept), ROWS[kept]))] == [0, 0, 0, 2, 0]
     named = [{"t": 0.02 * k, "q": [1, 2], "torque": 3, "cmd": 4} for k in (0, 4)]
     assert [lost for _, lost in read(map(json.dumps, named))] == [0, 3]
+
+
+def test_nested_json_and_units_are_read_as_from_a_file():
+    spec = StreamSpec((Channel("arm.q", 2, "rad"), Channel("current", 1, "A")), dt=0.02)
+    lines = [
+        '{"arm": {"q [deg]": [180, 90]}, "current [mA]": 500}',
+        '{"arm": {"q [deg]": [0, null]}, "current [mA]": 1}',
+    ]
+    first, second = (row.numbers for row, _ in RowReader(spec).rows(lines))
+    np.testing.assert_allclose(first, [np.pi, np.pi / 2, 0.5])
+    np.testing.assert_allclose(second, [0.0, np.nan, 0.001])
 
 
 @pytest.mark.parametrize(
@@ -150,80 +152,68 @@ def test_a_source_that_makes_no_sense_is_refused(source, message):
     assert is_live(source) == source.startswith("udp")
 
 
-@pytest.fixture(scope="module")
-def monitor():
-    episode = partial(swing, SPEC)
-    made = make_monitor("kalman", SPEC, seed=0).fit([episode(n) for n in range(12)])
-    return made.calibrate([episode(100 + n) for n in range(19)], 0.05), episode
+def paced(stamps: np.ndarray, dt: float = 0.02) -> tuple[list[int | None], Pace]:
+    pace = Pace(dt)
+    return [pace.lost(float(t)) for t in stamps], pace
 
 
-def watched(lines, monitor):
-    said = io.StringIO()
-    return follow(lines, monitor, Console(file=said)), said.getvalue()
+def test_every_row_of_its_own_rate_is_read_however_it_jitters():
+    rng = np.random.default_rng(0)
+    stamps = 0.02 * (np.arange(500) + rng.uniform(-0.2, 0.2, 500))
+    assert paced(stamps)[0] == [0] * 500
+    kept = np.delete(0.02 * np.arange(100), [50, 51])
+    assert [n for n in paced(kept)[0] if n] == [2]
 
 
-def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
-    asm, episode = monitor
-    rows = episode(500).stream[:30]
-
-    def dying():
-        yield from csv_lines(rows=rows)
-        raise SourceDied("nothing came for 2 s")
-
-    code, said = watched(dying(), asm)
-    assert code == 1
-    assert "0.600 s  the source has died, nothing came for 2 s: an alarm" in said
-    assert "30 rows, 1 alarm;" in said
-    kept = np.delete(np.arange(30), [12, 13])
-    code, said = watched(csv_lines(0.02 * kept, rows[kept]), asm)
-    assert code == 1
-    assert "0.260 s  2 rows lost: an alarm" in said
-    assert said.splitlines()[-1].startswith("30 rows, ")
+def test_of_a_faster_source_rows_are_read_at_the_rate_of_the_memory():
+    found, pace = paced(0.005 * np.arange(800))
+    after = found[NEWEST + 1 :]
+    assert pace.kind == "faster"
+    assert sum(n is not None for n in after) == pytest.approx(len(after) / 4, abs=1)
+    assert not any(after)  # none of them was lost
 
 
-def test_a_knock_that_excuses_surprise_is_said_once_and_is_no_alarm(monitor, monkeypatch):
-    asm, episode = monitor
-    observe, count = asm.observe, itertools.count()
-
-    def knocked(state, rows):
-        state, surprise = observe(state, rows)
-        felt = 5 <= next(count) - 1 < 9  # the first call compiles
-        kind = np.array([EVENTS.index(KNOCK) * felt], np.int8)
-        return state, surprise._replace(raw=surprise.value + 2 * asm.threshold * felt, excuse=kind)
-
-    monkeypatch.setattr(asm, "observe", knocked)
-    code, said = watched(csv_lines(rows=episode(501).stream[:30]), asm)
-    assert code == 0
-    assert said.count("knock") == 1
-    assert "0.120 s  knock: no alarm" in said
-    trace = ScoredEpisode("log", 0, 0.1, 1.0, np.zeros(6), excused={KNOCK: np.array([0, 2, 2, 0, 2, 0.5])})
-    assert excused_in(trace) == {KNOCK: 2}
+def test_of_a_slower_source_nothing_is_judged_until_it_is_right_again():
+    slow = 0.05 * np.arange(100)
+    found, pace = paced([*slow, *(slow[-1] + 0.02 * np.arange(1, 100))])
+    assert pace.kind == "right"
+    assert found[NEWEST:100] == [None] * (100 - NEWEST)
+    assert found[-30:] == [0] * 30
 
 
-def test_rows_are_watched_in_constant_memory(monitor, monkeypatch):
-    monkeypatch.setattr("asm_gym.scripts.live_watching.LATENCIES", 100)
-    asm, episode = monitor
-    line = json.dumps(episode(500).stream[20].tolist())
-    peaks = []
-    for rows in (400, 2000):
-        tracemalloc.start()
-        watched((line for _ in range(rows)), asm)
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[1] < peaks[0] + 20_000  # 1600 rows more, of 60 bytes as text alone
+def test_a_clock_that_goes_back_is_refused():
+    with pytest.raises(ClockWentBack, match=r"time must increase, got 1 s after 2 s"):
+        paced(np.array([0.0, 2.0, 1.0]))
 
 
-def test_a_pipe_is_watched_as_a_command(monitor, tmp_path, monkeypatch, capsys):
-    asm, episode = monitor
-    asm.save(tmp_path / "x.asm")
-    reader, writer = os.pipe()
-    os.write(writer, "\n".join(csv_lines(rows=episode(500).stream)).encode())
-    os.close(writer)
-    with os.fdopen(reader) as stdin:
-        monkeypatch.setattr("sys.stdin", stdin)
-        assert main(["watch", "-", "--monitor", str(tmp_path / "x.asm")]) == 0
-    assert "80 rows, 0 alarms; a row took" in capsys.readouterr().out
-    (tmp_path / "log.csv").write_text("\n".join(csv_lines(rows=episode(500).stream)) + "\n")
-    live = ["watch", f"tail:{tmp_path / 'log.csv'}", "--monitor", str(tmp_path / "x.asm"), "--silence", "0.1"]
-    assert main(live) == 1
-    assert "the source has died" in capsys.readouterr().out
+def test_a_bridge_goes_over_short_gaps_and_no_longer_or_frequent_ones():
+    missing = np.zeros((200, 1))
+    missing[[10, 11, 100, 101, 102]] = np.nan
+    assert np.flatnonzero(bridged(missing, 0.02, 0.04)).tolist() == [10, 11, 100, 101]
+    assert not bridged(missing, 0.02, 0.0).any()
+    loose = np.where(np.arange(400) % 3 == 0, np.nan, 0.0)[:, None]  # a third of all rows
+    assert 0 < np.flatnonzero(np.isnan(loose[:, 0]) & ~bridged(loose, 0.02, 0.04))[0] < 10
+    rare = np.where(np.arange(400) % 100 == 5, np.nan, 0.0)[:, None]
+    np.testing.assert_array_equal(bridged(rare, 0.02, 0.02), np.isnan(rare[:, 0]))
+    with pytest.raises(ValueError, match="bridge must be"):
+        Bridge(-1.0, 0.02, 1)
+
+
+def test_what_is_learned_from_lies_on_the_line_between_its_neighbours():
+    stream = np.arange(12, dtype=np.float32).reshape(6, 2)
+    holed = stream.copy()
+    holed[2:4, 0] = np.nan
+    holed[0, 1] = holed[4:, 1] = np.nan
+    out = filled(holed, 0.02, 0.04)
+    np.testing.assert_allclose(out[:, 0], stream[:, 0])
+    assert np.isnan(out[[0, 4, 5], 1]).all()  # nothing is known beyond the ends
+    assert np.isnan(filled(holed, 0.02, 0.02)[2:4, 0]).all()
+
+
+def test_reasons_and_blame_of_single_rows():
+    assert reason(np.array([1.0, np.nan])) == "missing data"
+    assert reason(np.array([1.0, np.inf])) == "not finite"
+    assert reason(np.array([1.0, 2.0])) == "surprise"
+    assert blamed(np.full(2, np.nan), np.zeros(2)) is None
+    assert blamed(np.array([1.0, np.nan]), np.zeros(2)) == 1
+    assert blamed(np.array([1.0, 2.0]), np.array([3.0, 1.0])) == 0

@@ -1,0 +1,165 @@
+"""Rows watched as they come: alarms, bridged gaps, lost rows, other rates, and sources that die and come back."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import tracemalloc
+from functools import partial
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from asm_gym.data.live import SourceDied
+from asm_gym.data.logs import Log
+from asm_gym.data.pace import ClockWentBack
+from asm_gym.detection.events import EVENTS, KNOCK
+from asm_gym.episode import Episode
+from asm_gym.evaluation.alarms import alarms_of, excused_in, traces_of
+from asm_gym.evaluation.scored_episode import ScoredEpisode
+from asm_gym.monitors import make_monitor
+from asm_gym.scripts.cli import main
+from asm_gym.scripts.watch import follow
+from asm_gym.spec import MOTOR, Channel, StreamSpec
+from tests.streams import swing
+
+SPEC = StreamSpec((Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02)
+DT = SPEC.dt
+
+episode = partial(swing, SPEC)
+
+
+@pytest.fixture(scope="module")
+def monitor():
+    made = make_monitor("kalman", SPEC, seed=0).fit([episode(n) for n in range(12)])
+    return made.calibrate([episode(100 + n) for n in range(39)], 0.05)
+
+
+def lines(rows, stamps=None, dies=False):
+    """Rows as JSON lines, at these times, of a source that may die."""
+    for t, row in zip(DT * np.arange(len(rows)) if stamps is None else stamps, rows, strict=False):
+        line = {"time": float(t), "q": row[:2].tolist(), "torque": float(row[2]), "cmd": float(row[3])}
+        yield json.dumps(line).replace("NaN", "null")
+    if dies:
+        raise SourceDied("nothing came for 2 s")
+
+
+def watched(source, monitor, *how):
+    """The exit code, and what was printed."""
+    out = io.StringIO()
+    return follow(source, monitor, Console(file=out, width=200), *how), out.getvalue()
+
+
+def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
+    rows = episode(500).stream[:30]
+    code, said = watched(lines(rows, dies=True), monitor)
+    assert code == 1
+    assert "0.600 s  the source has died, nothing came for 2 s: an alarm" in said
+    assert "30 rows, 1 alarm;" in said
+    kept = np.delete(np.arange(30), [12, 13])
+    code, said = watched(lines(rows[kept], DT * kept), monitor)
+    assert code == 1
+    assert "0.260 s  2 rows lost: an alarm (late)" in said
+    assert said.splitlines()[-1].startswith("30 rows, ")
+    assert watched(lines(rows[kept], DT * kept), monitor, 0.05)[0] == 0
+
+
+def test_missing_numbers_are_bridged_or_an_alarm_that_says_why(monitor):
+    def alarms(stream, bridge=0.0):
+        (trace,) = traces_of([Log("x", Episode.from_stream(stream, SPEC))], monitor, bridge)
+        return [(a.why, a.channel) for a in alarms_of(trace)]
+
+    def with_gap(start, rows, column=slice(None), value=np.nan):
+        stream = episode(500).stream.copy()
+        stream[start : start + rows, column] = value
+        return stream
+
+    assert alarms(episode(500).stream) == []
+    assert alarms(with_gap(50, 2)) == [("missing data", "")]
+    assert alarms(with_gap(50, 2, 1)) == [("missing data", "q[1]")]
+    assert alarms(with_gap(50, 2), bridge=0.05) == []
+    assert alarms(with_gap(50, 5), bridge=0.05) == [("missing data", "")]
+    assert alarms(with_gap(50, 1, 0, np.inf), bridge=0.05) == [("not finite", "q[0]")]
+    code, said = watched(lines(with_gap(50, 1, 1)), monitor)
+    assert code == 1
+    assert "q[1]  inf thresholds" in said
+    assert "(missing data)" in said
+    assert watched(lines(with_gap(50, 1, 1)), monitor, 0.05)[0] == 0
+
+
+def test_a_knock_that_excuses_surprise_is_said_once_and_is_no_alarm(monitor, monkeypatch):
+    asm = monitor
+    observe, count = asm.observe, itertools.count()
+
+    def knocked(state, rows):
+        state, surprise = observe(state, rows)
+        felt = 5 <= next(count) - 1 < 9  # the first call compiles
+        kind = np.array([EVENTS.index(KNOCK) * felt], np.int8)
+        return state, surprise._replace(raw=surprise.value + 2 * asm.threshold * felt, excuse=kind)
+
+    monkeypatch.setattr(asm, "observe", knocked)
+    code, said = watched(lines(episode(501).stream[:30]), asm)
+    assert code == 0
+    assert said.count("knock") == 1
+    assert "0.120 s  knock: no alarm" in said
+    trace = ScoredEpisode("log", 0, 0.1, 1.0, np.zeros(6), excused={KNOCK: np.array([0, 2, 2, 0, 2, 0.5])})
+    assert excused_in(trace) == {KNOCK: 2}
+
+
+def test_rows_are_watched_in_constant_memory(monitor, monkeypatch):
+    monkeypatch.setattr("asm_gym.scripts.live_watching.LATENCIES", 100)
+    line = json.dumps(episode(500).stream[20].tolist())
+    peaks = []
+    for rows in (400, 2000):
+        tracemalloc.start()
+        watched((line for _ in range(rows)), monitor)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < peaks[0] + 20_000  # 1600 rows more, of 60 bytes as text alone
+
+
+def test_a_pipe_and_a_file_are_watched_as_a_command(monitor, tmp_path, monkeypatch, capsys):
+    monitor.save(tmp_path / "x.asm")
+    text = "\n".join(lines(episode(500).stream)) + "\n"
+    monkeypatch.setattr("sys.stdin", io.StringIO(text))
+    assert main(["watch", "-", "--monitor", str(tmp_path / "x.asm")]) == 0
+    assert "80 rows, 0 alarms; a row took" in capsys.readouterr().out
+    (tmp_path / "log.jsonl").write_text(text)
+    live = ["watch", f"tail:{tmp_path / 'log.jsonl'}", "--monitor", str(tmp_path / "x.asm"), "--silence", "0.1"]
+    assert main(live) == 1
+    assert "the source has died" in capsys.readouterr().out
+
+
+def test_another_rate_is_said_once_and_is_an_alarm_where_it_is_slower(monitor):
+    rows = episode(500).stream
+    code, said = watched(lines(np.resize(rows, (200, 4)), 0.05 * np.arange(200)), monitor)
+    assert code == 1
+    assert said.count("rows come at 20 a second, and the memory reads 50: they are not judged") == 1
+    said = watched(lines(np.repeat(rows, 2, axis=0), 0.01 * np.arange(160)), monitor)[1]
+    assert said.count("rows come at 100 a second, and are read at 50, by their clock") == 1
+
+
+def test_a_source_is_watched_anew_after_its_death_and_after_its_clock_went_back(monitor):
+    rows, opened = episode(501).stream[:20], []
+
+    def again():
+        opened.append(1)
+        if len(opened) == 1:
+            raise ConnectionRefusedError
+        return lines(rows, [5.0, 5.02, 1.0] if len(opened) == 2 else None)
+
+    code, said = watched(lines(rows, dies=True), monitor, 0.0, again, 5.0)
+    assert code == 1
+    assert said.count("the source is back") == 2
+    assert "time must increase, got 1 s after 5.02 s: an alarm, and a new beginning" in said
+    assert "42 rows" in said
+    with pytest.raises(ClockWentBack):
+        watched(lines(rows, [5.0, 5.02, 1.0]), monitor)
+
+    def never():
+        raise OSError("no")
+
+    said = watched(lines(rows, dies=True), monitor, 0.0, never, 0.3)[1]
+    assert "the source did not come back within 0.3 s" in said
