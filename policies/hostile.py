@@ -20,15 +20,17 @@ TURNS_AT = 40
 """Control step in which a healthy policy turns hostile."""
 
 LATE_STEPS = 10
-"""Control steps by which stale actions are late."""
+"""Delay of stale actions [control steps]."""
+
+Floats = NDArray[np.floating[Any]]
 
 
 class Hostile:
-    """Does what ``choose`` says, whatever it sees.
+    """Acts by a rule, whatever it observes.
 
     Args:
         env: one whose actions are changes of the hand's pose, the grip last.
-        choose: (A,) from the control step and the generator of the episode.
+        choose: (A,) from the control step, the generator of the episode, and A.
         speed: share of the full action.
         seed: of the episode.
     """
@@ -36,7 +38,7 @@ class Hostile:
     def __init__(
         self,
         env: gym.Env[Any, Any],
-        choose: Callable[[int, np.random.Generator, int], NDArray[np.floating[Any]]],
+        choose: Callable[[int, np.random.Generator, int], Floats],
         speed: float,
         seed: int,
     ) -> None:
@@ -50,19 +52,14 @@ class Hostile:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], Any]:
-        """The next action (A,); the state is the step and the episode's generator."""
+        """Return the action (A,); the state is the step and the episode's generator."""
         step, rng = (0, np.random.default_rng(self._seed)) if state is None else state
         action = self._speed * np.asarray(self._choose(step, rng, self._space.shape[0]), np.float64)
         return np.clip(action, self._space.low, self._space.high).astype(np.float32), (step + 1, rng)
 
 
-def _towards(x: float, y: float, z: float) -> Callable[[int, np.random.Generator, int], NDArray[np.float64]]:
-    def choose(step: int, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
-        action = np.zeros(size)
-        action[:3] = x, y, z
-        return action
-
-    return choose
+def _towards(x: float, y: float, z: float) -> Callable[[int, np.random.Generator, int], Floats]:
+    return lambda step, rng, size: np.array([x, y, z, *[0.0] * (size - 3)])
 
 
 class _BangBang:
@@ -71,17 +68,17 @@ class _BangBang:
     def __init__(self) -> None:
         self._action = np.zeros(0)
 
-    def __call__(self, step: int, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    def __call__(self, step: int, rng: np.random.Generator, size: int) -> Floats:
         if step % BANG_STEPS == 0 or self._action.size != size:
             self._action = rng.choice([-1.0, 1.0], size)
         return self._action
 
 
-class _Healthy:
-    """A healthy policy whose actions are spoilt on their way."""
+class _Spoilt:
+    """A scripted expert whose actions are spoilt on their way: ``stale``, ``flipped``, or downwards once it turns."""
 
-    def __init__(self, env: gym.Env[Any, Any], seed: int, policy: str, how: str) -> None:
-        self._policy: Policy = make_policy(policy, env, seed=seed)
+    def __init__(self, env: gym.Env[Any, Any], seed: int, how: str) -> None:
+        self._policy: Policy = make_policy("scripted", env, seed=seed)
         self._space: Any = env.action_space
         self._how = how
 
@@ -92,13 +89,11 @@ class _Healthy:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], Any]:
-        """The next action (A,)."""
-        step, inner, late = (0, None, deque[NDArray[np.float32]](maxlen=LATE_STEPS + 1)) if state is None else state
-        start = np.array([step == 0])
-        action, inner = self._policy.predict(observation, state=inner, episode_start=start, deterministic=deterministic)
+        """Return the action (A,)."""
+        step, inner, late = (0, None, ()) if state is None else state
+        action, inner = self._policy.predict(observation, inner, np.array([step == 0]), deterministic)
         action = np.array(action, np.float32)
-        late = deque(late, maxlen=LATE_STEPS + 1)
-        late.append(action.copy())
+        late = deque((*late, action.copy()), maxlen=LATE_STEPS + 1)
         if self._how == "stale":
             action = late[0]
         elif self._how == "flipped":
@@ -117,8 +112,8 @@ HOSTILE: dict[str, Callable[[gym.Env[Any, Any], int, float], Policy]] = {
     "forward": lambda env, seed, speed: Hostile(env, _towards(1.0, 0.0, -0.3), speed, seed),
     "bang-bang": lambda env, seed, speed: Hostile(env, _BangBang(), speed, seed),
     "uniform": lambda env, seed, speed: Hostile(env, lambda t, rng, n: rng.uniform(-1.0, 1.0, n), speed, seed),
-    "turns hostile": lambda env, seed, speed: _Healthy(env, seed, "scripted", "turns"),
-    "stale actions": lambda env, seed, speed: _Healthy(env, seed, "scripted", "stale"),
-    "flipped actions": lambda env, seed, speed: _Healthy(env, seed, "scripted", "flipped"),
+    "turns hostile": lambda env, seed, speed: _Spoilt(env, seed, "turns"),
+    "stale actions": lambda env, seed, speed: _Spoilt(env, seed, "stale"),
+    "flipped actions": lambda env, seed, speed: _Spoilt(env, seed, "flipped"),
 }
 """Hostile policies by name: made for an environment, with a seed and a share of the full speed."""

@@ -1,9 +1,9 @@
-"""Trained agents as what they are: a network from observation to action, in arrays and JSON.
+"""Trained agents: a network from observation to action, in arrays and JSON.
 
     a = squash(W_n f(… f(W_1 x + b_1) …) + b_n),   x = (o - m) / s
 
-``squash`` is tanh, scaled from [-1, 1] to the action space (SAC, TD3, DDPG), or a clip to it (PPO, A2C). Nothing but
-numpy is needed to act, and loading one runs no code that the file brings.
+``squash`` is tanh, scaled from [-1, 1] to the action space (SAC, TD3, DDPG), or a clip to it (PPO, A2C). Only numpy is
+needed to act, and loading an agent runs no code that the file brings.
 """
 
 from __future__ import annotations
@@ -32,17 +32,14 @@ KIND = "agent"
 
 
 class NetworkPolicy:
-    """Acts by a network. A value: it keeps nothing between steps but its generator.
+    """Acts by a network, without noise; it keeps nothing between steps.
 
     Args:
         layers: (out, in) weights and (out,) biases, first to last.
         activation: of the hidden layers, one of ``ACTIVATIONS``.
         squash: what brings the output into the action space, one of ``SQUASHES``.
         mean, scale: (O,) what observations are standardised by; 0 and 1 where None.
-        log_std: the (A, hidden) weights and (A,) biases that give it: the noise of an agent that explores, before
-            ``squash``. None for one that does not.
-        trained_in: what the agent knows of its environment, by name: see ``describe``.
-        seed: of the noise.
+        trained_in: the agent's environment, by name: see ``describe``.
 
     Raises:
         ValueError: layers that do not fit one another, or an unknown name.
@@ -56,9 +53,7 @@ class NetworkPolicy:
         *,
         mean: Array | None = None,
         scale: Array | None = None,
-        log_std: tuple[Array, Array] | None = None,
         trained_in: dict[str, Any] | None = None,
-        seed: int | None = None,
     ) -> None:
         check_choice("activation", activation, ACTIVATIONS)
         check_choice("squash", squash, SQUASHES)
@@ -67,13 +62,14 @@ class NetworkPolicy:
         self.layers = [(np.asarray(W, np.float32), np.asarray(b, np.float32)) for W, b in layers]
         if self.layers[0][0].ndim != 2:
             raise ValueError(f"layer 0 needs weights in two dimensions, got {self.layers[0][0].shape}")
-        size = self.observation_size
+        size = self.observation_size = int(self.layers[0][0].shape[1])
         for n, (W, b) in enumerate(self.layers):
             if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
                 raise ValueError(f"layer {n} takes {size} numbers, got weights {W.shape} and biases {b.shape}")
             if not (np.isfinite(W).all() and np.isfinite(b).all()):
                 raise ValueError(f"layer {n} must be finite")
             size = len(W)
+        self.action_size = size
         self.activation, self.squash = activation, squash
         self.mean = np.zeros(self.observation_size, np.float32) if mean is None else np.asarray(mean, np.float32)
         self.scale = np.ones(self.observation_size, np.float32) if scale is None else np.asarray(scale, np.float32)
@@ -82,23 +78,11 @@ class NetworkPolicy:
                 raise ValueError(f"{what} must be {self.observation_size} finite numbers, got {array.shape}")
         if not (self.scale > 0).all():
             raise ValueError(f"scale must be positive, got {self.scale.min()}")
-        self.log_std = _fitting(log_std, (self.action_size, self.layers[-1][0].shape[1]))
         self.trained_in = dict(trained_in or {})
-        self.np_random = np.random.default_rng(seed)
-        self._low, self._high = np.full(self.action_size, -1.0, np.float32), np.ones(self.action_size, np.float32)
-
-    @property
-    def observation_size(self) -> int:
-        """O."""
-        return int(self.layers[0][0].shape[1])
-
-    @property
-    def action_size(self) -> int:
-        """A."""
-        return len(self.layers[-1][1])
+        self._low, self._high = np.full(size, -1.0, np.float32), np.ones(size, np.float32)
 
     def fit_to(self, env: gym.Env[Any, Any], whose: str) -> NetworkPolicy:
-        """This policy, once it has been found to fit ``env``.
+        """Return this policy, bound to the action space of ``env``.
 
         Raises:
             ValueError: sizes differ, or the agent was trained in another environment; the message names both.
@@ -117,10 +101,6 @@ class NetworkPolicy:
         self._low, self._high = env.action_space.low, env.action_space.high
         return self
 
-    def set_random_seed(self, seed: int) -> None:
-        """Its noise follows from ``seed`` from now on."""
-        self.np_random = np.random.default_rng(seed)
-
     def predict(
         self,
         observation: Any,
@@ -128,24 +108,19 @@ class NetworkPolicy:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[Array, Any]:
-        """The action (A,), or (n, A) for n observations; and the state as it came."""
+        """Return the action (A,), or (n, A) for n observations; and the state as it was."""
         f = ACTIVATIONS[self.activation]
         x = (np.asarray(observation, np.float32) - self.mean) / self.scale
         for W, b in self.layers[:-1]:
             x = f(x @ W.T + b)
         W, b = self.layers[-1]
         out = x @ W.T + b
-        if self.log_std is not None and not deterministic:
-            slope, offset = self.log_std
-            # The bounds are those of SB3's SAC; PPO's stay far within them.
-            std = np.exp(np.clip(x @ slope.T + offset, -20.0, 2.0))
-            out = out + std * self.np_random.standard_normal(out.shape).astype(np.float32)
         if self.squash == "tanh":
             out = self._low + 0.5 * (np.tanh(out) + 1.0) * (self._high - self._low)
         return np.clip(out, self._low, self._high).astype(np.float32), state
 
     def save(self, path: str | Path, **about: Any) -> None:
-        """Writes the agent without its noise.
+        """Write the agent.
 
         Args:
             about: JSON-serialisable; kept beside the weights.
@@ -158,7 +133,11 @@ class NetworkPolicy:
 
     @classmethod
     def load(cls, path: str | Path) -> NetworkPolicy:
-        """Reads what ``save`` wrote. Raises ValueError where the file is damaged or something else."""
+        """Read what ``save`` wrote.
+
+        Raises:
+            ValueError: the file is damaged, or no agent.
+        """
         saved = read_checkpoint(path, KIND)
         try:
             count = sum(name.startswith("W") for name in saved.arrays)
@@ -172,26 +151,14 @@ class NetworkPolicy:
             raise ValueError(f"{path} is damaged: {error}") from error
 
 
-def _fitting(log_std: tuple[Array, Array] | None, shape: tuple[int, int]) -> tuple[Array, Array] | None:
-    """The noise, where there is one. Raises ValueError unless its weights are of this shape, and its biases fit."""
-    if log_std is None:
-        return None
-    slope, offset = log_std
-    if slope.shape != shape or offset.shape != shape[:1]:
-        raise ValueError(f"log_std needs weights {shape} and biases {shape[:1]}, got {slope.shape} and {offset.shape}")
-    if not (np.isfinite(slope).all() and np.isfinite(offset).all()):
-        raise ValueError("log_std must be finite")
-    return slope, offset
-
-
 def describe(env: gym.Env[Any, Any]) -> dict[str, Any]:
-    """What an agent's actions depend on beside the observation, as far as ``env`` says it."""
+    """Return what an agent's actions depend on beside the observation, as far as ``env`` says it."""
     inner = env.unwrapped
     found: dict[str, Any] = {"env": inner.spec.id} if inner.spec is not None else {}
     if hasattr(inner, "robots"):
         found["robots"] = list(inner.robots)
     if hasattr(inner, "controller"):
         found["controller"] = inner.controller
-    if "render_fps" in inner.metadata and hasattr(inner, "controller"):
-        found["control_freq"] = int(inner.metadata["render_fps"])
+        if "render_fps" in inner.metadata:
+            found["control_freq"] = int(inner.metadata["render_fps"])
     return found

@@ -14,13 +14,14 @@ from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.reflexes import Hold
 from asm_gym.policies.sb3 import read_archive
 from asm_gym.policies.scripted.door import DoorExpert
-from asm_gym.policies.scripted.elsewhere import ELSEWHERE, Swaying
 from asm_gym.policies.scripted.handover import HandoverExpert
 from asm_gym.policies.scripted.lift import LiftExpert
 from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
 from asm_gym.policies.scripted.peg_in_hole import PegInHoleExpert
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
 from asm_gym.policies.scripted.stack import StackExpert
+from asm_gym.policies.scripted.sway import EXPERTS as OTHER_EXPERTS
+from asm_gym.policies.scripted.sway import Swaying
 from asm_gym.policies.scripted.tool_hang import ToolHangExpert
 from asm_gym.policies.scripted.transport import TransportExpert
 from asm_gym.policies.scripted.two_arm_lift import TwoArmLiftExpert
@@ -49,7 +50,7 @@ POLICIES = ("scripted", "hold", "sway")
 
 
 REGISTERED: dict[str, Callable[..., Policy]] = registry("asm_gym.policies.registry:REGISTERED", {})
-"""What ``register_policy`` added."""
+"""Policies that ``register_policy`` added."""
 
 SHIPPED = Path(__file__).resolve().parent / "agents"
 """Trained agents that come with the package.
@@ -59,7 +60,7 @@ SHIPPED = Path(__file__).resolve().parent / "agents"
 
 
 def register_policy(name: str, make: Callable[..., Policy] | str) -> None:
-    """Makes a policy of one's own known, here and in worker processes.
+    """Register a policy, in this process and in its workers.
 
     Args:
         make: is called as ``make(env, seed=seed)``, with whatever else ``make_policy`` is given; or ``module:name``.
@@ -70,7 +71,7 @@ def register_policy(name: str, make: Callable[..., Policy] | str) -> None:
 
     Example:
         >>> from asm_gym import make_policy, register_policy
-        >>> register_policy("calm", lambda env, seed=None: make_policy("sway", env, seed=seed))
+        >>> register_policy("waving", lambda env, seed=None: make_policy("sway", env, seed=seed))
     """
     if name in (*POLICIES, *agents()):
         raise ValueError(f"there is a policy {name!r} already")
@@ -78,12 +79,12 @@ def register_policy(name: str, make: Callable[..., Policy] | str) -> None:
 
 
 def agents() -> tuple[str, ...]:
-    """Names of the agents that come with the package."""
+    """Return the names of the agents that come with the package."""
     return tuple(sorted(f.stem for f in SHIPPED.glob("*.npz")))
 
 
 def trained_in(name: str) -> str:
-    """The id of the environment that an agent was trained in; empty where its file does not say.
+    """Return the id of the environment that an agent was trained in; empty where its file does not say.
 
     Args:
         name: of an agent that comes with the package, or the path of what ``asm-gym train`` left.
@@ -101,7 +102,7 @@ def _agent_file(name: str) -> Path:
 
 @typed
 def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kwargs: Any) -> Policy:
-    """The policy called ``name`` for ``env``.
+    """Make the policy called ``name`` for ``env``.
 
     Args:
         name: ``"scripted"`` (the task's expert), ``"hold"`` (stay where you are), ``"sway"`` (smooth motion in any
@@ -129,20 +130,18 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
     if name in REGISTERED:
         return REGISTERED[name](env, seed=seed, **kwargs)
     if name == "scripted":
-        task, elsewhere = getattr(env.unwrapped, "task", None), env.spec.id if env.spec else ""
-        if elsewhere in ELSEWHERE:
-            return ELSEWHERE[elsewhere](env, seed=seed, **kwargs)
-        if not isinstance(task, TaskSpec) or task.name not in EXPERTS:
-            known = ", ".join((*EXPERTS, *ELSEWHERE))
-            named = task.name if isinstance(task, TaskSpec) else env
-            raise ValueError(f"no scripted expert for {named}; there are: {known}; 'sway' moves any")
-        return EXPERTS[task.name](env, seed=seed, **kwargs)
+        experts: dict[str, Callable[..., Policy]] = {**EXPERTS, **OTHER_EXPERTS}
+        task = getattr(env.unwrapped, "task", None)
+        key = task.name if isinstance(task, TaskSpec) else env.spec.id if env.spec else ""
+        if key not in experts:
+            raise ValueError(f"no scripted expert for {key or env}; there are: {', '.join(experts)}; 'sway' moves any")
+        return experts[key](env, seed=seed, **kwargs)
     if name == "sway":
         return Swaying(env, seed=seed)
     if name == "hold":
         return Hold(env)
     if name.endswith(".zip"):
-        return read_archive(Path(name), seed).fit_to(env, name)
+        return read_archive(Path(name)).fit_to(env, name)
     if name.endswith(".asm"):
         return NeuralASMPolicy.load(name, env)
     if name.endswith(".npz") or name in agents():

@@ -20,7 +20,7 @@ def rollout(
     on_step: Callable[[dict[str, Any]], None] | None = None,
     steps: int | None = None,
 ) -> bool:
-    """One episode, from ``reset(seed)`` until it is terminated or truncated; whether it succeeded at some step.
+    """Run one episode, until it is terminated or truncated; return whether it succeeded at some step.
 
     In steps in which another acted, as ``info["overridden"]`` says, the policy's state stays what it was, so that it
     resumes where it was left.

@@ -334,7 +334,7 @@ def test_environments_side_by_side_must_sense_boxes():
 @pytest.mark.parametrize(
     ("package", "env_id", "policy"),
     [
-        ("gymnasium_robotics", "gymnasium_robotics:FetchReach-v4", "scripted"),
+        ("gymnasium_robotics", "gymnasium_robotics:FetchReach-v4", "sway"),
         ("shimmy", "shimmy:dm_control/cartpole-balance-v0", "sway"),
     ],
 )

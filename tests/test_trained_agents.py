@@ -18,7 +18,7 @@ from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
 from asm_gym import collect
 from asm_gym.checkpoint import write_checkpoint
-from asm_gym.policies import POLICIES, make_policy, rollout
+from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.registry import SHIPPED, agents
 from asm_gym.policies.sb3 import read_archive
@@ -55,28 +55,6 @@ def test_an_archive_acts_as_the_agent_that_was_saved(algorithm, kwargs, tmp_path
     assert expected.std(axis=0).max() > 0.01
 
 
-@pytest.mark.parametrize("algorithm", [SAC, PPO])
-def test_its_noise_is_that_of_the_agent(algorithm, tmp_path):
-    env = FakeEnv()
-    model = algorithm("MlpPolicy", env, seed=0)
-    model.save(tmp_path / "agent.zip")
-    agent = make_policy(str(tmp_path / "agent.zip"), env, seed=3)
-    observation = np.array([0.3, -0.2], np.float32)
-    with torch.no_grad():
-        tensor = torch.as_tensor(observation[None])
-        if algorithm is SAC:
-            mean, log_std, _ = model.actor.get_action_dist_params(tensor)
-            drawn = torch.tanh(mean + log_std.exp() * torch.randn(20000, 3)).numpy()
-        else:
-            drawn = model.policy.get_distribution(tensor).distribution.sample((20000,))[:, 0].clip(-1, 1).numpy()
-    many = np.tile(observation, (20000, 1))
-    ours = agent.predict(many)[0]
-    np.testing.assert_allclose(ours.mean(axis=0), drawn.mean(axis=0), atol=0.02)
-    np.testing.assert_allclose(ours.std(axis=0), drawn.std(axis=0), atol=0.02)
-    again = make_policy(str(tmp_path / "agent.zip"), env, seed=3)
-    np.testing.assert_array_equal(ours, again.predict(many)[0])
-
-
 @pytest.fixture
 def archive(tmp_path):
     """Rewrites members of a good archive."""
@@ -111,15 +89,10 @@ def edit_data(**entries):
     return edit
 
 
-def test_pickled_code_is_refused_and_never_run(archive, tmp_path):
+def test_pickled_code_is_never_run(archive, tmp_path):
     trace = str(tmp_path / "trace")
-    for protocol in (0, 2, 4):
-        evil = base64.b64encode(pickle.dumps(Evil(trace), protocol)).decode()
-        entry = {":type:": "<class 'function'>", ":serialized:": evil}
-        with pytest.raises(ValueError, match=r"would import posix\.mkdir"):
-            read_archive(archive(data=edit_data(lr_schedule=entry)))
-        with pytest.raises(ValueError, match=r"would import posix\.mkdir"):
-            read_archive(archive(data=edit_data(deep={"down": [entry]})))
+    evil = {":type:": "<class 'function'>", ":serialized:": base64.b64encode(pickle.dumps(Evil(trace))).decode()}
+    read_archive(archive(data=edit_data(lr_schedule=evil)))
     with pytest.raises(ValueError, match="more than tensors"):
         read_archive(archive(policy_pth=lambda _: pickle.dumps(Evil(trace))))
     assert not os.path.exists(trace)
@@ -164,19 +137,6 @@ def saved(content):
 def test_members_that_are_not_what_they_should_be_are_refused_with_a_reason(members, archive):
     with pytest.raises(ValueError, match=r"edited\.zip is not an agent that can be read: .+"):
         read_archive(archive(**members))
-
-
-def test_an_archive_that_cannot_be_unpacked_is_refused(archive):
-    path = archive()
-    content = bytearray(path.read_bytes())
-    with zipfile.ZipFile(path) as good:
-        entry = good.getinfo("data")
-    # Said to be deflated, in the local header and in the directory, though it is not.
-    content[entry.header_offset + 8] = 8
-    content[content.rindex(b"PK\x01\x02", 0, content.rindex(b"data")) + 10] = 8
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"edited\.zip is not an agent"):
-        read_archive(path)
 
 
 def test_an_archive_larger_than_its_file_may_be_is_refused_before_it_is_read(archive, monkeypatch):
@@ -256,7 +216,6 @@ def test_an_agent_is_the_same_after_saving(tmp_path):
         ([(np.zeros((3, 2)), np.zeros(2))], "layer 0"),
         ([(np.full((3, 2), np.nan), np.zeros(3))], "finite"),
         ([(np.zeros(3), np.zeros(3))], r"two dimensions, got \(3,\)"),
-        ([(np.zeros(()), np.zeros(3))], "two dimensions"),
     ],
 )
 def test_networks_that_do_not_hang_together_are_refused(layers, message):
@@ -270,18 +229,11 @@ def test_networks_that_do_not_hang_together_are_refused(layers, message):
         ({"mean": np.zeros(5)}, r"mean must be 2 finite numbers, got \(5,\)"),
         ({"mean": np.array([0, np.nan])}, "mean must be 2 finite"),
         ({"scale": np.zeros(2)}, "scale must be positive"),
-        ({"log_std": (np.zeros((3, 1)), np.zeros(3))}, r"log_std needs weights \(3, 2\)"),
-        ({"log_std": (np.zeros((3, 2)), np.full(3, np.inf))}, "log_std must be finite"),
     ],
 )
-def test_what_a_network_reads_and_draws_by_must_fit_it(fields, message):
+def test_what_a_network_standardises_by_must_fit_it(fields, message):
     with pytest.raises(ValueError, match=message):
         NetworkPolicy([(np.zeros((3, 2)), np.zeros(3))], "relu", "tanh", **fields)
-
-
-def test_unknown_policies_are_refused_with_the_shipped_ones_named(lift):
-    with pytest.raises(ValueError, match=", ".join((*POLICIES, *agents()))):
-        make_policy("teleop", lift)
 
 
 CHANCE = 0.05

@@ -72,8 +72,7 @@ class TwoArmLiftExpert(TwoArmExpert):
             return scene.handles + _above(state)
         if state.phase == DESCEND:
             return scene.handles - [0.0, 0.0, _DEPTH]
-        anchor: Vector = state.anchor
-        up = 0.0
+        anchor, up = state.anchor, 0.0
         if state.phase == LIFT:
             # The hand that is ahead waits: a pot that tilts turns in their fingers.
             risen = min(float(hand.at[2] - start[2]) for hand, start in zip(scene.hands, anchor, strict=True))
@@ -81,7 +80,8 @@ class TwoArmLiftExpert(TwoArmExpert):
         if state.phase == LOWER:
             # What one hand still holds comes down slowly, before both let go and try again.
             up = -0.01 * min(state.since, 15)
-        return anchor + np.array([0.0, 0.0, up])
+        targets: Vector = anchor + np.array([0.0, 0.0, up])
+        return targets
 
 
 def _above(state: State) -> Vector:

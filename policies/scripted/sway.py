@@ -1,4 +1,4 @@
-"""Policies for environments that are not robosuite's: what they do is not clever, but alike from episode to episode."""
+"""Policies for environments that are not robosuite's: smooth motion that is alike from episode to episode."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ class Swaying:
         self.set_random_seed(0 if seed is None else seed)
 
     def set_random_seed(self, seed: int) -> None:
-        """Begins a new episode of this seed."""
+        """Begin an episode of this seed."""
         self.rng = np.random.default_rng([seed, 3])
         self.t, self.noise = 0.0, np.zeros(self.size)
         self.draw()
 
     def draw(self) -> None:
-        """What is drawn once an episode."""
+        """Draw what an episode keeps."""
         self.phase = self.rng.normal(0.0, 0.3, self.size) + np.arange(self.size)
         self.width = self.WIDTH * self.rng.uniform(0.8, 1.2, self.size)
         self.frequency = 0.5 + 0.3 * np.linspace(0.0, 1.0, self.size)  # [Hz]
 
     def act(self, observation: Any) -> Floats:
-        """(A,) before noise."""
+        """Return the action (A,) before noise."""
         wave: Floats = self.middle + self.half * self.width * self.sine()
         return wave
 
     def sine(self) -> Floats:
-        """(A,) now, in [-1, 1]."""
+        """Return the present sines (A,)."""
         now: Floats = np.sin(2 * np.pi * self.frequency * self.t + self.phase)
         return now
 
@@ -64,6 +64,7 @@ class Swaying:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], PolicyState]:
+        """Return the action and the state as it was."""
         self.noise = self.COLOUR * self.noise + self.NOISE * self.half * self.rng.standard_normal(self.size)
         chosen = (self.act(observation) + self.noise).reshape(self.space.shape)
         self.t += self.dt
@@ -80,17 +81,6 @@ class Pusher(Swaying):
         return np.asarray(1.5 * towards - 0.3 * observation[7:14], np.float64)
 
 
-class HalfCheetah(Swaying):
-    """Hind and fore legs swing against each other, at 2 Hz."""
-
-    WIDTH = 0.6
-
-    def draw(self) -> None:
-        super().draw()
-        self.phase = self.rng.uniform(0, 2 * np.pi) + np.array([0.0, 0.7, 1.4, 3.1, 3.8, 4.5])
-        self.frequency = np.full(6, 2.0)
-
-
 class Arm(Swaying):
     """The synthetic arm goes through four poses, a second each, and sways a little on the way."""
 
@@ -105,7 +95,7 @@ class Arm(Swaying):
         return np.asarray((soon - now) / self.dt + 4.0 * (now - observation[:7]), np.float64)
 
     def reference(self, t: float) -> Floats:
-        """(7,) positions along minimum-jerk moves [rad]."""
+        """Return positions (7,) along minimum-jerk moves [rad]."""
         k = min(int(t), len(self.poses) - 2)
         s = min(t - k, 1.0)
         there = 10 * s**3 - 15 * s**4 + 6 * s**5
@@ -113,20 +103,5 @@ class Arm(Swaying):
         return np.asarray(self.poses[k] + there * (self.poses[k + 1] - self.poses[k]) + sway, np.float64)
 
 
-class Fetch(Swaying):
-    """The hand goes to the goal, and stays there."""
-
-    NOISE = 0.02
-
-    def act(self, observation: Any) -> Floats:
-        towards = 5.0 * (observation["desired_goal"] - observation["achieved_goal"])
-        return np.append(towards, np.zeros(self.size - 3))
-
-
-ELSEWHERE: dict[str, Callable[..., Policy]] = {
-    "Pusher-v5": Pusher,
-    "HalfCheetah-v5": HalfCheetah,
-    "FetchReach-v4": Fetch,
-    "asm_gym/SyntheticArm-v0": Arm,
-}
-"""The scripted policy of each environment, by its id."""
+EXPERTS: dict[str, Callable[..., Policy]] = {"Pusher-v5": Pusher, "asm_gym/SyntheticArm-v0": Arm}
+"""The scripted policy of environments that are not robosuite's, by id."""
