@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import doctest
 import inspect
+import io
 import json
 import re
 import shlex
@@ -22,7 +24,8 @@ from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import MONITORS
 from asm_gym.policies.registry import REGISTERED
 from asm_gym.scripts import command as command_of
-from asm_gym.scripts.cli import main
+from asm_gym.scripts.cli import COMMANDS, main
+from asm_gym.scripts.reproduce import STUDIES
 from asm_gym.tasks import OWN
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -147,6 +150,27 @@ def test_commands_of_a_page_parse(page: Path, monkeypatch: pytest.MonkeyPatch):
             assert done.returncode == 0, f"{name(page)}, line {block.line}: {done.stderr}"
             for line in done.stdout.splitlines():
                 check_command(line, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def options() -> set[str]:
+    """Every option of every command and study, from its help."""
+    help_of = [[name] for name in COMMANDS] + [["reproduce", study] for study in STUDIES]
+    found: set[str] = {"--help", "--version"}
+    for argv in help_of:
+        with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
+            main([*argv, "--help"])
+        found |= set(re.findall(r"--[a-z][\w-]*", out.getvalue()))
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_commands_and_options_named_in_a_text_exist(page: Path, options: set[str]):
+    for code in CODE.findall(FENCE.sub("", page.read_text(encoding="utf-8"))):
+        command = re.match(r"`asm-gym ([a-z]+)", code)
+        assert not command or command[1] in COMMANDS, code
+        if code.startswith(("`asm-gym", "`--")):
+            assert set(re.findall(r"--[a-z][\w-]*", code)) <= options, f"{name(page)}: {code}"
 
 
 @pytest.mark.parametrize("wrong", ["asm-gym demo --no-such-option", "asm-gym no-such-command", "make no-such-target"])
