@@ -55,6 +55,7 @@ format: $(stamp) ## format the code, and fix lint
 	$(bin)/ruff format .
 
 docs: $(stamp) ## build the documentation in docs/_build/html
+	rm -rf docs/reference/api
 	$(bin)/python -m sphinx -b html -W --keep-going -q docs docs/_build/html
 	@echo "make: open docs/_build/html/index.html"
 
