@@ -1,7 +1,4 @@
-"""Episodes: what happened between a reset and its end, in arrays; and the one file format of a single one.
-
-A file is a checkpoint: arrays and JSON, never pickle, written whole or not at all.
-"""
+"""Hold an episode in arrays, and save it to a file: a checkpoint of arrays and JSON, written whole or not at all."""
 
 from __future__ import annotations
 
@@ -26,8 +23,8 @@ ARRAYS = {"stream": "f", "actions": "f", "observations": "fiub", "rewards": "f",
 """What a file holds, and the kinds of numbers that each may have."""
 
 
-def _liveliest(part: NDArray[np.float32]) -> int:
-    """Which column of (T, n) moves most."""
+def _most_moving(part: NDArray[np.float32]) -> int:
+    """The column of (T, n) with the largest range."""
     return int(np.argmax(np.nan_to_num(np.ptp(part, axis=0)))) if len(part) else 0
 
 
@@ -37,7 +34,7 @@ def _empty() -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class EpisodeLabel:
-    """What an episode was recorded as.
+    """The task and role that an episode was recorded for.
 
     Args:
         task: a task's name.
@@ -46,8 +43,8 @@ class EpisodeLabel:
         severity: of the fault; empty for the others.
         seed: of the environment and of the policy. Episodes that share it are twins.
         onset: the first step with the fault or variation; None without one.
-        affected_channels: in which an attentive observer would see the fault first. Found out while recording, so two
-            labels that differ in nothing else are equal.
+        affected_channels: in which the fault shows first. Measured while recording, so two labels that differ in
+            nothing else are equal.
     """
 
     task: str
@@ -60,7 +57,7 @@ class EpisodeLabel:
 
     @property
     def path(self) -> Path:
-        """Where in a run's folder the episode lies."""
+        """The episode's file in a run's folder."""
         parts = [part for part in (self.kind, self.severity) if part]
         return Path("episodes") / self.task / self.role / "-".join([*parts, f"{self.seed}.npz"])
 
@@ -80,8 +77,8 @@ class Episode:
         rewards: (T,) float32.
         faults: (T,) bool, a fault was active in that row of the stream (the ground truth).
         contact_force: (T,) float32, between the robot and everything else [N].
-        label: what it was recorded as; None where nobody said.
-        info: whatever else is worth keeping; JSON-serialisable.
+        label: the task and role that it was recorded for; None where they are unknown.
+        info: anything else; JSON-serialisable.
 
     Example:
         >>> import numpy as np
@@ -113,7 +110,7 @@ class Episode:
         return len(self.stream)
 
     def __repr__(self) -> str:
-        """In a line: how long, of what, and how it ended."""
+        """Length, source and end in a line."""
         seconds, seed = len(self) * self.spec.dt, "" if self.seed is None else f", seed {self.seed}"
         faults = f", {int(self.faults.sum())} rows with a fault" if self.faults.any() else ""
         ended = "success" if self.success else "no success"
@@ -121,9 +118,9 @@ class Episode:
         return f"<Episode of {self.spec.source or 'a stream'}: {rows}, {ended}{seed}{faults}>"
 
     def _repr_html_(self) -> str:
-        """For notebooks: each channel over time, the largest number of it; red where a fault was active."""
+        """For notebooks: the most moving number of each channel over time; red where a fault was active."""
         parts = {f"{c.name} [{c.unit}]": self.stream[:, self.spec.slices[c.name]] for c in self.spec.channels}
-        lines = {name: part[:, _liveliest(part)] for name, part in parts.items()}
+        lines = {name: part[:, _most_moving(part)] for name, part in parts.items()}
         return lines_over_time(repr(self), lines, self.spec.dt, self.faults if len(self.faults) else None)
 
     @property
@@ -136,7 +133,7 @@ class Episode:
     @classmethod
     @typed
     def from_stream(cls, x: NDArray[np.floating[Any]], spec: StreamSpec, **fields: Any) -> Episode:
-        """An episode from a stream recorded elsewhere, a real robot's included: ``x`` has the shape (T, D)."""
+        """Make an episode from a stream ``x`` (T, D) that was recorded elsewhere, such as on a real robot."""
         return cls(np.ascontiguousarray(as_float32(x, "a stream")), spec, **fields)
 
     @classmethod
@@ -150,16 +147,27 @@ class Episode:
         labels: Sequence[str] = (),
         **fields: Any,
     ) -> Episode:
-        """An episode from a log: a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
+        """Make an episode from a log.
 
-        The arguments are those of ``asm_gym.data.channels.read_recorded``, and whatever else an episode has.
+        Args:
+            frame: a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
+            channels: the columns to read, as patterns such as ``joint*``; or patterns by channel; or the spec of a
+                memory that is to read them. By default all columns of numbers.
+            rate: rows a second [Hz]; by default that of its clock.
+            action: patterns of the columns that were commanded and not sensed.
+            labels: patterns of the columns that say what is wrong, beside those that are called so.
+            fields: other arguments of ``Episode``.
+
+        Raises:
+            ValueError: columns are missing, doubled, of several lengths or no numbers; the rate is unknown, or another
+                one than the spec's; time runs backwards.
         """
         found = read_recorded(frame, channels, rate, action, labels)
         return cls(found.stream, found.spec, **{"faults": found.faults} | fields)
 
 
 def check_recorded(episode: Episode) -> None:
-    """Raises ValueError unless the arrays of an episode are of one length, and its rewards are numbers."""
+    """Raise ValueError unless the arrays of an episode are of one length, and its rewards are numbers."""
     rows, steps = len(episode), len(episode.actions)
     for name, length in (("observations", steps + 1), ("rewards", steps), ("contact_force", steps)):
         found = len(getattr(episode, name))
@@ -179,7 +187,7 @@ def check_recorded(episode: Episode) -> None:
 
 @typed
 def save_episode(path: str | Path, episode: Episode) -> Path:
-    """Writes one episode to a file of its own, which appears only when it is complete; returns where it is."""
+    """Write one episode to a file of its own, which appears only when it is complete; return its path."""
     check_recorded(episode)
     label = None if episode.label is None else asdict(episode.label)
     if label is not None:
@@ -197,7 +205,7 @@ def save_episode(path: str | Path, episode: Episode) -> Path:
 
 @typed
 def load_episode(path: str | Path) -> Episode:
-    """What ``save_episode`` wrote.
+    """Return what ``save_episode`` wrote.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -230,6 +238,6 @@ def _fields(path: Path) -> dict[str, Any]:
 
 
 def spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """The runs of True in ``mask`` (T,), as half-open [start, stop) steps."""
+    """Return the runs of True in ``mask`` (T,), as half-open [start, stop) steps."""
     edges = np.diff(np.concatenate([[0], np.asarray(mask, np.int8), [0]]))  # (T + 1,)
     return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))

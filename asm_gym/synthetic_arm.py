@@ -1,9 +1,9 @@
-"""A synthetic arm at 100 Hz, for logs and tests without a simulator: seven coupled joints that follow velocities.
+"""Simulate a synthetic arm at 100 Hz without a simulator: seven coupled joints that follow commanded velocities.
 
     M v̇ = τ - g(q) - 3 D v - D tanh(20 v)/2      D: the diagonal of M;  g with a load that is drawn for each episode
     τ   = 60 D (u - v) + ĝ(q)                     the drive: a velocity loop, with gravity compensated for a load of 1
 
-Masses and gains resemble those of a seven-joint arm of 20 kg, but are nobody's.
+Masses and gains resemble those of a seven-joint arm of 20 kg.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ COUPLING = 0.15
 
 @compiled
 def _gravity(position: Floats) -> Floats:
-    """(7,) torques that would hold the arm with a load of 1."""
+    """Return the torques (7,) that hold the arm with a load of 1."""
     held: Floats = GRAVITY * np.sin(np.cumsum(position) + 0.5)
     return held
 
 
 @compiled
 def _advance(
-    position: Floats, velocity: Floats, told: Floats, load: float, inverse: Floats
+    position: Floats, velocity: Floats, command: Floats, load: float, inverse: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Position, velocity and torque (7,) after a control step."""
-    torque = told
+    """Return position, velocity and torque (7,) after a control step."""
+    torque = command
     for _ in range(SUBSTEPS):
         compensated = _gravity(position)
-        torque = 60 * MASS * (told - velocity) + compensated
+        torque = 60 * MASS * (command - velocity) + compensated
         friction = 3 * MASS * velocity + 0.5 * MASS * np.tanh(20 * velocity)
         velocity = velocity + DT / SUBSTEPS * (inverse @ (torque - load * compensated - friction))
         position = position + DT / SUBSTEPS * velocity
@@ -50,7 +50,7 @@ def _advance(
 
 
 class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """Observes positions [rad], velocities [rad/s] and torques [N m] of its joints, with noise; is told velocities.
+    """Observe noisy positions [rad], velocities [rad/s] and torques [N m] of the joints; actions are velocities.
 
     Args:
         horizon: control steps of an episode.
@@ -85,10 +85,10 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return observation, {"stream": np.concatenate([observation, np.zeros(JOINTS, np.float32)])}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Moves one step as it is told; the senses and the stream after it."""
-        told = np.clip(np.asarray(action, np.float64), -3.0, 3.0)
+        """Move one step by the commanded velocities [rad/s]."""
+        command = np.clip(np.asarray(action, np.float64), -3.0, 3.0)
         self._position, self._velocity, torque = _advance(
-            self._position, self._velocity, told, self._load, self._inverse
+            self._position, self._velocity, command, self._load, self._inverse
         )
         self._steps += 1
         observation = self._sense(torque)

@@ -1,11 +1,11 @@
-"""ROS bags and MCAP files as tables: what joints and wrists said, row by row.
+"""Read ROS bags and MCAP files as tables of the joints and wrists.
 
     sensor_msgs/JointState           position[name], velocity[name], effort[name]
     geometry_msgs/WrenchStamped      force[x], …, torque[z]
     std_msgs/Float64MultiArray       data[0], …           such as commands
 
 Each column is named after its topic, ``joint_states.position[panda_joint1]``. A row is a message of the topic of
-JointState that has most of them, at the time in its header; of the others each row holds what they said last.
+JointState that has most of them, at the time in its header, with the newest values of the other topics.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from asm_gym.extras import require
 from asm_gym.files import regular_file
 
 Numbers = dict[str, float]
-AXES = ("x", "y", "z")
 
 
 def _joints(message: Any) -> Numbers:
@@ -37,7 +36,7 @@ def _joints(message: Any) -> Numbers:
 
 def _wrench(message: Any) -> Numbers:
     parts = {"force": message.wrench.force, "torque": message.wrench.torque}
-    return {f"{name}[{axis}]": float(getattr(part, axis)) for name, part in parts.items() for axis in AXES}
+    return {f"{name}[{axis}]": float(getattr(part, axis)) for name, part in parts.items() for axis in "xyz"}
 
 
 def _array(message: Any) -> Numbers:
@@ -50,28 +49,14 @@ MESSAGES: dict[str, Callable[[Any], Numbers]] = {
     "geometry_msgs/msg/WrenchStamped": _wrench,
     "std_msgs/msg/Float64MultiArray": _array,
 }
-"""What is read, by the type of a message."""
-
+"""The numbers of a message, by its type."""
 
 MCAP_MAGIC, MCAP_CHUNK = 8, 0x06
 """Bytes before the first record of an MCAP file, and the opcode of a chunk (mcap.dev/spec)."""
 
 
-def _in_chunks(path: Path, size: int) -> int:
-    """[bytes] that the chunks of an MCAP file say they hold, none of them expanded."""
-    total = 0
-    with path.open("rb") as file:
-        file.seek(MCAP_MAGIC)
-        while len(head := file.read(9)) == 9:  # opcode, length
-            end = file.tell() + min(int.from_bytes(head[1:], "little"), size)
-            if head[0] == MCAP_CHUNK:
-                total += int.from_bytes(file.read(24)[16:], "little")  # after two times
-            file.seek(end)
-    return total
-
-
 def read_bag(path: Path) -> dict[str, NDArray[np.float64]]:
-    """The columns of a bag (``.mcap``, ``.db3``, ``.bag``), ``time`` among them [s].
+    """Return the columns of a bag (``.mcap``, ``.db3``, ``.bag``), ``time`` among them [s].
 
     Raises:
         ValueError: it is damaged, declares far more than it holds, or has no JointState; the message lists its topics.
@@ -79,7 +64,7 @@ def read_bag(path: Path) -> dict[str, NDArray[np.float64]]:
     """
     size = regular_file(path)
     if path.suffix == ".mcap":
-        check_declared(path, _in_chunks(path, size), size)
+        check_declared(path, _bytes_in_chunks(path, size), size)
     highlevel, typesys = (require(f"rosbags.{name}", what="a ROS bag") for name in ("highlevel", "typesys"))
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     try:
@@ -89,6 +74,19 @@ def read_bag(path: Path) -> dict[str, NDArray[np.float64]]:
         raise
     except Exception as error:  # rosbags, SQLite, struct: whichever meets the damage first
         raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def _bytes_in_chunks(path: Path, size: int) -> int:
+    """[bytes] that the chunks of an MCAP file declare, none of them expanded."""
+    total = 0
+    with path.open("rb") as file:
+        file.seek(MCAP_MAGIC)
+        while len(head := file.read(9)) == 9:  # opcode, length
+            end = file.tell() + min(int.from_bytes(head[1:], "little"), size)
+            if head[0] == MCAP_CHUNK:
+                total += int.from_bytes(file.read(24)[16:], "little")  # after two times
+            file.seek(end)
+    return total
 
 
 def _columns(bag: Any) -> dict[str, NDArray[np.float64]]:
@@ -102,12 +100,11 @@ def _columns(bag: Any) -> dict[str, NDArray[np.float64]]:
     rows: list[Numbers] = []
     for connection, written, raw in bag.messages(connections=chosen):
         message = bag.deserialize(raw, connection.msgtype)
-        said = MESSAGES[connection.msgtype](message)
-        latest |= {f"{connection.topic.strip('/')}.{name}": value for name, value in said.items()}
+        numbers = MESSAGES[connection.msgtype](message)
+        latest |= {f"{connection.topic.strip('/')}.{name}": value for name, value in numbers.items()}
         if connection.topic == clock:
             stamp = message.header.stamp
             rows.append({"time": stamp.sec + 1e-9 * stamp.nanosec or 1e-9 * written, **latest})
     names = list(dict.fromkeys(name for row in rows for name in row))
-    start = rows[0]["time"]  # counted from there, seconds since 1970 would cost digits
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
-    return columns | {"time": columns["time"] - start}
+    return columns | {"time": columns["time"] - columns["time"][0]}  # seconds since 1970 would cost digits

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.arrays import as_array
 from asm_gym.data.clock import clock_among, distinct, evenly, period
-from asm_gym.data.names import ELEMENT, is_clock, is_counter, is_label, label_of
+from asm_gym.data.names import ELEMENT, label_of, role_of
 from asm_gym.data.reader_notes import note
 from asm_gym.data.units import bare_name, factor, unit_of
 from asm_gym.readings import noise_of
@@ -87,24 +87,15 @@ def read_recorded(
 ) -> Recorded:
     """Return the rows of a table, their channels, and which are labelled as faulty.
 
-    Args:
-        frame: a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
-        channels: the columns to read, as patterns such as ``joint*``; or patterns by channel; or the spec of a memory
-            that is to read them. By default all columns of numbers.
-        rate: rows a second [Hz]; by default that of its clock.
-        action: patterns of the columns that were commanded and not sensed.
-        labels: patterns of the columns that say what is wrong, beside those that are called so.
-
-    Raises:
-        ValueError: columns are missing, doubled, of several lengths or no numbers; the rate is unknown, or another one
-            than the spec's; time runs backwards.
+    The arguments, and what is refused, are those of ``Episode.from_table``.
     """
     table = _columns(frame)
     spec = channels if isinstance(channels, StreamSpec) else None
     read = set(spec.labels) | {c.name for c in spec.channels} if spec else set()
-    marks = {n: _marked(c) for n, c in table.items() if c.ndim == 1 and is_label(n, labels) and n not in read}
-    faults = np.logical_or.reduce(list(marks.values())) if marks else np.zeros(0, np.bool_)
-    columns = {n: c for n, c in table.items() if n not in marks and _is_sense(n, c)}
+    roles = {n: "sense" if n in read else role_of(n, c, labels) for n, c in table.items()}
+    marks = [_marked(c) for n, c in table.items() if roles[n] == "label"]
+    faults = np.logical_or.reduce(marks) if marks else np.zeros(0, np.bool_)
+    columns = {n: c for n, c in table.items() if roles[n] in ("sense", "command") and c.ndim in (1, 2)}
     _check_lengths(columns, table)
     dt = None if rate is None else 1.0 / check_number("rate", rate, low=SLOWEST)
     clock = clock_among(table)
@@ -144,12 +135,6 @@ def _marked(column: Column) -> NDArray[np.bool_]:
     if column.dtype.kind in "biuf":
         return np.asarray(np.nan_to_num(column.astype(np.float64)) != 0)
     return np.array([str(cell).strip().lower() not in NORMAL for cell in column])
-
-
-def _is_sense(name: str, column: Column) -> bool:
-    """Whether a column that is no label holds numbers that were sensed or commanded, (T,) or (T, k)."""
-    numbers = column.dtype.kind in "biuf" and column.ndim in (1, 2)
-    return numbers and not is_clock(name) and not is_counter(name, column)
 
 
 def _check_lengths(columns: Mapping[str, Column], table: Mapping[str, Column]) -> None:

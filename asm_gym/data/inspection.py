@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.clock import FAR, clock_among, distinct, period
-from asm_gym.data.names import is_clock, is_command, is_counter, is_label
+from asm_gym.data.names import role_of
 from asm_gym.data.units import bare_name, unit_of
 from asm_gym.readings import noise_of, resolution
 
@@ -173,10 +173,12 @@ def inspected(name: str, columns: Mapping[str, NDArray[Any]], rate: float | None
         for k, part in enumerate(values.T if values.ndim == 2 else [values])
     }
     clock, times = _clock(flat, rate or 0.0)
+    roles = {n: role_of(n, v) for n, v in flat.items()}
+    words = [n for n, role in roles.items() if role == "words"]
     numbers = {n: v for n, v in flat.items() if v.dtype.kind in "biuf"}
-    words = [n for n in flat if n not in numbers and not is_clock(n) and not is_label(n)]
-    channels = [_channel(n, v) for n, v in numbers.items()]
-    channels += [_channel(n, np.zeros(0)) for n in flat if n not in numbers and n not in words]
+    in_words = [n for n in flat if n not in numbers and n not in words]  # clocks and labels
+    channels = [_channel(n, roles[n], v) for n, v in numbers.items()]
+    channels += [_channel(n, roles[n], np.zeros(0)) for n in in_words]
     return Inspection(name, clock, channels, words, times, numbers)
 
 
@@ -201,18 +203,12 @@ def _clock(columns: Mapping[str, NDArray[Any]], rate: float) -> tuple[ClockFound
     return ClockFound(clock.column, 1 / dt, jitter, gaps, rows, float(kept[-1] - kept[0])), times
 
 
-def _channel(column: str, values: NDArray[Any]) -> ChannelFound:
-    name, known = bare_name(column), values[np.isfinite(values)]
-    is_role = {
-        "clock": is_clock(column),
-        "label": is_label(name),
-        "counter": is_counter(name, values),
-        "command": is_command(name),
-    }
+def _channel(column: str, role: str, values: NDArray[Any]) -> ChannelFound:
+    known = values[np.isfinite(values)]
     return ChannelFound(
-        name,
+        bare_name(column),
         unit=unit_of(column),
-        role=next((role for role, holds in is_role.items() if holds), "sense"),
+        role=role,
         low=float(known.min()) if len(known) else float("nan"),
         high=float(known.max()) if len(known) else float("nan"),
         noise=noise_of(values),

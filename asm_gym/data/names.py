@@ -1,4 +1,4 @@
-"""Tell by the name of a column what it is: a clock, a label, a counter, a command, a position or a speed."""
+"""Tell what a column is, by its name: a clock, a label, a counter, a command, a sense; a position or a speed."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from asm_gym.data.units import bare_name
 
 SECONDS = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
@@ -59,10 +61,29 @@ def is_command(name: str) -> bool:
 
 def is_counter(name: str, column: NDArray[Any]) -> bool:
     """Tell whether a column counts rows: each is one more than the one before, but for rows that were lost."""
-    if name.lower() not in COUNTERS or column.ndim != 1 or len(column) < 2:
+    if name.lower() not in COUNTERS or column.ndim != 1 or len(column) < 2 or column.dtype.kind not in "biuf":
         return False
     steps = np.diff(column.astype(np.float64))
     return bool((steps >= 1).all() and (steps == np.rint(steps)).all() and np.median(steps) == 1)
+
+
+def role_of(column: str, values: NDArray[Any], labels: Sequence[str] = ()) -> str:
+    """Return the role of a column: clock, label, words, counter, command or sense.
+
+    Args:
+        column: its name.
+        values: (T,) or (T, k).
+        labels: patterns of the columns that say what is wrong, beside those that are called so.
+    """
+    name = bare_name(column)
+    roles = {
+        "clock": is_clock(column),
+        "label": values.ndim == 1 and is_label(name, labels),
+        "words": values.dtype.kind not in "biuf",
+        "counter": is_counter(name, values),
+        "command": is_command(name),
+    }
+    return next((role for role, holds in roles.items() if holds), "sense")
 
 
 @cache

@@ -1,4 +1,4 @@
-"""What a reader put right or left out, said once to whoever reads."""
+"""Collect what a reader put right or left out, to say it once to the user."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ class LogWarning(UserWarning):
 
 
 def note(message: str) -> None:
-    """Says so."""
+    """Warn the caller of a reader."""
     warnings.warn(message, LogWarning, stacklevel=2)
 
 
 @contextmanager
 def noted() -> Iterator[list[str]]:
-    """What was said in this block, each thing once, in order; nothing of it is printed."""
-    said: list[str] = []
+    """Collect the notes of this block, each once, in order; other warnings pass."""
+    notes: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", LogWarning)
-        yield said
-        others = [w for w in caught if not issubclass(w.category, LogWarning)]
-        said += dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, LogWarning))
-    for other in others:
-        warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
+        yield notes
+    for warning in caught:
+        if issubclass(warning.category, LogWarning):
+            notes += [str(warning.message)] if str(warning.message) not in notes else []
+        else:
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)

@@ -13,6 +13,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
@@ -163,7 +164,7 @@ def _surveyed(path: Path, encoding: str, columns: Sequence[str]) -> Text:
         if len(names) > MOST_COLUMNS:
             raise ValueError(f"it has {len(names)} columns, and at most {MOST_COLUMNS} can be watched")
         rows, widest, before = 0, len(names), ("", "")  # the last two lines
-        for n, line in lines if has_header else _again(first, lines):
+        for n, line in lines if has_header else chain([first], lines):
             width = dialect.width(line)
             if width > len(names):
                 widest, width = max(widest, width), dialect.width(line.rstrip().rstrip(dialect.separator))
@@ -185,15 +186,10 @@ def _lines(file: TextIO) -> Iterator[tuple[int, str]]:
         n += 1
         if len(line) == LONGEST_LINE:
             raise ValueError(f"a line of {LONGEST_LINE} characters or more is no row")
-        if len(line) > LONGEST_CELL and max(map(len, re.split(f"[{SEPARATORS}\\s]", line))) > LONGEST_CELL:
+        if len(line) > LONGEST_CELL and re.search(f"[^{SEPARATORS}\\s]{{{LONGEST_CELL}}}", line):
             raise ValueError(f"it is no table of text: line {n} has a cell of more than {LONGEST_CELL} characters")
         if line.strip(" \r\n"):
             yield n, line
-
-
-def _again(first: tuple[int, str], lines: Iterator[tuple[int, str]]) -> Iterator[tuple[int, str]]:
-    yield first
-    yield from lines
 
 
 def _cut_off(dialect: Dialect, last_two: tuple[str, str], size: int) -> bool:
