@@ -1,78 +1,87 @@
-"""Registries: rows by name. What is added to one after it was made travels with work into other processes.
+"""Registries: rows by name, such as tasks, faults, monitors, policies, reflexes and sources.
 
-    KINDS = registry("asm_gym.faults.suite:KINDS", {...})
+    KINDS: Registry[Kind] = Registry("kind of fault", "asm_gym.faults.suite:KINDS", {"push": make_push})
+    KINDS.register("shake", make)                       raises where the name is taken
+    KINDS.find("shaek")                                 raises, and names the nearest known one
 
-    register_task("Reach", "mypackage:ReachEnv", horizon=200)      asm_gym evaluate --tasks Reach
-    register_fault("shake", make)                                  --faults shake
-    register_monitor("persistence", Persistence)                   --monitors persistence
-    register_policy("reacher", "mypackage:Reacher")                --policy reacher
-
-All take a name and what makes it: an object, or ``module:name``, which is imported when it is needed.
+Rows that are added to a registry after it was made travel with the work into other processes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from asm_gym.extras import needed_for
-from asm_gym.validation import check_text
+from asm_gym.validation import check_choice, check_text
 
 Row = TypeVar("Row")
+Result = TypeVar("Result")
 
 Added = dict[str, dict[str, Any]]
-"""Rows by name, by where their registry stands."""
+"""Added rows by name, by the place of their registry."""
+
+_REGISTRIES: dict[str, Registry[Any]] = {}
 
 
-class _Known(NamedTuple):
-    rows: dict[str, Any]
-    own: frozenset[str]  # names that were there when it was made
-
-
-_REGISTRIES: dict[str, _Known] = {}
-
-
-def registry(where: str, rows: dict[str, Row]) -> dict[str, Row]:
-    """The same rows, of which those that are added from now on are known as ``added``.
+class Registry(dict[str, Row]):
+    """Rows by name.
 
     Args:
-        where: ``module:name`` of the registry.
+        what: a row is called, in messages.
+        where: ``module:name`` of the registry, by which other processes find it.
+        rows: rows of the package itself.
     """
-    _REGISTRIES[where] = _Known(rows, frozenset(rows))
-    return rows
 
+    def __init__(self, what: str, where: str, rows: Mapping[str, Row] | None = None) -> None:
+        super().__init__(rows or {})
+        self.what = what
+        self._own = frozenset(self)
+        _REGISTRIES[where] = self
 
-def add(what: str, rows: dict[str, Row], name: str, row: Row) -> None:
-    """Raises ValueError where the name is taken, or none."""
-    if check_text(f"the name of a {what}", name) in rows:
-        raise ValueError(f"there is a {what} {name!r} already")
-    rows[name] = row
+    def register(self, name: str, row: Row) -> None:
+        """Add a row.
+
+        Raises:
+            ValueError: the name is taken or no name.
+        """
+        if check_text(f"the name of a {self.what}", name) in self:
+            raise ValueError(f"there is a {self.what} {name!r} already")
+        self[name] = row
+
+    def find(self, name: str) -> Row:
+        """Return the row of a name.
+
+        Raises:
+            ValueError: there is none; the message lists the known names.
+        """
+        check_choice(self.what, name, self)
+        return self[name]
+
+    @property
+    def added(self) -> dict[str, Row]:
+        """Rows that were added after the registry was made."""
+        return {name: row for name, row in self.items() if name not in self._own}
 
 
 def added() -> Added:
-    """What was added to each registry of this process."""
-    found = {where: {n: row for n, row in rows.items() if n not in own} for where, (rows, own) in _REGISTRIES.items()}
-    return {where: rows for where, rows in found.items() if rows}
+    """Return the rows that were added to each registry of this process."""
+    return {where: rows for where, registry in _REGISTRIES.items() if (rows := registry.added)}
 
 
-def take(rows: Added) -> None:
-    """Adds what another process had added."""
+def knowing(rows: Added, task: Callable[[Any], Result], item: Any) -> Result:
+    """Return ``task(item)``, in a process that is first told of these rows."""
     for where, own in rows.items():
         target(where).update(own)
-
-
-def knowing(rows: Added, task: Callable[[Any], Row], item: Any) -> Row:
-    """``task(item)``, in a process that need not know of these rows yet."""
-    take(rows)
     return task(item)
 
 
 def target(found: Any) -> Any:
-    """What ``module:name`` stands for; anything else is itself.
+    """Return the object that ``module:name`` names; any other object is returned as it is.
 
     Raises:
-        ImportError: there is no such module; the message says what brings it.
+        ImportError: there is no such module; the message says what installs it.
         ValueError: the module has no such name.
     """
     if not isinstance(found, str):

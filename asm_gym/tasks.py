@@ -11,7 +11,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from asm_gym.extras import needed_for
-from asm_gym.registries import add, registry
+from asm_gym.registries import Registry
 from asm_gym.validation import check_choice, check_number, check_text
 
 ROBOTS = ("Panda", "Sawyer", "UR5e", "Kinova3", "IIWA", "Jaco")
@@ -83,7 +83,7 @@ TASKS = {
 """Every task by its name."""
 
 
-OWN: dict[str, EnvSpec] = registry("asm_gym.tasks:OWN", {})
+OWN: Registry[EnvSpec] = Registry("task", "asm_gym.tasks:OWN")
 """What ``register_task`` added, by name."""
 
 
@@ -116,7 +116,7 @@ def register_task(
         make, arguments = "asm_gym.envs.user_environment:OwnRobosuite", {"make": make} | arguments
     entry: Any = make
     spec = EnvSpec(f"asm_gym/{name}-v0", entry_point=entry, max_episode_steps=horizon, kwargs=arguments)
-    add("task", OWN, name, spec)
+    OWN.register(name, spec)
     gym.registry[spec.id] = spec
 
 

@@ -26,7 +26,7 @@ from asm_gym.policies.scripted.tool_hang import ToolHangExpert
 from asm_gym.policies.scripted.transport import TransportExpert
 from asm_gym.policies.scripted.two_arm_lift import TwoArmLiftExpert
 from asm_gym.policies.scripted.wipe import WipeExpert
-from asm_gym.registries import add, registry, target
+from asm_gym.registries import Registry, target
 from asm_gym.tasks import TaskSpec
 from asm_gym.validation import typed
 
@@ -49,7 +49,7 @@ POLICIES = ("scripted", "hold", "sway")
 """Names that ``make_policy`` knows, besides agents."""
 
 
-REGISTERED: dict[str, Callable[..., Policy]] = registry("asm_gym.policies.registry:REGISTERED", {})
+REGISTERED: Registry[Callable[..., Policy]] = Registry("policy", "asm_gym.policies.registry:REGISTERED")
 """Policies that ``register_policy`` added."""
 
 SHIPPED = Path(__file__).resolve().parent / "agents"
@@ -75,7 +75,7 @@ def register_policy(name: str, make: Callable[..., Policy] | str) -> None:
     """
     if name in (*POLICIES, *agents()):
         raise ValueError(f"there is a policy {name!r} already")
-    add("policy", REGISTERED, name, target(make))
+    REGISTERED.register(name, target(make))
 
 
 def agents() -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import numpy as np
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import action, actuator, body, object, sensor
 from asm_gym.faults.base import Fault
-from asm_gym.registries import add, registry, target
+from asm_gym.registries import Registry, target
 from asm_gym.validation import check_choice
 
 SEVERITIES = ("mild", "medium", "strong")
@@ -61,7 +61,8 @@ class Drawn(NamedTuple):
 
 Kind = Callable[[Drawn, int], Fault]
 
-KINDS: dict[str, Kind] = registry(
+KINDS: Registry[Kind] = Registry(
+    "kind of fault",
     "asm_gym.faults.suite:KINDS",
     {
         "push": lambda d, s: body.Push(
@@ -156,7 +157,7 @@ def register_fault(name: str, make: Kind | str) -> None:
         >>> from asm_gym.faults import Push
         >>> register_fault("nudge", lambda drawn, severity: Push(newtons=2.0 + severity, onset=drawn.onset))
     """
-    add("kind of fault", KINDS, name, target(make))
+    KINDS.register(name, target(make))
 
 
 def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
@@ -187,9 +188,9 @@ def suite_fault(kind: str, env: RobosuiteEnv, severity: str, onset: int, seed: i
     Raises:
         ValueError: an unknown kind or severity; the message lists what exists.
     """
-    check_choice("kind of fault", kind, KINDS)
+    make = KINDS.find(kind)
     check_choice("severity", severity, SEVERITIES)
-    return KINDS[kind](draw(env, onset, seed), SEVERITIES.index(severity))
+    return make(draw(env, onset, seed), SEVERITIES.index(severity))
 
 
 def harmless_variation(kind: str, env: RobosuiteEnv, onset: int, seed: int) -> Fault:

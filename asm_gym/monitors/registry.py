@@ -13,7 +13,7 @@ from asm_gym.monitors.estimators import adapted
 from asm_gym.monitors.monitor import CalibratedMonitor
 from asm_gym.monitors.monitor_file import restored
 from asm_gym.monitors.stream_model import parameter_names
-from asm_gym.registries import add, registry, target
+from asm_gym.registries import Registry, target
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, typed
 
@@ -116,7 +116,8 @@ PARTS = {
 }
 """Of the Neural ASM, each alone: for an ablation."""
 
-MONITORS: dict[str, MonitorKind] = registry(
+MONITORS: Registry[MonitorKind] = Registry(
+    "monitor",
     "asm_gym.monitors.registry:MONITORS",
     {
         "neural_asm": MonitorKind("asm_gym.monitors.neural_asm:NeuralASM"),
@@ -155,7 +156,7 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
     if not isinstance(model, str) and getattr(model, "kind", None) != name:
         raise ValueError(f"{model.__name__} is of the kind {getattr(model, 'kind', None)!r}, got the name {name!r}")
     row = MonitorKind(model, detection, detection)
-    add("monitor", MONITORS, name, row)
+    MONITORS.register(name, row)
     MONITORS[name + EVIDENCE] = row.under("evidence")
 
 
