@@ -1,14 +1,14 @@
-"""Completion: what a sense should say, from all other senses, the command and what went before.
+"""Completion: what a sense should say, from all other senses, the command and the row before.
 
     y_t = [v_t, v_{t-1}, u_t, p_t]      values now and before, the command, products of two slow values
-    C   = ⟨y_t y_tᵀ⟩                    learned by coincidence alone (Hebb): how often two things go together
-    v̂_M = C_MO (C_OO + λ)⁻¹ y_O         minimises the energy ½ yᵀ (C + λ)⁻¹ y over what is missing: precision 0
+    C   = ⟨y_t y_tᵀ⟩                    learned by coincidence alone (Hebb)
+    v̂_M = C_MO (C_OO + λ)⁻¹ y_O         minimises the energy ½ yᵀ (C + λ)⁻¹ y over the missing senses M: precision 0
 
-O is everything in which no missing sense takes part, so that any set of senses can be missing at once. Products make
-what is curved between senses, such as a joint's angle and where its hand is, linear enough.
+O is every entry in which no missing sense takes part, so that any set of senses can be missing at once. Products make
+curved relations, as between joint angles and the position of the hand, linear enough.
 
 Sources: Kohonen 1972 (IEEE Trans. Comput. 21(4)) for correlation matrix memories; Lauritzen 1996 for the conditionals
-of a Gaussian. The inverse is no local rule; C is.
+of a Gaussian. C is learned locally; the inverse is not local.
 """
 
 from __future__ import annotations
@@ -29,56 +29,41 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 PAIRED = 18
-"""So many of the slowest senses go into products, two at a time: an arm's joints and its hand."""
+"""Number of the slowest senses that go into products: an arm's joints and its hand."""
 
 PENALTY = 1e-4
 """λ, in units of the variance of a standardised number."""
 
 MOST_ENTRIES = 2048
-"""Of y: a stream of more is not completed, for C would outgrow the rest of the memory."""
+"""Largest length of y; wider streams are not completed, as C would outgrow the rest of the memory."""
 
 FARTHEST = 30.0
-"""Standardised numbers are cut off here, lest one broken sense that nobody knows of spoil all that is completed."""
+"""Standardised numbers are clipped to this, so that one broken sense does not spoil all completions."""
 
 ARRAYS = ("completion_products", "completion_covariance", "completion_centre", "completion_error")
 
 
 class Filling(NamedTuple):
-    """How missing senses are completed.
+    """How missing senses are completed."""
 
-    Attributes:
-        columns: (M,) of the stream.
-        weights: (M, Y) from y, centred.
-        error: (M,) standard deviation of what this leaves where nothing is wrong [unit of each].
-    """
-
-    columns: NDArray[np.intp]
-    weights: Floats
-    error: Floats
+    columns: NDArray[np.intp]  # (M,) of the stream
+    weights: Floats  # (M, Y) from centred y
+    error: Floats  # (M,) standard deviation of the error in nominal rows [unit of each]
 
 
 @dataclass(frozen=True, eq=False)
 class Completion:
-    """A correlation memory of a stream.
+    """A correlation memory of a stream."""
 
-    Args:
-        senses: how it reads a row.
-        products: (P, 2) which columns are multiplied.
-        covariance: (Y, Y) C, of centred y.
-        centre: (Y,) mean of y.
-        error: (D,) standard deviation of what is left of a column when its sensor is completed, in spreads; 1 for
-            actions.
-    """
-
-    senses: StreamScaler
-    products: NDArray[np.intp]
-    covariance: Floats
-    centre: Floats
-    error: Floats
+    senses: StreamScaler  # how it reads a row
+    products: NDArray[np.intp]  # (P, 2) columns that are multiplied
+    covariance: Floats  # (Y, Y) C of centred y
+    centre: Floats  # (Y,) mean of y
+    error: Floats  # (D,) standard deviation of a column's error when its sensor is completed, in spreads; 1 for actions
 
     @classmethod
     def fit(cls, senses: StreamScaler, streams: Sequence[NDArray[np.floating[Any]]]) -> Self | None:
-        """From training episodes (T, D) each; None where a stream is too wide."""
+        """Learn from training episodes (T, D); None for streams that are too wide."""
         spec, D = senses.spec, senses.spec.size
         slowest = senses.slow[np.argsort((senses.change / senses.spread)[senses.slow], kind="stable")][:PAIRED]
         first, second = np.triu_indices(len(slowest))
@@ -101,11 +86,7 @@ class Completion:
 
     @classmethod
     def found(cls, learned: Mapping[str, NDArray[Any]], senses: StreamScaler) -> Self | None:
-        """What ``named`` wrote; None where there was none.
-
-        Raises:
-            ValueError: something does not fit together.
-        """
+        """Restore what ``named`` returned; None where it is absent. Raises ValueError where it does not fit."""
         if not all(name in learned for name in ARRAYS):
             return None
         products, covariance, centre, error = (np.asarray(learned[name], np.float64) for name in ARRAYS)
@@ -120,7 +101,7 @@ class Completion:
         return cls(senses, products.astype(np.intp), covariance, centre, error)
 
     def named(self) -> dict[str, NDArray[Any]]:
-        """What it has learned, by name."""
+        """Return the arrays of a checkpoint."""
         arrays = self.products.astype(np.float32), self.covariance.astype(np.float32), self.centre, self.error
         return dict(zip(ARRAYS, arrays, strict=True))
 
@@ -130,11 +111,11 @@ class Completion:
 
     @cached_property
     def sensors(self) -> tuple[tuple[str, NDArray[np.intp]], ...]:
-        """What fails together, by name: the columns of each sensor."""
+        """Name and columns of each sensor."""
         return sensors_of(self.spec)
 
     def lift(self, stream: NDArray[np.floating[Any]]) -> Floats:
-        """(T, Y) y of the rows (T, D) of an episode, not centred; what is not finite counts as usual."""
+        """Return y (T, Y) of the rows (T, D) of an episode; numbers that are not finite count as their mean."""
         x = (np.asarray(stream, np.float64) - self.senses.mean) / self.senses.spread
         x = np.clip(np.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0), -FARTHEST, FARTHEST)
         sensory, motor = x[:, self.spec.sensory], x[:, self.spec.motor]
@@ -142,12 +123,12 @@ class Completion:
         return np.hstack([sensory, before, motor, x[:, self.products[:, 0]] * x[:, self.products[:, 1]]])
 
     def involved(self, missing: Mask) -> Mask:
-        """(Y,) the entries of y in which columns of ``missing`` (D,) take part."""
+        """Return the mask (Y,) of the entries of y in which columns of ``missing`` (D,) take part."""
         sensory = missing[self.spec.sensory]
         return np.concatenate([sensory, sensory, missing[self.spec.motor], missing[self.products].any(axis=1)])
 
     def filling(self, missing: Mask) -> Filling:
-        """What completes the senses of ``missing`` (D,), none of which takes part in it."""
+        """Return how to complete the senses of ``missing`` (D,) from all others."""
         known = ~self.involved(missing)
         wanted = np.flatnonzero(missing[self.spec.sensory])  # sensory entries come first in y
         C = self.covariance
@@ -156,24 +137,24 @@ class Completion:
         W[:, known] = np.linalg.solve(ridge, C[np.ix_(known, wanted)]).T
         left = C[wanted, wanted] - np.einsum("my,ym->m", W, C[:, wanted])
         columns = self.spec.sensory[wanted]
-        # Of a sensor that fails alone it is known how much is left; of several it follows from C.
+        # The error of one missing sensor was measured; that of several follows from C.
         error = np.sqrt(np.maximum(left, 0.0))
         return Filling(columns, W, np.maximum(error, self.error[columns]) * self.senses.spread[columns])
 
     def complete(self, filling: Filling, lifted: Floats) -> Floats:
-        """(T, M) what the missing senses should say in rows of y (T, Y) [unit of each]."""
+        """Return the completed senses (T, M) [unit of each] in rows of y (T, Y)."""
         scaler = self.senses
         return scaler.mean[filling.columns] + scaler.spread[filling.columns] * (
             self.centre[self._places(filling.columns)] + (lifted - self.centre) @ filling.weights.T
         )
 
     def _places(self, columns: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Where sensory columns stand in y."""
+        """Return the places of sensory columns in y."""
         return np.searchsorted(self.spec.sensory, columns)
 
     @cached_property
     def each_alone(self) -> Floats:
-        """(S, Y) the weights that complete each sensor alone, for all sensors; by one inverse."""
+        """Weights (S, Y) that complete each sensor alone; all from one inverse."""
         Y, sensory = len(self.covariance), self.spec.sensory
         P = np.linalg.inv(self.covariance + PENALTY * np.eye(Y))
         W = np.zeros((len(sensory), Y))
@@ -188,14 +169,17 @@ class Completion:
         return W
 
     def unexplained(self, lifted: Floats) -> Floats:
-        """(T, S) what of each sense its sensor's completion from all else leaves, in spreads, for y (T, Y)."""
+        """Return the error (T, S), in spreads, of completing each sense's sensor from all else, for y (T, Y)."""
         centred = lifted - self.centre
         return centred[:, : len(self.spec.sensory)] - along(centred, self.each_alone)
 
 
 def sensors_of(spec: StreamSpec) -> tuple[tuple[str, NDArray[np.intp]], ...]:
-    """What fails together, by name: a joint's position and velocity, the wrist's forces and torques, a mean and its
-    peak; else every number by itself."""
+    """Return name and columns of each sensor, whose numbers fail together.
+
+    These are a joint's position and velocity, the wrist's forces and torques, and a mean with its peak; every other
+    number is a sensor by itself.
+    """
     found: dict[str, list[int]] = {}
     for channel in spec.channels:
         start = spec.slices[channel.name].start
@@ -215,6 +199,6 @@ def sensors_of(spec: StreamSpec) -> tuple[tuple[str, NDArray[np.intp]], ...]:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """The arm's prefix, where there are two, and the rest."""
+    """Split the arm's prefix, which a stream of two arms has, from the rest."""
     head, _, tail = name.partition("_")
     return (f"{head}_", tail) if head.startswith("robot") and head[5:].isdigit() else ("", name)

@@ -1,23 +1,21 @@
-"""One energy over all that the memory expects: what surprise rises with, and what everything else descends.
+"""One energy over everything that the memory expects.
 
-    F(x, u, z) = [½ Π_z ‖z - μ‖² + ½ Π_x ‖ε‖²]/τ² + N log τ           time: the state, and what it says of the row
+    F(x, u, z) = [½ Π_z ‖z - μ‖² + ½ Π_x ‖ε‖²]/τ² + N log τ           time: the state, and its prediction of the row
                + Σ_i ½ (e_i/σ_i)² + log σ_i                           association: each group of senses from the rest
                + Σ_j ½ ((u_j - û_j)/τ_j)² + log τ_j                   motor association: the command that belongs here
 
     surprise      F rises where x is not what was expected
-    inference     z ← argmin F, at x and u as they are; the two other sums know nothing of z
-    completion    x_M ← argmin F over what is missing, and z with it
-    reaction      (x, u) ← argmin F over the command and the row that it will lead to, before either is there
+    inference     z ← argmin F at given x and u; the other two sums do not depend on z
+    completion    x_M ← argmin F over missing senses M, and z with it
+    reaction      (x, u) ← argmin F over the command and the row that it will lead to
     learning      ΔW ∝ -∂F/∂W of every synapse, in its own term
 
-ε, μ, e, σ and û are those of ``inference`` (or ``settling``), ``association`` and ``motor``. Π_z and Π_x are those that
-the network learned with, so that z settles where it does in use. τ, one for the network through time, and τ_j, one for
-each command, are the spreads that were left in healthy rows: with them the three sums are in the same unit, nats.
-
-A rule of ``association`` bounds e/σ, which is the slope of Huber's ρ in place of ½r²; to the bound they are the same.
+ε and μ are those of ``inference`` or ``settling``, e and σ of ``association``, û of ``motor``. The free parameters are τ,
+one for the temporal network, and τ_j, one for each command: the spreads left in healthy rows. With them the sums have
+one unit, nats. Learning of association bounds e/σ, the slope of Huber's ρ in place of ½r²; within the bound they agree.
 
 Sources: Friston 2005 (Phil. Trans. R. Soc. B) for the sum and its precisions; Millidge et al. 2024 for the part through
-time; Adams, Shipp and Friston 2013 (Brain Struct. Funct.) for actions that descend the energy of what they make felt.
+time; Adams, Shipp and Friston 2013 (Brain Struct. Funct.) for actions that descend the energy of their outcome.
 """
 
 from __future__ import annotations
@@ -40,14 +38,14 @@ from asm_gym.scaling import FARTHEST, StreamScaler
 Floats = NDArray[np.float64]
 
 STEPS = 200
-"""Steps of L-BFGS in which a row comes to rest, at most."""
+"""Largest number of L-BFGS steps for a row."""
 
 SMALLEST_SPREAD = 1e-3
 """Of τ."""
 
 
 class Terms(NamedTuple):
-    """What each part adds to F [nats]."""
+    """The parts of F [nats]."""
 
     time: float
     association: float
@@ -60,40 +58,40 @@ class Terms(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """Where F rises."""
+    """The gradient of F."""
 
-    row: Floats  # (D,) ∂F/∂(x, u), for each standard deviation of a number
+    row: Floats  # (D,) by (x, u), for each standard deviation of a number
     z: Floats  # (H,)
 
 
 class Before(NamedTuple):
-    """All that was there before a row."""
+    """What is known before a row."""
 
-    c: NDArray[np.float32]  # (1, I) what the network through time carries on
+    c: NDArray[np.float32]  # (1, I) the carried state of the temporal network
     before: Floats  # (1, D) the row l rows before
-    earlier: Floats  # (1, D) as long before that
-    last: Floats  # (1, D) the row before it
-
-
-Carried = tuple[Floats, ...]
-"""What the network through time makes of c: μ and its part of what is expected by traces, W_H f(c) by settling."""
+    earlier: Floats  # (1, D) the row 2 l rows before
+    last: Floats  # (1, D) the last row
 
 
 class _Given(NamedTuple):
-    """What of F follows from what was there before a row, whatever the row is."""
+    """What follows from ``Before``, whatever the row is."""
 
     moment: Before
-    carried: Carried
-    command: Floats  # (A,) the one that the motor association expects, in spreads of the stream
+    carried: tuple[Floats, ...]  # by traces μ and W_D's part of c; by settling W_H f(c)
+    command: Floats  # (A,) û, in spreads of the stream
 
 
 class _Read(NamedTuple):
-    """A row as the memory reads it."""
+    """A row as the memory reads it, in double precision."""
 
     x: Floats  # (S,)
     u: Floats  # (A + 1,)
     inputs: Floats  # (I,) of association
     changes: Floats  # (X,)
+
+
+Through = tuple[float, Floats, Floats, Floats]
+"""The sum through time, and its gradients by x (S,), u (A,) and z (H,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +101,8 @@ class FreeEnergy:
     Args:
         network: its synapses through time and between senses.
         senses: how it reads a row.
-        motor: its motor association; None where it has none, and the third sum is not there.
-        tau: τ, of the network through time.
+        motor: its motor association; without one the third sum is 0.
+        tau: τ of the temporal network.
         tau_motor: (A,) τ_j, in spreads of a command.
     """
 
@@ -122,15 +120,13 @@ class FreeEnergy:
         motor: Motor | None,
         streams: Sequence[NDArray[np.floating[Any]]],
     ) -> Self:
-        """With the spreads that healthy ``streams`` (T, D) leave."""
+        """Return F with τ and τ_j from healthy ``streams`` (T, D). Raises ValueError where they are too short."""
         raw = cls(network, senses, motor, 1.0, np.ones(len(senses.spec.motor)))
         time, commands, rows = 0.0, np.zeros(len(senses.spec.motor)), 0
         for stream in streams:
             for moment, row in raw.moments(stream):
-                z = raw.inferred(moment, row)
-                time += raw.terms(moment, row, z).time
-                given = raw._given(moment)
-                commands += raw._unexpected(given, raw._read(moment, row).u[:-1]) ** 2
+                time += raw.terms(moment, row, raw.inferred(moment, row)).time
+                commands += raw._unexpected(raw._given(moment), raw._read(moment, row).u[:-1]) ** 2
                 rows += 1
         if not rows:
             raise ValueError("no healthy row is long enough to learn the spreads of")
@@ -138,7 +134,7 @@ class FreeEnergy:
         return replace(raw, tau=tau, tau_motor=np.maximum(np.sqrt(commands / rows), SMALLEST_SPREAD))
 
     def moments(self, stream: NDArray[np.floating[Any]]) -> list[tuple[Before, Floats]]:
-        """Each row (D,) of an episode (T, D) from the ``2 lag``-th on, and what was there before it."""
+        """Return each row (D,) of an episode (T, D) from the ``2 lag``-th on, with what is known before it."""
         rows, lag = np.asarray(stream, np.float64), self.senses.lag
         c, found = self.network.at_rest(1), []
         for t in range(len(rows)):
@@ -149,25 +145,32 @@ class FreeEnergy:
         return found
 
     def inferred(self, moment: Before, row: Floats) -> Floats:
-        """z (H,), the state that the network through time infers from a row (D,)."""
+        """Return the state z (H,) that the temporal network infers from a row (D,)."""
         read = self.senses.read(row[None], moment.before, moment.earlier)
         z: Floats = self.network.follow(moment.c, read.commands, read.senses, read.seen).z[0].astype(np.float64)
         return z
 
+    def after(self, moment: Before, row: Floats, turn: bool = True) -> NDArray[np.float32]:
+        """Return c (1, I) after a row (D,); unchanged unless it is an l-th row (``turn``)."""
+        if not turn:
+            return moment.c
+        read = self.senses.read(row[None], moment.before, moment.earlier)
+        return self.network.carry_on(moment.c, read.commands, read.senses, read.seen)[1]
+
     def terms(self, moment: Before, row: Floats, z: Floats) -> Terms:
-        """F of a row (D,) and a state (H,), by its parts."""
+        """Return the parts of F for a row (D,) and a state (H,)."""
         return self._of(self._given(moment), row, z)[0]
 
     def slope(self, moment: Before, row: Floats, z: Floats) -> Slope:
-        """∂F of a row (D,) and a state (H,)."""
+        """Return the gradient of F for a row (D,) and a state (H,)."""
         return self._of(self._given(moment), row, z)[1]
 
     def settled(self, moment: Before, row: Floats, free: NDArray[np.bool_]) -> tuple[Floats, Terms]:
-        """The row (D,) in which F is lowest over its ``free`` (D,) numbers and the state; and F there.
+        """Return the row (D,) of lowest F over its ``free`` (D,) numbers and the state, and F there.
 
-        What is free should begin near what is likely, for F has other valleys: see ``expected``.
+        F has several valleys: ``free`` numbers should begin near likely values, such as those of ``expected``.
         """
-        from scipy.optimize import minimize  # a third of a second, that nobody else should wait for
+        from scipy.optimize import minimize  # takes a third of a second to import
 
         spread, count = self.senses.spread, int(free.sum())
         start, given = np.concatenate([np.zeros(count), self.inferred(moment, row)]), self._given(moment)
@@ -184,18 +187,22 @@ class FreeEnergy:
         return settled, self._of(given, settled, found.x[count:])[0]
 
     def reaction(self, moment: Before) -> Floats:
-        """(A,) the command that lets F be lowest over itself and the row that it leads to.
-
-        Nothing of the row is there yet: what the network through time expects of it is what it is drawn to.
-        """
+        """Return the command (A,) of lowest F over itself and the row that it leads to."""
         guess = moment.last[0].copy()
         guess[self.senses.spec.motor] = self.expected(moment)
         settled, _ = self.settled(moment, guess, np.ones(len(guess), np.bool_))
         return settled[self.senses.spec.motor]
 
+    def expected(self, moment: Before) -> Floats:
+        """Return the command (A,) of the motor association; without one that of the last row."""
+        known = moment.last[0, self.senses.spec.motor]
+        if self.motor is not None:
+            known = self.motor.command(situation(self.senses, moment.last))[0]
+        return np.asarray(known, np.float64)
+
     @cached_property
     def _weights(self) -> tuple[Any, Association]:
-        """All synapses in double precision, for differences of F are small."""
+        """All synapses in double precision, as differences of F are small."""
         w, association = self.network.weights, self.network.association
         return type(w)(*(np.asarray(W, np.float64) for W in w)), Association(
             *(np.asarray(W, np.float64) for W in association)
@@ -203,25 +210,11 @@ class FreeEnergy:
 
     @property
     def _numbers(self) -> int:
-        """N, that the network through time expects."""
+        """N, the numbers that the temporal network predicts."""
         return self.senses.size + len(self.senses.spec.motor)
 
-    def expected(self, moment: Before) -> Floats:
-        """(A,) the command that the motor association expects; that of the row before where there is none."""
-        known = moment.last[0, self.senses.spec.motor]
-        if self.motor is not None:
-            known = self.motor.command(situation(self.senses, moment.last))[0]
-        return np.asarray(known, np.float64)
-
-    def after(self, moment: Before, row: Floats, turn: bool = True) -> NDArray[np.float32]:
-        """c (1, I) after a row (D,); as it was where it is not the row's ``turn``, for every l-th is taken up."""
-        if not turn:
-            return moment.c
-        read = self.senses.read(row[None], moment.before, moment.earlier)
-        return self.network.carry_on(moment.c, read.commands, read.senses, read.seen)[1]
-
     def _read(self, moment: Before, row: Floats) -> _Read:
-        """What ``StreamScaler.read`` does, unrounded: L-BFGS sees the last digits of single precision as valleys."""
+        """Read a row as ``StreamScaler.read`` does, unrounded: L-BFGS takes rounding for valleys."""
         senses, spec, before = self.senses, self.senses.spec, moment.before[0]
         value, moved = (row - senses.mean) / senses.spread, (row - before) / senses.change
         x = np.concatenate([value[spec.sensory], moved[senses.slow]])
@@ -233,32 +226,30 @@ class FreeEnergy:
     def _given(self, moment: Before) -> _Given:
         senses, motor, (w, _) = self.senses, self.senses.spec.motor, self._weights
         c = moment.c[0].astype(np.float64)
-        if isinstance(w, SettlingWeights):
-            carried: Carried = (w.W_H @ np.tanh(c),)
-        else:
-            carried = w.W_C @ c, w.W_D[:, : len(c)] @ c
+        settling = isinstance(w, SettlingWeights)
+        carried = (w.W_H @ np.tanh(c),) if settling else (w.W_C @ c, w.W_D[:, : len(c)] @ c)
         return _Given(moment, carried, (self.expected(moment) - senses.mean[motor]) / senses.spread[motor])
 
     def _unexpected(self, given: _Given, u: Floats) -> Floats:
-        """u - û (A,) in spreads of the stream; 0 where there is no motor association."""
+        """Return u - û (A,) in spreads of the stream; 0 without a motor association."""
         return np.zeros(len(u)) if self.motor is None else u - given.command
 
     def _of(self, given: _Given, row: Floats, z: Floats) -> tuple[Terms, Slope]:
         senses, spec, (w, association) = self.senses, self.senses.spec, self._weights
         x, u, a, changes = self._read(given.moment, row)
-        how = float(self.network.prior_precision), float(self.network.sensory_precision)
+        precisions = float(self.network.prior_precision), float(self.network.sensory_precision)
         through = _by_settling if isinstance(w, SettlingWeights) else _by_traces
-        raw, of_x, of_u, of_z = through(w, given.carried, u, x, z, *how)
+        raw, of_x, of_u, of_z = through(w, given.carried, u, x, z, *precisions)
         time, scale = raw / self.tau**2 + self._numbers * np.log(self.tau), 1.0 / self.tau**2
         between, of_a, of_changes = _between(association, a, changes)
         off = self._unexpected(given, u[:-1])
         motor = float(np.sum(0.5 * (off / self.tau_motor) ** 2 + np.log(self.tau_motor))) if self.motor else 0.0
         D, X, L, A = len(row), len(spec.sensory), len(senses.slow), len(spec.motor)
         slope = np.zeros(D)
-        by_change = senses.spread / senses.change  # of a number that moves by one spread, in spreads of its change
-        believed = (np.abs(changes) < FARTHEST) * 1.0
+        by_change = senses.spread / senses.change  # spreads of a change for each spread of the number
+        within = (np.abs(changes) < FARTHEST) * 1.0
         slope[spec.sensory] += scale * of_x[:X]
-        slope[spec.sensory] += by_change[spec.sensory] * (of_changes + believed * of_a[D : D + X])
+        slope[spec.sensory] += by_change[spec.sensory] * (of_changes + within * of_a[D : D + X])
         slope[senses.slow] += scale * by_change[senses.slow] * of_x[X:]
         slope[spec.motor] += scale * of_u + of_a[D + X + L : D + X + L + A]
         if self.motor is not None:
@@ -267,26 +258,24 @@ class FreeEnergy:
 
 
 def _between(association: Association, a: Floats, changes: Floats) -> tuple[float, Floats, Floats]:
-    """Σ ½(e/σ)² + log σ for inputs (I,) and changes (X,), and how it rises with either."""
+    """Return Σ ½(e/σ)² + log σ for inputs (I,) and changes (X,), and its gradients by both."""
     V, U, D, W_S, b_S, span, s = association
     f = np.tanh(V @ a)
-    asked = W_S @ f + b_S
-    log_variance = np.clip(asked, span[0], span[1])
+    raw = W_S @ f + b_S
+    log_variance = np.clip(raw, span[0], span[1])
     e = (changes - D @ a - U @ f) / s
-    judged = e**2 * np.exp(-log_variance)
+    squares = e**2 * np.exp(-log_variance)
     of_changes = e * np.exp(-log_variance) / s
-    of_variance = np.where((asked > span[0]) & (asked < span[1]), 0.5 * (1.0 - judged), 0.0)
+    of_variance = np.where((raw > span[0]) & (raw < span[1]), 0.5 * (1.0 - squares), 0.0)
     of_f = W_S.T @ of_variance - U.T @ of_changes
     of_a = V.T @ ((1.0 - f**2) * of_f) - D.T @ of_changes
-    return float(np.sum(0.5 * judged + 0.5 * log_variance)), of_a, of_changes
+    return float(np.sum(0.5 * squares + 0.5 * log_variance)), of_a, of_changes
 
 
-Through = tuple[float, Floats, Floats, Floats]
-"""The sum through time, and how it rises with x (S,), u (A,) and z (H,)."""
-
-
-def _by_traces(w: Weights, carried: Carried, u: Floats, x: Floats, z: Floats, pi_z: float, pi_x: float) -> Through:
-    """½ Π_z ‖z - μ‖² + ½ Π_x ‖[x, u] - W_F f(z) - W_D [c, u, 1]‖²; carried are μ = W_C c, and what W_D makes of c."""
+def _by_traces(
+    w: Weights, carried: tuple[Floats, ...], u: Floats, x: Floats, z: Floats, pi_z: float, pi_x: float
+) -> Through:
+    """Return ½ Π_z ‖z - μ‖² + ½ Π_x ‖[x, u] - W_F f(z) - W_D [c, u, 1]‖², with its gradients."""
     mu, past = carried
     W_F, of_action = w.W_F, w.W_D[:, -len(u) :]
     f, off, S = np.tanh(z), z - mu, len(x)
@@ -297,9 +286,9 @@ def _by_traces(w: Weights, carried: Carried, u: Floats, x: Floats, z: Floats, pi
 
 
 def _by_settling(
-    w: SettlingWeights, carried: Carried, u: Floats, x: Floats, z: Floats, pi_z: float, pi_x: float
+    w: SettlingWeights, carried: tuple[Floats, ...], u: Floats, x: Floats, z: Floats, pi_z: float, pi_x: float
 ) -> Through:
-    """½ Π_z ‖z - μ‖² + ½ Π_x ‖x - W_F f(z) - b_F‖² + ½ ‖u - W_A f(h)‖²; carried is W_H f(c)."""
+    """Return ½ Π_z ‖z - μ‖² + ½ Π_x ‖x - W_F f(z) - b_F‖² + ½ ‖u - W_A f(h)‖², with its gradients."""
     _, W_U, W_F, b_F, W_A = w
     known, f = carried[0], np.tanh(z)
     off, error = z - known - W_U @ u, x - b_F - W_F @ f

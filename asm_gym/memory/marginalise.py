@@ -1,14 +1,13 @@
-"""A memory of fewer senses: those that are left stand in for those that are missing.
+"""A memory of fewer senses: the senses that are left stand in for those that are missing.
 
-    C = E[a aᵀ]                                  what the inputs a had in common in nominal episodes; it is kept
-    a ≈ T a',   T = C_·k (C_kk + λ I)⁻¹          a': the inputs that are left, k where they stand among a; T a'_k = a'_k
-    W a ≈ (W T) a'                               a synapse from a missing sense moves to those that tell of it
-    s'² = s² + diag(Q C Qᵀ) / σ̄²                 Q = W - W T at k: what they leave open is a wider expectation
-    E' = (s E s + Q C Qᵀ / σ̄²) / (s' s')         and goes through all errors alike, which are whitened anew
+    C = E[a aᵀ]                                  second moments of the inputs a of association in nominal episodes
+    a ≈ T a',   T = C_·k (C_kk + λ I)⁻¹          a': the inputs that are left, k their places in a; T a'_k = a'_k
+    W a ≈ (W T) a'                               a synapse from a missing sense moves to those that predict it
+    s'² = s² + diag(Q C Qᵀ) / σ̄²                 Q = W - W T at k: the unknown rest widens the expected error
+    E' = (s E s + Q C Qᵀ / σ̄²) / (s' s')         and enters the covariance of the errors, which are whitened anew
 
-The memory that comes out has no place for what is missing, and costs less. T is exact where inputs are Gaussian: for
-the linear part by the law of total expectation, for hidden units as far as they are not bent. T of a group of senses
-leaves out its own changes, as its synapses do. No row is needed, and none is remembered.
+T is exact for Gaussian inputs: for the linear part by the law of total expectation, for hidden units to first order.
+T of a group of senses leaves out its own changes, as its synapses do. No recorded row is needed.
 
 Source: Anderson 2003 (An Introduction to Multivariate Statistical Analysis, ch. 2) for conditionals of a Gaussian.
 """
@@ -40,39 +39,40 @@ MOST_INPUTS = 2048
 """C of these takes 16 MiB in a file; a memory of more inputs keeps none."""
 
 ONE = ("one", 0)
+"""Name of the constant input."""
 
 
 def moments(inputs: Array) -> NDArray[np.float32]:
-    """C (I, I) of rows (N, I)."""
+    """Return C (I, I) of rows (N, I)."""
     exact = np.asarray(inputs, np.float64)
     return (gram(exact) / len(exact)).astype(np.float32)
 
 
 def association_inputs(senses: StreamScaler, columns: Columns | None = None) -> list[Hashable]:
-    """What each input of association is: a kind, and a column of the stream.
+    """Return the name of each input of association: a kind, and a column of the stream.
 
     Args:
-        columns: under which number each column of the stream goes; its own by default.
+        senses: how rows are read.
+        columns: (D,) number under which each column of the stream goes; its own by default.
     """
-    name = np.arange(senses.spec.size) if columns is None else columns
-    kinds = (
-        ("before", range(senses.spec.size)),
-        ("change", senses.spec.sensory),
-        ("slow", senses.slow),
-        ("command", senses.spec.motor),
-    )
-    return [*((kind, int(name[i])) for kind, own in kinds for i in own), ONE]
+    every, spec = range(senses.spec.size), senses.spec
+    kinds = ("before", every), ("change", spec.sensory), ("slow", senses.slow), ("command", spec.motor)
+    return _named(kinds, np.arange(spec.size) if columns is None else columns)
 
 
 def traced_inputs(senses: StreamScaler, columns: Columns | None = None) -> list[Hashable]:
-    """What each number of a row of traces is, among the inputs of association: of the row before, so that C knows."""
-    name = np.arange(senses.spec.size) if columns is None else columns
-    kinds = (("before", senses.spec.sensory), ("slow", senses.slow), ("before", senses.spec.motor))
-    return [*((kind, int(name[i])) for kind, own in kinds for i in own), ONE]
+    """Return the same for a row of traces, by the inputs of the row after it, which C knows."""
+    spec = senses.spec
+    kinds = ("before", spec.sensory), ("slow", senses.slow), ("before", spec.motor)
+    return _named(kinds, np.arange(spec.size) if columns is None else columns)
+
+
+def _named(kinds: Sequence[tuple[str, Sequence[int] | Columns | range]], columns: Columns) -> list[Hashable]:
+    return [*((kind, int(columns[i])) for kind, own in kinds for i in own), ONE]
 
 
 def stand_in(C: Floats, old: Sequence[Hashable], new: Sequence[Hashable], without: frozenset[Hashable]) -> Floats:
-    """T (N, N'): each of N old inputs as a sum of N' new ones; 0 from those that are ``without`` use or unknown."""
+    """Return T (N, N'): each of N old inputs as a sum of N' new ones; 0 for new ones in ``without`` or unknown."""
     at = {name: n for n, name in enumerate(old)}
     pairs = [(at[name], n) for n, name in enumerate(new) if name in at and name not in without]
     kept, place = np.array(pairs, np.intp).T
@@ -85,9 +85,10 @@ def stand_in(C: Floats, old: Sequence[Hashable], new: Sequence[Hashable], withou
 
 
 class Kept(NamedTuple):
-    """What is left of association, and what its errors were and are to each other.
+    """The smaller association, and how its errors change.
 
     Attributes:
+        association: of the senses that are left.
         left: (X',) which errors are left.
         widened: (X', X') Q C Qᵀ / σ̄² s².
         narrower: (X',) s/s'.
@@ -100,12 +101,13 @@ class Kept(NamedTuple):
 
 
 def fewer_changes(memory: Association, C: Array, old: StreamScaler, new: StreamScaler, columns: Columns) -> Kept:
-    """Association of the senses that are left.
+    """Return association of the senses that are left.
 
     Args:
         memory: of the ``old`` senses.
-        C: (I, I) as ``moments`` found it.
-        columns: (D',) where each number of the new stream stands in the old one; -1 for commands it does not know.
+        C: (I, I) of ``moments``.
+        old, new: how rows were and are read.
+        columns: (D',) place of each number of the new stream in the old one; -1 for unknown commands.
     """
     exact = np.asarray(C, np.float64)
     before, after = association_inputs(old), association_inputs(new, columns)
@@ -115,11 +117,12 @@ def fewer_changes(memory: Association, C: Array, old: StreamScaler, new: StreamS
     variance = log_variance(at_mean, memory.W_S, memory.b_S, memory.span_S)[0]  # (X,)
     spread = memory.remainder * np.exp(0.5 * variance)  # (X,) s σ̄
     through = memory.D + (memory.U * (1.0 - at_mean**2)) @ memory.V  # (X, I) Δ̂ to first order
-    unit_group = _unit_groups(memory, old)
+    groups = int(old.groups.max()) + 1
+    unit_group = np.repeat(np.arange(groups), len(memory.V) // groups)
     known = np.array([before.index(name) if name in before else -1 for name in after])
     V, D = np.zeros((len(memory.V), len(after))), np.zeros((len(left), len(after)))
     Q = through[left].astype(np.float64)
-    for g in range(int(old.groups.max()) + 1):
+    for g in range(groups):
         own = frozenset(("change", sensory[i]) for i in np.flatnonzero(old.groups == g))
         T = stand_in(exact, before, after, own)
         units, rows = unit_group == g, np.flatnonzero(old.groups[left] == g)
@@ -134,7 +137,7 @@ def fewer_changes(memory: Association, C: Array, old: StreamScaler, new: StreamS
 
 
 def fewer_traces(memory: Weights, C: Array, old: StreamScaler, new: StreamScaler, columns: Columns) -> Weights:
-    """The synapses through time of the senses that are left; arguments as in ``fewer_changes``."""
+    """Return the synapses by traces of the senses that are left; arguments as in ``fewer_changes``."""
     exact = np.asarray(C, np.float64)
     everything, before, after = association_inputs(old), traced_inputs(old), traced_inputs(new, columns)
     places = [everything.index(name) for name in before]
@@ -155,10 +158,10 @@ def fewer_traces(memory: Weights, C: Array, old: StreamScaler, new: StreamScaler
 
 
 def fewer_settled(memory: SettlingWeights, old: StreamScaler, new: StreamScaler, columns: Columns) -> SettlingWeights:
-    """The synapses of a state that settles, of the senses that are left; arguments as in ``fewer_changes``.
+    """Return the synapses of a settling network of the senses that are left; arguments as in ``fewer_changes``.
 
-    A sense that is never seen has no precision, so that it has no term in the energy: its synapses are not needed, and
-    nothing stands in for it. A command that is not known is at its mean.
+    A missing sense has no precision and no term in the energy, so nothing needs to stand in for it. An unknown command
+    is at its mean.
     """
     before, after = traced_inputs(old), traced_inputs(new, columns)
     S, A = len(after) - 1 - len(new.spec.motor), len(old.spec.motor)
@@ -170,8 +173,3 @@ def fewer_settled(memory: SettlingWeights, old: StreamScaler, new: StreamScaler,
     W_A = np.where(known[:-1, None], memory.W_A[place[:-1]], 0.0)
     found = memory.W_H, W_U, memory.W_F[senses], memory.b_F[senses], W_A
     return SettlingWeights(*(np.ascontiguousarray(a, np.float32) for a in found))
-
-
-def _unit_groups(memory: Association, senses: StreamScaler) -> NDArray[np.intp]:
-    groups = int(senses.groups.max()) + 1
-    return np.repeat(np.arange(groups), len(memory.V) // groups)
