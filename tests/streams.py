@@ -82,3 +82,18 @@ def pendulum_columns(rows: int = 6000, rate: float = 100.0, seed: int = 0) -> di
         "velocity": dq + 1e-3 * rng.normal(size=q.shape),
         "effort": effort + 0.05 * rng.normal(size=q.shape),
     }
+
+
+EVENTFUL_ARM = StreamSpec(
+    (
+        Channel("joint_position", 2, "rad", 2e-4, "joint", stops=((-1.0, 1.0), (-2.0, 2.0))),
+        Channel("wrist_force", 3, "N", 0.2, "wrench"),
+        Channel("wrist_force_peak", 3, "N", 0.4, "wrench"),
+        Channel("gripper_velocity", 2, "m/s", 0.002, "gripper"),
+    ),
+    dt=0.05,
+)
+"""An arm that knows its stops, forces at its wrist and the speed of its fingers."""
+
+UNEVENTFUL = np.array([0.2, 1.5, 60.0, 0, 0, 10.0, 0, 0, 0, 0])
+"""A row of it without an event; where a peak is sensed, the mean tells no knock."""

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from asm_gym import Episode, NeuralASM
-from asm_gym.detection.detector import EvidenceDetection
 from asm_gym.detection.events import EXCUSED, Excuses
+from asm_gym.detection.evidence_detection import EvidenceDetection
 from asm_gym.detection.tails import FEWEST_EPISODES, HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX
 from asm_gym.episode import EpisodeLabel
 from asm_gym.monitors import make_monitor
@@ -17,8 +17,7 @@ from asm_gym.monitors.ceilings import worst_of
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.rollouts.pretraining.healthy import FOR_CEILINGS, for_threshold
 from tests.memories import SMALL, sine_memory
-from tests.streams import sine_episodes, sine_spec
-from tests.test_events import ARM, CALM
+from tests.streams import EVENTFUL_ARM, UNEVENTFUL, sine_episodes, sine_spec
 
 
 @pytest.fixture
@@ -100,11 +99,11 @@ def test_what_ceilings_are_of_is_not_calibrated_on_by_the_hour(asm):
 
 
 def test_rows_that_the_senses_excuse_tell_little():
-    quiet = Excuses(ARM).divisors(np.tile(CALM, (5, 1)))
+    quiet = Excuses(EVENTFUL_ARM).divisors(np.tile(UNEVENTFUL, (5, 1)))
     np.testing.assert_array_equal(quiet, 1.0)
-    knocked = np.tile(CALM, (5, 1))
+    knocked = np.tile(UNEVENTFUL, (5, 1))
     knocked[2, 6] = 60.0
-    np.testing.assert_array_equal(Excuses(ARM).divisors(knocked), [1, 1, EXCUSED, EXCUSED, EXCUSED])
+    np.testing.assert_array_equal(Excuses(EVENTFUL_ARM).divisors(knocked), [1, 1, EXCUSED, EXCUSED, EXCUSED])
 
 
 def test_bad_input_is_named(asm):

@@ -1,125 +1,123 @@
-"""Whitening, accumulation and conformal thresholds against closed forms and Monte Carlo."""
+"""Whitening, evidence, calibration, adaptive thresholds and repetitions, against closed forms and Monte Carlo."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from asm_gym.detection import (
+    AdaptiveThreshold,
+    Blocks,
     Detector,
+    Evidence,
     ModelOutput,
-    accumulate,
+    Promise,
     accumulated,
+    alarms_in,
     bounded,
     conformal_episodes,
     conformal_threshold,
+    hourly_promise,
+    hourly_threshold,
     no_evidence,
     pool,
     strength,
     whitening,
     worst_case,
 )
-from asm_gym.detection.habituation import STEPS_PER_NUMBER, USUAL, Habituation, habituate, usual, usual_levels
+from asm_gym.detection.evidence import CONTEXT_GAIN
+from asm_gym.detection.habituation import STEPS_PER_NUMBER, USUAL, Habituation, habituate, usual_levels
+from asm_gym.detection.hourly import MINUTE
+from asm_gym.detection.repetition import (
+    MOST_BEYOND,
+    REPETITION_OFFSET,
+    STUCK,
+    Repetition,
+    count_repetitions,
+    evidence_steps,
+    improbability,
+    repeated,
+    unrepeated,
+)
 from asm_gym.detection.tails import TAIL_INDEX
+from asm_gym.monitors import NeuralASM
+from tests.streams import frozen, sine_episodes, sine_spec
 
 
-def correlated(rng: np.random.Generator, n: int = 4000, size: int = 5) -> np.ndarray:
+def accumulate(evidence, whitened, context, gains):
+    """The equation of ``evidence``, the oracle of ``accumulated`` and of the compiled step."""
+    vector = evidence.vector + gains[:, None] * (whitened[:, None, :] - evidence.vector)
+    return Evidence(vector, evidence.context + CONTEXT_GAIN * (context - evidence.context), evidence.steps + 1)
+
+
+def usual(found, context):
+    """log ŝ (N,) in contexts (N, C), the oracle of the compiled step."""
+    return np.clip(context @ found.weights[:-1] + found.weights[-1], *found.span)
+
+
+def correlated(seed: int, n: int = 4000, size: int = 5) -> np.ndarray:
+    rng = np.random.default_rng(seed)
     return rng.normal(size=(n, size)) @ rng.normal(size=(size, size))
 
 
-def test_whitened_errors_have_the_identity_as_covariance():
-    errors = correlated(np.random.default_rng(0))
-    white = errors @ whitening(errors, shrinkage=0.0)
-    np.testing.assert_allclose(white.T @ white / len(white), np.eye(5), atol=1e-9)
-
-
-def test_whitening_is_symmetric_and_positive():
-    M = whitening(correlated(np.random.default_rng(1)))
+def test_whitened_errors_have_the_identity_as_covariance_by_a_symmetric_matrix():
+    errors = correlated(0)
+    M = whitening(errors, shrinkage=0.0)
+    np.testing.assert_allclose((errors @ M).T @ (errors @ M) / len(errors), np.eye(5), atol=1e-9)
     np.testing.assert_allclose(M, M.T, atol=1e-12)
     assert np.linalg.eigvalsh(M)[0] > 0
+    independent = np.array([[2.0, 0.0], [-2.0, 0.0], [0.0, 0.5], [0.0, -0.5]]) * np.sqrt(2)
+    np.testing.assert_allclose(whitening(independent, 0.0), [[0.5, 0], [0, 2]], atol=1e-12)
 
 
-def test_whitening_of_independent_channels_only_scales_them():
-    errors = np.array([[2.0, 0.0], [-2.0, 0.0], [0.0, 0.5], [0.0, -0.5]]) * np.sqrt(2)
-    np.testing.assert_allclose(whitening(errors, 0.0), [[0.5, 0], [0, 2]], atol=1e-12)
-
-
-def test_full_shrinkage_only_divides_by_the_mean_spread():
-    errors = np.array([[2.0, 0.0], [-2.0, 0.0], [0.0, 0.0], [0.0, 0.0]])  # variances 2 and 0
-    np.testing.assert_allclose(whitening(errors, 1.0), np.eye(2), atol=1e-12)
-
-
-def test_shrinkage_bounds_what_duplicated_and_constant_channels_are_blown_up_by():
-    errors = correlated(np.random.default_rng(2))
+def test_shrinkage_bounds_the_gain_of_duplicated_and_constant_channels():
+    errors = correlated(2)
     errors = np.column_stack([errors, errors[:, 0], np.zeros(len(errors))])
     scale = np.trace(errors.T @ errors / len(errors)) / errors.shape[1]
     assert np.linalg.norm(whitening(errors, 0.01), 2) <= 1 / np.sqrt(0.01 * scale) + 1e-9
-    assert np.array_equal(whitening(np.zeros((9, 3)), 0.5) > 0, np.eye(3) > 0)
+    for shrinkage in (-0.1, 1.1, np.nan):
+        with pytest.raises(ValueError, match="shrinkage must be in"):
+            whitening(np.eye(3), shrinkage)
 
 
-@pytest.mark.parametrize("shrinkage", [-0.1, 1.1, np.nan])
-def test_shrinkage_outside_the_unit_interval_is_refused(shrinkage):
-    with pytest.raises(ValueError, match="shrinkage must be in"):
-        whitening(np.eye(3), shrinkage)
+@given(st.floats(-1e9, 1e9), st.floats(1.0, 100.0))
+def test_no_error_exceeds_the_bound_and_small_ones_count_in_full(size, bound):
+    small = 1e-6 * size / (1 + abs(size))
+    pulled = bounded(np.array([[size, small]]), bound)
+    assert abs(pulled[0, 0]) <= bound * (1 + 1e-12)
+    assert np.sign(pulled[0, 0]) == np.sign(size)
+    np.testing.assert_allclose(pulled[0, 1], small, rtol=1e-9)
 
 
-def test_evidence_of_white_noise_has_mean_one_from_the_first_step_on():
+def test_evidence_of_white_noise_has_mean_one_from_the_first_row_on():
     rng, streams, size, gains = np.random.default_rng(0), 4000, 3, np.array([0.2, 0.05, 1.0])
     evidence = no_evidence(streams, 3, size)
     for _ in range(12):
         evidence = accumulate(evidence, rng.normal(size=(streams, size)), np.zeros((streams, 0)), gains)
-        # variance of a chi-square over its 3 degrees of freedom is 2/3
         for value in strength(evidence, gains).mean(axis=2).T:
             assert value.mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / size / streams))
 
 
-def test_evidence_is_the_hand_computed_moving_average():
-    half, first = np.array([0.5]), no_evidence(1, 1, 2, context=1)
-    one = accumulate(first, np.array([[1.0, 2.0]]), np.array([[5.0]]), half)
-    two = accumulate(one, np.array([[3.0, 0.0]]), np.array([[0.0]]), half)
-    np.testing.assert_allclose(two.vector, [[[1.75, 0.5]]])
-    np.testing.assert_allclose(two.context, [[0.8]])  # 5 × 0.2 × 0.8
-    # variance of each: 0.5 / 1.5 * (1 - 0.5 ** 4) = 0.3125
-    np.testing.assert_allclose(strength(two, half), [[[1.75**2 / 0.3125, 0.25 / 0.3125]]])
-    assert first.steps[0] == 0
-    assert not first.vector.any()
-
-
 @pytest.mark.parametrize("steps", [1, 2, 40])
-def test_the_evidence_of_a_whole_episode_is_that_of_its_steps_to_the_bit(steps):
+def test_the_evidence_of_a_whole_episode_is_that_of_its_rows(steps):
     rng, gains = np.random.default_rng(steps), np.array([0.5, 0.1, 1.0])
     whitened, contexts = rng.normal(size=(steps, 4)), rng.normal(size=(steps, 3))
-    evidence, vectors, lately = no_evidence(1, 3, 4, context=3), [], []
+    evidence, vectors, running = no_evidence(1, 3, 4, context=3), [], []
     for e, c in zip(whitened, contexts, strict=True):
         evidence = accumulate(evidence, e[None], c[None], gains)
         vectors.append(evidence.vector[0])
-        lately.append(evidence.context[0])
-    whole = accumulated(whitened, contexts, gains)
-    np.testing.assert_array_equal(whole[0], vectors)
-    np.testing.assert_array_equal(whole[1], lately)
+        running.append(evidence.context[0])
+    for found, wanted in zip(accumulated(whitened, contexts, gains), (vectors, running), strict=True):
+        np.testing.assert_array_equal(found, wanted)
 
 
-def test_a_lasting_shift_adds_up_while_noise_averages_out():
-    gains, evidence = np.array([0.2]), no_evidence(1, 1, 4)
-    values = []
-    for _ in range(60):
-        evidence = accumulate(evidence, np.array([[1.0, 0, 0, 0]]), np.zeros((1, 0)), gains)
-        values.append(strength(evidence, gains).sum())
-    assert np.all(np.diff(values) > 0)
-    assert values[-1] == pytest.approx((2 - 0.2) / 0.2, rel=1e-3)
-
-
-@given(st.floats(-1e9, 1e9), st.floats(1.0, 100.0))
-def test_no_error_counts_more_than_the_bound_and_small_ones_count_in_full(size, bound):
-    pulled = bounded(np.array([[size, 1e-6 * size / (1 + abs(size))]]), bound)
-    assert abs(pulled[0, 0]) <= bound * (1 + 1e-12)
-    assert np.sign(pulled[0, 0]) == np.sign(size)
-    np.testing.assert_allclose(pulled[0, 1], 1e-6 * size / (1 + abs(size)), rtol=1e-9)
-
-
-def test_pooling_is_the_hand_computed_norm_and_its_parts_add_up():
+def test_pooling_is_the_norm_and_its_parts_add_up():
     pooled, parts = pool(np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0]]), power=2)
     np.testing.assert_allclose(pooled, [5.0, 0.0], atol=1e-300)
     np.testing.assert_allclose(parts, [[5 * 9 / 25, 5 * 16 / 25, 0.0], [0.0, 0.0, 0.0]], atol=1e-300)
@@ -128,55 +126,37 @@ def test_pooling_is_the_hand_computed_norm_and_its_parts_add_up():
     assert parts.sum() == pytest.approx(1e200)
 
 
-def test_the_tail_of_the_maxima_is_that_of_the_distribution_they_come_from():
+def test_the_tail_of_the_maxima_is_that_of_their_distribution():
     rng, index = np.random.default_rng(3), np.array([0.1, 0.6, 1.2])
     maxima = 5.0 * (1.0 - rng.random((100_000, 3))) ** -index  # Pareto: P(v > q) = (q/5)^(-1/ξ)
     ceiling, tail = worst_case(maxima)
     np.testing.assert_allclose(ceiling, 5.0 * 0.1**-index, rtol=0.03)
     np.testing.assert_allclose(tail, np.minimum(1.0, TAIL_INDEX / index), rtol=0.03)
-    # What is equally rare becomes the same ratio, in tails as heavy as TAIL_INDEX or heavier.
     rare = np.quantile((maxima / ceiling) ** tail, 0.999, axis=0)
     assert rare[1] == pytest.approx(rare[2], rel=0.1)
     assert rare[0] < rare[1]
-
-
-def test_constant_maxima_have_no_tail():
-    ceiling, tail = worst_case(np.zeros((1, 2, 3)))
-    assert ceiling.shape == tail.shape == (2, 3)
+    ceiling, tail = worst_case(np.zeros((1, 2, 3)))  # constant maxima have no tail
     assert (ceiling > 0).all()
     assert (tail == 1.0).all()
 
 
-def test_habituation_finds_the_quantile_of_each_context():
+def test_habituation_finds_the_quantile_of_each_context_and_no_more_than_nominal_ones():
     rng = np.random.default_rng(0)
     context = np.repeat(np.eye(2, dtype=np.float32), 20_000, axis=0)
     level = rng.normal(size=40_000) + np.where(context[:, 0] > 0, 0.6, -0.6)
     found = habituate(context, level, rng)
-    usual = context @ found[:2] + found[2]
     for which in (0, 1):
-        below = (level < usual)[context[:, which] > 0].mean()
+        below = (level < context @ found[:2] + found[2])[context[:, which] > 0].mean()
         assert below == pytest.approx(USUAL, abs=0.015)
-
-
-def levels(rng: np.random.Generator, episodes: int, told: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Contexts (100, 40) and log s (100,), of which the first number of the context tells as much as ``told``."""
-    contexts = [rng.normal(size=(100, 40)).astype(np.float32) for _ in range(episodes)]
-    return contexts, [told * c[:, 0] + rng.normal(size=100) for c in contexts]
-
-
-def test_no_context_excuses_more_than_nominal_ones_did():
-    rng = np.random.default_rng(2)
-    contexts, surprises = levels(rng, 90, 2.0)
-    found = usual_levels(contexts, surprises, rng)
-    nominal = usual(found, np.concatenate(contexts))
-    wild = usual(found, 1e3 * contexts[0])
-    assert wild.min() == nominal.min()
-    assert wild.max() == nominal.max()
-    assert nominal.max() < 2.0 * 3.5 + 2.0  # the largest of so many normal numbers, and the quantile of the noise
+    contexts = [rng.normal(size=(100, 40)).astype(np.float32) for _ in range(90)]
+    limited = usual_levels(contexts, [2.0 * c[:, 0] + rng.normal(size=100) for c in contexts], rng)
+    nominal, wild = usual(limited, np.concatenate(contexts)), usual(limited, 1e3 * contexts[0])
+    assert (wild.min(), wild.max()) == (nominal.min(), nominal.max())
+    assert nominal.max() < 2.0 * 3.5 + 2.0
 
 
 def runs(rng: np.random.Generator, count: int, steps: int = 200) -> list[ModelOutput]:
-    """Errors four times as large in one of two contexts, between which an episode goes to and fro."""
+    """Errors four times as large in one of two contexts, between which an episode alternates."""
     made = []
     for _ in range(count):
         rough = (np.arange(steps) // 50 + rng.integers(2)) % 2
@@ -194,29 +174,37 @@ def judged(detector: Detector, run: ModelOutput) -> np.ndarray:
     return np.array(values)
 
 
-def test_what_is_usual_in_a_context_alarms_no_more_than_elsewhere():
+def test_the_compiled_step_is_the_same_equations_put_together():
+    rng = np.random.default_rng(2)
+    detector = Detector.fit(runs(rng, 8), runs(rng, 8), [0.8, 0.2], 5.0, 1e-3, rng)
+    gains, evidence, plain = detector.gains, detector.start(2), no_evidence(2, 2, 3, 2)
+    habituation = Habituation(detector.context_quantile, detector.context_range)
+    for _ in range(30):
+        errors, context = 4.0 * rng.normal(size=(2, 3)), rng.random((2, 2))
+        evidence, value, parts = detector.step(evidence, errors, context)
+        plain = accumulate(plain, bounded(errors, 5.0) @ detector.whitening, context, gains)
+        ratios = (strength(plain, gains) / detector.ceiling) ** detector.tail
+        pooled, _ = pool(ratios.reshape(2, -1))
+        log_usual = usual(habituation, np.hstack([context, plain.context]))
+        np.testing.assert_allclose(value, pooled / np.exp(log_usual), rtol=1e-9)
+        np.testing.assert_allclose(parts.sum(axis=1), value, rtol=1e-9)
+        for a, b in zip(evidence, plain, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+
+
+def test_a_usual_context_alarms_no_more_than_others_once_enough_rows_taught_it():
     rng = np.random.default_rng(0)
     detector = Detector.fit(runs(rng, 40), runs(rng, 40), [0.8, 0.2], 10.0, 1e-3, rng)
-    rough, calm = [], []
+    values: list[list[np.ndarray]] = [[], []]
     for run in runs(rng, 20):
-        value = judged(detector, run)
-        settled = np.arange(len(value)) % 50 >= 25  # the evidence of the last context has gone
-        rough.append(value[settled & (run.contexts[:, 0] > 0)])
-        calm.append(value[settled & (run.contexts[:, 0] == 0)])
-    a, b = (np.quantile(np.concatenate(v), 0.95) for v in (rough, calm))
-    assert 0.6 < a / b < 1.7  # 16 without habituation, for the evidence is squared
-
-
-def test_what_is_usual_in_a_context_is_left_out_where_few_steps_tell_of_it():
-    few, enough = 4 * STEPS_PER_NUMBER - 1, 4 * STEPS_PER_NUMBER  # two numbers, now and lately
-    rng = np.random.default_rng(3)
-    for steps, learned in ((few, False), (enough, True)):
-        nominal = runs(rng, 1, steps)
-        how = nominal, [], [0.8, 0.2], 10.0, 1e-3, np.random.default_rng(0)
-        found, without = Detector.fit(*how), Detector.fit(*how, habituates=False)
+        settled = np.arange(200) % 50 >= 25  # the evidence of the last context has gone
+        for rough in (0, 1):
+            values[rough].append(judged(detector, run)[settled & (run.contexts[:, 0] == rough)])
+    a, b = (np.quantile(np.concatenate(v), 0.95) for v in values)
+    assert 0.6 < b / a < 1.7  # 16 without habituation
+    for steps, learned in ((4 * STEPS_PER_NUMBER - 1, False), (4 * STEPS_PER_NUMBER, True)):
+        found = Detector.fit(runs(rng, 1, steps), [], [0.8, 0.2], 10.0, 1e-3, rng)
         assert found.context_quantile[:-1].any() == learned
-        same = np.array_equal(judged(found, nominal[0]), judged(without, nominal[0]))
-        assert same != learned
 
 
 def test_a_fault_in_a_calm_error_is_not_drowned_by_a_wild_one():
@@ -242,23 +230,20 @@ def test_a_rate_needs_its_inverse_in_episodes_less_one(rate, episodes):
         conformal_threshold(np.arange(episodes - 1), rate)
 
 
-@pytest.mark.parametrize("rate", [0.0, 1.0, -0.1, 1.5, np.nan, True, None, "0.1", 10**400])
+@pytest.mark.parametrize("rate", [0.0, 1.0, -0.1, np.nan, True, None, "0.1", 10**400])
 def test_a_rate_that_is_no_probability_is_refused(rate):
     with pytest.raises(ValueError, match=r"false_alarm_rate must be a number in \(0, 1\), got"):
         conformal_episodes(rate)
-
-
-@pytest.mark.parametrize("rate", [5e-324, 2.2250738585e-313, 1e-300])
-def test_the_smallest_rates_there_are_need_more_episodes_than_there_are(rate):
-    with pytest.raises(ValueError, match=r"needs at least \d{15} nominal episodes, got 20"):
-        conformal_threshold(np.arange(20.0), rate)
+    with pytest.raises(ValueError, match=r"at least \d{15} nominal episodes, got 20"):
+        conformal_threshold(np.arange(20.0), 5e-324)
 
 
 def test_threshold_is_the_hand_computed_rank():
     maxima = np.array([5.0, 1.0, 9.0, 3.0, 7.0, 2.0, 8.0, 4.0, 6.0])
-    assert conformal_threshold(maxima, 0.1) == 9.0  # ceil(10 * 0.9) = 9
-    assert conformal_threshold(maxima, 0.25) == 8.0  # ceil(10 * 0.75) = 8
-    assert conformal_threshold(maxima, 0.3) == 7.0  # ceil(10 * 0.7) = 7, though 10 * 0.7 is 7.000000000000001 or not
+    assert [conformal_threshold(maxima, rate) for rate in (0.1, 0.25, 0.3)] == [9.0, 8.0, 7.0]
+    blocks = Blocks(np.array([5.0, 1.0, 9.0, 3.0, 7.0]), np.full(5, 0.5))  # 2.5 hours
+    rates = {0.4: 9.0, 0.79: 9.0, 0.8: 7.0, 1.2: 5.0, 100.0: 1.0}  # at 0.8 one may exceed it: 1 + 1 <= 0.8 * 2.5
+    assert [hourly_threshold(blocks, rate) for rate in rates] == list(rates.values())
 
 
 @pytest.mark.parametrize(("n", "rate"), [(19, 0.05), (50, 0.05), (99, 0.01), (30, 0.2)])
@@ -271,19 +256,277 @@ def test_a_fresh_episode_exceeds_the_threshold_as_rarely_as_promised(n, rate):
     assert rank.mean() == pytest.approx(exact, abs=4 * np.sqrt(exact * (1 - exact) / trials))
 
 
-def test_the_compiled_step_is_the_same_equations_put_together():
-    rng = np.random.default_rng(2)
-    detector = Detector.fit(runs(rng, 8), runs(rng, 8), [0.8, 0.2], 5.0, 1e-3, rng)
-    gains, evidence, plain = detector.gains, detector.start(2), no_evidence(2, 2, 3, 2)
-    for _ in range(30):
-        errors, context = 4.0 * rng.normal(size=(2, 3)), rng.random((2, 2))
-        evidence, value, parts = detector.step(evidence, errors, context)
-        plain = accumulate(plain, bounded(errors, 5.0) @ detector.whitening, context, gains)
-        ratios = (strength(plain, gains) / detector.ceiling) ** detector.tail
-        pooled, _ = pool(ratios.reshape(2, -1))
-        habituated = Habituation(detector.context_quantile, detector.context_range)
-        log_usual = usual(habituated, np.hstack([context, plain.context]))
-        np.testing.assert_allclose(value, pooled / np.exp(log_usual), rtol=1e-9)
-        np.testing.assert_allclose(parts.sum(axis=1), value, rtol=1e-9)
-        for a, b in zip(evidence, plain, strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+DT = 0.05
+ROWS = round(MINUTE / DT)
+
+
+def operation(rng: np.random.Generator, hours: float) -> list[np.ndarray]:
+    """Values of episodes of very different lengths with correlated rows: bursts, and a level of each episode."""
+    found: list[np.ndarray] = []
+    left = hours * 3600 / DT
+    while left > 0:
+        steps = max(10, int(rng.exponential(9.0 / DT)))
+        burst = np.convolve(rng.standard_t(4, steps + 20), np.ones(20) / 4, "valid")[:steps]
+        found.append(np.exp(0.5 * burst + rng.normal(0, 0.5)))
+        left -= steps
+    return found
+
+
+def test_episodes_are_blocks_and_longer_ones_are_cut_into_minutes():
+    long = np.zeros(2 * ROWS + 10)
+    long[[3, ROWS - 1, ROWS, 2 * ROWS + 5]] = [1.0, 4.0, 2.0, 3.0]
+    blocks = Blocks.of([np.array([0.5, 0.2]), long], DT)
+    assert blocks.maxima.tolist() == [0.5, 4.0, 2.0, 3.0]
+    np.testing.assert_allclose(blocks.hours * 3600, [2 * DT, MINUTE, MINUTE, 10 * DT])
+    assert blocks.total == pytest.approx((len(long) + 2) * DT / 3600)
+
+
+def test_an_alarm_that_persists_or_returns_within_a_minute_is_one():
+    value = np.zeros(5 * ROWS)
+    counts = [alarms_in(value, 1.0, DT)]
+    for part in (slice(10, 3 * ROWS), slice(3 * ROWS + ROWS // 2, 3 * ROWS + ROWS // 2 + 1), slice(-1, None)):
+        value[part] = 2.0
+        counts.append(alarms_in(value, 1.0, DT))
+    assert counts == [0, 1, 1, 2]
+    rng = np.random.default_rng(0)
+    for value in (rng.exponential(size=7 * ROWS + 13) for _ in range(50)):
+        for q in np.quantile(value, [0.5, 0.99, 0.9998]):
+            assert alarms_in(value, q, DT) <= (Blocks.of([value], DT).maxima > q).sum()
+
+
+@pytest.mark.parametrize(("rate", "hours"), [(1.0, 4.0), (5.0, 1.5), (20.0, 0.6)])
+def test_fresh_operation_alarms_no_more_an_hour_than_was_promised(rate, hours):
+    rng = np.random.default_rng(7)
+    fresh = Blocks.of(operation(rng, 60.0), DT)
+    realised, promised = [], []
+    for _ in range(60):
+        episodes = operation(rng, hours)
+        blocks = Blocks.of(episodes, DT)
+        q = hourly_threshold(blocks, rate)
+        promise = hourly_promise(blocks, q, len(episodes))
+        assert promise.rate <= rate
+        realised.append((fresh.maxima > q).sum() / fresh.total)
+        promised.append(promise.at_most)
+    assert 0.6 * rate <= np.mean(realised) <= rate + 3 * np.std(realised) / np.sqrt(len(realised))
+    assert np.mean(np.array(realised) <= promised) >= 0.85  # 95 %, of 60
+
+
+def test_a_promise_by_the_hour_bounds_the_blocks_in_alarm():
+    blocks = Blocks(np.arange(40.0), np.full(40, 0.1))  # 4 hours
+    promise = hourly_promise(blocks, 38.0, 12)
+    assert promise == Promise(12, pytest.approx(2 / 4), promise.at_most, "hour", pytest.approx(4))
+    assert stats.binom.cdf(1, 40, promise.at_most / 10) == pytest.approx(0.05)  # one block is above, of 10 an hour
+
+
+@pytest.mark.parametrize(
+    ("rate", "hours", "message"),
+    [
+        (1.0, 0.25, r"at least 1 hours .*, got 0.25: record 0.75 hours more, or promise 4$"),
+        (0.1, 3.7, r"at least 10 hours .*: record 6.3 hours more, or promise 0.271$"),
+    ],
+)
+def test_too_few_hours_are_refused_with_the_hours_missing(rate, hours, message):
+    with pytest.raises(ValueError, match=message):
+        hourly_threshold(Blocks(np.ones(10), np.full(10, hours / 10)), rate)
+
+
+def test_hours_as_long_as_needed_suffice_and_rates_that_are_none_are_refused():
+    for rate in (0.1, 0.3, 1.0, 3.0, 7.0):
+        assert hourly_threshold(Blocks(np.arange(10.0), np.full(10, 1.0 / rate / 10)), rate) == 9.0
+    for wrong in (0.0, -1.0, np.nan, np.inf, 1e308, "1", None, True):
+        with pytest.raises(ValueError, match="false_alarms_per_hour must be"):
+            hourly_threshold(Blocks(np.ones(3), np.ones(3)), wrong)
+
+
+def test_a_rate_holds_in_each_group():
+    values = [np.full(round(360 / DT), v) for v in range(40)]  # 0.1 hours each, cut into six blocks
+    blocks = Blocks.of(values, DT, ["Lift"] * 20 + ["Door"] * 20)
+    assert hourly_threshold(blocks, 10.0) == 36.0  # of Door's 2 hours 19 blocks may exceed it: six of 39, 38, 37 each
+    assert hourly_threshold(Blocks(*blocks[:2]), 10.0) == 33.0  # 39 of all 4 hours'
+    assert Blocks.restored(blocks.array).groups[1].maxima.tolist() == blocks.maxima[120:].tolist()
+    promise = hourly_promise(blocks, 37.0, 40)
+    assert (promise.rate, promise.hours) == (pytest.approx(13 / 2), pytest.approx(4))
+    with pytest.raises(ValueError, match=r"got 0\.0167"):  # one group has too few hours
+        hourly_threshold(Blocks.of([np.ones(ROWS)] * 61, DT, ["Lift"] * 60 + ["Door"]), 1.0)
+
+
+def alarms_of(how: AdaptiveThreshold, maxima: np.ndarray, start: float = 1.0) -> np.ndarray:
+    """(K,) which episodes of these maxima alarm."""
+    running, alarms = how.start(start), []
+    for largest in maxima:
+        alarms.append(largest > running.value)
+        running.follow(largest)
+    return np.array(alarms)
+
+
+@given(
+    maxima=st.lists(st.floats(0.01, 3.999), min_size=1, max_size=300),
+    rate=st.floats(0.01, 0.5),
+    step=st.floats(0.05, 2.0),
+)
+@settings(max_examples=200, deadline=None)
+def test_no_sequence_of_episodes_has_more_alarms_than_the_bound(maxima, rate, step):
+    how = AdaptiveThreshold(rate, step, ceiling=4.0)
+    assert alarms_of(how, np.array(maxima)).sum() <= rate * len(maxima) + math.log(4.0) / step + 1 + 1e-9
+
+
+@pytest.mark.parametrize("rate", [0.02, 0.1])
+def test_an_adaptive_threshold_keeps_its_rate_while_a_policy_changes(rate):
+    rng = np.random.default_rng(0)
+    nominal = rng.lognormal(0.0, 0.3, size=4000)
+    step = nominal * np.where(np.arange(4000) < 2000, 1.0, 2.5)
+    slow, calmer = nominal * np.exp(np.linspace(0.0, math.log(2.5), 4000)), 0.4 * nominal
+    start = float(np.quantile(nominal, 1 - rate))
+    assert (step[2000:] > start).mean() > 5 * rate  # by the calibrated threshold
+    for maxima in (nominal, step, slow, calmer):
+        alarms = alarms_of(AdaptiveThreshold(rate, 0.1, ceiling=10.0), maxima, start)
+        assert alarms[1500:].mean() == pytest.approx(rate, rel=0.45)
+
+
+def test_faults_above_the_ceiling_and_confirmed_alarms_do_not_move_it():
+    running = AdaptiveThreshold(0.01, 0.5, ceiling=3.0).start(1.0)
+    for largest in (*[3.1] * 1000, math.inf, math.nan):
+        assert running.value < 3.1
+        running.follow(largest)
+    running.follow(2.0, confirmed=True)
+    assert running.value == pytest.approx(1.0)
+    assert math.isnan(running.level)
+    running.follow(2.0)
+    assert running.value == pytest.approx(math.exp(0.5 * 0.99))
+    assert running.level == 1.0
+    running.follow(1.0, confirmed=True)  # nothing alarmed, so nothing was confirmed
+    assert running.level == 0.5
+    side_by_side = AdaptiveThreshold(0.1, 0.5).start(1.0)
+    for _ in range(3):
+        side_by_side.follow(1.2, judged_by=1.0)
+    assert side_by_side.level == 1.0
+
+
+@pytest.mark.parametrize("wrong", [{"rate": 0.0}, {"rate": 1.0}, {"step": 0.0}, {"ceiling": 1.0}, {"step": math.nan}])
+def test_adaptive_settings_that_mean_nothing_are_refused_by_name(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        AdaptiveThreshold(**wrong)
+
+
+def repetitions(rows: np.ndarray, counted: np.ndarray, most: float = np.inf) -> list[Repetition]:
+    state, states = unrepeated(1, rows.shape[1]), []
+    for row in rows:
+        state = Repetition(*repeated(*state, row[None], evidence_steps(counted[:2]), np.full(rows.shape[1], most)))
+        states.append(state)
+    return states
+
+
+def test_repetitions_are_counted_after_a_change_and_after_a_repetition():
+    # Repeated: no, no, yes, yes, no, no: after a change 1 in 3, after a repetition 1 in 2.
+    found = count_repetitions([np.array([1.0, 2, 3, 3, 3, 4, 5])[:, None]], np.array([True]))
+    first = (1 + 0.5) / (3 + 1)
+    np.testing.assert_allclose(np.exp(-found[:2, 0]), [first, (1 + first) / (2 + 1)])
+
+
+def test_senses_with_declared_noise_are_watched_and_without_any_those_that_never_repeated():
+    streams = [np.random.default_rng(seed).normal(size=(100, 3)) for seed in range(2)]
+    counted = count_repetitions(streams, np.array([True, False, False]))
+    stuck = repetitions(np.full((20, 3), 12.0), counted)[-1].unlikely[0]
+    assert stuck[0] > REPETITION_OFFSET
+    assert stuck[1] == 0.0  # a command at its limit
+    streams[1][50, 1] = streams[1][49, 1]
+    found = count_repetitions(streams, np.zeros(3, np.bool_))
+    assert (found[:2, [0, 2]] > 2.0).all()
+    assert (found[:2, 1] == 0.0).all()
+
+
+def test_evidence_for_a_stuck_sense_is_that_of_pages_test():
+    p = np.array([[1e-4], [1e-2]])  # of a repetition after a change, and after a repetition
+    states = repetitions(np.array([[1.0], [1.0], [1.0], [2.0], [np.nan], [np.nan]]), -np.log(p))
+    one, two = np.log(STUCK / p[0, 0]), np.log(STUCK / p[1, 0])
+    change = np.log((1 - STUCK) / (1 - p[:, 0]))
+    rest = np.cumsum([one + two, change[1], change[0], change[0]])
+    np.testing.assert_allclose([s.unlikely[0, 0] for s in states], [0.0, one, *rest])
+    ratio = improbability(states[2], np.array([REPETITION_OFFSET]))
+    np.testing.assert_allclose(ratio, np.exp(TAIL_INDEX * (one + two - REPETITION_OFFSET)))
+    assert improbability(states[0], np.array([REPETITION_OFFSET])) == 0.0
+
+
+def quantised(steps: int, seed: int) -> np.ndarray:
+    """(steps, 1) of a sensor at rest, whose noise is a bit more than its resolution: one reading of four repeats."""
+    return np.rint(np.random.default_rng(seed).normal(scale=1.14, size=(steps, 1)))
+
+
+def test_a_sensor_at_rest_repeats_itself_by_chance_and_is_found_once_it_sticks():
+    counted = count_repetitions([quantised(100, seed) for seed in range(60)], np.array([True]))
+    np.testing.assert_allclose(np.exp(-counted[:2, 0]), 0.24, atol=0.03)
+    fresh = [max(s.unlikely[0, 0] for s in repetitions(quantised(100, seed), counted)) for seed in range(100, 400)]
+    for n in (6.0, 8.0):  # Page's bound: e^-n from each of 100 beginnings
+        assert np.mean(np.array(fresh) >= n) <= 100 * np.exp(-n) + 0.02
+    assert max(fresh) < REPETITION_OFFSET
+    stuck = np.array([s.unlikely[0, 0] for s in repetitions(np.ones((20, 1)), counted)])
+    assert np.argmax(stuck > REPETITION_OFFSET) == pytest.approx(10, abs=1)
+
+
+def test_a_sense_that_was_stuck_for_long_is_believed_again_soon():
+    p, rows = np.full((2, 1), 1e-4), np.concatenate([np.ones(5000), np.arange(20)])[:, None]
+    states = repetitions(rows, -np.log(p), REPETITION_OFFSET + MOST_BEYOND)
+    n = np.array([s.unlikely[0, 0] for s in states])
+    assert n.max() == n[4999] == REPETITION_OFFSET + MOST_BEYOND
+    assert n[5015] < REPETITION_OFFSET
+
+
+def test_repetitions_of_nominal_episodes_and_rest_are_not_held_against_a_sense():
+    still = np.concatenate([quantised(200, 0), np.ones((30, 1)), quantised(200, 1)])
+    counted = count_repetitions([still], np.array([True]))
+    assert counted[2, 0] == max(s.unlikely[0, 0] for s in repetitions(still, counted)) > REPETITION_OFFSET
+    rng, t = np.random.default_rng(0), np.arange(400) / 50
+
+    def moving() -> np.ndarray:
+        phase = rng.uniform(0, 6)
+        encoder = np.rint((np.sin(2 * t + phase) + 1e-5 * rng.normal(size=400)) / 1e-3) * 1e-3
+        return np.stack([encoder, np.cos(2 * t + phase) + 0.05 * rng.normal(size=400)], axis=1)
+
+    counted = count_repetitions([moving() for _ in range(10)], np.array([True, True]))
+    rest = np.stack([np.full(500, 0.5), 0.05 * rng.normal(size=500)], axis=1)
+    assert max(s.unlikely.max() for s in repetitions(rest, counted)) < REPETITION_OFFSET
+    rest[:, 1] = 0.3  # a noisy sense does not rest
+    assert repetitions(rest[:20], counted)[-1].unlikely[0, 1] > REPETITION_OFFSET
+
+
+def test_the_fewer_episodes_the_longer_a_rest_is_believed():
+    def rows_until(episodes: int) -> int:
+        streams = [np.random.default_rng(seed).normal(size=(100, 1)) for seed in range(episodes)]
+        states = repetitions(np.full((40, 1), 0.5), count_repetitions(streams, np.array([True])))
+        return int(np.argmax([s.unlikely[0, 0] > REPETITION_OFFSET for s in states]))
+
+    assert [rows_until(n) for n in (4, 12, 90)] == [5, 4, 2]  # 12 = 4.15 * log(0.9 * 20), 3.0 * log(54), 2 * log(405)
+
+
+@pytest.fixture(scope="module")
+def asm() -> NeuralASM:
+    noisy = replace(sine_spec(), channels=tuple(replace(c, noise=0.5) for c in sine_spec().channels))
+    fit, others = (sine_episodes(30, seed=seed, spec=noisy, noise=0.5) for seed in (0, 1))
+    return NeuralASM(noisy, hidden_size=16, association_size=40, epochs=2).fit(fit).calibrate(others, 0.05)
+
+
+def test_a_frozen_sense_alarms_within_four_rows_however_poor_the_prediction(asm):
+    for n, episode in enumerate(sine_episodes(12, seed=2, spec=asm.spec, noise=0.5)):
+        surprise = asm.score(frozen(episode, n, onset=20))
+        np.testing.assert_allclose(surprise.attribution.sum(axis=1), surprise.value)
+        assert surprise.value[24] > asm.threshold
+        assert surprise.attribution[23].argmax() == n
+    state, row = asm.initial_state(1), sine_episodes(1, spec=asm.spec)[0].stream[:1]
+    for _ in range(3):
+        state, _ = asm.observe(state, row)
+    assert state.detection.repetition.unlikely.any()
+    assert not asm.reset_evidence(state).detection.repetition.unlikely.any()
+
+
+def test_repetitions_of_an_older_memory_load_and_damaged_ones_are_refused(asm):
+    detection, senses = asm.detection, len(asm.spec.sensory)
+    learned = detection.learned_ | {"repetition": detection.learned_["repetition"][:2]}
+    old = type(detection)(asm.spec, gains=detection.gains).restore(learned)
+    state, row = old.start(1, senses), np.ones((1, asm.spec.size))
+    output = ModelOutput(np.zeros((1, senses)), np.zeros((1, asm.hidden_size)))
+    for _ in range(4):
+        state, _ = old.attribute_step(state, output, row, lambda parts: np.zeros((1, asm.spec.size)))
+    assert (state.repetition.unlikely > REPETITION_OFFSET).all()
+    for damaged in (np.full((3, 2), -1.0), np.zeros((1, 2)), np.full((3, senses), np.nan)):
+        with pytest.raises(ValueError, match="repetition of evidence"):
+            old.restore(learned | {"repetition": damaged})

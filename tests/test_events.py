@@ -13,17 +13,8 @@ from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from asm_gym.wrappers.logging import SafetyCounter
 from tests.fakes import SPEC, FadingMonitor, FakeEnv
-
-ARM = StreamSpec(
-    (
-        Channel("joint_position", 2, "rad", 2e-4, "joint", stops=((-1.0, 1.0), (-2.0, 2.0))),
-        Channel("wrist_force", 3, "N", 0.2, "wrench"),
-        Channel("wrist_force_peak", 3, "N", 0.4, "wrench"),
-        Channel("gripper_velocity", 2, "m/s", 0.002, "gripper"),
-    ),
-    dt=0.05,
-)
-CALM = np.array([0.2, 1.5, 60.0, 0, 0, 10.0, 0, 0, 0, 0])  # the mean of a row tells no knock where its peak is sensed
+from tests.streams import EVENTFUL_ARM as ARM
+from tests.streams import UNEVENTFUL
 
 
 def excused(rows, spec=ARM):
@@ -36,7 +27,7 @@ def excused(rows, spec=ARM):
 
 
 def changed(column, value):
-    row = CALM.copy()
+    row = UNEVENTFUL.copy()
     row[column] = value
     return row
 
@@ -44,7 +35,7 @@ def changed(column, value):
 @pytest.mark.parametrize(
     ("row", "event", "divisor"),
     [
-        (CALM, "", 1.0),
+        (UNEVENTFUL, "", 1.0),
         (changed(6, -50.1), "knock", EXCUSED),
         (changed(6, -49.9), "", 1.0),
         (changed(6, np.nan), "", 1.0),
@@ -81,7 +72,7 @@ def test_a_joint_that_was_seen_on_its_way_is_at_its_stop_and_one_that_jumps_ther
 def test_a_knock_is_felt_for_a_second_at_any_rate_and_fades_as_what_it_has_left_in_the_slowest_evidence():
     for dt in (0.05, 0.01):
         spec = StreamSpec(ARM.channels, dt)
-        found = excused([changed(5, 80.0)] + [CALM] * 200, spec)
+        found = excused([changed(5, 80.0)] + [UNEVENTFUL] * 200, spec)
         second = round(KNOCKED_S / dt)
         assert found[:second] == [("knock", EXCUSED)] * second
         fading = np.array([by for _, by in found[second:]])
@@ -92,7 +83,7 @@ def test_a_knock_is_felt_for_a_second_at_any_rate_and_fades_as_what_it_has_left_
 
 
 def test_a_stop_fades_once_the_joint_has_left_it():
-    found = excused([changed(0, 0.98), *[CALM] * (FADING + 1)])
+    found = excused([changed(0, 0.98), *[UNEVENTFUL] * (FADING + 1)])
     assert [event for event, _ in found] == ["stop"] * (FADING + 1) + [""]
     assert found[0][1] == EXCUSED
     assert found[1][1] == pytest.approx(EXCUSED * (1 - min(GAINS)) ** 2)
@@ -114,7 +105,7 @@ def test_the_end_of_a_knocks_second_is_no_fault_and_a_fault_that_comes_then_is()
 
 
 def test_a_finger_has_moved_for_a_tenth_of_a_second():
-    assert [d for _, d in excused([changed(8, -0.1), CALM, CALM])] == [SLIPPED, SLIPPED, 1.0]
+    assert [d for _, d in excused([changed(8, -0.1), UNEVENTFUL, UNEVENTFUL])] == [SLIPPED, SLIPPED, 1.0]
 
 
 def test_streams_without_such_senses_excuse_nothing():
@@ -137,7 +128,7 @@ def wild(count, knocks=False, seed=0, spec=ARM):
     rng = np.random.default_rng(seed)
     found = []
     for _ in range(count):
-        x = 0.02 * rng.normal(size=(80, spec.size)).cumsum(0) + CALM
+        x = 0.02 * rng.normal(size=(80, spec.size)).cumsum(0) + UNEVENTFUL
         x[:, 2:5] -= 55.0
         x[:, 8:] = 0.002 * rng.normal(size=(80, 2))
         if knocks:
@@ -177,14 +168,6 @@ class Eventful(FadingMonitor):
         return state._replace(steps=state.steps + 1), Surprise(value, shares, raw=raw, excuse=excuse)
 
 
-class Stopping(Eventful):
-    kind = "stop"
-
-
-class Faulty(Eventful):
-    kind = ""
-
-
 def lived(env, steps=15):
     env.reset(seed=0)
     counter, said = SafetyCounter(0.05), []
@@ -197,25 +180,25 @@ def lived(env, steps=15):
     return said, counter.total
 
 
-def test_a_knock_is_braked_and_the_policy_goes_on():
-    said, total = lived(NeuralASMSafety(FakeEnv(), Eventful([5]), "hold", release_after=3))
-    assert said[4] == ("knock", True, "reflex", 1.0)
-    assert [s[2] for s in said[5:9]] == ["reflex", "reflex", "trial", "trial"]
+def eventful(kind, cue=(5,)):
+    monitor = Eventful(list(cue))
+    monitor.kind = kind
+    return monitor
+
+
+def test_a_knock_is_braked_a_stop_only_counted_and_a_fault_acted_on():
+    rows, total = lived(NeuralASMSafety(FakeEnv(), eventful("knock"), "hold", release_after=3))
+    assert rows[4] == ("knock", True, "reflex", 1.0)
+    assert [r[2] for r in rows[5:9]] == ["reflex", "reflex", "trial", "trial"]
     assert (total.knocks, total.stops, total.faults, total.alarms) == (1, 0, 0, 1)
-
-
-def test_a_stop_is_said_and_no_alarm():
-    said, total = lived(NeuralASMSafety(FakeEnv(), Stopping([5]), "hold"))
-    assert said[4] == ("stop", False, "policy", 0.0)
+    rows, total = lived(NeuralASMSafety(FakeEnv(), eventful("stop"), "hold"))
+    assert rows[4] == ("stop", False, "policy", 0.0)
     assert (total.knocks, total.stops, total.faults, total.cost) == (0, 1, 0, 0.0)
-
-
-def test_a_fault_is_acted_on_and_ends_an_episode_that_a_knock_does_not():
-    said, total = lived(NeuralASMSafety(FakeEnv(), Faulty([5]), "terminate"))
-    assert said[4][:2] == ("fault", True)
-    assert (len(said), total.faults) == (5, 1)
-    said, _ = lived(NeuralASMSafety(FakeEnv(), Eventful([5]), "terminate"))
-    assert len(said) == 15
+    rows, total = lived(NeuralASMSafety(FakeEnv(), eventful(""), "terminate"))
+    assert rows[4][:2] == ("fault", True)
+    assert (len(rows), total.faults) == (5, 1)
+    rows, _ = lived(NeuralASMSafety(FakeEnv(), eventful("knock"), "terminate"))
+    assert len(rows) == 15
 
 
 class Losing(FakeEnv):
@@ -229,8 +212,7 @@ class Losing(FakeEnv):
 
 @pytest.mark.parametrize("reaction", ["terminate", "hold", "graded"])
 def test_a_knock_hides_no_number_that_is_missing(reaction):
-    """A knock ended nothing where alarms end the episode, though a number was missing in the same row."""
-    said, total = lived(NeuralASMSafety(Losing(), Eventful([5]), reaction, release_after=3))
+    said, total = lived(NeuralASMSafety(Losing(), eventful("knock"), reaction, release_after=3))
     assert said[4][:2] == ("fault", True)
     assert total.faults == 1
     if reaction == "terminate":

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from asm_gym.addresses import table
 from asm_gym.compilation import must_compile
-from asm_gym.detection.detector import EvidenceState
 from asm_gym.detection.evidence import Evidence
+from asm_gym.detection.evidence_detection import EvidenceState
 from asm_gym.detection.repetition import Repetition
 from asm_gym.kinematics import HAND
 from asm_gym.memory.state import MemoryState

@@ -1,12 +1,13 @@
-"""From a model's errors to surprise, and from surprise to an alarm: each step a module, any model's errors will do."""
+"""From a model's errors to surprise, and from surprise to an alarm."""
 
 from __future__ import annotations
 
 from asm_gym.detection.adaptive import AdaptiveThreshold, RunningThreshold
 from asm_gym.detection.base import Detection, ModelOutput, Nominal
 from asm_gym.detection.conformal import Promise, conformal_episodes, conformal_threshold
-from asm_gym.detection.detector import Detector, EvidenceDetection, EvidenceState
-from asm_gym.detection.evidence import Evidence, accumulate, accumulated, no_evidence, pool, strength
+from asm_gym.detection.detector import Detector
+from asm_gym.detection.evidence import Evidence, accumulated, no_evidence, pool, strength
+from asm_gym.detection.evidence_detection import EvidenceDetection, EvidenceState
 from asm_gym.detection.hourly import Blocks, alarms_in, check_per_hour, hourly_promise, hourly_threshold
 from asm_gym.detection.tails import worst_case
 from asm_gym.detection.whitening import bounded, whitening
@@ -23,7 +24,6 @@ __all__ = [
     "Nominal",
     "Promise",
     "RunningThreshold",
-    "accumulate",
     "accumulated",
     "alarms_in",
     "bounded",

@@ -1,19 +1,17 @@
-"""A running threshold: the promised share of nominal episodes in alarm is kept while the policy changes.
+"""Adaptive threshold: the promised share of nominal episodes in alarm is kept while the policy changes.
 
-    log q_{k+1} = log q_k + η (err_k - α)        err_k = 1 where episode k had a false alarm, else 0
-    threshold   min(q_k, c)                      c: what exceeds it is an alarm, and never counts
+    log q_{k+1} = log q_k + η (err_k - α)        err_k = 1 if episode k had a false alarm, else 0
+    threshold   min(q_k, c)                      what exceeds c is an alarm, and never counts as a false one
 
-α is the promised rate, and η how far one false alarm raises q. Each raises it by η (1 - α), each quiet episode lowers
-it by η α: only where one in 1/α alarms does q stay. Whatever the episodes are, of K that count at most
+α is the promised rate, and η the step of one false alarm. q stays only where one episode in 1/α has a false alarm. In
+any K episodes that count, at most
 
     α K + log(c/q_1)/η + 1
 
-have an alarm, for from c on q can rise no further. What is learned is drift, not faults: an alarm above c, and one that
-somebody or something has confirmed, tells nothing of what is usual.
+have an alarm, as q rises no further than c. Confirmed alarms do not move q, so that it learns drift and not faults.
 
-Sources: Angelopoulos et al. 2023 (NeurIPS, arXiv 2307.16895), its P control, on log q for surprise spans decades; Gibbs
-and Candès 2021 (NeurIPS, arXiv 2106.00170), which moves the level instead of the threshold: at a level of 1 % one
-alarm would send it to infinity.
+Sources: Angelopoulos et al. 2023 (NeurIPS, arXiv 2307.16895), its P control, on log q as surprise spans decades; Gibbs
+and Candès 2021 (NeurIPS, arXiv 2106.00170), which moves the level instead of the threshold.
 """
 
 from __future__ import annotations
@@ -30,8 +28,8 @@ class AdaptiveThreshold:
 
     Args:
         rate: α in (0, 1), share of nominal episodes that may raise an alarm.
-        step: η > 0; a false alarm raises the threshold by a factor of exp(η), about.
-        ceiling: > 1, how many times the calibrated threshold it may come to; above that anything is an alarm.
+        step: η > 0; a false alarm raises the threshold by a factor of about exp(η).
+        ceiling: > 1, largest multiple of the calibrated threshold; anything above is an alarm.
     """
 
     rate: float = 0.01
@@ -44,12 +42,12 @@ class AdaptiveThreshold:
         check_number("ceiling", self.ceiling, above=1.0)
 
     def start(self, threshold: float) -> RunningThreshold:
-        """The running threshold, which begins at a calibrated one."""
+        """Return the running threshold that begins at a calibrated one."""
         return RunningThreshold(self, check_number("threshold", threshold, above=0.0))
 
 
 class RunningThreshold:
-    """A threshold that is moved at the end of every episode.
+    """A threshold that moves at the end of every episode.
 
     Args:
         how: it follows.
@@ -66,21 +64,21 @@ class RunningThreshold:
 
     @property
     def value(self) -> float:
-        """The threshold as it is now."""
+        """The present threshold."""
         return min(math.exp(self._log), self.ceiling)
 
     @property
     def level(self) -> float:
-        """Share of the episodes so far that had a false alarm, of those that counted; NaN before the first."""
+        """Share of the counted episodes so far that had a false alarm; NaN before the first."""
         return self._alarms / self._episodes if self._episodes else math.nan
 
     def follow(self, largest: float, judged_by: float | None = None, confirmed: bool = False) -> None:
-        """Takes account of an episode that has ended.
+        """Move after an episode.
 
         Args:
             largest: its greatest surprise.
             judged_by: the threshold that it began with; the present one by default.
-            confirmed: an alarm in it was no false one.
+            confirmed: whether an alarm in it was true.
         """
         alarm = not largest <= (self.value if judged_by is None else judged_by)
         if alarm and (confirmed or not largest <= self.ceiling):

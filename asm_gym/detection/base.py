@@ -1,4 +1,4 @@
-"""What a model says of rows, and what can be made of it: the two sides of every detection."""
+"""The interface between a model's errors and a detection."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ Array = NDArray[np.floating[Any]]
 Arrays = Mapping[str, NDArray[Any]]
 State = Any
 Place = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""From each error's share (B, X) to each number's in the stream (B, D)."""
+"""Maps each error's share (B, X) to each number's in the stream (B, D)."""
 
 
 class ModelOutput(NamedTuple):
-    """What a model said of N rows: one each of as many streams, or all of one episode."""
+    """A model's output for N rows: one each of N streams, or all of one episode."""
 
     errors: Array  # (N, X) in standard deviations, where the model knows them
-    contexts: Array  # (N, C) what the model took to be going on; C may be 0
+    contexts: Array  # (N, C) the model's state; C may be 0
 
 
 class Nominal(NamedTuple):
-    """Nominal episodes to fit a detection on, and what the fitted model says of any of them."""
+    """Nominal episodes to fit a detection on, and the fitted model's outputs."""
 
     episodes: Sequence[Episode]  # all, in the order given
     learned: Sequence[Episode]  # those that the model has learned
-    held_out: Sequence[Episode]  # those that it has not; where there are none, those that it has
+    held_out: Sequence[Episode]  # the others; without any, those that it has
     outputs: Callable[[Sequence[Episode]], list[ModelOutput]]
 
 
 class Detection(Protocol):
-    """Turns a model's errors into surprise, shared out among the numbers of the stream.
+    """Turns a model's errors into surprise, attributed to the numbers of the stream.
 
-    Arguments of ``__init__`` beside the stream's spec are hyperparameters, kept under their own names.
+    Arguments of ``__init__`` beside the stream's spec are hyperparameters, kept as attributes of the same names.
 
     Attributes:
         name: in ``make_monitor`` and in checkpoints.
-        arrays: names of all that ``fit`` finds; no other detection and no model may use them.
-        learned_: what it has found; empty before.
+        arrays: names of what ``fit`` learns, which no other detection and no model may use.
+        learned_: learned arrays; empty before ``fit``.
     """
 
     name: str
@@ -50,27 +50,27 @@ class Detection(Protocol):
 
     @property
     def reach(self) -> float:
-        """What errors alone can make of surprise, in a context of 0: a threshold above it would hardly ever alarm."""
+        """Largest surprise by errors in a context of 0; a threshold above it would hardly ever alarm."""
         ...
 
     def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
-        """Learns what is usual of errors."""
+        """Learn which errors are usual."""
         ...
 
     def restore(self, learned: Arrays) -> Self:
-        """Takes what another has learned."""
+        """Take over what another has learned."""
         ...
 
     def start(self, batch: int, errors: int) -> State:
-        """Before the first row of ``batch`` streams: arrays whose first axis is B, in tuples or not."""
+        """Return the state before the first row of ``batch`` streams: arrays with a first axis B, or tuples of them."""
         ...
 
     def attribute_step(
         self, state: State, output: ModelOutput, rows: NDArray[np.float64], place: Place
     ) -> tuple[State, NDArray[np.float64]]:
-        """The new state, and each number's share (B, D) of the surprise at the next rows (B, D), perhaps not finite."""
+        """Return the new state, and each number's share (B, D), perhaps not finite, of the surprise at rows (B, D)."""
         ...
 
     def reset(self, state: State) -> State:
-        """The state with what has added up so far forgotten."""
+        """Return the state without accumulated evidence."""
         ...

@@ -1,18 +1,17 @@
-"""Knock, stop or fault: how far what the senses themselves tell of excuses a surprise.
+"""Events: knocks, joints at their stops and sliding fingers excuse a surprise in part.
 
-    knock    a wrist has felt more than 50 N on an axis within the last second; its peaks count, where they are sensed
-    stop     a joint is at one of its stops, less than 0.03 rad before it or 0.1 rad past it, and was seen on its way
-    s'       s / 10 where either is so, s / 3 where a finger has just slid by 1 cm/s, else s
-    after    k rows after either is over  s / (10 (1 - a)^{2k}), as long as that is less than s
+    knock    a wrist has measured more than 50 N on an axis within the last second; peaks count where they are sensed
+    stop     a joint is at its stop, less than 0.03 rad before it or 0.1 rad past it, and approached it
+    s'       s / 10 at a knock or a stop, s / 3 where a finger has just slid by 1 cm/s, else s
+    after    k rows after a knock or a stop  s / (10 (1 - a)^{2k}), while that is less than s
 
-A hand that strikes a table surprises, and so does a joint that comes to its stop or a finger that slips: none is a
-fault of the body, and most alarms of healthy robots are such. They are not forgiven: what is still over the threshold
-is a fault. What is over it but for the excuse has a name of its own, and is counted. A number that is missing excuses
-nothing, and neither does one that jumps to a stop or far past it, as those of swapped joints and of encoders that drop
-out do: an arm is seen on its way, within 5 rad/s of the stop, in the row before it comes there.
+A hand that strikes a table surprises, and so does a joint that reaches its stop or a finger that slips: none is a fault
+of the body, and most alarms of healthy robots are such events. What exceeds the threshold in spite of the excuse is a
+fault; what exceeds it without the excuse only is counted as the event. A missing number excuses nothing, and neither
+does one that jumps to a stop, as those of swapped joints do: a joint approaches within 5 rad/s in the row before.
 
-Evidence outlives what it is of: the slowest fades by (1 - a)² with each row, a the least of the usual gains. So does
-the excuse, or what is left of a knock would be a fault once its second is over, and of a stop once the joint leaves it.
+Evidence outlives its cause: the slowest fades by (1 - a)² a row, a being the least of the usual gains. The excuse fades
+as slowly, or what is left of a knock after its second would be a fault.
 """
 
 from __future__ import annotations
@@ -30,43 +29,38 @@ from asm_gym.spec import Channel, StreamSpec
 
 NO_EVENT, KNOCK, STOP, FAULT = "", "knock", "stop", "fault"
 EVENTS = NO_EVENT, KNOCK, STOP, FAULT
-"""What a row is. The last is the worst."""
+"""Kinds of rows; the last is the worst."""
 
 KNOCKING = 50.0
-"""At the wrist, on an axis [N]."""
+"""Force at the wrist, on an axis [N]."""
 KNOCKED_S = 1.0
-"""For how long a knock is felt in what comes after it [s]."""
+"""Duration of the excuse of a knock [s]."""
 NEAR_STOP, PAST_STOP = 0.03, 0.1
-"""A joint is at a stop from so far before it to so far past it [rad]; healthy arms went 0.04 rad past theirs at most,
-in 4,199 episodes."""
+"""A joint is at its stop from so far before it to so far past it [rad]. In 4,199 episodes healthy arms went 0.04 rad
+past theirs at most."""
 FASTEST = 5.0
-"""At which joints turn [rad/s]: one that was farther from its stop in the row before is not at it now."""
+"""Largest joint speed [rad/s]: a joint that was farther from its stop in the row before is not at it now."""
 EXCUSED, SLIPPED = 10.0, 3.0
-"""What surprise is divided by, at a knock or a stop, and where fingers move."""
+"""Divisors of surprise at a knock or a stop, and where fingers slide."""
 FADE = (1.0 - min(GAINS)) ** 2
 FADING = math.ceil(-math.log(EXCUSED) / math.log(FADE))
-"""What is left of the slowest evidence after a row; in how many it comes down to a tenth, and the excuse too."""
+"""Share of the slowest evidence left after a row; rows in which it, and the excuse, falls to a tenth."""
 MOVING, MOVED_S = 0.01, 0.1
-"""At which a finger moves that slides [m/s], and for how long it has just moved [s]. Those that turn never rest."""
+"""Speed of a sliding finger [m/s], and duration of its excuse [s]. Turning fingers never rest and do not count."""
 
 
 class Excused(NamedTuple):
-    """What the senses make of rows.
+    """The events in rows."""
 
-    Attributes:
-        kind: (B,) 1 for a knock, 2 for a stop, 0 for neither: places in ``EVENTS``.
-        divisor: (B,) of the surprise.
-    """
-
-    kind: NDArray[np.int8]
-    divisor: NDArray[np.float64]
+    kind: NDArray[np.int8]  # (B,) place in ``EVENTS``: 1 for a knock, 2 for a stop, 0 for neither
+    divisor: NDArray[np.float64]  # (B,) of the surprise
 
 
 class Excuses:
-    """What excuses surprise, by the names of the channels of a stream.
+    """Detects events by the names of a stream's channels.
 
     Args:
-        spec: of the stream; without forces at a wrist no knock is known, and without ``Channel.stops`` no stop.
+        spec: of the stream; knocks need forces at a wrist, stops need ``Channel.stops``.
     """
 
     def __init__(self, spec: StreamSpec) -> None:
@@ -80,29 +74,29 @@ class Excuses:
 
     @property
     def joints(self) -> int:
-        """How many have stops."""
+        """Number of joints with stops."""
         return len(self._joints)
 
     @property
     def arrays(self) -> tuple[list[NDArray[Any]], NDArray[np.float64]]:
-        """Columns of wrists, joints and fingers, and how many rows things last and fade; (J, 2) the stops."""
+        """Columns of wrists, joints and fingers and the rows of their excuses; (J, 2) the stops."""
         return [self._wrist, self._joints, self._fingers, self._rows], self._ends
 
     def start(self, batch: int) -> NDArray[np.int64]:
-        """(B, 3 + J) for how many rows a knock and a stop are still felt, and fingers have just moved: none. Then
-        whether each joint with stops may come to one in the next row: all may."""
+        """Return the state (B, 3 + J): rows that the excuses of a knock, a stop and a finger still last, 0; and
+        whether each joint may be at its stop in the next row, 1."""
         left = np.ones((batch, 3 + self.joints), np.int64)
         left[:, :3] = 0
         return left
 
     def step(self, left: NDArray[np.int64], rows: NDArray[np.float64]) -> tuple[NDArray[np.int64], Excused]:
-        """What the next rows (B, D) excuse, some of whose numbers may not be finite."""
+        """Return the new state, and the events in the next rows (B, D), which may not be finite."""
         senses = self._wrist, self._joints, self._ends, self._fingers
         after, kind, divisor = _step(left, rows, *senses, self._rows, self.on_its_way)
         return after, Excused(kind, divisor)
 
     def divisors(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-        """(T,) what surprise is divided by in each row of a whole stream (T, D)."""
+        """Return the divisor of surprise (T,) in each row of a whole stream (T, D)."""
         left, found = self.start(1), np.ones(len(stream))
         for t, row in enumerate(np.asarray(stream, np.float64)):
             left, excused = self.step(left, row[None])
@@ -111,14 +105,14 @@ class Excuses:
 
 
 def event_of(value: float, raw: float, kind: int, threshold: float) -> str:
-    """What a row is: its surprise as far as it is not excused, all of it, and what excuses it."""
+    """Return one of ``EVENTS`` for a row with excused surprise ``value``, full surprise ``raw`` and event ``kind``."""
     if not value <= threshold:
         return FAULT
     return EVENTS[kind] if raw > threshold else NO_EVENT
 
 
 def _columns(spec: StreamSpec, which: Callable[[Channel], bool]) -> NDArray[np.intp]:
-    """(N,) of the channels that are meant."""
+    """Return the columns (N,) of the channels that ``which`` selects."""
     found = [np.arange(spec.size)[spec.slices[c.name]] for c in spec.channels if which(c)]
     columns: NDArray[np.intp] = np.concatenate([np.zeros(0, np.intp), *found])
     return columns
@@ -128,6 +122,7 @@ def _columns(spec: StreamSpec, which: Callable[[Channel], bool]) -> NDArray[np.i
 def _step(
     left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any, lasting: Any, on_its_way: float
 ) -> Any:
+    """Return the new state (B, 3 + J), and the fields of ``Excused``."""
     B = len(rows)
     after, kind, divisor = np.maximum(left - 1, 0), np.zeros(B, np.int8), np.ones(B)
     for n in range(B):
@@ -141,14 +136,14 @@ def _step(
             divisor[n] = SLIPPED
         for j in range(len(joints)):
             q = rows[n, joints[j]]
-            past, came = max(ends[j, 0] - q, q - ends[j, 1]), left[n, 3 + j]
+            past, near = max(ends[j, 0] - q, q - ends[j, 1]), left[n, 3 + j]
             if not -on_its_way < past < PAST_STOP:
-                came = 0 if np.isfinite(q) else 1  # which was not seen may have come from anywhere
+                near = 0 if np.isfinite(q) else 1  # a missing joint may be anywhere
             elif past <= -NEAR_STOP:
-                came = 1
-            elif came > 0:
+                near = 1
+            elif near > 0:
                 after[n, 1] = lasting[2] + 1
-            after[n, 3 + j] = came
+            after[n, 3 + j] = near
         for k in (1, 0):
             if after[n, k] > 0:
                 kind[n] = k + 1

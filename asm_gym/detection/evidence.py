@@ -1,11 +1,11 @@
-"""Evidence: what whitened errors add up to over a short while, at several time scales.
+"""Evidence: whitened errors accumulated over a short while, at several time scales.
 
     evidence   w_t = (1 - a) w_{t-1} + a ẽ_t,   w_0 = 0
                v_i = w_i² (2 - a) / (a (1 - (1 - a)^{2t}))              nominal mean 1 for white errors, for every t
     pooled     s_t = (Σ_i r_i^p)^(1/p)                                  r_i: v_i against its worst, see ``tails``
 
-p lets the most surprising one count, and several add up. ``accumulated`` is what they are fitted with, and the others
-are the oracle of that and of the compiled step in ``detector``.
+A large p lets the most surprising error decide, and several add up. ``accumulated`` serves to fit; in use the compiled
+step of ``detector`` does the same.
 
 Source: Lowry et al. 1992 (multivariate EWMA chart, its exact variance at start-up).
 """
@@ -24,61 +24,55 @@ POWER = 8
 """p."""
 
 CONTEXT_GAIN = 0.2
-"""Weight of the newest step in the running mean of the context."""
+"""Weight of the newest row in the running mean of the context."""
 
 TINY = float(np.finfo(np.float64).tiny)
 
 
 class Evidence(NamedTuple):
-    """What the last steps of each stream in a batch have added up to; never changed in place."""
+    """Evidence of B streams; never changed in place."""
 
     vector: NDArray[np.float64]  # (B, G, X) w_t, for each of G gains
     context: NDArray[np.float64]  # (B, C) running mean of the contexts
-    steps: NDArray[np.int64]  # (B,) t, how many steps are in it
+    steps: NDArray[np.int64]  # (B,) t, rows so far
 
 
 def no_evidence(batch: int, gains: int, size: int, context: int = 0) -> Evidence:
-    """w_0 for ``batch`` streams of ``size`` errors."""
+    """Return w_0 for ``batch`` streams of ``size`` errors."""
     return Evidence(np.zeros((batch, gains, size)), np.zeros((batch, context)), np.zeros(batch, np.int64))
-
-
-def accumulate(evidence: Evidence, whitened: Array, context: Array, gains: Array) -> Evidence:
-    """w_t from w_{t-1} and the whitened errors e_t (B, X); a gain a in (0, 1] of 1 forgets all but this step."""
-    vector = evidence.vector + gains[:, None] * (whitened[:, None, :] - evidence.vector)
-    return Evidence(vector, evidence.context + CONTEXT_GAIN * (context - evidence.context), evidence.steps + 1)
 
 
 @compiled
 def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``accumulate`` over a whole episode: w_t (T, G, X), and the running mean of the contexts (T, C).
+    """Return w_t (T, G, X) of a whole episode, and the running mean of its contexts (T, C).
 
     Args:
-        whitened: (T, X) e_t.
+        whitened: (T, X) ẽ_t.
         contexts: (T, C).
-        gains: (G,).
+        gains: (G,) a.
     """
     T, X = whitened.shape
-    vectors, lately = np.zeros((T, len(gains), X)), np.zeros(contexts.shape)
+    vectors, running = np.zeros((T, len(gains), X)), np.zeros(contexts.shape)
     for t in range(T):
-        before = max(t - 1, 0)  # of the first row, where all is 0 still
+        before = max(t - 1, 0)  # in the first row all is still 0
         for g in range(len(gains)):
             for i in range(X):
                 w = vectors[before, g, i]
                 vectors[t, g, i] = w + gains[g] * (whitened[t, i] - w)
         for c in range(contexts.shape[1]):
-            lately[t, c] = lately[before, c] + CONTEXT_GAIN * (contexts[t, c] - lately[before, c])
-    return vectors, lately
+            running[t, c] = running[before, c] + CONTEXT_GAIN * (contexts[t, c] - running[before, c])
+    return vectors, running
 
 
 def strength(evidence: Evidence, gains: Array) -> NDArray[np.float64]:
-    """v (B, G, X): the squared evidence in each error, with a nominal mean of 1."""
+    """Return v (B, G, X), the squared evidence in each error."""
     variance = gains / (2.0 - gains) * (1.0 - (1.0 - gains) ** (2 * evidence.steps[:, None]))  # (B, G) of each w_t,i
     squared: NDArray[np.float64] = evidence.vector**2 / variance[:, :, None]
     return squared
 
 
 def pool(ratios: Array, power: float = POWER) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(Σ_i r_i^p)^(1/p) (B,), and each one's part of it (B, X), which add up to it; r >= 0."""
+    """Return (Σ_i r_i^p)^(1/p) (B,), and each ratio's part of it (B, X), which add up to it; r >= 0."""
     greatest = np.maximum(ratios.max(axis=1, keepdims=True), TINY)
     powers = (ratios / greatest) ** power
     total = powers.sum(axis=1, keepdims=True)

@@ -1,20 +1,20 @@
-"""Repetition: a sense that is stuck says the same again and again, as a working one seldom does.
+"""Repetition: a stuck sense repeats its reading, which a working one seldom does.
 
-    p_i = P(x_t,i = x_{t-1,i}), counted apart for senses that repeated themselves the time before and that did not
+    p_i = P(x_t,i = x_{t-1,i}), counted separately after a repetition and after a change
     n_t = max(0, n_{t-1} + log ρ/p) after a repetition, max(0, n_{t-1} + log (1 - ρ)/(1 - p)) after a change,
-          and at most n_0 + 24, so that a sense that works again is believed again within some ten rows
-    r_t = exp(ξ_0 (n_t - n_0)) where n_t > 0, else 0                 beside the ratios of ``tails``, with their ξ_0
+          and at most n_0 + 24, so that a sense that works again is believed within about ten rows
+    r_t = exp(ξ_0 (n_t - n_0)) where n_t > 0, else 0                 pooled with the ratios of ``tails``
 
-What predicts a change finds nothing odd in one that is just 0. Yet noise carries a working sensor from one of its
-readings to another, by steps of its resolution, and how seldom it stays is counted in nominal episodes. n_t is the
-evidence for "it repeats itself with probability ρ" against "with p", begun anew wherever that is best (Page 1954,
-Biometrika 41, 100-115). A sense that repeats itself as often as not, being read more slowly than the stream or coarsely
-rounded, then counts for little or nothing, and none for more than it came to in nominal episodes. Where nobody
-declared the noise of any sense, those are watched that never repeated themselves in any of them.
+A prediction of changes cannot tell a stuck sense from one at rest. But noise moves a working sense between its
+readings, and p, counted in nominal episodes, tells how seldom it stays. n_t is the evidence for "it repeats itself with
+probability ρ" against "with p" (CUSUM). A sense that often repeats itself, because it is coarse or slower than the
+stream, counts for little; none counts for more than it reached in nominal episodes. If no channel declares its noise,
+the senses that never repeated themselves are watched.
 
-An arm that stands still repeats its digits, and is healthy: a sense whose noise does not carry it from one of its
-readings to the next (σ < δ/2, see ``readings``), or that went on repeating itself in nominal episodes, is not watched
-here. If such a sense is stuck, the others say so: what they do asks for a change that does not come.
+A sense is not watched here if its noise is too small to change its reading at rest (σ < δ/2, see ``readings``), or if
+it kept repeating itself in nominal episodes.
+
+Source: Page 1954 (Biometrika 41, 100-115).
 """
 
 from __future__ import annotations
@@ -30,43 +30,43 @@ from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.readings import noise_of, resolution
 
 STUCK = 0.9
-"""ρ: below 1, for a cable that is loose lets a reading through now and then."""
+"""ρ; below 1, as a loose cable lets a reading through now and then."""
 
 REPETITION_OFFSET = 12.0
-"""n_0: one in 160,000, which among a hundred senses happens once in some thousand steps."""
+"""n_0: one in 160,000, which among a hundred senses happens once in some thousand rows."""
 
 UNMOVED = 0.5
-"""Noise of fewer steps than this leaves a reading where it is."""
+"""Noise below this many steps of the resolution leaves a reading where it is."""
 
 RESTS = 0.5
-"""A sense that repeats itself again as often as that, once it has begun to, stands still now and then."""
+"""A sense that repeats itself this often after a repetition is at rest now and then."""
 
 RESTLESS = 5.0
-"""A repetition is no rarer than one in so many times the number of nominal episodes: of ninety, two are enough."""
+"""A repetition is assumed no rarer than one in this many times the number of nominal episodes."""
 
 MOST_READ = 20_000
-"""Rows from which noise and resolution are told."""
+"""Largest number of rows from which noise and resolution are estimated."""
 
 MOST_BEYOND = 24.0
-"""How far n may pass n_0: what is stuck for an hour is no more stuck than what is stuck for a second."""
+"""Largest n - n_0."""
 
 
 class Repetition(NamedTuple):
-    """What is carried from row to row, one entry a stream; a value, never changed in place."""
+    """State of B streams; a value, never changed in place."""
 
-    row: NDArray[np.float64]  # (B, X) what the senses said last; not a number before the first
-    again: NDArray[np.bool_]  # (B, X) whether that was a repetition
+    row: NDArray[np.float64]  # (B, X) the last readings; NaN before the first
+    again: NDArray[np.bool_]  # (B, X) whether they were repetitions
     unlikely: NDArray[np.float64]  # (B, X) n
 
 
 def unrepeated(batch: int, size: int) -> Repetition:
-    """Before the first row, of ``size`` senses."""
+    """Return the state before the first row of ``size`` senses."""
     shape = batch, size
     return Repetition(np.full(shape, np.nan), np.zeros(shape, np.bool_), np.zeros(shape))
 
 
 def stands_still(streams: Sequence[NDArray[np.floating[Any]]]) -> NDArray[np.bool_]:
-    """(X,) which senses repeat themselves where the robot is at rest, by their readings in nominal episodes (T, X)."""
+    """Return the senses (X,) that repeat themselves at rest, judged by nominal episodes (T, X)."""
     enough: list[NDArray[np.floating[Any]]] = []
     for stream in streams:
         enough.append(stream)
@@ -83,12 +83,12 @@ def stands_still(streams: Sequence[NDArray[np.floating[Any]]]) -> NDArray[np.boo
 
 
 def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(3, X) -log p of a repetition, after none and after one, 0 for senses that may well stand still; and n_0.
+    """Return (3, X): -log p after a change and after a repetition, 0 for senses not watched; and n_0.
 
     Args:
         streams: (T, X) the senses in nominal episodes.
-        noisy: (X,) which are known to have noise; the others may well stand still, as a command at its limit does.
-            Where none is known to have any, nobody said which: then those that never repeat themselves are watched.
+        noisy: (X,) senses with declared noise; only those are watched, and where there are none, senses that never
+            repeated themselves.
     """
     chances, happened = np.zeros((2, len(noisy))), np.zeros((2, len(noisy)))
     for stream in streams:
@@ -99,7 +99,7 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
     first = (happened[0] + 0.5) / (chances[0] + 1.0)
     # Rest comes by the episode: where n of them never rested, the next may.
     first = np.maximum(first, 1.0 / (RESTLESS * len(streams)))
-    # As rare after a repetition as after none, until seen to be otherwise.
+    # As rare after a repetition as after a change, unless seen to be otherwise.
     p = np.array([first, (happened[1] + first) / (chances[1] + 1.0)])
     watched = (noisy & ~stands_still(streams) & (p[1] < RESTS)) if noisy.any() else happened.sum(axis=0) == 0
     counted = np.where(watched, -np.log(p), 0.0)
@@ -115,10 +115,10 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
 
 
 def evidence_steps(surprise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2, 2, X) what a change and a repetition add to n, after none and after one.
+    """Return (2, 2, X): what a change and a repetition add to n, after a change and after a repetition.
 
     Args:
-        surprise: (2, X) -log p. Nothing is learned from a sense that repeats itself more often than a stuck one.
+        surprise: (2, X) -log p; a sense that repeats itself more often than a stuck one adds nothing.
     """
     p = np.exp(-surprise)
     with np.errstate(divide="ignore"):
@@ -128,7 +128,7 @@ def evidence_steps(surprise: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def improbability(repetition: Repetition, offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """r (B, X), with n_0 (X,)."""
+    """Return r (B, X), with n_0 ``offset`` (X,)."""
     unlikely = repetition.unlikely
     ratio: NDArray[np.float64] = np.where(unlikely > 0, np.exp(TAIL_INDEX * (unlikely - offset)), 0.0)
     return ratio
@@ -136,7 +136,14 @@ def improbability(repetition: Repetition, offset: NDArray[np.float64]) -> NDArra
 
 @compiled
 def repeated(row: Any, again: Any, unlikely: Any, rows: Any, steps: Any, most: Any) -> Any:
-    """The fields of a ``Repetition`` after the next rows (B, X), with ``evidence_steps`` and the most n (X,) may be."""
+    """Return the fields of ``Repetition`` after the next rows (B, X).
+
+    Args:
+        row, again, unlikely: the fields before.
+        rows: (B, X).
+        steps: (2, 2, X) of ``evidence_steps``.
+        most: (X,) upper bound of n.
+    """
     B, X = rows.shape
     now, evidence = np.zeros((B, X), np.bool_), np.zeros((B, X))
     for n in range(B):

@@ -1,13 +1,13 @@
-"""Scores of the literature: each row by itself, or a few, against nothing but what errors are usual.
+"""Scores of the literature: errors of one row or a few, relative to usual errors only.
 
     squares        Σ_i ε_i²
     mahalanobis    ‖M ε‖²                       M whitens the errors of nominal steps
     moving_mean    mean over 5 steps of ε_i²    summed over i
     largest        max_i |ε_i|
-    per_dimension  max_i |ε_i| / q_i            q_i: what |ε_i| exceeds in one of a thousand nominal rows
+    per_dimension  max_i |ε_i| / q_i            q_i: |ε_i| exceeds it in one of a thousand nominal rows
 
-Source: Xu et al. 2025 (RSS) for the moving mean; Haddadin, De Luca and Albu-Schäffer 2017, Eq. 31, for the largest;
-Munn et al. 2026 (arXiv 2602.01515) for dimensions that are calibrated each by itself.
+Sources: Xu et al. 2025 (RSS) for the moving mean; Haddadin, De Luca and Albu-Schäffer 2017, Eq. 31, for the largest;
+Munn et al. 2026 (arXiv 2602.01515) for the calibration of each dimension.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number
 
 WINDOW = 5
-"""Rows that the moving mean is taken over."""
+"""Rows of the moving mean."""
 
 SELDOM, TINY = 1e-3, 1e-6
-"""Share of nominal rows in which an error is larger than what it is measured by; the least that it is measured by."""
+"""Share of nominal rows above q_i, and the least q_i."""
 
 
 class Squares:
-    """The sum of squared errors; nothing is learned, nothing carried on."""
+    """The sum of squared errors, which learns nothing."""
 
     name = "squares"
     arrays: tuple[str, ...] = ()
@@ -59,7 +59,7 @@ class Squares:
         return state
 
     def parts(self, output: ModelOutput) -> NDArray[np.float64]:
-        """(B, X) each error's share of the score; >= 0."""
+        """Return each error's share of the score (B, X), >= 0."""
         squared: NDArray[np.float64] = np.asarray(output.errors, np.float64) ** 2
         return squared
 
@@ -68,7 +68,7 @@ class Mahalanobis(Squares):
     """The Mahalanobis distance of errors, squared.
 
     Args:
-        spec: the stream that is watched.
+        spec: the stream.
         shrinkage: λ in [0, 1], towards no correlation between errors.
     """
 
@@ -117,7 +117,7 @@ class Largest(Squares):
 
 
 class PerDimension(Largest):
-    """The largest error, each measured by what it seldom exceeds in nominal rows that the model has not learned."""
+    """The largest error relative to a quantile of its own in held-out nominal rows."""
 
     name = "per_dimension"
     arrays = ("seldom",)

@@ -1,15 +1,13 @@
-"""Tails: how surprised each number is in nominal episodes at its worst, and how much further it may go.
+"""Tails: each number's surprise relative to its worst in nominal episodes, and how far beyond it may go.
 
-    r_i = (v_i/q_i)^κ_i        q_i: what v_i stays below in 90 % of episodes
+    r_i = (v_i/q_i)^κ_i        q_i: v_i stays below it in 90 % of episodes
                                κ_i = min(1, ξ_0/ξ_i),  ξ_i: the index of the tail beyond q_i
 
-Each number is measured against what it does at its worst, so that a wrist that is often surprised by contact does not
-drown an encoder that never is. Beyond q the maxima of episodes fall off as v^(-1/ξ): a ratio of 10 happens to a wrist
-now and then, to an encoder never. The exponent κ makes the same ratio as rare for the one as for the other.
+Relative to its own worst, a wrist that contact often surprises does not drown an encoder that is never surprised.
+Beyond q the maxima of episodes fall off as v^(-1/ξ). κ makes equal ratios equally rare for all numbers.
 
-Hours of healthy operation tell q better than what was learned from (``ceilings``): q is then what 98 % of episodes stay
-below, and κ goes by a smaller ξ_0. Few hours tell no tail of 98 %, and those of one policy nothing of others, so ξ_i
-stays what was learned.
+Hours of healthy operation tell q better than the learned episodes (``ceilings``): q is then a quantile of 98 %, and κ
+goes by a smaller ξ_0. ξ_i stays what was learned, as few hours show no tail beyond 98 %.
 
 Source: Hill 1975 for the index of a tail.
 """
@@ -25,27 +23,26 @@ TAIL_INDEX = 0.3
 """ξ_0: a ratio falls off as probability to this power."""
 
 HOURS_TAIL_INDEX, HOURS_QUANTILE = 0.2, 0.98
-"""ξ_0, and the share of episodes below q, where hours of healthy operation tell q."""
+"""ξ_0, and the share of episodes below q, where hours of healthy operation set q."""
 
 FEWEST_EPISODES = 100
-"""That tell what 98 % of episodes stay below."""
+"""Number of episodes that such a quantile needs."""
 
 NOMINAL_QUANTILE = 0.9
-"""Share of nominal episodes whose maximum of v stays below q; those above tell how far it goes."""
+"""Share of nominal episodes whose maximum of v stays below q."""
 
 TAIL_PRIOR_COUNT = 10
-"""How many maxima beyond q a tail must show of its own to count as much as what is common among all."""
+"""Maxima beyond q after which a number's own tail counts as much as the tail common to all."""
 
 SMALLEST = 1e-9
 """Lower bound of q."""
 
 LEAST_SHARE = 1e-3
-"""q is at least this share of what is common among all numbers: one that never erred in a few episodes may do so yet,
-and its first small error is not a thousand million times what is usual."""
+"""Lower bound of q as a share of the median q, for numbers that never erred in a few episodes."""
 
 
 def worst_case(maxima: Array, tail_index: float = TAIL_INDEX) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """q and κ by ξ_0, of the shape of one episode's maxima, from those of N nominal episodes (N, …)."""
+    """Return q and κ (…) by ξ_0 from the maxima of N nominal episodes (N, …)."""
     ceiling = ceilings(maxima, NOMINAL_QUANTILE)
     beyond = np.log(np.maximum(maxima / ceiling, 1.0))
     total, count = beyond.sum(axis=0), (beyond > 0).sum(axis=0)
@@ -55,7 +52,7 @@ def worst_case(maxima: Array, tail_index: float = TAIL_INDEX) -> tuple[NDArray[n
 
 
 def ceilings(maxima: Array, quantile: float) -> NDArray[np.float64]:
-    """q, of the shape of one episode's maxima: what that share of N nominal episodes (N, …) stays below."""
+    """Return q (…): a quantile of the maxima of N nominal episodes (N, …)."""
     found = np.maximum(np.quantile(maxima, quantile, axis=0), SMALLEST)
     least: NDArray[np.float64] = np.maximum(found, LEAST_SHARE * np.median(found))
     return least

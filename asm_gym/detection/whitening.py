@@ -1,4 +1,4 @@
-"""Whitening: errors without correlation, of equal variance, and none of them out of all proportion.
+"""Whitening: errors of equal variance without correlation, each bounded.
 
     whitened   e_t = M ε_t/σ_t,   M = ((1 - λ) C + λ tr(C)/X I)^(-½),   C = E[(ε/σ)(ε/σ)ᵀ] over nominal steps
     bounded    ẽ_i = e_i / √(1 + e_i²/ν²)                               |ẽ_i| < ν, however large e_i
@@ -19,12 +19,15 @@ MOST_ERRORS = 8192
 
 
 def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
-    """The symmetric (ZCA) matrix M (X, X) that makes ``errors`` (N, X) white; of all, it turns them the least.
+    """Return the symmetric (ZCA) matrix M (X, X) that makes ``errors`` (N, X) white and turns them least.
 
     Args:
-        errors: normalised errors of nominal steps; their mean is taken to be 0, as that of a prediction should be.
-        shrinkage: λ in [0, 1], towards equal variance and no correlation. Above 0 a channel that is constant, or a
-            copy of another, is no trouble.
+        errors: normalised errors of nominal rows, of mean 0.
+        shrinkage: λ in [0, 1], towards equal variance and no correlation. Above 0 constant channels and copies of
+            channels are no trouble.
+
+    Raises:
+        ValueError: too many errors, or shrinkage out of range.
     """
     if errors.shape[1] > MOST_ERRORS:
         raise ValueError(
@@ -43,7 +46,7 @@ def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
 
 
 def bounded(errors: Array, bound: float) -> NDArray[np.float64]:
-    """Errors pulled in one by one: none counts more than ν = ``bound`` standard deviations."""
+    """Return the errors, none beyond ν = ``bound`` standard deviations."""
     exact = np.asarray(errors, np.float64)
     pulled: NDArray[np.float64] = exact / np.sqrt(1.0 + (exact / bound) ** 2)
     return pulled

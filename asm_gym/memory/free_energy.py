@@ -10,9 +10,10 @@
     reaction      (x, u) ← argmin F over the command and the row that it will lead to
     learning      ΔW ∝ -∂F/∂W of every synapse, in its own term
 
-ε and μ are those of ``inference`` or ``settling``, e and σ of ``association``, û of ``motor``. The free parameters are τ,
-one for the temporal network, and τ_j, one for each command: the spreads left in healthy rows. With them the sums have
-one unit, nats. Learning of association bounds e/σ, the slope of Huber's ρ in place of ½r²; within the bound they agree.
+ε and μ are those of ``inference`` or ``settling``, e and σ of ``association``, û of ``motor``. The free parameters are
+τ, one for the temporal network, and τ_j, one for each command: the spreads left in healthy rows. With them the sums
+have one unit, nats. Learning of association bounds e/σ, the slope of Huber's ρ in place of ½r²; within the bound they
+agree.
 
 Sources: Friston 2005 (Phil. Trans. R. Soc. B) for the sum and its precisions; Millidge et al. 2024 for the part through
 time; Adams, Shipp and Friston 2013 (Brain Struct. Funct.) for actions that descend the energy of their outcome.

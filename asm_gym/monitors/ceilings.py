@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.detector import EvidenceDetection
 from asm_gym.detection.events import Excuses
+from asm_gym.detection.evidence_detection import EvidenceDetection
 from asm_gym.episode import Episode
 from asm_gym.monitors.base import Model
 from asm_gym.monitors.stream_model import model_outputs

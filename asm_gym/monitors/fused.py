@@ -20,8 +20,9 @@ from threadpoolctl import ThreadpoolController
 
 from asm_gym.compilation import compiled, must_compile
 from asm_gym.detection import Detection, EvidenceDetection
-from asm_gym.detection.detector import EvidenceState, _step
+from asm_gym.detection.detector import _step
 from asm_gym.detection.evidence import POWER, TINY, Evidence
+from asm_gym.detection.evidence_detection import EvidenceState
 from asm_gym.detection.repetition import Repetition, repeated
 from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.memory.association import normalised_errors
