@@ -27,6 +27,29 @@ class Policy(Protocol):
 
 
 @runtime_checkable
+class Reflex(Policy, Protocol):
+    """A policy that is told of every step, and starts from what was done last."""
+
+    def reset(self) -> None:
+        """A new episode begins."""
+        ...
+
+    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
+        """Take in what was sensed in a step, and what was done.
+
+        Args:
+            row: (D,) of the stream; NaN where it is missing.
+            executed: (A,).
+            acting: whether this reflex did it.
+        """
+        ...
+
+    def begin(self, executed: NDArray[np.float32]) -> Any:
+        """Return the state to start from, after ``executed`` (A,)."""
+        ...
+
+
+@runtime_checkable
 class Seeded(Protocol):
     """What draws at random and can be told to draw the same again, as every stable-baselines3 model can."""
 

@@ -1,64 +1,69 @@
-"""What to do on an alarm, beside staying: go on as expected, go back, give way, or what its cause asks for."""
+"""Staying where one is: what a reflex of your own derives from, and which action is rest."""
 
 from __future__ import annotations
 
-from collections import deque
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.policies.holding import Begun, Hold, Reflex, nearest_to_rest, require_unchanged, resting_action
-from asm_gym.protocols import TurnsJoints
-from asm_gym.spec import StreamSpec, control_period
-from asm_gym.validation import check_number
-
-__all__ = [
-    "Begun",
-    "Comply",
-    "Graded",
-    "Hold",
-    "Recall",
-    "Reflex",
-    "Retract",
-    "nearest_to_rest",
-    "resting_action",
-]
-
-USUAL_GAIN = 0.1
-"""Weight of the newest step in the external torque that is taken to be usual."""
-
-FELT_AT_ONCE = 100
-"""Rows that are kept before they are reckoned with."""
-
-DELTAS = ("OSC_POSE", "JOINT_POSITION")
-"""Controllers whose actions are changes, of pose or of joint angles."""
+from asm_gym.protocols import HasGrippers, HoldsItself
 
 
-class Recall(Hold):
-    """Goes on along what the memory expects to be commanded: the skill's own continuation.
+class Begun(NamedTuple):
+    """Where a reflex is."""
 
-    The wrapper says what that is after every step, by the monitor's ``expected_action``.
+    executed: NDArray[np.float32]  # (A,) the action executed last before it began; its grip is kept
+    steps: int  # that it has acted
+
+
+class Hold:
+    """Stay, and keep the grip, so that nothing is dropped.
+
+    An environment that can hold itself, as all of this package can, is told to: it stays under any controller and with
+    any wrapper in between. Each ``predict`` speaks for the next step, whatever action that is then given. In any other
+    environment a zero action is taken to mean "stay".
 
     Args:
-        env: one whose stream carries the actions it is given.
+        env: one with a Box action space.
+        safe_action: what to do instead, where a zero action does not mean "stay"; it goes through all wrappers.
 
     Raises:
-        ValueError: a wrapper inside changes actions, so that those of the stream are others.
+        TypeError: the action space is no Box.
+        ValueError: ``safe_action`` does not fit the action space, or no action is known that arrives as zero.
     """
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        if env.has_wrapper_attr("stream_spec"):
-            require_unchanged(env, "recall")
+    def __init__(self, env: gym.Env[Any, Any], safe_action: NDArray[np.float32] | None = None) -> None:
+        space = env.action_space
+        if not isinstance(space, spaces.Box):
+            raise TypeError(f"a reflex needs a Box action space, got {space}")
+        inner = env.unwrapped
+        self.env = env
+        """Where it acts; a guard refuses one that was made for another environment."""
+        self.explicit = safe_action is not None
+        """It does ``safe_action``, and knows of no environment."""
+        self._robot = inner if isinstance(inner, HoldsItself) and not self.explicit else None
+        if safe_action is not None:
+            self._rest = np.array(safe_action, np.float32)
+        else:
+            self._rest = nearest_to_rest(space) if self._robot else resting_action(env)
+        if not space.contains(self._rest):
+            raise ValueError(f"safe_action {self._rest} is not in {space}")
+        self._grip = np.asarray(inner.gripper_actions if isinstance(inner, HasGrippers) else (), dtype=int)
+        if self._grip.size and self._grip.max() >= self._rest.size:  # a wrapper inside takes other numbers
+            self._grip = self._grip[:0]
 
     def reset(self) -> None:
-        self.expects(self._rest)
+        """A new episode begins."""
 
-    def expects(self, action: NDArray[np.float32]) -> None:
-        """What the memory expects to be commanded next (A,)."""
-        self._expected = np.nan_to_num(np.array(action, np.float32))
+    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
+        """What was sensed in a step (D,), what was done (A,), and whether this reflex did it."""
+
+    def begin(self, executed: NDArray[np.float32]) -> Begun:
+        """The state to start from, after ``executed`` (A,)."""
+        return Begun(np.array(executed, np.float32), 0)
 
     def predict(
         self,
@@ -67,153 +72,67 @@ class Recall(Hold):
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], Begun | None]:
-        """The next action (A,), the gripper's part of it included."""
-        return self._expected.copy(), None if state is None else Begun(state.executed, state.steps + 1)
+        """The next action (A,)."""
+        action = self._rest.copy() if self.explicit else self.move()
+        if state is None:
+            return action, None
+        if not self.explicit:
+            action[self._grip] = state.executed[self._grip]
+        return action, Begun(state.executed, state.steps + 1)
+
+    def move(self) -> NDArray[np.float32]:
+        """The next action (A,); the gripper's part of it does not count."""
+        if self._robot is not None:
+            self._robot.holding = True
+        return self._rest.copy()
 
 
-class Retract(Hold):
-    """Back along the path just travelled, then stay.
+def nearest_to_rest(space: spaces.Box) -> NDArray[np.float32]:
+    """(A,) the action of a space that comes nearest to none."""
+    nearest: NDArray[np.float32] = np.clip(np.zeros(space.shape), space.low, space.high).astype(np.float32)
+    return nearest
 
-    Under a delta controller the negative of an action undoes it, so the last ones are undone, the newest first.
 
-    Args:
-        env: one whose controller takes changes of pose or of joint angles.
-        steps: how many actions to undo.
+def resting_action(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
+    """Return (A,) the action that reaches the innermost environment as zero.
 
     Raises:
-        ValueError: the environment's actions are no changes, a wrapper inside changes them, or it does not say.
+        ValueError: a wrapper inside changes actions so that none is known.
     """
-
-    def __init__(self, env: gym.Env[Any, Any], steps: int = 10) -> None:
-        super().__init__(env)
-        _require_deltas(env, "retract")
-        self._path: deque[NDArray[np.float32]] = deque(
-            maxlen=check_number("steps", steps, low=1, high=10_000, whole=True)
-        )
-
-    def reset(self) -> None:
-        self._path.clear()
-
-    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
-        if not acting:
-            self._path.append(np.array(executed, np.float32))
-
-    def move(self) -> NDArray[np.float32]:
-        if not self._path:
-            return super().move()
-        undone: NDArray[np.float32] = -self._path.pop()
-        return undone
+    space: Any = env.action_space
+    bounded = np.isfinite(space.low) & np.isfinite(space.high)
+    middle = 0.5 * (np.where(bounded, space.low, 0.0) + np.where(bounded, space.high, 0.0))
+    for candidate in (nearest_to_rest(space), middle.astype(np.float32)):
+        arrives, wrapper = candidate, env
+        while isinstance(wrapper, gym.Wrapper):
+            if isinstance(wrapper, gym.wrappers.TransformAction):  # a function of the action alone, so it may be asked
+                arrives = np.asarray(wrapper.action(arrives))
+            elif isinstance(wrapper, gym.ActionWrapper):
+                raise ValueError(outside(wrapper, "hold"))
+            wrapper = wrapper.env
+        if not np.any(arrives):
+            return candidate
+    changed = changed_by(env)
+    raise ValueError(outside(changed, "hold") if changed else no_rest(space))
 
 
-class Comply(Hold):
-    """Yields along the external torque that the joints measure, as a damper would.
-
-    Args:
-        env: one of this package's, with the channel ``external_torque``.
-        compliance: how far a joint gives way in a second [rad / (N m s)].
-        tolerated: external torque that no joint gives way to [N m].
-
-    Raises:
-        ValueError: the environment measures no external torque, its controller cannot be told to move so, or a wrapper
-            inside changes actions.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any], compliance: float = 0.05, tolerated: float = 2.0) -> None:
-        super().__init__(env)
-        self._joints = _require_deltas(env, "comply")
-        spec: StreamSpec = env.get_wrapper_attr("stream_spec")
-        self._columns = np.array(
-            [i for n, s in spec.slices.items() if n.endswith("external_torque") for i in range(spec.size)[s]], np.intp
-        )
-        if not self._columns.size:
-            raise ValueError("comply needs the channel external_torque: make the environment with stream group torque")
-        self.tolerated = check_number("tolerated", tolerated, low=0)
-        self._each_step = check_number("compliance", compliance, low=0) * control_period(env)
-        self.reset()
-
-    def reset(self) -> None:
-        self._usual = np.zeros(len(self._columns))
-        self._torque = np.zeros(len(self._columns))
-        self._felt: list[tuple[NDArray[np.floating[Any]], bool]] = []  # (J,) each, and whether it acted
-
-    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
-        self._felt.append((row[self._columns], acting))
-        if len(self._felt) > FELT_AT_ONCE:
-            self._reckon()
-
-    def _reckon(self) -> None:
-        """Makes up for rows that were only kept: nobody asks while the policy acts."""
-        for felt, acting in self._felt:
-            if not acting:
-                # What is carried weighs on the joints as well; only what has come since is yielded to.
-                self._usual += USUAL_GAIN * (self._torque - self._usual)
-            torque = np.asarray(felt, np.float64)
-            self._torque = torque if np.isfinite(torque).all() else np.nan_to_num(torque)
-        self._felt.clear()
-
-    @property
-    def load(self) -> NDArray[np.float64]:
-        """(J,) external torque beyond the usual and the tolerated [N m]."""
-        self._reckon()
-        more = self._torque - self._usual
-        beyond: NDArray[np.float64] = np.sign(more) * np.maximum(np.abs(more) - self.tolerated, 0.0)
-        return beyond
-
-    def move(self) -> NDArray[np.float32]:
-        return self._joints.action_for(self._each_step * self.load)
+def changed_by(env: gym.Env[Any, Any]) -> gym.ActionWrapper[Any, Any, Any] | None:
+    """Return the outermost wrapper that changes actions; None where there is none."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.ActionWrapper) and not isinstance(env, gym.wrappers.ClipAction):
+            return env
+        env = env.env
+    return None
 
 
-class Graded(Hold):
-    """Does what is asked for: stays, gives way, or goes back.
-
-    The wrapper says which, by severity and cause of the alarm. What the environment does not allow is replaced by
-    staying. The wrapper hands back when surprise is quiet, and on trial after ``TRY_AFTER_S`` where it
-    is not, for a robot that holds still where it never did may surprise itself; after ``GIVE_UP_AFTER_S`` in all it
-    ends the episode. The policy may go on in alarm for ``GO_ON_S`` in an episode. It ends where the policy passes a
-    contact limit for the time ``STRIKES``, or presses with more than ``IMPULSE`` [N s] beyond healthy motion.
-
-    Args:
-        env: one with a Box action space.
-        compliance, tolerated: of ``Comply``.
-    """
-
-    TRY_AFTER_S, GIVE_UP_AFTER_S, GO_ON_S = 0.5, 3.0, 5.0
-    STRIKES, IMPULSE = 3, 20.0
-
-    def __init__(self, env: gym.Env[Any, Any], compliance: float = 0.05, tolerated: float = 4.0) -> None:
-        super().__init__(env)
-        self._reflexes: dict[str, Hold] = {"hold": Hold(env)}
-        for name, make in (("yield", lambda: Comply(env, compliance, tolerated)), ("retract", lambda: Retract(env))):
-            try:
-                self._reflexes[name] = make()
-            except ValueError:  # the environment does not allow it
-                self._reflexes[name] = self._reflexes["hold"]
-        self.choose("hold")
-
-    def choose(self, name: str) -> None:
-        """What to do from now on: ``"hold"``, ``"yield"`` or ``"retract"``; anything else is staying."""
-        self._chosen = self._reflexes.get(name, self._reflexes["hold"])
-
-    def reset(self) -> None:
-        for reflex in self._reflexes.values():
-            reflex.reset()
-        self.choose("hold")
-
-    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
-        for reflex in self._reflexes.values():
-            reflex.feel(row, executed, acting)
-
-    def move(self) -> NDArray[np.float32]:
-        return self._chosen.move()
+def outside(wrapper: Any, reflex: str, guard: str = "NeuralASMSafety") -> str:
+    """Return that a wrapper must not stand inside of the guard."""
+    return (
+        f"{type(wrapper).__name__} changes actions, so that {reflex} cannot know what reaches the robot: "
+        f"put it outside of {guard}, or use Hold(env, safe_action=...)"
+    )
 
 
-def _require_deltas(env: gym.Env[Any, Any], name: str) -> TurnsJoints:
-    inner = env.unwrapped
-    controller = inner.controller if isinstance(inner, TurnsJoints) else None
-    if not isinstance(inner, TurnsJoints) or controller not in DELTAS:
-        raise ValueError(
-            f"{name} needs an environment whose controller is {' or '.join(DELTAS)}, got {controller}: "
-            "use hold with a safe_action of your own, or name any policy"
-        )
-    require_unchanged(env, name)
-    return inner
+def no_rest(space: Any) -> str:
+    """Return that no action of a space is known to rest."""
+    return f"hold takes a zero action for rest, which is not in {space}: use Hold(env, safe_action=...)"

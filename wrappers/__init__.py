@@ -4,10 +4,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from asm_gym.extras import needed_for
+from asm_gym.wrappers.completed import CompletedObservation
 from asm_gym.wrappers.features import StreamFeatures
 from asm_gym.wrappers.logging import FlatInfo, SafetyLog, SixValues, WandbWriter
 from asm_gym.wrappers.recording import StreamRecorder
-from asm_gym.wrappers.repair import CompletedObservation
 from asm_gym.wrappers.safety import NeuralASMSafety
 from asm_gym.wrappers.vector import VectorNeuralASMSafety
 

@@ -9,7 +9,7 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 
 from asm_gym.faults import Fault
-from asm_gym.policies.holding import Begun, Hold
+from asm_gym.policies.reflexes import Begun, Hold
 
 STAYS_S = 0.5
 """For so long after the last substep in which something pressed the arm stays [s]."""

@@ -12,25 +12,19 @@ from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection import AdaptiveThreshold
-from asm_gym.monitors import LearnsOnTheJob, Monitor, Surprise
-from asm_gym.protocols import HoldsItself
+from asm_gym.guard.checks import LOG, Fitted, check_monitor, diagnosis_of, fitted_to
+from asm_gym.guard.engine import Engine
+from asm_gym.guard.motion import Command
+from asm_gym.guard.options import GuardOptions, OnAlarm
+from asm_gym.guard.report import INFO, RowReport, report
+from asm_gym.monitors import Monitor
+from asm_gym.policies.base import Policy
+from asm_gym.policies.reflexes import Hold
+from asm_gym.protocols import HoldsItself, SensesWithinSteps
 from asm_gym.spec import control_period
 from asm_gym.stream_source import StreamSource
 from asm_gym.validation import as_float32, check_choice, check_number, shown
-from asm_gym.wrappers.factory import (
-    LOG,
-    OnAlarm,
-    body_memory,
-    check_monitor,
-    check_rate,
-    fitted_parts,
-    fitted_to,
-    running,
-)
-from asm_gym.wrappers.guard import Guard, GuardOptions, nothing
-from asm_gym.wrappers.observer import Observer, joined
-from asm_gym.wrappers.quiet import QuietRow, QuietRows
-from asm_gym.wrappers.step_report import INFO, STALE, RowReport, Said, ends, report
+from asm_gym.wrappers.robots import body_memory, felt_by, robots_of
 
 
 class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -52,7 +46,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     and stream hold what that sensor should say, completed from all others, until it has been well for a second. A
     number that is not finite is an alarm; under ``"graded"`` it is completed, and surprise goes on from what is left.
 
-    ``info["asm"]`` says what came of a step: see ``asm_gym.wrappers.step_report.report``. For loggers the same stands
+    ``info["asm"]`` says what came of a step: see ``asm_gym.guard.report.report``. For loggers the same stands
     beside it as NumPy scalars: ``info["asm_surprise"]``, ``info["asm_alarm"]``, ``info["asm_intervened"]``, and
     ``info["cost"]``, which is 1.0 on every step with an alarm and 0.0 otherwise, as safe-RL libraries expect.
     ``info["overridden"]`` is True after a step that began with another than the policy in charge: a policy with a state
@@ -65,7 +59,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             alone, and ``info["asm"]["alarms"]`` and ``info["cost_sum"]`` count those that it skips.
         monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that ``env`` moves.
         on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip, in environments of this package under
-            every controller and wrapper; ``"retract"`` goes back along the path; ``"comply"`` yields to what presses;
+            every controller and wrapper; ``"retract"`` goes back along the path; ``"comply"`` gives way;
             ``"recall"`` goes on as the memory expects; ``"graded"`` does what severity and cause ask for
             (``responses``), hands back on trial, and ends the episode where trials fail, or the policy presses too
             often; ``"terminate"`` ends the episode; any other policy acts itself, and where it raises, or returns what
@@ -92,7 +86,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             with a false alarm. Not counted are alarms above the ceiling, those that went on while the reflex acted, and
             those that ``confirm_alarm`` was called for. None for a threshold that stays.
         responses: under ``"graded"``, what is done about which cause, where it is not what
-            ``asm_gym.wrappers.responses.DEFAULT`` says: ``{"contact": "yield"}``. None may let a pressing arm go on.
+            ``asm_gym.guard.responses.DEFAULT`` says: ``{"contact": "comply"}``. None may let a pressing arm go on.
         contact_limits: what an arm may feel and how fast its hand may go. ``"memory"`` for the usual ones, and more
             where the monitor's calibration episodes have shown that healthy motion here does. None for none: then
             nobody knows what presses, and ``"graded"`` holds at every alarm but a sensor's.
@@ -143,6 +137,9 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             "max_override": max_override,
             "try_after": try_after,
             "truncate": truncate,
+            "online_learning_rate": online_learning_rate,
+            "on_overrun": on_overrun,
+            "adaptive_threshold": adaptive_threshold,
             "responses": responses,
             "contact_limits": contact_limits,
         }
@@ -150,10 +147,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             self,
             _disable_deepcopy=True,  # a reflex holds its environment, and a memory is large
             monitor=monitor,
-            online_learning_rate=online_learning_rate,
             monitor_freq=monitor_freq,
-            on_overrun=on_overrun,
-            adaptive_threshold=adaptive_threshold,
             info=info,
             **given,
         )
@@ -164,24 +158,20 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 f"on_alarm={shown(on_alarm)} needs a Box action space to act in, got {env.action_space}: others can "
                 'only be watched, on_alarm="monitor", or ended, "terminate"'
             )
-        check_choice("on_overrun", on_overrun, ("warn", "alarm", "ignore"))
         check_choice("info", info, INFO)
         self._full = info == "full"
         self._options = GuardOptions(**given)
-        self.online_learning_rate = check_number("online_learning_rate", online_learning_rate, low=0, high=1)
-        self._source, self._monitor_freq = StreamSource(env), monitor_freq
-        self._adaptive = adaptive_threshold
+        self._source = StreamSource(env)
         self._spec = self._source.spec
         if monitor_freq is not None:
-            sensing = check_rate(env, monitor_freq)
+            sensing = _can_sense(env, monitor_freq)
             self._spec = sensing.stream_spec_at(monitor_freq)
         self._rows_per_step = max(1, round(control_period(env) / self._spec.dt)) if self._source.own else 1
         self._watch_with(body_memory(env, self._spec) if monitor is None else monitor)
         if monitor_freq is not None:
             sensing.stream_freq = monitor_freq  # nothing changes before everything is known to fit
-        self._on_overrun: str = on_overrun
-        self._warm = self._warned = False
-        self._holds = env.unwrapped if isinstance(env.unwrapped, HoldsItself) else None
+        self._inner: Any = env.unwrapped
+        self._holds = isinstance(self._inner, HoldsItself)
         self._ended = True
 
     @property
@@ -196,55 +186,39 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._next = monitor
 
     def _watch_with(self, monitor: Monitor) -> None:
-        """Takes up a monitor, and all that depends on it."""
+        """Take up a monitor, and all that depends on it."""
         monitor = fitted_to(monitor, self._spec)
-        if self.online_learning_rate > 0 and not isinstance(monitor, LearnsOnTheJob):
-            raise ValueError(f"{type(monitor).__name__} cannot learn on the job: online_learning_rate must be 0")
-        threshold = check_monitor(monitor, self._spec)
-        self._running = running(self._adaptive, threshold)
-        self._guard = Guard(self.env, monitor, self._options, threshold, self._box, self._rows_per_step)
-        self._observer = Observer(monitor, recalls=self._guard.recalls)
-        learns = self.online_learning_rate > 0
-        self._quiet, self._calm = None if learns else QuietRows.of(monitor, self._guard), False
-        self._monitor = self._next = monitor
-        self._parts, self._promised = fitted_parts(monitor), threshold
-        self._confirmed = False
-
-    def _take_over(self) -> None:
-        """Sees whether the monitor has changed since it was taken up."""
-        changed = any(a is not b for a, b in zip(fitted_parts(self._next), self._parts, strict=True))
-        if changed or check_monitor(self._next, self._spec) != self._promised:
-            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
-            self._watch_with(self._next)
+        check_monitor(monitor, self._spec)
+        chosen = self._options.reaction(diagnosis_of(monitor) is not None)
+        policies = () if isinstance(chosen, str) else (made_for(chosen, self.env),)
+        robots, self._places = robots_of(self.env, monitor.spec)
+        self._engine = Engine(robots, monitor, self._options, policies, self._rows_per_step)
+        self._robots, self._monitor = robots, monitor
+        self._next, self._taken_up = monitor, Fitted.of(monitor, self._spec)
 
     @property
     def threshold(self) -> float:
         """What surprise must exceed for an alarm in this episode."""
-        return self._guard.arbiter.threshold
+        return float(self._engine.threshold[0])
 
     def confirm_alarm(self) -> None:
-        """Says that what has alarmed in this episode was real, so that ``adaptive_threshold`` does not take it for a
+        """Say that what has alarmed in this episode was real, so that ``adaptive_threshold`` does not take it for a
         false alarm."""
-        self._confirmed = True
+        self._engine.confirmed[:] = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._ended = True  # until it has worked
         observation, info = self.env.reset(seed=seed, options=options)
         info = dict(info)
-        self._follow()
-        self._take_over()
-        self._observer.begin()
-        self._observation = observation
-        self._guard.begin()
-        if self._quiet is not None:
-            self._quiet.begin()
-        self._calm = self._quiet is not None and self._guard.calm
-        self._threshold = float(self.threshold)
-        self._passing: list[NDArray[np.float32]] = []  # quiet rows of which the guard has not been told
-        self._alarms = 0
-        none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))
+        nothing = self._engine.begin()
+        if Fitted.of(self._next, self._spec).differs(self._taken_up):
+            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
+            self._watch_with(self._next)
+            nothing = self._engine.begin()
+        self._limit_contact(anew=True)
+        self._observation, self._alarms, self._failed = observation, 0, ""
         self._ended = False
-        self._report(info, [nothing(none)], None)
+        self._report(info, [nothing], None)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -255,163 +229,141 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             if action.shape != self._box.shape:
                 raise ValueError(f"an action has the shape {self._box.shape}, got {action.shape}")
         self._ended = True  # where anything raises, nobody knows what was done
-        self._failed = ""
-        self._command(action)
-        overridden = self._guard.arbiter.overriding or self._refused
-        self._rows: list[RowReport | QuietRow] = []
-        parts = zip(fitted_parts(self._monitor), self._parts, strict=True)
-        self._stale = "" if all(a is b for a, b in parts) else STALE
-        if self._calm and self._quiet is not None and self._quiet.stale:
-            self._interrupt()
-            self._quiet = None
+        self._failed, overridden = "", False
+        self._executed = action
+        if self._box is not None:
+            overridden = bool(self._command(action).overridden[0])
+        self._rows: list[RowReport] = []
         observation, reward, terminated, truncated, info = self._run()
         info = dict(info)  # an environment may use its own again
         row, failure = self._sensed(observation, info)
-        self._look(row, failure, info)
-        self._observation = observation = self._guard.responder.observed(observation)
-        repaired = self._guard.responder.row()
-        if repaired is not None and "stream" in info:
-            info["stream"] = repaired
+        self._judge(row, failure, info)
+        self._limit_contact()
+        if repaired := self._engine.repaired:
+            row, missing = repaired[0]
+            observation = observation if self._places is None else self._places.repaired(observation, row, missing)
+            if "stream" in info:
+                info["stream"] = row.copy()
+        self._observation = observation
         info["overridden"] = overridden or bool(info.get("overridden"))
-        asm = self._report(info, self._rows, self._executed)
-        if asm["gave_up"] or (
-            self._guard.ends_on_alarm and any(r.decision.alarm and ends(r.whole(self.threshold)) for r in self._rows)
-        ):
+        self._report(info, self._rows, self._executed)
+        if any(row.gave_up[0] or (self._engine.ends_on_alarm and row.ends[0]) for row in self._rows):
             terminated, truncated = terminated or not self._options.truncate, truncated or self._options.truncate
         self._ended = bool(terminated or truncated)
         return observation, reward, terminated, truncated, info
 
-    def _follow(self) -> None:
-        """Moves the threshold by the episode that has ended."""
-        guard = self._guard
-        if self._running is not None and guard.largest is not None:
-            confirmed = self._confirmed or guard.arbiter.confirmed
-            self._running.follow(guard.largest, guard.arbiter.threshold, confirmed)
-            guard.arbiter.threshold = self._running.value
-        guard.largest, self._confirmed = None, False
-
-    def _command(self, action: Any) -> None:
-        """Says what is to be done next: the policy's ``action`` (A,), or something else; never, where it is no Box."""
-        if self._box is None:
-            self._executed, self._refused = action, False
-            return
-        self._executed, failure, self._refused = self._guard.arbiter.command(action, self._observation)
-        self._failed = joined(self._failed, failure)
+    def _command(self, action: NDArray[np.float32]) -> Command:
+        """Choose what is to be done next: the policy's ``action`` (A,), or something else."""
+        command = self._engine.act(action.reshape(1, -1), lambda _: self._observation)
+        self._executed = command.actions[0].reshape(action.shape)
+        self._failed = "; ".join(filter(None, (self._failed, command.failures.get(0, ""))))
+        if command.brakes[0]:
+            self._inner.holding = True
+        return command
 
     def _run(self) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """The step of the environment. Rows that come before its end are watched meanwhile, and who is held is held in
-        all steps that wrappers in between make of one."""
+        """Make a step of the environment. Rows that come before its end are judged meanwhile, and a robot that is held
+        is held in all steps that wrappers in between make of one."""
         hooks: Any = self.env.get_wrapper_attr("row_hooks") if self._rows_per_step > 1 else None
         if hooks is not None:
-            hooks.append(self._look)
-        if self._holds is not None:
-            self._holds.keeps_holding = True
+            hooks.append(self._judge)
+        if self._holds:
+            self._inner.keeps_holding = True
         try:
             return self.env.step(self._executed)
         finally:
-            if self._holds is not None:
-                self._holds.keeps_holding = self._holds.holding = False
+            if self._holds:
+                self._inner.keeps_holding = self._inner.holding = False
             if hooks is not None:
-                hooks.remove(self._look)
+                hooks.remove(self._judge)
 
     def _sensed(self, observation: Any, info: dict[str, Any]) -> tuple[NDArray[np.float32], str]:
-        """The row (D,) that ends a step, or NaN and what failed."""
+        """Return the row (D,) that ends a step, or NaN and what failed."""
         try:
             row = as_float32(self._source.row(observation, self._executed, info))
-            if row.shape != (self.monitor.spec.size,):
-                raise ValueError(f"a row has the shape {(self.monitor.spec.size,)}, got {row.shape}")
+            if row.shape != (self._spec.size,):
+                raise ValueError(f"a row has the shape {(self._spec.size,)}, got {row.shape}")
         except Exception as error:
-            return np.full(self.monitor.spec.size, np.nan, np.float32), f"stream: {error!r}"
+            return np.full(self._spec.size, np.nan, np.float32), f"stream: {error!r}"
         return row, ""
 
-    def _look(self, row: NDArray[np.float32], failure: str = "", info: dict[str, Any] | None = None) -> None:
-        """One row: what the monitor makes of it, and who acts next; with ``info`` of the step that it ends."""
-        guard, late = self._guard, False
-        if self._calm:
-            if failure or self._refused or self._stale:
-                self._interrupt()
-            else:
-                late = self._passes(row, info)
-                if self._calm:
-                    return
-        beneath = None if info is None else guard.substeps.came(row, info)
-        if self._refused:
-            failure, self._refused = joined(self._failed, failure), False
-        if self._stale:
-            failure = joined(failure, self._stale)
-        row, failure = guard.read(row, failure)
-        surprise, expected, (failure,), latency = self._observer.observe(row[None], (failure,))
-        if late or self._late(latency):
-            surprise = surprise._replace(value=np.full(1, np.inf))
-        surprise = guard.heard(surprise, bool(failure))
-        if self.online_learning_rate > 0 and not guard.arbiter.overriding and not failure:
-            failure = self._observer.learn(row[None], surprise, self.online_learning_rate)
-            surprise = surprise if not failure else surprise._replace(value=np.full(1, np.inf))
-        said = guard.judge(
-            surprise, row, self._executed, failure, beneath, None if expected is None else expected[0], latency
-        )
-        if said.decision.acted_on or guard.forgets:
-            said = said._replace(failure=joined(said.failure, self._observer.forget(np.ones(1, np.bool_))))
+    def _judge(self, row: NDArray[np.float32], failure: str = "", info: dict[str, Any] | None = None) -> None:
+        """Judge one row, with ``info`` of the step that it ends; in mid-step a reflex takes over at once."""
+        executed = np.zeros((1, 0), np.float32) if self._box is None else self._executed.reshape(1, -1)
+        felt = None if info is None else felt_by(self._robots, info)
+        acts = bool(self._engine.overriding[0])
+        failures = {0: failure} if failure else None
+        said = self._engine.judge(np.array(row)[None], executed, felt, failures, ends_step=info is not None)
         self._rows.append(said)
-        if guard.arbiter.overriding and not said.decision.intervened and beneath is None:
+        if info is None and self._engine.overriding[0] and not (acts or said.intervened[0]):
             self._command(self._executed)
+            self._limit_contact()
             self.env.get_wrapper_attr("command")(self._executed)
-        self._calm = self._quiet is not None and guard.calm
 
-    def _passes(self, row: NDArray[np.float32], info: dict[str, Any] | None) -> bool:
-        """Lets a row pass in which nothing happens; else it is calm no more. Whether it was so late as to alarm."""
-        quiet = self._quiet
-        assert quiet is not None
-        quiet.take(self._observer.state)
-        row = np.array(row)  # an environment may use its own again
-        said = quiet.judge(row, info, self._threshold)
-        late = said is not None and self._late(said.latency)
-        if said is None or late:
-            self._interrupt()
-            return late
-        quiet.keep()
-        self._passing.append(row)
-        self._rows.append(said)
-        if info is not None and (failure := self._let_pass(ends_step=True)):
-            decision = said.decision._replace(failure=failure)
-            self._rows[-1] = said.whole(self._threshold)._replace(decision=decision, failure=failure)
-        return False
+    def _limit_contact(self, anew: bool = False) -> None:
+        """Tell the environment its contact limits, where they have changed; a new episode has forgotten them."""
+        limits = self._engine.limits[0]
+        if self._robots.limits_contact and (anew or limits is not self._limits):
+            self._inner.contact_limits = limits
+        self._limits = limits
 
-    def _let_pass(self, ends_step: bool) -> str:
-        """Tells the guard of the quiet rows of this step; what failed."""
-        rows, self._passing = self._passing, []
-        largest = max(said.value for said in self._rows[-len(rows) :])
-        return self._guard.let_pass(rows, self._executed, largest, ends_step)
-
-    def _interrupt(self) -> None:
-        """Something may have happened: ``Observer`` and ``Guard`` go on from where the quiet rows have come to."""
-        if self._passing:
-            self._let_pass(ends_step=False)
-        self._calm, state = False, None if self._quiet is None else self._quiet.hand_back()
-        if state is not None:
-            self._observer.state = state
-
-    def _late(self, latency: float) -> bool:
-        """Whether the monitor took so long that it counts as an alarm."""
-        late, self._warm = self._warm and latency > self.monitor.spec.dt, True
-        if late and self._on_overrun == "warn" and not self._warned:
-            self._warned = True
-            gym.logger.warn(
-                f"the monitor took {1e3 * latency:.1f} ms for a row that lasts {1e3 * self.monitor.spec.dt:.1f} ms"
-            )
-        return late and self._on_overrun == "alarm"
-
-    def _report(self, info: dict[str, Any], rows: Sequence[Said], executed: Any) -> dict[str, Any]:
-        """Says in ``info`` what came of a step."""
-        failed, responder = self._failed if executed is not None else "", self._guard.responder
-        asm = report(rows, self.monitor.spec, self.threshold, executed, failed)
-        self._alarms += asm["alarm"]
-        asm.update(completed=responder.completed, unread=responder.unread, lost=responder.lost, alarms=self._alarms)
-        if self._running is not None:
-            asm.update(ceiling=self._running.ceiling, level=self._running.level)
+    def _report(self, info: dict[str, Any], rows: Sequence[RowReport], executed: Any) -> None:
+        """Say in ``info`` what became of a step."""
+        self._alarms += any(row.alarm[0] for row in rows)
         if self._full:
-            info["asm"] = asm
-        info["asm_surprise"], info["asm_alarm"] = np.float64(asm["surprise"]), np.bool_(asm["alarm"])
-        info["asm_intervened"], info["cost"] = np.bool_(asm["intervened"]), np.float64(asm["alarm"])
+            asm = report(rows, 0, self._spec, executed, self._failed) | {"alarms": self._alarms}
+            running = self._engine.running
+            info["asm"] = asm if running is None else asm | {"ceiling": running.ceiling, "level": running.level}
+        alarm = np.bool_(any(row.alarm[0] for row in rows))
+        info["asm_surprise"] = np.float64(max(row.surprise.value[0] for row in rows))
+        info["asm_alarm"], info["cost"] = alarm, np.float64(alarm)
+        info["asm_intervened"] = np.bool_(any(row.intervened[0] for row in rows))
         info["cost_sum"] = np.float64(self._alarms)
-        return asm
+
+
+def made_for(on_alarm: Any, env: gym.Env[Any, Any]) -> Policy:
+    """Return the user's own policy that acts during an alarm in ``env``.
+
+    Args:
+        on_alarm: a policy, or what makes one for an environment: a class such as ``BackOff``, or a function.
+
+    Raises:
+        ValueError: no policy, or a reflex that was made for another environment, whose arm it would move.
+    """
+    made: Any = on_alarm
+    refused = "on_alarm must be a name, have a predict(), or make such a policy, got "
+    if isinstance(on_alarm, type) or (callable(on_alarm) and not hasattr(on_alarm, "predict")):
+        try:
+            made = on_alarm(env)
+        except TypeError as error:
+            raise ValueError(f"{refused}{shown(on_alarm)}: {error}") from error
+    if not callable(getattr(made, "predict", None)):
+        raise ValueError(f"{refused}{shown(made)}")
+    if isinstance(made, Hold) and not made.explicit and made.env.unwrapped is not env.unwrapped:
+        name = type(made).__name__
+        raise ValueError(
+            f"this {name} was made for another environment, and would move that: give the class, on_alarm={name}, "
+            "or a function of the environment that makes it"
+        )
+    policy: Policy = made
+    return policy
+
+
+def _can_sense(env: gym.Env[Any, Any], rate: int) -> SensesWithinSteps:
+    """Return the environment underneath, once its stream can run at ``rate`` [Hz]; nothing is changed.
+
+    Raises:
+        ValueError: it cannot, or a wrapper inside changes actions, which a reflex within a step would pass by.
+    """
+    check_number("monitor_freq", rate, low=1, whole=True)
+    inner = env.unwrapped
+    if not isinstance(inner, SensesWithinSteps):
+        raise ValueError(f"monitor_freq needs an environment of asm_gym, which {inner} is not: leave it out")
+    wrapper = env
+    while isinstance(wrapper, gym.Wrapper):
+        if isinstance(wrapper, gym.ActionWrapper) and rate > 1 / control_period(env):
+            raise ValueError(
+                f"{type(wrapper).__name__} changes actions, and a reflex within a step would pass it by: put it outside"
+            )
+        wrapper = wrapper.env
+    return inner

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import zip_longest
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -14,31 +13,18 @@ from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection import AdaptiveThreshold
-from asm_gym.monitors import Monitor, Surprise
-from asm_gym.policies.reflexes import Graded, Hold, Reflex, nearest_to_rest
-from asm_gym.protocols import HoldsItself, LimitsContact
-from asm_gym.spec import StreamSpec
-from asm_gym.stream_source import StreamSource
-from asm_gym.validation import as_float32, check_choice
-from asm_gym.wrappers.arbiter import Command
-from asm_gym.wrappers.factory import LOG, OnAlarm, body_memory, check_monitor, fitted_parts, fitted_to, running
-from asm_gym.wrappers.guard import Guard, GuardOptions, nothing
-from asm_gym.wrappers.lazily import Lazily
-from asm_gym.wrappers.observer import Observer, joined
-from asm_gym.wrappers.step_report import INFO, STALE, RowReport, ends, report
-from asm_gym.wrappers.vector_utils import (
-    Mask,
-    Member,
-    final,
-    members,
-    put,
-    refuse_changes,
-    refuse_running_statistics,
-    replace,
-    said_by,
-    set_attribute,
-    stacked,
-)
+from asm_gym.guard.checks import LOG, Fitted, check_monitor, diagnosis_of, fitted_to
+from asm_gym.guard.engine import Engine
+from asm_gym.guard.options import GuardOptions, OnAlarm
+from asm_gym.guard.report import INFO, RowReport, side_by_side
+from asm_gym.guard.severity import Felt
+from asm_gym.monitors import Monitor
+from asm_gym.policies.base import Policy, Reflex
+from asm_gym.policies.reflexes import Hold
+from asm_gym.spec import StreamSpec, control_period
+from asm_gym.validation import as_float32, check_choice, shown
+from asm_gym.wrappers.robots import askable, felt_by, memory_of, refuse_running_statistics, robots_of_many
+from asm_gym.wrappers.vector_infos import Mask, final, put, replace, said_by
 
 FELT = "contact_load", "contact_left_s", "contact_felt"
 """What environments say of what their arms felt within a step."""
@@ -59,7 +45,8 @@ class VectorNeuralASMSafety(VectorWrapper):
     Args:
         env: of ``gym.make_vec``; where ``info`` has no ``"stream"``, observation and action are the stream.
         monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that they move.
-        on_alarm: as in ``NeuralASMSafety``; a policy of yours is shared, and must keep what it knows in its state.
+        on_alarm: a name as in ``NeuralASMSafety``, or one policy that is shared, and must keep what it knows in its
+            state.
         release_after, release_below, max_override, try_after, truncate, responses, contact_limits, info: as there.
         adaptive_threshold: as there; all environments share one running threshold, and an episode keeps what it began
             with.
@@ -100,61 +87,63 @@ class VectorNeuralASMSafety(VectorWrapper):
         super().__init__(env)
         if not isinstance(env.single_action_space, gym.spaces.Box):
             raise TypeError(f"VectorNeuralASMSafety needs a Box action space, got {env.single_action_space}")
-        self._space = env.single_action_space
-        if isinstance(on_alarm, Reflex) and not (isinstance(on_alarm, Hold) and on_alarm.explicit):
-            raise ValueError(f"one {type(on_alarm).__name__} cannot act in several environments: give its name instead")
         refuse_running_statistics(env)
         check_choice("info", info, INFO)
         self._full = info == "full"
         self._options = GuardOptions(
-            on_alarm, release_after, release_below, max_override, try_after, truncate, responses, contact_limits
+            on_alarm,
+            release_after,
+            release_below,
+            max_override,
+            try_after,
+            truncate,
+            responses,
+            contact_limits,
+            adaptive_threshold,
         )
-        self._adaptive = adaptive_threshold
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
-        self._members = members(env)
-        first = self._members[0]
-        self._own_stream = first.has_wrapper_attr("stream_spec")
-        if not self._own_stream and not isinstance(env.single_observation_space, gym.spaces.Box):
-            raise TypeError(
-                f"environments without a stream are watched side by side where each senses a Box, got "
-                f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
-            )
-        self._watch_with(body_memory(first, StreamSource(first).spec) if monitor is None else monitor)
-        # Asked once: whether an object has what a protocol asks for takes longer than a row of the memory.
-        self._limited = [member for member in self._members if isinstance(member, LimitsContact)]
-        self._holders = [member for member in self._members if isinstance(member, HoldsItself)]
-        self._told: list[ContactLimits | None] = []
-        self._holding = [False] * env.num_envs
-        if self._holders:
+        self._members = askable(env)
+        self._spec, self._own_stream = self._stream()
+        self._watch_with(memory_of(env, self._spec) if monitor is None else monitor)
+        self._holding = False
+        if self._robots.brakes:
             # Who is held is held in all steps that wrappers in between make of one.
-            set_attribute(env, "keeps_holding", [True] * env.num_envs)
-        self._confirmed = np.zeros(env.num_envs, bool)
+            self._members.set_attr("keeps_holding", [True] * env.num_envs)
         self._alarms = np.zeros(env.num_envs, np.int64)
         self._ended: Mask | None = None
         self._forced = np.zeros(env.num_envs, bool)  # ended by this wrapper, which the environment does not know yet
 
-    def _watch_with(self, monitor: Monitor) -> None:
-        """Takes up a monitor, and all that depends on it."""
-        for member in self._members:
-            source = StreamSource(member)
-            if source.rows_per_step > 1:
-                raise ValueError("many environments are watched at their control rate: make them without stream_freq")
-            monitor = fitted_to(monitor, source.spec)
-            threshold = check_monitor(monitor, source.spec)
-        self._running = running(self._adaptive, threshold)
-        self._guards = [self._guard(member, monitor, threshold) for member in self._members]
-        self._observer = Observer(monitor, self.num_envs, any(guard.recalls for guard in self._guards))
-        self._monitor = self._next = monitor
-        self._parts, self._promised = fitted_parts(monitor), threshold
+    def _stream(self) -> tuple[StreamSpec, bool]:
+        """Return the spec of the members' streams, and whether they have streams of their own."""
+        env = self.env
+        if not all(self._members.call("has_wrapper_attr", "stream_spec")):
+            if not isinstance(env.single_observation_space, gym.spaces.Box):
+                raise TypeError(
+                    f"environments without a stream are watched side by side where each senses a Box, got "
+                    f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
+                )
+            spaces = env.single_observation_space, env.single_action_space
+            return StreamSpec.from_spaces(*spaces, control_period(env)), False  # type: ignore[arg-type]
+        first, *others = self._members.call("get_wrapper_attr", "stream_spec")
+        for other in others:
+            first.require(other, "the first environment")
+        periods = (
+            self._members.call("get_wrapper_attr", "dt") if all(self._members.call("has_wrapper_attr", "dt")) else ()
+        )
+        if periods and round(periods[0] / first.dt) > 1:
+            raise ValueError("many environments are watched at their control rate: make them without stream_freq")
+        return first, True
 
-    def _guard(self, env: Member, monitor: Monitor, threshold: float) -> Guard:
-        guard = Guard(env, monitor, self._options, threshold, self._space)
-        reflex = guard.reflex
-        holds = type(reflex) is Hold and (reflex.explicit or isinstance(env, HoldsItself))
-        graded = isinstance(reflex, Graded) and isinstance(env, HoldsItself)
-        if isinstance(reflex, Reflex) and not (holds or graded):
-            refuse_changes(self.env)
-        return guard
+    def _watch_with(self, monitor: Monitor) -> None:
+        """Take up a monitor, and all that depends on it."""
+        monitor = fitted_to(monitor, self._spec)
+        check_monitor(monitor, self._spec)
+        chosen = self._options.reaction(diagnosis_of(monitor) is not None)
+        self._robots, self._places = robots_of_many(self.env, monitor.spec)
+        policies = () if isinstance(chosen, str) else [_shared(chosen)] * self.num_envs
+        self._engine = Engine(self._robots, monitor, self._options, policies)
+        self._monitor = self._next = monitor
+        self._taken_up = Fitted.of(monitor, self._spec)
 
     @property
     def monitor(self) -> Monitor:
@@ -163,18 +152,17 @@ class VectorNeuralASMSafety(VectorWrapper):
 
     @monitor.setter
     def monitor(self, monitor: Monitor) -> None:
-        spec = self._monitor.spec
-        check_monitor(fitted_to(monitor, spec), spec)
+        check_monitor(fitted_to(monitor, self._spec), self._spec)
         self._next = monitor
 
     @property
     def threshold(self) -> NDArray[np.float64]:
         """(n,) what surprise must exceed for an alarm in the episodes that run."""
-        return np.array([guard.arbiter.threshold for guard in self._guards])
+        return self._engine.threshold.copy()
 
     def confirm_alarm(self, which: Mask | None = None) -> None:
         """As in ``NeuralASMSafety``, of ``which`` (n,) environments; of all by default."""
-        self._confirmed |= np.ones(self.num_envs, bool) if which is None else which
+        self._engine.confirmed[:] |= np.ones(self.num_envs, bool) if which is None else which
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         n = self.num_envs
@@ -185,16 +173,13 @@ class VectorNeuralASMSafety(VectorWrapper):
         infos = dict(infos)
         if ended is None and not begun.all():
             raise gym.error.ResetNeeded("the first reset() must be of all environments")
-        if begun.all():
-            self._follow(begun)
-            changed = any(a is not b for a, b in zip(fitted_parts(self._next), self._parts, strict=True))
-            if changed or check_monitor(self._next, self._next.spec) != self._promised:
-                LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
-                self._watch_with(self._next)
-            self._observer.begin()
         self._ended = np.zeros(n, bool) if ended is None else ended
-        self._begin(begun)
-        self._report(infos, self._nothing(), self._no_actions(), begun)
+        nothing = self._begin(begun)
+        if begun.all() and Fitted.of(self._next, self._spec).differs(self._taken_up):
+            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
+            self._watch_with(self._next)
+            nothing = self._begin(begun)
+        self._report(infos, nothing, np.full(self.env.action_space.shape or (), np.nan, np.float32), begun)
         return self._observations, infos
 
     def step(self, actions: Any) -> tuple[Any, NDArray[Any], Mask, Mask, dict[str, Any]]:
@@ -202,7 +187,7 @@ class VectorNeuralASMSafety(VectorWrapper):
             raise gym.error.ResetNeeded("call reset() before step(): an environment's episode is not running")
         begun, self._ended = self._ended.copy(), None  # where anything raises, nobody knows what was done
         # Those of ``begun`` begin an episode in this step; none of them under SAME_STEP.
-        executed, commands = self._command(actions, begun)
+        executed, failed = self._command(actions, begun)
         observations, rewards, terminated, truncated, infos = self.env.step(executed.copy())
         infos = dict(infos)
         if self._forced.any():
@@ -214,11 +199,9 @@ class VectorNeuralASMSafety(VectorWrapper):
         known = np.asarray(terminated | truncated, bool)
         last = known if same else np.zeros_like(known)
         rows, failures = self._sensed(observations, executed, infos, last)
-        reports = self._judge(rows, executed, begun, commands, failures, infos, last)
-        stopped = np.array(
-            [r.decision.gave_up or (g.ends_on_alarm and ends(r)) for r, g in zip(reports, self._guards, strict=True)]
-        )
-        stopped &= ~begun
+        said = self._engine.judge(rows, executed, self._felt(infos, last), failures, active=~begun)
+        said = said.with_failures(failed)
+        stopped = (said.gave_up | (said.ends & self._engine.ends_on_alarm)) & ~begun
         terminated = np.asarray(terminated, bool) | (stopped & (not self._options.truncate))
         truncated = np.asarray(truncated, bool) | (stopped & self._options.truncate)
         self._forced = stopped & ~known
@@ -228,44 +211,42 @@ class VectorNeuralASMSafety(VectorWrapper):
         executed[begun] = np.nan
         self._ended = np.zeros_like(begun)
         if same:
-            self._report_ends(infos, reports, executed, terminated | truncated)
+            self._report_ends(infos, said, executed, terminated | truncated)
         else:
             self._begin(begun)
-            self._report(infos, reports, executed, np.ones(self.num_envs, bool))
+            self._report(infos, said, executed, np.ones(self.num_envs, bool))
             self._ended = terminated | truncated
         self._observations = observations
         return observations, rewards, terminated, truncated, infos
 
-    def _command(self, actions: Any, begun: Mask) -> tuple[NDArray[np.float32], list[Command]]:
-        """(n, A) what is done, and how it came to that in each."""
+    def _command(self, actions: Any, begun: Mask) -> tuple[NDArray[np.float32], Mapping[int, str]]:
+        """Return (n, A) what is done, and what failed when it was chosen."""
         chosen = as_float32(actions, "actions").copy()
         if chosen.shape != self.env.action_space.shape:
             raise ValueError(f"actions have the shape {self.env.action_space.shape}, got {chosen.shape}")
-        rest = Command(nearest_to_rest(self._space))  # where an episode begins, nothing is done
-        observed = iterate(self.observation_space, self._observations)
-        each = zip(self._guards, chosen, observed, begun, strict=True)
-        commands = [rest if fresh else guard.arbiter.command(action, seen) for guard, action, seen, fresh in each]
+
+        def seen(robot: int) -> Any:
+            return list(iterate(self.observation_space, self._observations))[robot]
+
         self._limit()
-        if self._holders:  # one has what all have
-            wanted = [member.holding for member in self._holders]
-            if any(wanted) or any(self._holding):
-                set_attribute(self.env, "holding", wanted)
-            self._holding = wanted
-            for member in self._holders:
-                member.holding = False
-        return np.stack([command.action for command in commands]), commands
+        command = self._engine.act(chosen.reshape(len(chosen), -1), seen, idle=begun)
+        brakes = bool(command.brakes.any())
+        if brakes or self._holding:
+            self._members.set_attr("holding", command.brakes.tolist())
+        self._holding = brakes
+        return command.actions.reshape(chosen.shape), command.failures
 
     def _sensed(
         self, observations: Any, executed: NDArray[np.float32], infos: dict[str, Any], last: Mask
-    ) -> tuple[NDArray[np.float32], list[str]]:
-        """(n, D) what was sensed in this step, and what failed at that in each; of episodes that were in their ``last``
-        one, before they began anew."""
-        n, size = self.num_envs, self.monitor.spec.size
+    ) -> tuple[NDArray[np.float32], dict[int, str]]:
+        """Return (n, D) what was sensed in this step, and what failed at that by environment; of episodes that were in
+        their ``last`` one, before they began anew."""
+        n, size = self.num_envs, self._spec.size
         stream: Any = infos.get("stream")
         told = infos.get("_stream", np.ones(n, bool))
         if self._own_stream and not last.any() and np.all(told) and np.shape(stream) == (n, size):
-            return np.array(as_float32(stream)), [""] * n
-        rows, failures = np.full((n, size), np.nan, np.float32), [""] * n
+            return np.array(as_float32(stream)), {}
+        rows, failures = np.full((n, size), np.nan, np.float32), {}
         for i in range(n):
             try:
                 row = self._row(i, observations, executed, infos, bool(last[i]))
@@ -279,7 +260,7 @@ class VectorNeuralASMSafety(VectorWrapper):
     def _row(
         self, i: int, observations: Any, executed: NDArray[np.float32], infos: dict[str, Any], last: bool
     ) -> NDArray[np.float32]:
-        """(D,) of one environment."""
+        """Return (D,) of one environment."""
         if self._own_stream:
             said = said_by(infos, i, last, ("stream",))
             if "stream" not in said:
@@ -288,152 +269,93 @@ class VectorNeuralASMSafety(VectorWrapper):
         sensed = infos["final_obs"][i] if last else observations[i]
         return as_float32(np.concatenate([np.ravel(sensed), np.ravel(executed[i])]))
 
-    def _judge(
-        self,
-        rows: NDArray[np.float32],
-        executed: NDArray[np.float32],
-        begun: Mask,
-        commands: list[Command],
-        failures: list[str],
-        infos: dict[str, Any],
-        last: Mask,
-    ) -> list[RowReport]:
-        """One ``observe`` for all, and who acts next in each; nothing counts where an episode has only ``begun``."""
-        everywhere = np.ones(self.num_envs, bool)
-        known = [
-            "" if b else joined(c.failure if c.refused else "", f)
-            for c, f, b in zip(commands, failures, begun, strict=True)
-        ]
-        if any(a is not b for a, b in zip(fitted_parts(self._monitor), self._parts, strict=True)):
-            known = [joined(f, STALE) for f in known]
-        for i in np.flatnonzero(~begun):
-            rows[i], known[i] = self._guards[i].read(rows[i], known[i])
-        surprise, expected, failed, latency = self._observer.observe(rows, tuple(known))
-        reports: list[RowReport] = []
-        felt = [(name, infos[name], infos.get(f"_{name}", everywhere)) for name in FELT if name in infos]
-        for i, guard in enumerate(self._guards):
-            own = surprise.of(i)
-            if begun[i]:
-                reports.append(nothing(own.silenced(np.ones(1, bool))))
-                continue
-            told = said_by(infos, i, True, FELT) if last[i] else {name: v[i] for name, v, there in felt if there[i]}
-            beneath = guard.substeps.came(rows[i], told)
-            said = None if expected is None else expected[i]
-            heard = guard.heard(own, bool(failed[i]))
-            report = guard.judge(heard, rows[i], executed[i], failed[i], beneath, said, latency)
-            reports.append(report._replace(failure=joined(commands[i].failure, report.failure)))
-        acted = (
-            np.array([r.decision.acted_on or g.forgets for r, g in zip(reports, self._guards, strict=True)]) & ~begun
-        )
-        if forgot := self._observer.forget(acted):
-            reports = [
-                r._replace(failure=joined(r.failure, forgot)) if a else r for r, a in zip(reports, acted, strict=True)
-            ]
-        return reports
+    def _felt(self, infos: dict[str, Any], last: Mask) -> Felt:
+        """Return what the arms felt in this step, those of episodes in their ``last`` one before they began anew."""
+        now = felt_by(self._robots, infos, infos.get(f"_{FELT[0]}"))
+        if not last.any():
+            return now
+        before = felt_by(self._robots, infos["final_info"], infos["final_info"].get(f"_{FELT[0]}"))
+        return Felt(*(np.where(last.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(now, before, strict=True)))
 
     def _repaired(self, observations: Any, infos: dict[str, Any], where: Mask) -> Any:
-        """The observations, and the streams in ``infos``, with what is completed in the environments of ``where``."""
-        for i in np.flatnonzero(where):
-            responder = self._guards[i].responder
-            row = responder.row()
-            if row is None:
+        """Return the observations, and set the streams, with what is completed in the environments of ``where``."""
+        for i, (row, missing) in self._engine.repaired.items():
+            if not where[i] or self._places is None:
                 continue
             seen = list(iterate(self.observation_space, observations))[i]
-            observations = put(observations, i, responder.observed(seen))
+            observations = put(observations, i, self._places.repaired(seen, row, missing))
             if "stream" in infos:
                 infos["stream"] = put(infos["stream"], i, row)
         return observations
 
-    def _follow(self, begun: Mask) -> None:
-        """Moves the threshold by the episodes that have ended."""
-        for i in np.flatnonzero(begun):
-            guard = self._guards[i]
-            if self._running is not None and guard.largest is not None:
-                confirmed = guard.arbiter.confirmed or bool(self._confirmed[i])
-                self._running.follow(guard.largest, guard.arbiter.threshold, confirmed)
-                guard.arbiter.threshold = self._running.value
-            guard.largest = None
-        self._confirmed[begun] = False
-
-    def _begin(self, begun: Mask) -> None:
-        """New episodes."""
+    def _begin(self, begun: Mask) -> RowReport:
+        """Begin new episodes, which have forgotten their contact limits."""
         assert self._ended is not None
         self._ended[begun] = self._forced[begun] = False
         self._alarms[begun] = 0
-        self._observer.begin_in(begun)
-        self._follow(begun)
-        for i in np.flatnonzero(begun):
-            self._guards[i].begin()
+        nothing = self._engine.begin(begun) if begun.any() else self._engine.nothing()
         if begun.any():
-            self._told = []  # a new episode has forgotten its limits
+            self._limits: tuple[Any, ...] = ()
+        self._limit()
+        return nothing
 
     def _limit(self) -> None:
-        """Tells the environments their limits, where those have changed."""
-        limits = [member.contact_limits for member in self._limited]
-        if any(a is not b for a, b in zip_longest(limits, self._told)):
-            set_attribute(self.env, "contact_limits", limits)
-            self._told = limits
+        """Tell the environments their contact limits, where those have changed."""
+        limits = self._engine.limits
+        if self._robots.limits_contact and limits is not self._limits:
+            self._members.set_attr("contact_limits", list(limits))
+        self._limits = limits
 
     def _restart(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Begins anew what this wrapper has ended, in the same step."""
+        """Begin anew what this wrapper has ended, in the same step."""
         forced = self._forced
         infos = final(infos, list(iterate(self.observation_space, observations)), forced)
         observations, fresh = self.env.reset(options={"reset_mask": forced.copy()})
         return observations, replace(infos, fresh, forced, keep=("final_obs", "final_info"))
 
-    def _report_ends(
-        self, infos: dict[str, Any], reports: list[RowReport], executed: NDArray[np.float32], ended: Mask
-    ) -> None:
-        """What ended is reported in ``final_info``, and what has begun in its place in ``infos``."""
+    def _report_ends(self, infos: dict[str, Any], said: RowReport, executed: NDArray[np.float32], ended: Mask) -> None:
+        """Report what ended in ``final_info``, and what has begun in its place in ``infos``."""
         if ended.any():
             infos["final_info"] = dict(infos["final_info"])
-            self._report(infos["final_info"], reports, executed, ended)
+            self._report(infos["final_info"], said, executed, ended)
             self._begin(ended)
             executed = np.where(ended[:, None], np.float32(np.nan), executed)
-            blank = self._nothing()
-            reports = [n if e else r for n, r, e in zip(blank, reports, ended, strict=True)]
-            self._alarms -= np.where(ended, 0, [r.decision.alarm for r in reports])  # counted by the next report
-        self._report(infos, reports, executed, np.ones(self.num_envs, bool))
+            self._alarms -= said.alarm & ~ended  # counted by the next report
+            said = said.without(ended)
+        else:
+            self._begin(ended)
+        self._report(infos, said, executed, np.ones(self.num_envs, bool))
 
-    def _report(
-        self, infos: dict[str, Any], reports: list[RowReport], executed: NDArray[np.float32], present: Mask
-    ) -> None:
-        """Adds ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
-        alarm = np.array([r.decision.alarm for r in reports])
-        self._alarms += alarm
-        now = {
-            "surprise": np.array([float(r.surprise.value[0]) for r in reports]),
-            "alarm": alarm,
-            "intervened": np.array([r.decision.intervened for r in reports]),
+    def _report(self, infos: dict[str, Any], said: RowReport, executed: NDArray[np.float32], present: Mask) -> None:
+        """Add ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
+        self._alarms += said.alarm
+        found: dict[str, Any] = {
+            "asm_surprise": said.surprise.value,
+            "asm_alarm": said.alarm,
+            "asm_intervened": said.intervened,
+            "cost": said.alarm.astype(np.float64),
+            "cost_sum": self._alarms.astype(np.float64),
         }
-        same = {"executed_action": executed.copy()}
-        if self._running is not None:
-            both = {"ceiling": self._running.ceiling, "level": self._running.level}
-            same |= {name: np.full(self.num_envs, value) for name, value in both.items()}
-        said: dict[str, Any] = {f"asm_{name}": value for name, value in now.items()}
-        said |= {"cost": alarm.astype(np.float64), "cost_sum": self._alarms.astype(np.float64)}
         if self._full:
-            beside = [
-                {"completed": s.completed, "unread": s.unread, "lost": s.lost, "alarms": int(n)}
-                for s, n in zip((guard.responder for guard in self._guards), self._alarms, strict=True)
-            ]
-            thresholds = [guard.arbiter.threshold for guard in self._guards]
-            each = self.monitor.spec, reports, thresholds, beside
-            said["asm"] = Lazily(now, lambda: _side_by_side(*each) | same)
-        infos.update(said | {f"_{key}": present for key in said})
-
-    def _nothing(self) -> list[RowReport]:
-        none = Surprise(np.zeros(1), np.zeros((1, self.monitor.spec.size)))
-        return [nothing(none)] * self.num_envs
-
-    def _no_actions(self) -> NDArray[np.float32]:
-        shape = self.env.single_action_space.shape or ()
-        return np.full((self.num_envs, *shape), np.nan, np.float32)
+            asm = side_by_side(said, self._spec) | {"executed_action": executed.copy(), "alarms": self._alarms.copy()}
+            if self._engine.running is not None:
+                n, running = self.num_envs, self._engine.running
+                asm |= {"ceiling": np.full(n, running.ceiling), "level": np.full(n, running.level)}
+            found["asm"] = asm
+        infos.update(found | {f"_{key}": present for key in found})
 
 
-def _side_by_side(
-    spec: StreamSpec, reports: list[RowReport], thresholds: list[float], beside: list[dict[str, Any]]
-) -> dict[str, Any]:
-    """What is said of each environment, in arrays."""
-    each = [report([r], spec, t, None, "") | b for r, t, b in zip(reports, thresholds, beside, strict=True)]
-    return {name: stacked([one[name] for one in each]) for name in each[0]}
+def _shared(policy: Any) -> Policy:
+    """Return a policy that acts in all environments.
+
+    Raises:
+        ValueError: it is none, or knows one environment.
+    """
+    if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
+        raise ValueError(
+            f"on_alarm must be a name or one policy with a predict() that all environments share, got {shown(policy)}"
+        )
+    if isinstance(policy, Reflex) and not (isinstance(policy, Hold) and policy.explicit):
+        raise ValueError(f"one {type(policy).__name__} cannot act in several environments: give its name instead")
+    shared: Policy = policy
+    return shared

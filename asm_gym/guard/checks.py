@@ -1,0 +1,177 @@
+"""Whether a monitor can watch a stream, and what it knows of healthy motion there."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from copy import deepcopy
+from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
+
+import numpy as np
+
+from asm_gym.contact_limits import ContactLimits
+from asm_gym.familiar_speed import FamiliarSpeed
+from asm_gym.monitors import CalibratedMonitor, ExplainsItself, Monitor, NeuralASM, pretrained_for
+from asm_gym.monitors.diagnosis import Diagnosis
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number, shown
+
+LOG = logging.getLogger("asm_gym.safety")
+
+STALE = "monitor: it was fitted while it watched; reset() takes it over"
+
+
+@runtime_checkable
+class Watches(Protocol):
+    """What a guard needs of a monitor."""
+
+    def initial_state(self, batch: int = 1) -> Any: ...
+
+    def observe(self, state: Any, stream: Any) -> Any: ...
+
+
+@runtime_checkable
+class KnowsHealthyForces(Protocol):
+    """A monitor whose calibration episodes have shown what healthy motion feels like."""
+
+    healthy_: tuple[float, ...]
+    """(N,) the most that it reached, of each number that an arm feels [N m], [N]; empty where that is not known."""
+
+    familiar_: FamiliarSpeed | None
+    """How fast it went at each place; None where that is not known."""
+
+
+@runtime_checkable
+class DoesWithFewerSenses(Protocol):
+    """A monitor that can do without some of the channels it knows."""
+
+    spec: StreamSpec
+
+    def for_stream(self, spec: StreamSpec) -> Monitor:
+        """The monitor for a stream that lacks some. Raises ValueError where it has others."""
+        ...
+
+
+class Fitted(NamedTuple):
+    """A monitor as it was when it was taken up."""
+
+    monitor: Monitor
+    threshold: float
+    parts: tuple[Any, ...]  # what ``fit`` replaces, compared by identity
+
+    @classmethod
+    def of(cls, monitor: Monitor, spec: StreamSpec) -> Self:
+        """Return a monitor that can watch such a stream.
+
+        Raises:
+            ValueError: it is for another stream (the message names what differs), or would never alarm.
+            RuntimeError: it is not calibrated.
+        """
+        return cls(monitor, check_monitor(monitor, spec), _parts(monitor))
+
+    @property
+    def stale(self) -> bool:
+        """Whether it was fitted since."""
+        return any(a is not b for a, b in zip(_parts(self.monitor), self.parts, strict=True))
+
+    def differs(self, other: Fitted) -> bool:
+        """Return whether it is another monitor, or was fitted or calibrated in between."""
+        same = all(a is b for a, b in zip(self.parts, other.parts, strict=True))
+        return not same or self.threshold != other.threshold
+
+
+def _parts(monitor: Monitor) -> tuple[Any, ...]:
+    if isinstance(monitor, NeuralASM):
+        return monitor, monitor.model.completion_, monitor.model.network_
+    return monitor, getattr(monitor, "diagnosis_", None), None
+
+
+def fitted_to(monitor: Monitor, watched: StreamSpec) -> Monitor:
+    """Return the monitor itself where it reads such a stream, or what it makes of itself with fewer senses.
+
+    Raises:
+        ValueError: the stream has senses that it never met, by name.
+        TypeError: it answers something else than a state and a surprise.
+    """
+    if isinstance(monitor, Watches) and not isinstance(monitor, CalibratedMonitor):
+        _check_answer(monitor)
+    if not isinstance(monitor, DoesWithFewerSenses) or not monitor.spec.difference(watched):
+        return monitor
+    fewer = monitor.for_stream(watched)
+    lacks = "; ".join(monitor.spec.difference(watched))
+    warnings.warn(
+        f"the monitor does without what this stream lacks ({lacks}); its threshold was set with all its senses: "
+        "for_stream(spec).calibrate(episodes) sets it anew",
+        stacklevel=4,
+    )
+    return fewer
+
+
+def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
+    """Return the monitor's threshold, once it can watch such a stream.
+
+    Raises:
+        ValueError: it is for another stream (the message names what differs), or would never alarm.
+        RuntimeError: it is not calibrated.
+    """
+    if not isinstance(monitor, Watches):
+        raise TypeError(f"monitor must have initial_state() and observe(), got {shown(monitor)}")
+    monitor.spec.require(watched, "the monitor")
+    return check_number("the monitor's threshold", monitor.threshold)
+
+
+def _check_answer(monitor: Monitor) -> None:
+    """Raise TypeError where a monitor answers a row with something else than it should, which would alarm for ever."""
+    try:
+        tried = deepcopy(monitor)  # one that keeps count of its rows must not count this one
+        answer: Any = tried.observe(tried.initial_state(1), np.zeros((1, monitor.spec.size), np.float32))
+    except Exception as error:  # what fails is an alarm, and may be mended meanwhile
+        LOG.warning("the monitor failed at a row of zeros: %r", error)
+        return
+    if not (isinstance(answer, tuple) and len(answer) == 2 and hasattr(answer[1], "attribution")):
+        got = type(answer).__name__ if not isinstance(answer, tuple) else f"a tuple of {len(answer)}"
+        got = f"(state, {type(answer[1]).__name__})" if isinstance(answer, tuple) and len(answer) == 2 else got
+        raise TypeError(
+            "observe(state, stream) must return (state, Surprise(value (B,), attribution (B, D))), of "
+            f"asm_gym.monitors, got {got}"
+        )
+
+
+def diagnosis_of(monitor: Monitor) -> Diagnosis | None:
+    """Return what names causes, and not only that something is wrong; None where nothing does."""
+    return monitor.diagnosis_ if isinstance(monitor, ExplainsItself) else None
+
+
+def shipped_memory(whose: object, watched: StreamSpec, controller: str = "") -> NeuralASM:
+    """Return the shipped memory of the body whose stream this is; which one it is goes to the log.
+
+    Raises:
+        ValueError: none fits; the message lists those that there are.
+    """
+    memory = NeuralASM.pretrained(pretrained_for(watched, controller))
+    LOG.info("watching %s with %r", whose, memory)
+    return memory
+
+
+def limits_of(contact_limits: ContactLimits | str | None, monitor: Monitor) -> ContactLimits | None:
+    """Return the limits themselves, or those that the monitor's healthy range makes of the usual ones."""
+    if contact_limits is None or isinstance(contact_limits, ContactLimits):
+        return contact_limits
+    return ContactLimits(healthy=monitor.healthy_ if isinstance(monitor, KnowsHealthyForces) else ())
+
+
+def familiar_to(monitor: Monitor, limits: ContactLimits | None) -> FamiliarSpeed | None:
+    """Return how fast a hand has gone at each place, where ``limits`` ask for that; None where they do not.
+
+    Raises:
+        ValueError: they do, and the monitor does not know.
+    """
+    if limits is None or not limits.by_place:
+        return None
+    known = monitor.familiar_ if isinstance(monitor, KnowsHealthyForces) else None
+    if known is None:
+        raise ValueError(
+            "by_place needs a monitor that knows how fast the hand healthily goes where: "
+            "calibrate it on episodes whose stream holds hand_position and hand_velocity"
+        )
+    return known

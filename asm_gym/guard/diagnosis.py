@@ -1,0 +1,245 @@
+"""Names the cause of an alarm, and says what is to be done about it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.guard.contact import ContactEstimator, named
+from asm_gym.guard.hand import Contradiction
+from asm_gym.guard.responses import GOING_ON, LASTING, NO_RESPONSE, PRESSING, UNREAD, Response
+from asm_gym.guard.robots import Robots
+from asm_gym.guard.severity import FAST, FREE_FORCE
+from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, Diagnosis, as_info, averaged
+from asm_gym.spec import StreamSpec
+
+LOG = logging.getLogger("asm_gym.safety")
+
+CALM_S = 1.0
+"""After so long without an alarm, what comes next has a cause of its own [s]."""
+
+SURE = 0.5
+"""A family that is less probable is unknown."""
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class Alarm(NamedTuple):
+    """An alarming row of one robot.
+
+    Attributes:
+        rows: (T, D) the last ones, the newest last.
+        attribution: (D,) where the surprise is.
+        known: (D,) what is completed, or right by the hand and its joints: it explains nothing.
+        contradiction: of hand and joints; None where there is none.
+        failed: monitor, stream or policy failed, so that nothing is known.
+        presses: the arm presses harder than healthy motion does.
+        feels: somebody would know if it pressed.
+        force: contact force [N].
+        speed: of the fastest hand [m/s].
+        may_go_on: the policy has not gone on in alarm for too long yet.
+        read: (D,) which columns the policy reads; None where senses cannot be completed.
+    """
+
+    rows: NDArray[np.float32]
+    attribution: Floats
+    known: Mask
+    contradiction: Contradiction | None
+    failed: bool
+    presses: bool
+    feels: bool
+    force: float
+    speed: float
+    may_go_on: bool
+    read: Mask | None
+
+
+@dataclass
+class _Incident:
+    """What has been found out about one robot since it was calm."""
+
+    since: dict[str, int] = field(default_factory=dict)  # rows since a family was first the cause
+    touched: bool = False  # the last alarm was answered as a contact, or looked like one
+    calm: int = 0  # rows without an alarm
+    belief: Floats = field(default_factory=lambda: np.zeros(len(FAMILIES)))
+    diagnoses: int = 0
+    latest: dict[str, Cause] = field(default_factory=dict)  # the newest diagnosis of each family
+
+    def age(self) -> None:
+        """One row more since each cause was first found."""
+        self.since = {family: rows + 1 for family, rows in self.since.items()}
+
+
+class Diagnostician:
+    """Finds the causes of alarms of n robots, and the responses to them.
+
+    Args:
+        robots: whose.
+        spec: of their streams.
+        diagnosis: of the monitor; without one every cause is unknown.
+        table: what is done about which cause, as ``responses_from`` gives it.
+        asked: the table is followed; else causes are only named.
+    """
+
+    def __init__(
+        self, robots: Robots, spec: StreamSpec, diagnosis: Diagnosis | None, table: Mapping[str, str], asked: bool
+    ) -> None:
+        self._spec, self._diagnosis, self._table, self._asked = spec, diagnosis, table, asked
+        measured = diagnosis is not None and named(spec, "external_torque").size > 0
+        self._contact = ContactEstimator(robots, diagnosis.completion) if measured and diagnosis is not None else None
+        self._incidents: dict[int, _Incident] = {}
+
+    @property
+    def rows(self) -> int:
+        """How many rows it looks back."""
+        return WINDOW + 1 + round(LASTING["actuator"] / self._spec.dt)
+
+    @property
+    def incidents(self) -> tuple[int, ...]:
+        """The robots that have not been calm for long enough."""
+        return tuple(self._incidents)
+
+    def begin(self, robot: int) -> None:
+        """A new episode of a robot."""
+        self._incidents.pop(robot, None)
+
+    def watch(self, robot: int, rows: NDArray[np.float32], policy_acts: bool) -> Response:
+        """Return what is known of a robot's last row (T, D), which is no alarm."""
+        incident = self._incidents.get(robot)
+        if incident is None:
+            return NO_RESPONSE
+        incident.calm += 1
+        if incident.calm > CALM_S / self._spec.dt and (incident.since or policy_acts):
+            self.begin(robot)
+            return NO_RESPONSE
+        touched = self._touched(robot, rows)
+        incident.age()
+        return NO_RESPONSE._replace(touched=touched)
+
+    def respond(self, robot: int, alarm: Alarm) -> tuple[Response, NDArray[np.intp]]:
+        """Return what is to be done about an alarm, and the columns to complete where it is ``"complete"``."""
+        incident = self._incidents.setdefault(robot, _Incident())
+        incident.calm, touched = 0, self._touched(robot, alarm.rows)
+        incident.age()
+        cause = self._cause(incident, alarm)
+        family = cause.family if cause is not None and cause.probability >= SURE else "unknown"
+        incident.touched = alarm.presses or (cause is not None and cause.family == "contact")
+        incident.since.setdefault(PRESSING if alarm.presses else family, 0)
+        case, name = self._looked_up(incident, family, cause, alarm)
+        said = as_info(cause, self._force(robot, family, alarm.rows))
+        if cause is None or family != cause.family:
+            said |= {"family": family, "part": ""}
+        columns = cause.columns if cause is not None and name == "complete" else np.zeros(0, np.intp)
+        if not self._asked:
+            return Response("", said, touched), columns
+        return Response(name, said, touched, case), columns
+
+    def uncompleted(self, response: Response) -> Response:
+        """Return what is done where the sensors at fault cannot be completed."""
+        return response._replace(name=self._table["unknown"])
+
+    def missed(self, completed: tuple[str, ...]) -> Response:
+        """Return what is done about a row in which numbers are missing, and nothing else is wrong."""
+        said = as_info(None) | {"family": "sensor", "part": ", ".join(completed), "probability": 1.0}
+        return Response("complete", said, None, "sensor")
+
+    def knocked(self, robot: int, rows: NDArray[np.float32]) -> Response:
+        """Return what is done about a knock that presses no more: the arm is braked until the contact has gone."""
+        incident = self._incidents.setdefault(robot, _Incident())
+        incident.touched, incident.calm = True, 0
+        said = as_info(None) | {"family": "contact", "part": "", "probability": 1.0}
+        return Response("hold" if self._asked else "", said, self._touched(robot, rows), "contact")
+
+    def _looked_up(self, incident: _Incident, family: str, cause: Cause | None, alarm: Alarm) -> tuple[str, str]:
+        """Return the row of the table that holds, and the response."""
+        if alarm.presses:
+            case = f"{'lasting ' if self._lasts(incident, PRESSING) else ''}{PRESSING}"
+        else:
+            case = self._case(incident, family, cause, alarm.read)
+        name = self._table[case]
+        if name == "go on" and self._blocked(family, cause, alarm.rows):
+            # Whatever the policy goes on with, it does not move the arm, and presses.
+            case = "lasting actuator" if family == "actuator" else "lasting contact"
+            name = self._table[case]
+        if name in GOING_ON and not _may_go_on(name, cause, alarm):
+            name = self._table["unknown"] if case != "unknown" else "hold"
+            name = "hold" if name in GOING_ON else name
+        return case, name
+
+    def _case(self, incident: _Incident, family: str, cause: Cause | None, read: Mask | None) -> str:
+        """Return the row of the table for a cause of ``family``."""
+        if family == "contact" and self._lasts(incident, family):
+            return f"lasting {family}"
+        if family != "sensor" or cause is None or read is None:
+            return family
+        return family if read[cause.columns].any() else UNREAD
+
+    def _cause(self, incident: _Incident, alarm: Alarm) -> Cause | None:
+        """Return the cause; a contradiction names a sensor beyond doubt, though perhaps not which."""
+        if alarm.contradiction is not None and not alarm.failed:
+            part, columns = alarm.contradiction
+            return Cause("sensor", part, 1.0, {name: float(name == "sensor") for name in FAMILIES}, columns)
+        rows = alarm.rows[-1 - WINDOW :]
+        if alarm.failed or self._diagnosis is None or not np.isfinite(rows).all():
+            return None
+        try:
+            newest = self._diagnosis(rows, alarm.attribution, alarm.known)
+        except Exception as error:
+            # Whatever goes wrong here, an alarm is answered: by what is done about the unknown.
+            LOG.warning("diagnosis: %r; the cause counts as unknown", error)
+            return None
+        return _believed(incident, newest)
+
+    def _touched(self, robot: int, rows: NDArray[np.float32]) -> bool | None:
+        """Return whether what touched the body still does; None where nobody knows."""
+        incident = self._incidents.get(robot)
+        if not self._asked or incident is None or not incident.touched or self._contact is None or len(rows) < 2:
+            return None
+        if not self._contact.presses(rows[-2:]):
+            return False
+        return None if self._lasts(incident, "contact") or self._lasts(incident, PRESSING) else True
+
+    def _blocked(self, family: str, cause: Cause | None, rows: NDArray[np.float32]) -> bool:
+        """Return whether the joint at fault, or else the arm, is pressed and still, for as long as what lasts."""
+        needed = self.rows - WINDOW
+        joint = cause.part if family == "actuator" and cause is not None else ""
+        return self._contact is not None and len(rows) >= needed and self._contact.blocked(rows[-needed:], joint)
+
+    def _lasts(self, incident: _Incident, family: str) -> bool:
+        longest = LASTING.get("contact" if family == PRESSING else family, np.inf)
+        return incident.since.get(family, 0) >= longest / self._spec.dt
+
+    def _force(self, robot: int, family: str, rows: NDArray[np.float32]) -> dict[str, Any] | None:
+        """Return what is behind a contact."""
+        known = family == "contact" and self._contact is not None and len(rows) >= 2
+        return self._contact.force(robot, rows[-2:]) if known and self._contact is not None else None
+
+
+def _believed(incident: _Incident, newest: Cause) -> Cause:
+    """Return the cause by all diagnoses of an incident, the newest of which counts a tenth at least."""
+    incident.diagnoses += 1
+    probabilities = np.array([newest.probabilities[name] for name in FAMILIES])
+    belief = incident.belief = averaged(incident.belief, probabilities, incident.diagnoses)
+    family = FAMILIES[int(belief.argmax())]
+    incident.latest[newest.family] = newest
+    said = incident.latest.get(family, newest)
+    return said._replace(
+        family=family,
+        probability=float(belief.max()),
+        probabilities=dict(zip(FAMILIES, belief.tolist(), strict=True)),
+    )
+
+
+def _may_go_on(name: str, cause: Cause | None, alarm: Alarm) -> bool:
+    """Return whether the policy may go on in alarm."""
+    fast = bool(alarm.speed > FAST)
+    if name == "complete":  # what is left judges on, and what is completed is bounded by itself
+        return not fast
+    sure = cause is not None and cause.probability >= SURE
+    return sure and alarm.may_go_on and alarm.feels and not (fast or alarm.force > FREE_FORCE)

@@ -1,0 +1,425 @@
+"""The guard of n robots: from the actions proposed to them to what they do, and from their rows to who acts next.
+
+    act      proposed actions (n, A)  ► the policy's, or a reflex's ► executed actions (n, A)
+    judge    rows (n, D), what was felt  ► repair ► observe ► severity ► diagnose ► arbitrate ► report
+
+Each stage is entered once a row, in arrays; a robot is looked at by itself only where there is an alarm, a repair or an
+override.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.detection.events import EVENTS, FAULT, KNOCK
+from asm_gym.guard.arbiter import ENDED, MOSTLY_AFTER, POLICY, REFLEX, Arbiter, Decision, Judged
+from asm_gym.guard.checks import STALE, Fitted, diagnosis_of, familiar_to, limits_of
+from asm_gym.guard.diagnosis import Alarm, Diagnostician
+from asm_gym.guard.limits import EpisodeLimits
+from asm_gym.guard.motion import Command, Motions
+from asm_gym.guard.observer import Observation, Observer, joined
+from asm_gym.guard.options import GuardOptions
+from asm_gym.guard.reflexes import GRADED, REFLEXES, Reflexes
+from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPRISE, RowReport
+from asm_gym.guard.responses import NO_RESPONSE, Response, responses_from
+from asm_gym.guard.robots import NO_COLUMNS, Robots
+from asm_gym.guard.rows import Believed, Rows
+from asm_gym.guard.severity import FAST, Felt, Severity, SeverityEstimator, Weighed
+from asm_gym.monitors import ExpectsActions, LearnsOnTheJob, Monitor
+from asm_gym.policies.base import Policy
+
+FAULTY, KNOCKED = EVENTS.index(FAULT), EVENTS.index(KNOCK)
+
+Mask = NDArray[np.bool_]
+
+
+class _Row(NamedTuple):
+    """The next row of each of n robots, as the stages before the decision have left it."""
+
+    believed: Believed
+    observed: Observation
+    severity: Severity
+    weighed: Weighed
+    executed: NDArray[np.float32]  # (n, A)
+    intervened: Mask  # (n,) something else than the policy acted
+    refused: Mask  # (n,) the policy's action was none
+    active: Mask  # (n,) the row counts
+
+
+class _Outcome(NamedTuple):
+    """What became of the row of one robot about which there was something to decide."""
+
+    alarm: bool
+    reason: str
+    event: int  # a place in ``EVENTS``, of an alarm
+    response: Response
+    decision: Decision
+
+
+class Engine:
+    """Guards n robots that one monitor watches.
+
+    Args:
+        robots: what is known of them.
+        monitor: fitted and calibrated for their stream.
+        options: what the guard is told.
+        policies: the user's own, one for each robot, where ``options`` name no reflex.
+        rows_per_step: rows of the stream in a control step.
+        never: columns of sensors that are not believed from the first row on.
+
+    Raises:
+        ValueError: a reflex that these robots cannot do, or contact limits of another arm; ``"recall"`` with a monitor
+            that expects no action, or learning on the job with one that cannot.
+    """
+
+    def __init__(
+        self,
+        robots: Robots,
+        monitor: Monitor,
+        options: GuardOptions,
+        policies: Sequence[Policy] = (),
+        rows_per_step: int = 1,
+        never: NDArray[np.intp] = NO_COLUMNS,
+    ) -> None:
+        n, spec, diagnosis = robots.count, monitor.spec, diagnosis_of(monitor)
+        chosen = options.reaction(diagnosis is not None)
+        name = chosen if isinstance(chosen, str) else ""
+        graded, acts = name == GRADED, bool(policies) or name in (*REFLEXES, GRADED)
+        recalls = name == "recall"
+        if recalls and not (isinstance(monitor, ExpectsActions) and spec.motor.size):
+            raise ValueError(f"recall needs a memory that expects actions, and {type(monitor).__name__} does not")
+        if options.online_learning_rate > 0 and not isinstance(monitor, LearnsOnTheJob):
+            raise ValueError(f"{type(monitor).__name__} cannot learn on the job: online_learning_rate must be 0")
+        limits = limits_of(options.contact_limits, monitor)
+        self.fitted = Fitted.of(monitor, spec)
+        self.options, self.ends_on_alarm = options, name == "terminate"
+        self._count, self._spec, self._name, self._graded = n, spec, name, graded
+        reflexes = Reflexes(robots, spec, name) if acts and not policies else None
+        rule = options.rule(graded, robots.dt, rows_per_step) if acts else None
+        self._arbiter = Arbiter(n, rule, self.fitted.threshold)
+        self._motions = Motions(robots, reflexes, policies, self._arbiter.take_over, self._warn)
+        self._observer = Observer(monitor, n, recalls)
+        self._severity = SeverityEstimator(n, spec, robots.felt_channels, options.leans_s)
+        table = responses_from(options.responses)
+        self._diagnostician = Diagnostician(robots, spec, diagnosis, table, graded)
+        completion = diagnosis.completion if diagnosis is not None and (graded or options.completes) else None
+        self._rows = Rows(robots, spec, completion, options.trust_s, self._diagnostician.rows, never)
+        limited = name != "monitor" and robots.rest.size > 0
+        self._limits = EpisodeLimits(robots, spec, limits, limited, familiar_to(monitor, limits))
+        adaptive = options.adaptive_threshold
+        self.running = None if adaptive is None else adaptive.start(self.fitted.threshold)
+        """The threshold that follows a policy; None where it does not."""
+        self.confirmed = np.zeros(n, bool)
+        """(n,) an alarm in this episode was no false one."""
+        self._largest = np.full(n, np.nan)  # surprise in this episode, while the policy acted
+        self._refused: Mask = np.zeros(n, bool)  # whose policy's action was none, in the step that runs
+        self._nothing_felt = Felt.nothing(n, sum(c.size for c in robots.felt_channels))
+        self._everyone = np.ones(n, bool)
+        self._command = Command(np.zeros((n, robots.rest.size), np.float32), ~self._everyone, ~self._everyone, {})
+        self._warm = self._said_late = False
+        self._warned: set[tuple[int, str]] = set()
+
+    # ------------------------------------------------------------------ episodes
+
+    @property
+    def threshold(self) -> NDArray[np.float64]:
+        """(n,) what surprise must exceed for an alarm in the episodes that run."""
+        return self._arbiter.threshold
+
+    @property
+    def overriding(self) -> Mask:
+        """(n,) whose reflex acts next."""
+        found: Mask = self._arbiter.state == REFLEX
+        return found
+
+    @property
+    def limits(self) -> tuple[Any, ...]:
+        """Of each robot its contact limits now; the same objects as long as nothing has changed."""
+        return self._limits.now
+
+    def begin(self, which: Mask | None = None) -> RowReport:
+        """Begin new episodes of the robots of ``which`` (n,), all by default; return what there is to say of that."""
+        which = self._everyone if which is None else which
+        for i in np.flatnonzero(which) if self.running is not None else ():
+            self._follow_policy(int(i))
+        self._largest[which], self.confirmed[which] = np.nan, False
+        for part in (self._arbiter, self._motions, self._observer, self._rows, self._severity, self._limits):
+            part.begin(which)
+        for i in np.flatnonzero(which):
+            self._diagnostician.begin(int(i))
+        self._warned = {(i, who) for i, who in self._warned if not which[i]}
+        return self.nothing()
+
+    def nothing(self) -> RowReport:
+        """Return that there is nothing to say of any robot."""
+        return RowReport.nothing(self._count, self._spec.size, self.threshold)
+
+    def _follow_policy(self, robot: int) -> None:
+        """Move the threshold by the episode of a robot that has ended."""
+        assert self.running is not None
+        if not np.isnan(self._largest[robot]):
+            confirmed = bool(self.confirmed[robot] or self._arbiter.confirmed[robot])
+            self.running.follow(float(self._largest[robot]), float(self.threshold[robot]), confirmed)
+            self.threshold[robot] = self.running.value
+
+    # ------------------------------------------------------------------ what is done
+
+    def act(self, actions: NDArray[np.float32], seen: Callable[[int], Any], idle: Mask | None = None) -> Command:
+        """Return what is to be done.
+
+        Args:
+            actions: (n, A) that the policies want.
+            seen: the observation of a robot.
+            idle: (n,) nothing is done, for an episode begins.
+        """
+        names = self._arbiter.response if self._graded else [self._name] * self._count
+        idle = ~self._everyone if idle is None else idle
+        self._command, self._refused = self._motions.choose(actions, self.overriding, idle, names, seen)
+        return self._command
+
+    # ------------------------------------------------------------------ what comes of it
+
+    def judge(
+        self,
+        rows: NDArray[np.float32],
+        executed: NDArray[np.float32],
+        felt: Felt | None = None,
+        failures: Mapping[int, str] | None = None,
+        ends_step: bool = True,
+        active: Mask | None = None,
+        bridged: Mask | None = None,
+    ) -> RowReport:
+        """Judge the next rows, and decide who acts next.
+
+        Args:
+            rows: (n, D) as they were sensed.
+            executed: (n, A).
+            felt: in the step that the rows end; None where nothing feels within steps, or in mid-step.
+            failures: what failed when the rows were sensed, by robot.
+            ends_step: the rows end a control step.
+            active: (n,) whose rows count; all by default.
+            bridged: (n,) whose missing numbers are no alarm.
+        """
+        active = self._everyone if active is None else active
+        refused, self._refused = self._refused & active, ~self._everyone
+        held = self.overriding
+        failed = self._failures(failures or {}, refused, active)
+        believed = self._rows.next(rows, active)
+        if bridged is not None:
+            believed = believed._replace(lost={i: lost for i, lost in believed.lost.items() if not bridged[i]})
+        failed |= {i: joined(failed.get(i, ""), said) for i, said in believed.failures.items()}
+        observed = self._observed(believed, failed, held, active if bridged is None else active & ~bridged)
+        severity, weighed = self._severity.weigh(
+            believed.rows,
+            felt or self._nothing_felt,
+            held,
+            observed.surprise,
+            self.threshold,
+            self._arbiter.strikes,
+            self._arbiter.most_impulse,
+            self._needs_decision(believed, observed.failures, held | refused),
+        )
+        row = _Row(believed, observed, severity, weighed, executed, held | refused, refused, active)
+        self._arbiter.let_pass(active & ~weighed.decides)
+        unfelt = self._motions.feel(believed.rows, executed, row.intervened, active) if ends_step else {}
+        self._motions.expect(observed.expected)
+        outcomes = {int(i): self._decide(int(i), row) for i in np.flatnonzero(weighed.decides & active)}
+        policy = active & ~row.intervened
+        self._largest[policy] = np.fmax(self._largest[policy], observed.surprise.value[policy])
+        pressed = policy & severity.presses
+        self._limits.follow(believed.rows, policy if ends_step else pressed, pressed)
+        unforgotten = self._forget(row, outcomes)
+        report = self._report(row, outcomes, (unfelt, unforgotten))
+        self._rows.drop_repairs()
+        return report
+
+    @property
+    def repaired(self) -> Mapping[int, tuple[NDArray[np.float32], Mask]]:
+        """The last row (D,) as it should be, and which of its numbers were completed (D,), by robot."""
+        found = {i: (self._rows.last(i, 1)[0], repair.missing) for i, repair in self._rows.repairs.items()}
+        return {i: (row, missing) for i, (row, missing) in found.items() if missing.any()}
+
+    @property
+    def trusted(self) -> Mask:
+        """(n,) whether a policy can rely on what was completed."""
+        return np.array([i not in self._rows.repairs or self._rows.repairs[i].trusted for i in range(self._count)])
+
+    def read(self, rows: NDArray[np.float32]) -> None:
+        """Take in rows (n, D) that nothing judges, such as the first of an episode."""
+        self._rows.next(rows, self._everyone)
+
+    @property
+    def completed(self) -> Mapping[int, tuple[str, ...]]:
+        """The sensors that are not believed now, by robot."""
+        return {i: repair.names for i, repair in self._rows.repairs.items()}
+
+    def amend(self, rows: NDArray[np.float32]) -> None:
+        """Tell the monitor that the last rows (n, D) were these: something else was commanded than it seemed."""
+        self._observer.amend(rows)
+
+    def _failures(self, failures: Mapping[int, str], refused: Mask, active: Mask) -> dict[int, str]:
+        """Return all that is known to have failed before the rows are looked at, by robot."""
+        found = {i: said for i, said in failures.items() if active[i]}
+        for i in map(int, np.flatnonzero(refused)):
+            found[i] = joined(self._command.failures.get(i, ""), found.get(i, ""))
+        if self.fitted.stale:
+            found |= {i: joined(found.get(i, ""), STALE) for i in map(int, np.flatnonzero(active))}
+        return found
+
+    def _observed(self, believed: Believed, failures: dict[int, str], held: Mask, judged: Mask) -> Observation:
+        """Return what counts of the surprise at the rows; none of it where they are not ``judged`` (n,)."""
+        observed = self._observer.observe(believed.rows, failures)
+        surprise = self._rows.counted(observed.surprise, observed.failures)
+        if self._late(observed.latency):
+            surprise = surprise._replace(value=np.full(self._count, np.inf))
+        failed, rate = dict(observed.failures), self.options.online_learning_rate
+        if rate > 0 and not held.any() and not failed:
+            said = self._observer.learn(believed.rows, surprise, rate)
+            if said:
+                failed = dict.fromkeys(range(self._count), said)
+                surprise = surprise._replace(value=np.full(self._count, np.inf))
+        if not judged.all():
+            surprise = surprise.silenced(~judged)
+        for i, said in failed.items():
+            self._warn(i, said, "which counts as an alarm")
+        return observed._replace(surprise=surprise, failures=failed)
+
+    def _needs_decision(self, believed: Believed, failures: Mapping[int, str], intervened: Mask) -> Mask:
+        """Return (n,) where there is something to decide, whatever the surprise."""
+        decides = intervened | (self._arbiter.state != POLICY) | (self._arbiter.rows == MOSTLY_AFTER - 1)
+        for i in (
+            *believed.lost,
+            *believed.contradictions,
+            *failures,
+            *self._rows.repairs,
+            *self._diagnostician.incidents,
+        ):
+            decides[i] = True
+        return decides
+
+    def _decide(self, robot: int, row: _Row) -> _Outcome:
+        """Return what is done about the row of one robot."""
+        i, value = robot, float(row.observed.surprise.value[robot])
+        over, knocked, presses = (bool(x[i]) for x in (row.weighed.over, row.weighed.knocked, row.severity.presses))
+        failed, lost, contradicts = i in row.observed.failures, i in row.believed.lost, i in row.believed.contradictions
+        alarm = over or knocked or lost or contradicts or presses
+        response = self._response(i, row, alarm)
+        intervened, impulse = bool(row.intervened[i]), float(row.severity.impulse[i])
+        if not intervened and np.isfinite(value) and (warning := self._arbiter.judge_policy(i, alarm)):
+            warnings.warn(warning, stacklevel=4)
+        judged = Judged(value, over, knocked, alarm, presses, impulse, intervened, bool(row.refused[i]), response)
+        decision = self._arbiter.decide(i, judged)
+        if decision.takes_over:
+            self._motions.start(i, row.executed[i])
+        told = (presses, CONTACT), (failed, FAILURE), (over or knocked, SURPRISE)
+        reason = next((name for holds, name in (*told, (contradicts, CONTRADICTION), (lost, MISSING)) if holds), "")
+        event = FAULTY if over or lost or contradicts else KNOCKED
+        return _Outcome(alarm, reason, event, response, decision)
+
+    def _response(self, robot: int, row: _Row, alarm: bool) -> Response:
+        """Return what is to be done about the last row of one robot."""
+        i, diagnostician, weighed, severity = robot, self._diagnostician, row.weighed, row.severity
+        rows = self._rows.last(i)
+        if not alarm:
+            return diagnostician.watch(i, rows, bool(self._arbiter.state[i] == POLICY))
+        failed, lost = i in row.observed.failures, i in row.believed.lost
+        contradiction = row.believed.contradictions.get(i)
+        certain = contradiction is not None or failed or bool(severity.presses[i])
+        if lost and not (certain or weighed.over[i] or weighed.knocked[i] or severity.speed[i] > FAST):
+            repair = self._rows.repairs.get(i)
+            return (
+                NO_RESPONSE if self._rows.read is None else diagnostician.missed(() if repair is None else repair.names)
+            )
+        if weighed.knocked[i] and not certain:
+            return diagnostician.knocked(i, rows)
+        feels = bool(np.isfinite(severity.load[i]) or np.isfinite(severity.force[i]))
+        response, columns = diagnostician.respond(
+            i,
+            Alarm(
+                rows,
+                row.observed.surprise.attribution[i],
+                self._rows.explained(i),
+                contradiction,
+                failed,
+                bool(severity.presses[i]),
+                feels,
+                float(severity.force[i]),
+                float(severity.speed[i]),
+                self._arbiter.may_go_on(i),
+                self._rows.read,
+            ),
+        )
+        if columns.size or response.name == "complete":
+            if self._rows.suspect(i, columns):
+                diagnostician.begin(i)
+            elif response.name == "complete":
+                response = diagnostician.uncompleted(response)
+        return response
+
+    def _forget(self, row: _Row, outcomes: Mapping[int, _Outcome]) -> Mapping[int, str]:
+        """Let evidence begin anew where it was acted on, or is of rows not yet repaired; return what failed."""
+        acted_on = np.zeros(self._count, bool)
+        for i, outcome in outcomes.items():
+            acted_on[i] = outcome.decision.acted_on
+        for i, repair in self._rows.repairs.items():
+            acted_on[i] |= repair.settling > 0
+        acted_on &= row.active
+        if not acted_on.any() or not (said := self._observer.forget(acted_on)):
+            return {}
+        return dict.fromkeys(map(int, np.flatnonzero(acted_on)), said)
+
+    def _report(self, row: _Row, outcomes: Mapping[int, _Outcome], failures: Sequence[Mapping[int, str]]) -> RowReport:
+        """Return what there is to say of the rows."""
+        surprise, active = row.observed.surprise, row.active
+        alarm, event = np.zeros(self._count, bool), np.zeros(self._count, np.int8)
+        if surprise.raw is not None and surprise.excuse is not None:
+            event[:] = np.where((surprise.raw > self.threshold) & ~row.weighed.over, surprise.excuse, 0)
+        for i, outcome in outcomes.items():
+            if outcome.alarm:
+                alarm[i], event[i] = True, outcome.event
+        failed: dict[int, str] = dict(row.observed.failures)
+        for i, said in ((i, said) for some in failures for i, said in some.items()):
+            failed[i] = joined(failed.get(i, ""), said)
+        severity, repairs = row.severity, {i: repair for i, repair in self._rows.repairs.items() if active[i]}
+        if not active.all():
+            blank = self.nothing().severity
+            severity = Severity(*(np.where(active, now, none) for now, none in zip(severity, blank, strict=True)))
+        return RowReport(
+            surprise=surprise,
+            threshold=self.threshold.copy(),
+            alarm=alarm,
+            intervened=row.intervened & active,
+            gave_up=(self._arbiter.state == ENDED) & active,
+            event=event,
+            state=np.where(active, self._arbiter.state, POLICY).astype(np.int8),
+            severity=severity,
+            reason={i: outcome.reason for i, outcome in outcomes.items() if outcome.reason},
+            transition={i: outcome.decision.transition for i, outcome in outcomes.items()},
+            failure=failed,
+            response={i: outcome.response for i, outcome in outcomes.items()},
+            completed={i: repair.names for i, repair in repairs.items()},
+            unread={i: repair.unread for i, repair in repairs.items()},
+            lost=row.believed.lost,
+            latency=row.observed.latency,
+        )
+
+    def _late(self, latency: float) -> bool:
+        """Return whether the monitor took so long that it counts as an alarm."""
+        late, self._warm = self._warm and latency > self._spec.dt, True
+        if late and self.options.on_overrun == "warn" and not self._said_late:
+            self._said_late = True
+            said = f"the monitor took {1e3 * latency:.1f} ms for a row that lasts {1e3 * self._spec.dt:.1f} ms"
+            warnings.warn(said, stacklevel=4)
+        return late and self.options.on_overrun == "alarm"
+
+    def _warn(self, robot: int, failure: str, instead: str) -> None:
+        """Say what failed, and what happens instead: once an episode for each part that can fail."""
+        who = robot, failure.partition(":")[0]
+        if who not in self._warned:
+            self._warned.add(who)
+            warnings.warn(f"{failure}; {instead}", stacklevel=4)

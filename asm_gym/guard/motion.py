@@ -1,0 +1,215 @@
+"""What n robots do in a step: what their policies want, or what a reflex does in their place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.compilation import compiled
+from asm_gym.guard.observer import joined
+from asm_gym.guard.reflexes import Motion, Reflexes
+from asm_gym.guard.robots import Robots
+from asm_gym.policies.base import Policy, Reflex
+from asm_gym.validation import as_float32, shown
+
+USUAL_GAIN = 0.1
+"""Weight of the newest step in the external torque that is taken to be usual."""
+
+Floats32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+class Command(NamedTuple):
+    """What is to be done in a step.
+
+    Attributes:
+        actions: (n, A) finite, in the action space.
+        brakes: (n,) the robot stays, whatever the action is.
+        overridden: (n,) something else than the policy's action is done.
+        failures: what failed when it was chosen, by robot.
+    """
+
+    actions: Floats32
+    brakes: Mask
+    overridden: Mask
+    failures: Mapping[int, str]
+
+
+class Motions:
+    """Chooses what the robots do.
+
+    Args:
+        robots: which.
+        reflexes: act after an alarm; None where policies do, or nothing.
+        policies: the user's own, for each robot, in the place of reflexes.
+        takes_over: lets the reflex of a robot act from now on, for its policy's action is none.
+        warn: says what failed, and what happens instead.
+    """
+
+    def __init__(
+        self,
+        robots: Robots,
+        reflexes: Reflexes | None,
+        policies: Sequence[Policy],
+        take_over: Callable[[int], None],
+        warn: Callable[[int, str, str], None],
+    ) -> None:
+        n, shape = robots.count, robots.rest.shape
+        self._robots, self._reflexes, self._policies = robots, reflexes, policies
+        self._take_over, self._warn = take_over, warn
+        self._last = np.zeros((n, *shape), np.float32)  # executed last
+        self._before = np.zeros((n, *shape), np.float32)  # executed last before the override
+        self._fresh = np.zeros(n, bool)  # the override has just begun
+        self._memory: dict[int, Any] = {}  # the policies' own states
+        self.begin(np.ones(n, bool))
+
+    def begin(self, which: Mask) -> None:
+        """New episodes of the robots of ``which`` (n,)."""
+        self._last[which] = self._before[which] = 0.0
+        self._fresh[which] = False
+        if self._reflexes is not None:
+            self._reflexes.begin(which)
+        for i in np.flatnonzero(which) if self._policies else ():
+            self._memory.pop(int(i), None)
+            policy = self._policies[i]
+            if isinstance(policy, Reflex):
+                policy.reset()
+
+    def start(self, robot: int, executed: Floats32) -> None:
+        """The override of a robot has begun, after it has ``executed`` (A,)."""
+        self._before[robot], self._fresh[robot] = executed, True
+
+    def choose(
+        self, actions: Floats32, acts: Mask, idle: Mask, names: Sequence[str], seen: Callable[[int], Any]
+    ) -> tuple[Command, Mask]:
+        """Return what is to be done, and whose policy wanted what is no action.
+
+        Args:
+            actions: (n, A) that the policies want.
+            acts: (n,) the reflex acts.
+            idle: (n,) nothing is done, for an episode begins.
+            names: of the reflex that each is to do.
+            seen: the observation of a robot.
+        """
+        robots, failures = self._robots, {}
+        finite = np.isfinite(actions).all(axis=1)
+        executed = np.minimum(np.maximum(actions, robots.low), robots.high)  # np.clip takes three times as long
+        refused, brakes = ~finite & ~acts & ~idle, np.zeros(len(actions), bool)
+        for i in np.flatnonzero(refused | acts | idle):
+            robot = int(i)
+            if idle[robot]:
+                executed[robot] = np.clip(0.0, robots.low, robots.high)
+                continue
+            said = ""
+            if refused[robot]:
+                said = f"policy: the action must be finite, got {shown(actions[robot].tolist())}"
+                self._warn(robot, said, "another is done instead")
+                if self._acts:
+                    self._take_over(robot)
+                    self.start(robot, self._last[robot])
+            if self._acts:
+                executed[robot], brakes[robot], failed = self._reaction(robot, names[robot], seen)
+            else:
+                (executed[robot], brakes[robot]), failed = self._stay(robot, self._last[robot]), ""
+            if said or failed:
+                failures[robot] = joined(said, failed)
+        self._last[:] = executed
+        return Command(executed, brakes, (acts | refused) & ~idle, failures), refused
+
+    @property
+    def _acts(self) -> bool:
+        return self._reflexes is not None or bool(self._policies)
+
+    def feel(self, rows: Floats32, executed: Floats32, intervened: Mask, active: Mask) -> Mapping[int, str]:
+        """Let the reflexes feel rows (n, D) and what was executed (n, A); return what failed, by robot."""
+        failures = {}
+        if self._reflexes is not None and self._reflexes.possible - {"hold", "recall"}:
+            r = self._reflexes
+            _feel(rows, r.torques, executed, intervened, active, r.torque, r.usual, r.path, r.steps)
+        for i in np.flatnonzero(active) if self._policies else ():
+            policy = self._policies[i]
+            if not isinstance(policy, Reflex):
+                continue
+            try:
+                policy.feel(rows[i], executed[i], bool(intervened[i]))
+            except Exception as error:
+                failures[int(i)] = f"reflex: {error!r}"
+                self._warn(int(i), failures[int(i)], "it has not felt this row")
+        return failures
+
+    def expect(self, expected: Floats32 | None) -> None:
+        """Take up what the memory expects to be commanded next (n, A)."""
+        if expected is not None and self._reflexes is not None:
+            self._reflexes.expected = np.nan_to_num(expected)
+
+    def _reaction(self, robot: int, name: str, seen: Callable[[int], Any]) -> tuple[Floats32, bool, str]:
+        """Return what the reflex does, whether the robot brakes, and what failed; where it fails the robot stays."""
+        robots, before = self._robots, self._before[robot]
+        try:
+            motion = self._asked(robot, name, seen)
+            action = as_float32(motion.action)
+            if action.shape != robots.rest.shape or not np.isfinite(action).all():
+                raise ValueError(f"a finite action of shape {robots.rest.shape} was needed, got {action}")
+            if motion.keeps_grip:
+                action[robots.grip] = before[robots.grip]
+        except Exception as error:
+            # Whatever a user's policy does, an alarm must not end in no action.
+            said = f"reflex: {error!r}"
+            self._warn(robot, said, "the robot holds instead")
+            return *self._stay(robot, before), said
+        return np.clip(action, robots.low, robots.high), motion.brakes, ""
+
+    def _asked(self, robot: int, name: str, seen: Callable[[int], Any]) -> Motion:
+        fresh = bool(self._fresh[robot])
+        if self._reflexes is not None:
+            self._fresh[robot] = False
+            return self._reflexes.move(robot, name)
+        policy = self._policies[robot]
+        if fresh:
+            # Reflexes start from what was last done; any other policy starts as in a new episode.
+            before = self._before[robot].copy()
+            self._memory[robot] = policy.begin(before) if isinstance(policy, Reflex) else None
+        action, memory = policy.predict(
+            seen(robot), state=self._memory.get(robot), episode_start=np.array([fresh]), deterministic=True
+        )
+        self._memory[robot], self._fresh[robot] = memory, False
+        return Motion(np.array(action), keeps_grip=False)
+
+    def _stay(self, robot: int, executed: Floats32) -> tuple[Floats32, bool]:
+        action = self._robots.rest.copy()
+        if self._robots.rests:
+            action[self._robots.grip] = executed[self._robots.grip]
+        return action, self._robots.brakes
+
+
+@partial(compiled, calls=(".",))
+def _feel(
+    rows: Any,
+    columns: Any,
+    executed: Any,
+    intervened: Any,
+    active: Any,
+    torque: Any,
+    usual: Any,
+    path: Any,
+    steps: Any,
+) -> None:
+    """Take rows (n, D) into external torques (n, J), and what policies executed (n, A) into their paths."""
+    for n in range(len(rows)):
+        if not active[n]:
+            continue
+        for j in range(len(columns)):
+            if not intervened[n]:
+                # What is carried weighs on the joints as well; only what has come since is yielded to.
+                usual[n, j] += USUAL_GAIN * (torque[n, j] - usual[n, j])
+            felt = float(rows[n, columns[j]])
+            torque[n, j] = felt if np.isfinite(felt) else 0.0
+        if not intervened[n]:
+            for k in range(path.shape[1] - 1):
+                path[n, k] = path[n, k + 1]
+            path[n, path.shape[1] - 1] = executed[n]
+            steps[n] = min(steps[n] + 1, path.shape[1])

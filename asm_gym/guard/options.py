@@ -1,0 +1,146 @@
+"""Everything that a guard can be told, in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from asm_gym.contact_limits import ContactLimits
+from asm_gym.detection.adaptive import AdaptiveThreshold
+from asm_gym.guard.reflexes import GRADED, REFLEXES
+from asm_gym.guard.responses import responses_from
+from asm_gym.guard.severity import LEANS_S
+from asm_gym.policies.base import Policy
+from asm_gym.validation import check_choice, check_flag, check_number, shown
+
+ON_ALARM = ("monitor", *REFLEXES, GRADED, "terminate")
+"""Names that ``on_alarm`` takes."""
+
+OnAlarm = str | Policy | Callable[[Any], Policy]
+"""What ``on_alarm`` takes: a name, a policy, or what makes a policy for an environment."""
+
+TRY_AFTER_S, GIVE_UP_AFTER_S, GO_ON_S = 0.5, 3.0, 5.0
+"""Under ``"graded"``: when control is handed back on trial, when the episode ends, and for how long in an episode the
+policy may go on in alarm [s]."""
+
+STRIKES, IMPULSE = 3, 20.0
+"""Under ``"graded"``: the episode ends where the policy passes a contact limit for the time ``STRIKES``, or presses
+with more than ``IMPULSE`` beyond healthy motion [N s]."""
+
+TRUST_S = 1.0
+"""How long a sense that no other sense tells of is completed, by its last good value [s]."""
+
+
+@dataclass(frozen=True)
+class ReleaseRule:
+    """When control is handed back, and when the episode ends.
+
+    Args:
+        release_after: calm steps after which control is handed back.
+        release_below: share of the threshold, in (0, 1], that surprise must be under to count as calm.
+        max_override: steps for which a reflex may act. Those before a hand-back after which the alarm is back within
+            ``release_after`` steps count too. None for no limit.
+        try_after: steps after which control is handed back on trial though surprise is not low; after each trial that
+            fails, twice as many. None for no trials.
+        free_after: steps without contact after which a contact is over though surprise is not low; after each
+            hand-back that was too early, twice as many.
+        strikes: how often the policy may pass a contact limit before the episode ends. None for no limit.
+        impulse: how much the arm may press in an episode, beyond healthy motion [N s]. None for no limit.
+        go_on: steps in alarm in an episode for which the policy may go on; the robot holds at all later alarms.
+    """
+
+    release_after: int = 10
+    release_below: float = 0.8
+    max_override: int | None = None
+    try_after: int | None = None
+    free_after: int = 5
+    strikes: int | None = None
+    impulse: float | None = None
+    go_on: int = 100
+
+
+@dataclass(frozen=True)
+class GuardOptions:
+    """What the safety wrappers take beside environment and monitor; see ``NeuralASMSafety``.
+
+    Args:
+        on_alarm, release_after, release_below, max_override, try_after, truncate, responses, contact_limits,
+            adaptive_threshold, online_learning_rate, on_overrun: as there.
+        completes: sensors at fault are completed whatever ``on_alarm`` is; always so under ``"graded"``.
+        trust_s: how long a sense that no other sense tells of is completed [s].
+        leans_s: how long an arm may press with more than healthy motion does below its limits [s].
+
+    Raises:
+        ValueError: a number out of its range, an unknown name, or responses that let a pressing arm go on.
+    """
+
+    on_alarm: OnAlarm | None = None
+    release_after: int = 10
+    release_below: float = 0.8
+    max_override: int | None = None
+    try_after: int | None = None
+    truncate: bool = False
+    responses: Mapping[str, str] | None = None
+    contact_limits: ContactLimits | str | None = "memory"
+    adaptive_threshold: AdaptiveThreshold | None = None
+    online_learning_rate: float = 0.0
+    on_overrun: str = "ignore"
+    completes: bool = False
+    trust_s: float = TRUST_S
+    leans_s: float = LEANS_S
+
+    def __post_init__(self) -> None:
+        if isinstance(self.on_alarm, str) and self.on_alarm not in ON_ALARM:
+            raise ValueError(f"unknown on_alarm {shown(self.on_alarm)}; known: {', '.join(ON_ALARM)}, or any policy")
+        check_number("release_after", self.release_after, low=1, whole=True)
+        check_number("release_below", self.release_below, above=0, high=1)
+        for name in ("max_override", "try_after"):
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), low=1, whole=True)
+        check_flag("truncate", self.truncate)
+        responses_from(self.responses)
+        limits = self.contact_limits
+        if not (limits is None or isinstance(limits, ContactLimits) or limits == "memory"):
+            raise ValueError(f'contact_limits must be ContactLimits, "memory" or None, got {shown(limits)}')
+        if self.adaptive_threshold is not None and not isinstance(self.adaptive_threshold, AdaptiveThreshold):
+            raise TypeError(f"adaptive_threshold must be an AdaptiveThreshold, got {shown(self.adaptive_threshold)}")
+        check_number("online_learning_rate", self.online_learning_rate, low=0, high=1)
+        check_choice("on_overrun", self.on_overrun, ("warn", "alarm", "ignore"))
+        check_number("trust_s", self.trust_s, low=0)
+
+    def reaction(self, names_causes: bool) -> OnAlarm:
+        """Return ``on_alarm``, or what None means for a monitor that names causes or does not.
+
+        Raises:
+            ValueError: there are responses, and nobody asks for them.
+        """
+        chosen: OnAlarm = (GRADED if names_causes else "hold") if self.on_alarm is None else self.on_alarm
+        if self.responses is not None and not (isinstance(chosen, str) and chosen == GRADED):
+            raise ValueError(f"responses are those of on_alarm='graded', got on_alarm={shown(chosen)}")
+        return chosen
+
+    def rule(self, graded: bool, dt: float, rows_per_step: int) -> ReleaseRule:
+        """Return when control is handed back, counted in rows.
+
+        Args:
+            graded: limits of time, strikes and impulse hold where none are given.
+            dt: control period [s].
+            rows_per_step: rows of the stream in a control step.
+        """
+
+        def rows(steps: int | None, seconds: float) -> int | None:
+            if steps is None and graded:
+                steps = max(1, round(seconds / dt))
+            return None if steps is None else rows_per_step * steps
+
+        return ReleaseRule(
+            rows_per_step * self.release_after,
+            self.release_below,
+            rows(self.max_override, GIVE_UP_AFTER_S),
+            rows(self.try_after, TRY_AFTER_S),
+            rows_per_step * ReleaseRule.free_after,
+            STRIKES if graded else None,
+            IMPULSE if graded else None,
+            (rows(None, GO_ON_S) or 0) if graded else rows_per_step * ReleaseRule.go_on,
+        )

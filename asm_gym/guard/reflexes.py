@@ -1,0 +1,135 @@
+"""What a robot does after an alarm: it stays, goes back, gives way, or goes on as the memory expects.
+
+A reflex is a function of ``Reflexes``, which knows what was felt and done, and of which robot it is. To add one, write
+the function and name it in ``REFLEXES``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.guard.robots import Robots
+from asm_gym.spec import StreamSpec
+
+Mask = NDArray[np.bool_]
+
+GRADED = "graded"
+"""Not a reflex, but the one that severity and cause ask for."""
+
+PATH = 10
+"""How many actions a retreat undoes."""
+
+COMPLIANCE = 0.05
+"""How far a joint gives way in a second [rad / (N m s)]."""
+
+TOLERATED = {GRADED: 4.0}
+TOLERATED_ALONE = 2.0
+"""External torque that no joint gives way to [N m]: under ``"graded"``, and under ``"comply"`` by itself."""
+
+
+class Motion(NamedTuple):
+    """What a reflex does next.
+
+    Attributes:
+        action: (A,).
+        brakes: the robot stays, whatever the action is.
+        keeps_grip: the grippers are told what they were told before the override.
+    """
+
+    action: NDArray[np.float32]
+    brakes: bool = False
+    keeps_grip: bool = True
+
+
+class Reflexes:
+    """What the reflexes of n robots have felt.
+
+    Args:
+        robots: whose.
+        spec: of their streams.
+        on_alarm: the name of a reflex, or ``"graded"``.
+
+    Raises:
+        ValueError: the robots cannot do it.
+    """
+
+    def __init__(self, robots: Robots, spec: StreamSpec, on_alarm: str) -> None:
+        n, actions = robots.count, robots.rest.size
+        wanted = ("hold", "retract", "comply") if on_alarm == GRADED else (on_alarm,)
+        self.torques = _columns(spec, "external_torque")
+        """(J,) columns of external torques."""
+        lacks = dict(robots.refused)
+        if not self.torques.size:
+            lacks.setdefault(
+                "comply", "comply needs the channel external_torque: make the environment with stream group torque"
+            )
+        for name in (on_alarm, "hold"):
+            if name in lacks and name != GRADED:
+                raise ValueError(lacks[name])
+        self.possible = frozenset(name for name in wanted if name not in lacks)
+        self.robots = robots
+        self.tolerated = TOLERATED.get(on_alarm, TOLERATED_ALONE)
+        self.torque, self.usual = np.zeros((n, len(self.torques))), np.zeros((n, len(self.torques)))
+        """(n, J) external torque now, and what is usual while the policy acts [N m]."""
+        self.path, self.steps = np.zeros((n, PATH, actions), np.float32), np.zeros(n, np.int64)
+        """(n, PATH, A) what the policy did last, the newest last, and how much of it there is."""
+        self.expected = np.zeros((n, actions), np.float32)
+        """(n, A) what the memory expects to be commanded next."""
+
+    def begin(self, which: Mask) -> None:
+        """New episodes of the robots of ``which`` (n,)."""
+        self.torque[which] = self.usual[which] = 0.0
+        self.steps[which] = 0
+        self.expected[which] = self.robots.rest
+
+    def move(self, robot: int, name: str) -> Motion:
+        """Return what a robot does; it stays where it cannot do what is asked for."""
+        return REFLEXES[name if name in self.possible else "hold"](self, robot)
+
+
+def hold(felt: Reflexes, robot: int) -> Motion:
+    """Stay, by a brake beneath the controller where there is one."""
+    return Motion(felt.robots.rest.copy(), felt.robots.brakes)
+
+
+def retract(felt: Reflexes, robot: int) -> Motion:
+    """Undo the last actions, the newest first, then stay: under a delta controller its negative undoes an action."""
+    if not felt.steps[robot]:
+        return hold(felt, robot)
+    undone = -felt.path[robot, -1]
+    felt.path[robot, 1:] = felt.path[robot, :-1].copy()
+    felt.steps[robot] -= 1
+    return Motion(undone)
+
+
+def comply(felt: Reflexes, robot: int) -> Motion:
+    """Give way along the external torque beyond the usual, as a damper would."""
+    assert felt.robots.turn is not None
+    more = felt.torque[robot] - felt.usual[robot]
+    beyond = np.sign(more) * np.maximum(np.abs(more) - felt.tolerated, 0.0)
+    return Motion(np.array(felt.robots.turn(robot, COMPLIANCE * felt.robots.dt * beyond), np.float32))
+
+
+def recall(felt: Reflexes, robot: int) -> Motion:
+    """Go on along what the memory expects to be commanded, grip included."""
+    return Motion(felt.expected[robot].copy(), keeps_grip=False)
+
+
+REFLEXES: dict[str, Callable[[Reflexes, int], Motion]] = {
+    "hold": hold,
+    "retract": retract,
+    "comply": comply,
+    "recall": recall,
+}
+"""Reflexes by name."""
+
+
+def _columns(spec: StreamSpec, ending: str) -> NDArray[np.intp]:
+    """(N,) columns of the channels whose names end so."""
+    found = [np.arange(spec.size)[s] for name, s in spec.slices.items() if name.endswith(ending)]
+    columns: NDArray[np.intp] = np.concatenate([np.zeros(0, np.intp), *found]).astype(np.intp)
+    return columns

@@ -1,0 +1,95 @@
+"""What is done about which cause: one table, and the responses that it names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from asm_gym.monitors.diagnosis import FAMILIES, as_info
+from asm_gym.validation import check_choice, shown
+
+LASTING = {"contact": 1.0, "actuator": 2.5}
+"""From when on a cause is a lasting one [s]: a contact that is there for so long; an actuator's fault where its joint
+has been pressed for most of that time and has not turned. Where the policy goes on in spite of another cause, and the
+arm is pressed so and does not move, it is a lasting contact."""
+
+UNREAD = "unread sensor"
+"""A sensor at fault of which nothing stands in the observation, so that the policy has never read it."""
+
+PRESSING = "pressing"
+"""The arm presses harder than healthy motion does, whatever the cause is taken for."""
+
+CAUSES = (*FAMILIES, UNREAD, *(f"lasting {family}" for family in LASTING), PRESSING, f"lasting {PRESSING}")
+"""What a table of responses says something about."""
+
+GOING_ON = ("go on", "complete")
+"""Responses to an alarm under which the policy acts."""
+
+RESPONSES = (*GOING_ON, "hold", "comply", "retract", "stop")
+"""Let the policy go on; complete the sensors at fault and go on; stay and keep the grip, yielding to more than a hold's
+force; give way to what presses; go back along the path; stay, and end the episode."""
+
+DEFAULT: dict[str, str] = {
+    "sensor": "complete",
+    UNREAD: "complete",
+    "contact": "hold",
+    "lasting contact": "comply",
+    "actuator": "go on",
+    "lasting actuator": "stop",
+    "action": "hold",
+    "object": "go on",
+    "unknown": "hold",
+    PRESSING: "hold",
+    f"lasting {PRESSING}": "comply",
+}
+"""What ``on_alarm="graded"`` does. What presses comes first: then only its two rows count, and neither may let the
+policy go on. Below that, the policy may go on where the cause is sure, the hand is not faster than any healthy one, for
+a bounded time, and where a sense of force says that it presses with no more than 40 N; else the robot holds."""
+
+
+class Response(NamedTuple):
+    """What is to be done about a row of one robot.
+
+    Attributes:
+        name: one of ``RESPONSES``; empty where there is nothing to respond to, or the table is not asked.
+        cause: as ``info["asm"]["cause"]`` says it.
+        touched: whether the contact that was responded to is still there; None where that is not known, and where it
+            has lasted for so long that it may never end.
+        case: one of ``CAUSES``: the row of the table that was followed; empty where none was.
+    """
+
+    name: str
+    cause: dict[str, Any]
+    touched: bool | None = None
+    case: str = ""
+
+    @property
+    def why(self) -> str:
+        """The cause in words."""
+        if not self.cause["family"]:
+            return ""
+        part = " ".join(filter(None, (self.case or self.cause["family"], self.cause["part"])))
+        return f"{part}, {self.cause['probability']:.2f}"
+
+
+NO_RESPONSE = Response("", as_info(None))
+"""Where nothing is to be done."""
+
+
+def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:
+    """Return the default table with the entries of ``table`` in place of its own.
+
+    Raises:
+        ValueError: an unknown cause or response (the message lists those that exist), or one that lets the policy go on
+            while the arm presses.
+    """
+    if table is not None and not isinstance(table, Mapping):
+        raise ValueError(f"responses must map causes to responses, got {shown(table)}")
+    for cause, response in (table or {}).items():
+        check_choice("cause", cause, CAUSES)
+        check_choice("response", response, RESPONSES)
+        if cause.endswith(PRESSING) and response in GOING_ON:
+            raise ValueError(
+                f"{shown(response)} would let an arm go on that presses: {cause} takes hold, comply, retract or stop"
+            )
+    return {**DEFAULT, **(table or {})}

@@ -1,0 +1,225 @@
+"""What a guard has to know of the robots in an environment, or in many side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
+from gymnasium.wrappers.vector import NormalizeObservation
+from numpy.typing import NDArray
+
+from asm_gym.guard.checks import shipped_memory
+from asm_gym.guard.robots import Robots
+from asm_gym.guard.severity import Felt
+from asm_gym.monitors import NeuralASM
+from asm_gym.policies.reflexes import changed_by, nearest_to_rest, no_rest, outside, resting_action
+from asm_gym.spec import StreamSpec, control_period
+from asm_gym.wrappers.observation_map import ObservationMap
+
+DELTAS = ("OSC_POSE", "JOINT_POSITION")
+"""Controllers whose actions are changes, of pose or of joint angles."""
+
+Values = tuple[Any, ...] | None
+
+
+@runtime_checkable
+class Askable(Protocol):
+    """A vector environment whose members can be asked, and told."""
+
+    def call(self, name: str, *args: Any) -> tuple[Any, ...]:
+        """What the method ``name`` of each returns."""
+        ...
+
+    def set_attr(self, name: str, values: list[Any]) -> None:
+        """Sets an attribute of each."""
+        ...
+
+
+def robots_of(env: gym.Env[Any, Any], spec: StreamSpec) -> tuple[Robots, ObservationMap | None]:
+    """Return what is known of the robot in an environment, wrapped or not, and where its stream stands in what it
+    observes; None where that is not known."""
+    inner: Any = env.unwrapped
+    if not isinstance(env.action_space, gym.spaces.Box):
+        none = np.zeros(0, np.float32)
+        return Robots(1, none, none, none, dt=control_period(env)), None
+
+    def ask(name: str) -> Values:
+        if name == "laid_out_space":
+            return (getattr(inner, name, inner.observation_space),)
+        if name == "stream_spec":
+            return (env.get_wrapper_attr(name),) if env.has_wrapper_attr(name) else None
+        return (getattr(inner, name),) if hasattr(inner, name) else None
+
+    def call(name: str, argument: Any) -> tuple[Any, ...]:
+        return (getattr(inner, name)(argument),)
+
+    wrapper = changed_by(env)
+    changed = "" if wrapper is None else outside(wrapper, "a reflex", "NeuralASMSafety")
+    rest, refused = nearest_to_rest(env.action_space), {}
+    if ask("holding") is None:
+        try:
+            rest = resting_action(env)
+        except ValueError as error:  # no action is known to rest
+            refused["hold"] = str(error)
+    asked = _Asked(1, ask, call, env.observation_space, env.action_space, control_period(env))
+    return _known(asked, spec, rest, changed, refused)
+
+
+def robots_of_many(envs: VectorEnv[Any, Any, Any], spec: StreamSpec) -> tuple[Robots, ObservationMap | None]:
+    """Return what is known of the robots in a vector environment, and where their streams stand in what they observe.
+
+    Raises:
+        TypeError: its members cannot be asked what they are.
+    """
+    members = askable(envs)
+
+    def ask(name: str) -> Values:
+        # Asked first, for a worker process in which an attribute is missing is ended by Gymnasium.
+        there = all(members.call("has_wrapper_attr", name))
+        return tuple(members.call("get_wrapper_attr", name)) if there else None
+
+    space: Any = envs.single_action_space
+    changed, wrapper = "", envs
+    while isinstance(wrapper, VectorWrapper):
+        if isinstance(wrapper, VectorActionWrapper):
+            changed = outside(wrapper, "a reflex", "VectorNeuralASMSafety")
+        wrapper = wrapper.env
+    rest, refused = nearest_to_rest(space), {}
+    if ask("holding") is None and (changed or np.any(rest)):
+        refused["hold"] = changed or no_rest(space)
+    dt = ask("dt")
+    period = control_period(envs) if dt is None else float(dt[0])  # type: ignore[arg-type]
+    asked = _Asked(envs.num_envs, ask, members.call, envs.single_observation_space, space, period)
+    return _known(asked, spec, rest, changed, refused)
+
+
+def askable(envs: VectorEnv[Any, Any, Any]) -> Askable:
+    """Return a vector environment whose members can be asked what they are. Raises TypeError where they cannot."""
+    inner = envs.unwrapped
+    if not isinstance(inner, Askable):
+        raise TypeError(
+            f"{inner} cannot be asked what its environments are: make it with SyncVectorEnv or AsyncVectorEnv"
+        )
+    return inner
+
+
+class _Asked(NamedTuple):
+    """n environments that can be asked."""
+
+    count: int
+    ask: Callable[[str], Values]
+    call: Callable[..., tuple[Any, ...]]
+    observations: gym.spaces.Space[Any]
+    actions: gym.spaces.Box
+    dt: float
+
+
+def _known(
+    envs: _Asked, spec: StreamSpec, rest: NDArray[np.float32], changed: str, refused: dict[str, str]
+) -> tuple[Robots, ObservationMap | None]:
+    """Return what environments say of their robots.
+
+    Args:
+        rest: (A,) the action for which they stay.
+        changed: why no reflex can know what reaches the robots; empty where it can.
+        refused: the reflexes that they cannot do, and why; more are added.
+    """
+    ask, call = envs.ask, envs.call
+
+    def first(name: str, otherwise: Any = None) -> Any:
+        return (ask(name) or (otherwise,))[0]
+
+    grip = np.asarray(first("gripper_actions", ()), np.intp)
+    if grip.size and grip.max() >= rest.size:  # a wrapper inside takes other numbers
+        grip = grip[:0]
+    has_stream, controller = ask("stream_spec") is not None, first("controller")
+    for name in ("retract", "comply"):
+        if controller not in DELTAS:
+            refused[name] = (
+                f"{name} needs an environment whose controller is {' or '.join(DELTAS)}, got {controller}: "
+                "use hold with a safe_action of your own, or name any policy"
+            )
+        elif changed:
+            refused[name] = changed
+    if changed and has_stream:
+        refused["recall"] = changed
+    try:
+        places = ObservationMap(
+            envs.observations, spec, has_stream, first("observation_layout"), first("laid_out_space")
+        )
+    except ValueError as error:
+        places, refused["complete"] = None, str(error)
+    felt, chains = first("felt_channels", ()), ask("hand_chains") or ()
+    robots = Robots(
+        count=envs.count,
+        low=envs.actions.low,
+        high=envs.actions.high,
+        rest=rest,
+        rests="hold" not in refused,
+        brakes=ask("holding") is not None and ask("keeps_holding") is not None,
+        grip=grip,
+        dt=envs.dt,
+        chains=tuple(zip(*chains, strict=True)),
+        felt_channels=felt,
+        limits_contact=bool(felt) and ask("contact_limits") is not None,
+        read=None if places is None else places.shown,
+        turn=(lambda i, turns: call("action_for", turns)[i]) if controller in DELTAS else None,
+        force_behind=(lambda i, torques: call("force_behind", torques)[i]) if felt else None,
+        refused=refused,
+    )
+    return robots, places
+
+
+def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | None = None) -> Felt:
+    """Return what environments say in ``info`` of what their arms felt within a step.
+
+    Args:
+        infos: of one environment, or of n with arrays whose first axis is n.
+        there: (n,) whose information is there; of all where None.
+    """
+    n, size = robots.count, sum(c.size for c in robots.felt_channels)
+    if "contact_load" not in infos:
+        return Felt.nothing(n, size)
+    shapes = ((n,), (n,), (n, size))
+    names = "contact_load", "contact_left_s", "contact_felt"
+    parts = []
+    for name, shape in zip(names, shapes, strict=True):
+        part = np.asarray(infos.get(name, np.full(shape, np.nan)), np.float64).reshape(shape)
+        parts.append(part if there is None else np.where(there.reshape(-1, *[1] * (part.ndim - 1)), part, np.nan))
+    return Felt(*parts)
+
+
+def body_memory(env: gym.Env[Any, Any], watched: StreamSpec) -> NeuralASM:
+    """Return the shipped memory of the body that ``env`` moves; which one it is goes to the log.
+
+    Raises:
+        ValueError: none fits; the message lists those that there are.
+    """
+    inner: Any = env.unwrapped
+    return shipped_memory(inner, watched, str(getattr(inner, "controller", "")))
+
+
+def memory_of(envs: VectorEnv[Any, Any, Any], watched: StreamSpec) -> NeuralASM:
+    """Return the shipped memory of the body that all members move.
+
+    Raises:
+        ValueError: none fits; the message lists those that there are.
+    """
+    members = askable(envs)
+    there = all(members.call("has_wrapper_attr", "controller"))
+    controller = members.call("get_wrapper_attr", "controller")[0] if there else ""
+    return shipped_memory(envs, watched, str(controller))
+
+
+def refuse_running_statistics(envs: VectorEnv[Any, Any, Any]) -> None:
+    """Raise ValueError for a wrapper around all members by which the same sense reads differently as it goes on."""
+    while isinstance(envs, VectorWrapper):
+        if isinstance(envs, NormalizeObservation) and envs.update_running_mean:
+            raise ValueError(
+                "NormalizeObservation changes what it makes of the same sense as it goes on: put it outside, as in "
+                "NormalizeObservation(VectorNeuralASMSafety(envs, monitor)), or set its update_running_mean to False"
+            )
+        envs = envs.env
