@@ -183,13 +183,13 @@ def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | No
     n, size = robots.count, sum(c.size for c in robots.felt_channels)
     if "contact_load" not in infos:
         return Felt.nothing(n, size)
-    shapes = ((n,), (n,), (n, size))
-    names = "contact_load", "contact_left_s", "contact_felt"
-    parts = []
-    for name, shape in zip(names, shapes, strict=True):
-        part = np.asarray(infos.get(name, np.full(shape, np.nan)), np.float64).reshape(shape)
-        parts.append(part if there is None else np.where(there.reshape(-1, *[1] * (part.ndim - 1)), part, np.nan))
-    return Felt(*parts)
+    numbers = np.full((n, 2 + size), np.nan)
+    numbers[:, 0], numbers[:, 1] = infos["contact_load"], infos["contact_left_s"]
+    if "contact_felt" in infos:
+        numbers[:, 2:] = infos["contact_felt"]
+    if there is not None:
+        numbers[~there] = np.nan
+    return Felt(numbers)
 
 
 def body_memory(env: gym.Env[Any, Any], watched: StreamSpec) -> NeuralASM:

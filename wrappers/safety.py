@@ -14,6 +14,7 @@ from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.guard.checks import LOG, Fitted, check_monitor, diagnosis_of, fitted_to
 from asm_gym.guard.engine import Engine
+from asm_gym.guard.lazy_info import LazyInfo
 from asm_gym.guard.motion import Command
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import INFO, RowReport, report
@@ -309,16 +310,21 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _report(self, info: dict[str, Any], rows: Sequence[RowReport], executed: Any) -> None:
         """Say in ``info`` what became of a step."""
-        self._alarms += any(row.alarm[0] for row in rows)
+        surprise = max(float(row.surprise.value[0]) for row in rows)
+        alarm = any(bool(row.alarm[0]) for row in rows)
+        self._alarms += alarm
         if self._full:
-            asm = report(rows, 0, self._spec, executed, self._failed) | {"alarms": self._alarms}
-            running = self._engine.running
-            info["asm"] = asm if running is None else asm | {"ceiling": running.ceiling, "level": running.level}
-        alarm = np.bool_(any(row.alarm[0] for row in rows))
-        info["asm_surprise"] = np.float64(max(row.surprise.value[0] for row in rows))
-        info["asm_alarm"], info["cost"] = alarm, np.float64(alarm)
+            info["asm"] = self._asm(rows, executed)
+        info["asm_surprise"], info["asm_alarm"], info["cost"] = np.float64(surprise), np.bool_(alarm), np.float64(alarm)
         info["asm_intervened"] = np.bool_(any(row.intervened[0] for row in rows))
         info["cost_sum"] = np.float64(self._alarms)
+
+    def _asm(self, rows: Sequence[RowReport], executed: Any) -> LazyInfo:
+        """Return all that there is to say of a step; it is made when it is read."""
+        failed, alarms, running = self._failed, {"alarms": self._alarms}, self._engine.running
+        done = None if executed is None else np.array(executed)
+        more = alarms if running is None else alarms | {"ceiling": running.ceiling, "level": running.level}
+        return LazyInfo(lambda: report(rows, 0, self._spec, done, failed) | more)
 
 
 def made_for(on_alarm: Any, env: gym.Env[Any, Any]) -> Policy:

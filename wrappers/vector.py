@@ -275,7 +275,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         if not last.any():
             return now
         before = felt_by(self._robots, infos["final_info"], infos["final_info"].get(f"_{FELT[0]}"))
-        return Felt(*(np.where(last.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(now, before, strict=True)))
+        return Felt(np.where(last[:, None], before.numbers, now.numbers))
 
     def _repaired(self, observations: Any, infos: dict[str, Any], where: Mask) -> Any:
         """Return the observations, and set the streams, with what is completed in the environments of ``where``."""
@@ -321,7 +321,7 @@ class VectorNeuralASMSafety(VectorWrapper):
             self._begin(ended)
             executed = np.where(ended[:, None], np.float32(np.nan), executed)
             self._alarms -= said.alarm & ~ended  # counted by the next report
-            said = said.without(ended)
+            said = said.of(~ended)
         else:
             self._begin(ended)
         self._report(infos, said, executed, np.ones(self.num_envs, bool))

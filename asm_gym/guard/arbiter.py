@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import logging
 import math
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
 from asm_gym.guard.options import ReleaseRule
 from asm_gym.guard.responses import GOING_ON, Response
 from asm_gym.guard.transitions import Situation, State, Transition, following
@@ -24,6 +22,12 @@ LOG = logging.getLogger("asm_gym.safety")
 
 STATES = tuple(State)
 POLICY, TRIAL, REFLEX, ENDED = (STATES.index(s) for s in (State.POLICY, State.TRIAL, State.REFLEX, State.ENDED))
+
+COUNTS = CALM, ACTED, HELD, FREE, RETURNED, SINCE, WENT_ON, STRIKES, ROWS, ALARMS = range(10)
+"""What is counted of each robot in an episode, in rows: of low surprise, in a row; under the reflex, those before a
+hand-back that came too early included; under the reflex since it took over; without a contact, in a row; hand-backs that
+came too early, in a row; under the policy since control was handed back; in alarm under the policy; how often it has
+pressed too hard. In all episodes: rows under the policy, and how many of them alarmed."""
 
 MOSTLY_AFTER = 200
 """Rows under the policy after which it is said that most of them alarm."""
@@ -89,24 +93,19 @@ class Arbiter:
         """(n,) who acts next, a place in ``STATES``."""
         self.confirmed = np.zeros(count, bool)
         """(n,) what alarmed in this episode went on while the reflex acted, and so was no habit of the policy."""
-        self.strikes = np.zeros(count, np.int64)
-        """(n,) how often the policy has pressed too hard in this episode."""
+        self.counts = np.zeros((len(COUNTS), count), np.int64)
+        """(10, n) rows and strikes, in the order of ``COUNTS``."""
+        self.largest = np.full(count, -np.inf)
+        """(n,) the largest surprise in this episode, while the policy acted."""
         self.response = [""] * count
         """To the last alarm of each."""
-        zeros = np.zeros((7, count), np.int64)
-        self._calm, self._acted, self._held, self._free, self._returned, self._since, self._went_on = zeros
-        self._wait = np.zeros(count)  # rows of override before a trial
+        self._wait = np.full(count, self._rule.try_after or math.inf)  # rows of override before a trial
         self._on_trial = np.zeros(count, bool)
-        self.rows = np.zeros(count, np.int64)
-        """(n,) under the policy, in all episodes."""
-        self._alarms = np.zeros(count, np.int64)  # of those rows
-        self.begin(np.ones(count, bool))
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
-        for counts in (self._calm, self._acted, self._held, self._free, self._returned, self._since, self._went_on):
-            counts[which] = 0
-        self.state[which], self.strikes[which] = POLICY, 0
+        self.counts[:ROWS, which] = 0
+        self.state[which], self.largest[which] = POLICY, -np.inf
         self.confirmed[which] = self._on_trial[which] = False
         self._wait[which] = self._rule.try_after or math.inf
         for robot in np.flatnonzero(which):
@@ -119,20 +118,17 @@ class Arbiter:
 
     def may_go_on(self, robot: int) -> bool:
         """Return whether the policy may go on in alarm, for all the time that it did."""
-        return bool(self._went_on[robot] < self._rule.go_on)
-
-    def let_pass(self, undecided: Mask) -> None:
-        """Count rows of ``undecided`` (n,) robots, whose policy acts and for which there is nothing to decide."""
-        _let_pass(undecided, self._calm, self._free, self._since, self.rows)
+        return bool(self.counts[WENT_ON, robot] < self._rule.go_on)
 
     def judge_policy(self, robot: int, alarm: bool) -> str:
         """Count a row under the policy; return what is to be said once, and early: most of what it does alarms."""
-        self.rows[robot] += 1
-        self._alarms[robot] += alarm
-        if self.rows[robot] != MOSTLY_AFTER or 2 * self._alarms[robot] <= self.rows[robot]:
+        self.counts[ROWS, robot] += 1
+        self.counts[ALARMS, robot] += alarm
+        rows, alarms = self.counts[ROWS, robot], self.counts[ALARMS, robot]
+        if rows != MOSTLY_AFTER or 2 * alarms <= rows:
             return ""
         return (
-            f"{self._alarms[robot]} of the first {self.rows[robot]} rows under this policy alarm: something is wrong "
+            f"{alarms} of the first {rows} rows under this policy alarm: something is wrong "
             'all the time, or the memory does not know this policy, task or set-up. Look with on_alarm="monitor" which '
             'channels info["asm"]["attribution"] names; if all is well, record episodes of it, and '
             "monitor.fit(episodes, warm_start=True).calibrate(others, 0.05)"
@@ -140,6 +136,8 @@ class Arbiter:
 
     def decide(self, robot: int, row: Judged) -> Decision:
         """Return what a row leads to, and move the robot's state on."""
+        if not row.intervened:
+            self.largest[robot] = max(self.largest[robot], row.surprise)
         if not self._acts:
             return Decision()
         situation = self._count(robot, row)
@@ -154,48 +152,48 @@ class Arbiter:
 
     def take_over(self, robot: int) -> None:
         """Let the reflex act from now on."""
-        i, rule = robot, self._rule
-        if self.state[i] == TRIAL and self._since[i] <= rule.release_after:
+        i, rule, counts = robot, self._rule, self.counts
+        if self.state[i] == TRIAL and counts[SINCE, i] <= rule.release_after:
             self._wait[i] *= 2 if self._on_trial[i] else 1
-            self._returned[i] += 1
+            counts[RETURNED, i] += 1
         else:
-            self._acted[i], self._wait[i], self._returned[i] = 0, rule.try_after or math.inf, 0
-        self._held[i] = self._free[i] = self._calm[i] = 0
+            counts[ACTED, i], self._wait[i], counts[RETURNED, i] = 0, rule.try_after or math.inf, 0
+        counts[HELD, i] = counts[FREE, i] = counts[CALM, i] = 0
         self.state[i] = REFLEX
 
     def _count(self, robot: int, row: Judged) -> Situation:
         """Count the row, and return what it comes to."""
-        i, rule, response = robot, self._rule, row.response
+        i, rule, response, counts = robot, self._rule, row.response, self.counts
         overriding = self.state[i] == REFLEX
         low = row.surprise <= self.threshold[i] * (rule.release_below if row.intervened else 1.0)
-        self._calm[i] = self._calm[i] + 1 if low and not row.alarm else 0
-        self._free[i] = self._free[i] + 1 if response.touched is False and row.intervened else 0
+        counts[CALM, i] = counts[CALM, i] + 1 if low and not row.alarm else 0
+        counts[FREE, i] = counts[FREE, i] + 1 if response.touched is False and row.intervened else 0
         goes_on = response.name in GOING_ON and not row.presses
         if row.intervened:
             # Where nobody knows what is sensed, no trial comes nearer.
-            self._acted[i] += 1
-            self._held[i] = self._held[i] + 1 if math.isfinite(row.surprise) else 0
+            counts[ACTED, i] += 1
+            counts[HELD, i] = counts[HELD, i] + 1 if math.isfinite(row.surprise) else 0
             # What the arm feels when it changes over to the reflex confirms nothing yet.
-            self.confirmed[i] |= row.alarm and self._held[i] > rule.release_after
+            self.confirmed[i] |= row.alarm and counts[HELD, i] > rule.release_after
         else:
-            self._since[i] += 1
-            self._went_on[i] += row.alarm and goes_on
-            self.strikes[i] += row.presses
+            counts[SINCE, i] += 1
+            counts[WENT_ON, i] += row.alarm and goes_on
+            counts[STRIKES, i] += row.presses
         if overriding and row.alarm and response.name not in ("", *GOING_ON):
             self.response[i] = response.name
         stopping = self.response[i] == "stop"  # a fault that is calm while nothing is asked of the robot has not gone
-        frees = rule.free_after << min(int(self._returned[i]), 16)
+        _, acted, held, free, returned, since, _, strikes, _, _ = counts[:, i].tolist()
         return Situation(
             alarm=row.alarm,
             presses=row.presses,
-            spent=self.strikes[i] >= (rule.strikes or math.inf) or row.impulse > (rule.impulse or math.inf),
+            spent=strikes >= (rule.strikes or math.inf) or row.impulse > (rule.impulse or math.inf),
             goes_on=goes_on and (response.name == "complete" or not overriding),
-            stops=stopping and self._held[i] >= (rule.try_after or rule.release_after),
-            overdue=self._acted[i] >= (rule.max_override or math.inf),
-            calm=not stopping and self._calm[i] >= rule.release_after and not response.touched,
-            free=not (stopping or row.presses) and self._free[i] >= frees,
-            waited=not (stopping or row.presses) and self._held[i] >= self._wait[i] and response.touched is None,
-            settled=self._since[i] > rule.release_after,
+            stops=stopping and held >= (rule.try_after or rule.release_after),
+            overdue=acted >= (rule.max_override or math.inf),
+            calm=not stopping and bool(counts[CALM, i] >= rule.release_after) and not response.touched,
+            free=not (stopping or row.presses) and free >= rule.free_after << min(returned, 16),
+            waited=not (stopping or row.presses) and held >= self._wait[i] and response.touched is None,
+            settled=since > rule.release_after,
         )
 
     def _follow(self, robot: int, transition: Transition | None, row: Judged) -> str:
@@ -208,16 +206,6 @@ class Arbiter:
         elif transition.to is not None:
             self.state[robot] = STATES.index(transition.to)
             if transition.to is State.TRIAL:
-                self._since[robot], self._calm[robot] = 0, 0
+                self.counts[SINCE, robot] = self.counts[CALM, robot] = 0
                 self._on_trial[robot] = transition.name == "trial"
         return row.response.name if transition.name == "*" else transition.name
-
-
-@partial(compiled, calls=(".",))
-def _let_pass(undecided: Any, calm: Any, free: Any, since: Any, rows: Any) -> None:
-    for n in range(len(undecided)):
-        if undecided[n]:
-            calm[n] += 1
-            free[n] = 0
-            since[n] += 1
-            rows[n] += 1

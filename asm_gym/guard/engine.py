@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.events import EVENTS, FAULT, KNOCK
-from asm_gym.guard.arbiter import ENDED, MOSTLY_AFTER, POLICY, REFLEX, Arbiter, Decision, Judged
+from asm_gym.guard.arbiter import POLICY, REFLEX, Arbiter, Judged
 from asm_gym.guard.checks import STALE, Fitted, diagnosis_of, familiar_to, limits_of
 from asm_gym.guard.diagnosis import Alarm, Diagnostician
 from asm_gym.guard.limits import EpisodeLimits
@@ -25,7 +25,7 @@ from asm_gym.guard.motion import Command, Motions
 from asm_gym.guard.observer import Observation, Observer, joined
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.reflexes import GRADED, REFLEXES, Reflexes
-from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPRISE, RowReport
+from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, NOTHING, SURPRISE, Outcome, RowReport
 from asm_gym.guard.responses import NO_RESPONSE, Response, responses_from
 from asm_gym.guard.robots import NO_COLUMNS, Robots
 from asm_gym.guard.rows import Believed, Rows
@@ -49,16 +49,6 @@ class _Row(NamedTuple):
     intervened: Mask  # (n,) something else than the policy acted
     refused: Mask  # (n,) the policy's action was none
     active: Mask  # (n,) the row counts
-
-
-class _Outcome(NamedTuple):
-    """What became of the row of one robot about which there was something to decide."""
-
-    alarm: bool
-    reason: str
-    event: int  # a place in ``EVENTS``, of an alarm
-    response: Response
-    decision: Decision
 
 
 class Engine:
@@ -104,7 +94,7 @@ class Engine:
         self._arbiter = Arbiter(n, rule, self.fitted.threshold)
         self._motions = Motions(robots, reflexes, policies, self._arbiter.take_over, self._warn)
         self._observer = Observer(monitor, n, recalls)
-        self._severity = SeverityEstimator(n, spec, robots.felt_channels, options.leans_s)
+        self._severity = SeverityEstimator(n, spec, robots.felt_channels, options.leans_s, self._arbiter)
         table = responses_from(options.responses)
         self._diagnostician = Diagnostician(robots, spec, diagnosis, table, graded)
         completion = diagnosis.completion if diagnosis is not None and (graded or options.completes) else None
@@ -116,7 +106,6 @@ class Engine:
         """The threshold that follows a policy; None where it does not."""
         self.confirmed = np.zeros(n, bool)
         """(n,) an alarm in this episode was no false one."""
-        self._largest = np.full(n, np.nan)  # surprise in this episode, while the policy acted
         self._refused: Mask = np.zeros(n, bool)  # whose policy's action was none, in the step that runs
         self._nothing_felt = Felt.nothing(n, sum(c.size for c in robots.felt_channels))
         self._everyone = np.ones(n, bool)
@@ -147,7 +136,7 @@ class Engine:
         which = self._everyone if which is None else which
         for i in np.flatnonzero(which) if self.running is not None else ():
             self._follow_policy(int(i))
-        self._largest[which], self.confirmed[which] = np.nan, False
+        self.confirmed[which] = False
         for part in (self._arbiter, self._motions, self._observer, self._rows, self._severity, self._limits):
             part.begin(which)
         for i in np.flatnonzero(which):
@@ -162,9 +151,10 @@ class Engine:
     def _follow_policy(self, robot: int) -> None:
         """Move the threshold by the episode of a robot that has ended."""
         assert self.running is not None
-        if not np.isnan(self._largest[robot]):
+        largest = float(self._arbiter.largest[robot])
+        if largest > -np.inf:
             confirmed = bool(self.confirmed[robot] or self._arbiter.confirmed[robot])
-            self.running.follow(float(self._largest[robot]), float(self.threshold[robot]), confirmed)
+            self.running.follow(largest, float(self.threshold[robot]), confirmed)
             self.threshold[robot] = self.running.value
 
     # ------------------------------------------------------------------ what is done
@@ -214,26 +204,22 @@ class Engine:
             believed = believed._replace(lost={i: lost for i, lost in believed.lost.items() if not bridged[i]})
         failed |= {i: joined(failed.get(i, ""), said) for i, said in believed.failures.items()}
         observed = self._observed(believed, failed, held, active if bridged is None else active & ~bridged)
+        intervened = held | refused if refused.any() else held
+        decides = self._known_to_decide(believed, observed.failures, refused)
         severity, weighed = self._severity.weigh(
-            believed.rows,
-            felt or self._nothing_felt,
-            held,
-            observed.surprise,
-            self.threshold,
-            self._arbiter.strikes,
-            self._arbiter.most_impulse,
-            self._needs_decision(believed, observed.failures, held | refused),
+            believed.rows, felt or self._nothing_felt, held, observed.surprise, active, decides
         )
-        row = _Row(believed, observed, severity, weighed, executed, held | refused, refused, active)
-        self._arbiter.let_pass(active & ~weighed.decides)
-        unfelt = self._motions.feel(believed.rows, executed, row.intervened, active) if ends_step else {}
+        row = _Row(believed, observed, severity, weighed, executed, intervened, refused, active)
+        unfelt = self._motions.feel(believed.rows, executed, intervened, active) if ends_step else NOTHING
         self._motions.expect(observed.expected)
-        outcomes = {int(i): self._decide(int(i), row) for i in np.flatnonzero(weighed.decides & active)}
-        policy = active & ~row.intervened
-        self._largest[policy] = np.fmax(self._largest[policy], observed.surprise.value[policy])
-        pressed = policy & severity.presses
-        self._limits.follow(believed.rows, policy if ends_step else pressed, pressed)
-        unforgotten = self._forget(row, outcomes)
+        outcomes = (
+            {i: self._decide(i, row) for i in np.flatnonzero(weighed.decides).tolist()} if weighed.some else NOTHING
+        )
+        if outcomes or not self._limits.steady:
+            policy = active & ~intervened
+            pressed = policy & severity.presses
+            self._limits.follow(believed.rows, policy if ends_step else pressed, pressed)
+        unforgotten = self._forget(row, outcomes) if outcomes or self._rows.repairs else NOTHING
         report = self._report(row, outcomes, (unfelt, unforgotten))
         self._rows.drop_repairs()
         return report
@@ -274,42 +260,43 @@ class Engine:
     def _observed(self, believed: Believed, failures: dict[int, str], held: Mask, judged: Mask) -> Observation:
         """Return what counts of the surprise at the rows; none of it where they are not ``judged`` (n,)."""
         observed = self._observer.observe(believed.rows, failures)
-        surprise = self._rows.counted(observed.surprise, observed.failures)
+        surprise, failed = self._rows.counted(observed.surprise, observed.failures), observed.failures
         if self._late(observed.latency):
             surprise = surprise._replace(value=np.full(self._count, np.inf))
-        failed, rate = dict(observed.failures), self.options.online_learning_rate
-        if rate > 0 and not held.any() and not failed:
-            said = self._observer.learn(believed.rows, surprise, rate)
-            if said:
-                failed = dict.fromkeys(range(self._count), said)
-                surprise = surprise._replace(value=np.full(self._count, np.inf))
-        if not judged.all():
+        rate = self.options.online_learning_rate
+        if rate > 0 and not failed and not held.any() and (said := self._observer.learn(believed.rows, surprise, rate)):
+            failed = dict.fromkeys(range(self._count), said)
+            surprise = surprise._replace(value=np.full(self._count, np.inf))
+        if not (judged is self._everyone or judged.all()):
             surprise = surprise.silenced(~judged)
         for i, said in failed.items():
             self._warn(i, said, "which counts as an alarm")
-        return observed._replace(surprise=surprise, failures=failed)
+        return Observation(surprise, observed.expected, failed, observed.latency)
 
-    def _needs_decision(self, believed: Believed, failures: Mapping[int, str], intervened: Mask) -> Mask:
-        """Return (n,) where there is something to decide, whatever the surprise."""
-        decides = intervened | (self._arbiter.state != POLICY) | (self._arbiter.rows == MOSTLY_AFTER - 1)
-        for i in (
-            *believed.lost,
-            *believed.contradictions,
-            *failures,
-            *self._rows.repairs,
-            *self._diagnostician.incidents,
+    def _known_to_decide(self, believed: Believed, failures: Mapping[int, str], refused: Mask) -> Mask:
+        """Return (n,) where there is something to decide, whatever surprise and severity are."""
+        decides = refused.copy()
+        for known in (
+            believed.lost,
+            believed.contradictions,
+            failures,
+            self._rows.repairs,
+            self._diagnostician.incidents,
         ):
-            decides[i] = True
+            for i in known:
+                decides[i] = True
         return decides
 
-    def _decide(self, robot: int, row: _Row) -> _Outcome:
+    def _decide(self, robot: int, row: _Row) -> Outcome:
         """Return what is done about the row of one robot."""
         i, value = robot, float(row.observed.surprise.value[robot])
-        over, knocked, presses = (bool(x[i]) for x in (row.weighed.over, row.weighed.knocked, row.severity.presses))
+        over, knocked, presses = (
+            bool(x[i]) for x in (row.weighed.over, row.weighed.event == KNOCKED, row.severity.presses)
+        )
         failed, lost, contradicts = i in row.observed.failures, i in row.believed.lost, i in row.believed.contradictions
         alarm = over or knocked or lost or contradicts or presses
         response = self._response(i, row, alarm)
-        intervened, impulse = bool(row.intervened[i]), float(row.severity.impulse[i])
+        intervened, impulse = bool(row.intervened[i]), float(row.severity.numbers[i, 1])
         if not intervened and np.isfinite(value) and (warning := self._arbiter.judge_policy(i, alarm)):
             warnings.warn(warning, stacklevel=4)
         judged = Judged(value, over, knocked, alarm, presses, impulse, intervened, bool(row.refused[i]), response)
@@ -318,8 +305,8 @@ class Engine:
             self._motions.start(i, row.executed[i])
         told = (presses, CONTACT), (failed, FAILURE), (over or knocked, SURPRISE)
         reason = next((name for holds, name in (*told, (contradicts, CONTRADICTION), (lost, MISSING)) if holds), "")
-        event = FAULTY if over or lost or contradicts else KNOCKED
-        return _Outcome(alarm, reason, event, response, decision)
+        event = 0 if not alarm else FAULTY if over or lost or contradicts else KNOCKED
+        return Outcome(alarm, reason, event, response, decision)
 
     def _response(self, robot: int, row: _Row, alarm: bool) -> Response:
         """Return what is to be done about the last row of one robot."""
@@ -330,14 +317,15 @@ class Engine:
         failed, lost = i in row.observed.failures, i in row.believed.lost
         contradiction = row.believed.contradictions.get(i)
         certain = contradiction is not None or failed or bool(severity.presses[i])
-        if lost and not (certain or weighed.over[i] or weighed.knocked[i] or severity.speed[i] > FAST):
+        if lost and not (certain or weighed.over[i] or weighed.knocked(i) or severity.numbers[i, 2] > FAST):
             repair = self._rows.repairs.get(i)
             return (
                 NO_RESPONSE if self._rows.read is None else diagnostician.missed(() if repair is None else repair.names)
             )
-        if weighed.knocked[i] and not certain:
+        if weighed.knocked(i) and not certain:
             return diagnostician.knocked(i, rows)
-        feels = bool(np.isfinite(severity.load[i]) or np.isfinite(severity.force[i]))
+        force, _, speed = severity.numbers[i].tolist()
+        feels = bool(np.isfinite(severity.felt.numbers[i, 0]) or np.isfinite(force))
         response, columns = diagnostician.respond(
             i,
             Alarm(
@@ -348,8 +336,8 @@ class Engine:
                 failed,
                 bool(severity.presses[i]),
                 feels,
-                float(severity.force[i]),
-                float(severity.speed[i]),
+                force,
+                speed,
                 self._arbiter.may_go_on(i),
                 self._rows.read,
             ),
@@ -361,7 +349,7 @@ class Engine:
                 response = diagnostician.uncompleted(response)
         return response
 
-    def _forget(self, row: _Row, outcomes: Mapping[int, _Outcome]) -> Mapping[int, str]:
+    def _forget(self, row: _Row, outcomes: Mapping[int, Outcome]) -> Mapping[int, str]:
         """Let evidence begin anew where it was acted on, or is of rows not yet repaired; return what failed."""
         acted_on = np.zeros(self._count, bool)
         for i, outcome in outcomes.items():
@@ -373,40 +361,29 @@ class Engine:
             return {}
         return dict.fromkeys(map(int, np.flatnonzero(acted_on)), said)
 
-    def _report(self, row: _Row, outcomes: Mapping[int, _Outcome], failures: Sequence[Mapping[int, str]]) -> RowReport:
+    def _report(self, row: _Row, outcomes: Mapping[int, Outcome], failures: Sequence[Mapping[int, str]]) -> RowReport:
         """Return what there is to say of the rows."""
-        surprise, active = row.observed.surprise, row.active
-        alarm, event = np.zeros(self._count, bool), np.zeros(self._count, np.int8)
-        if surprise.raw is not None and surprise.excuse is not None:
-            event[:] = np.where((surprise.raw > self.threshold) & ~row.weighed.over, surprise.excuse, 0)
+        alarm, event, failed = np.zeros(self._count, bool), row.weighed.event, row.observed.failures
         for i, outcome in outcomes.items():
             if outcome.alarm:
                 alarm[i], event[i] = True, outcome.event
-        failed: dict[int, str] = dict(row.observed.failures)
-        for i, said in ((i, said) for some in failures for i, said in some.items()):
-            failed[i] = joined(failed.get(i, ""), said)
-        severity, repairs = row.severity, {i: repair for i, repair in self._rows.repairs.items() if active[i]}
-        if not active.all():
-            blank = self.nothing().severity
-            severity = Severity(*(np.where(active, now, none) for now, none in zip(severity, blank, strict=True)))
-        return RowReport(
-            surprise=surprise,
-            threshold=self.threshold.copy(),
-            alarm=alarm,
-            intervened=row.intervened & active,
-            gave_up=(self._arbiter.state == ENDED) & active,
-            event=event,
-            state=np.where(active, self._arbiter.state, POLICY).astype(np.int8),
-            severity=severity,
-            reason={i: outcome.reason for i, outcome in outcomes.items() if outcome.reason},
-            transition={i: outcome.decision.transition for i, outcome in outcomes.items()},
-            failure=failed,
-            response={i: outcome.response for i, outcome in outcomes.items()},
-            completed={i: repair.names for i, repair in repairs.items()},
-            unread={i: repair.unread for i, repair in repairs.items()},
-            lost=row.believed.lost,
-            latency=row.observed.latency,
+        for some in failures:
+            failed = {**failed, **{i: joined(failed.get(i, ""), said) for i, said in some.items()}} if some else failed
+        said = RowReport(
+            row.observed.surprise,
+            self.threshold.copy(),
+            alarm,
+            row.intervened,
+            event,
+            self._arbiter.state.copy(),
+            row.severity,
+            outcomes,
+            failed,
+            {i: (repair.names, repair.unread) for i, repair in self._rows.repairs.items()},
+            row.believed.lost,
+            row.observed.latency,
         )
+        return said if row.active is self._everyone else said.of(row.active)
 
     def _late(self, latency: float) -> bool:
         """Return whether the monitor took so long that it counts as an alarm."""

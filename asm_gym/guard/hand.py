@@ -111,15 +111,14 @@ class HandAgainstJoints:
         for robot in np.flatnonzero(which):
             self._cases.pop(int(robot), None)
 
-    def compare(self, rows: NDArray[np.float32]) -> Mask:
-        """Take in the next rows (n, D) as they were sensed; return where (n,) they contradict themselves."""
+    def compare(self, rows: NDArray[np.float32]) -> list[int]:
+        """Take in the next rows (n, D) as they were sensed; return which robots' contradict themselves."""
         state = self._mean, self._size_of, self._whole, self._recent, self._kept, self._good
-        _compare(rows, self._at, *self._geometry, self._late, self._weights, self._gain, self._cap, LIMIT, *state)
-        found: Mask = self._size_of > LIMIT
-        if self._cases:
-            for robot in [robot for robot in self._cases if 0.0 <= self._size_of[robot] <= LIMIT]:
-                del self._cases[robot]
-        return found
+        how = self._at, *self._geometry, self._late, self._weights, self._gain, self._cap, LIMIT
+        some = _compare(rows, *how, *state)
+        for robot in [robot for robot in self._cases if 0.0 <= self._size_of[robot] <= LIMIT]:
+            del self._cases[robot]
+        return [int(i) for i in np.flatnonzero(self._size_of > LIMIT)] if some else []
 
     def contradiction(self, robot: int, missing: Mask) -> Contradiction | None:
         """Return what is wrong with a robot whose last row contradicts itself, beside what is ``missing`` (D,)."""
@@ -229,8 +228,10 @@ def _compare(
     recent: Any,
     kept: Any,
     good: Any,
-) -> None:
-    """Take rows (n, D) into the running means (n, 9), and what else is known of each robot, in place."""
+) -> bool:
+    """Take rows (n, D) into the running means (n, 9), and what else is known of each robot, in place; return whether
+    any contradicts itself."""
+    some = False
     J, newest = axes.shape[1], recent.shape[1] - 1
     row = np.empty(len(at))
     for n in range(len(rows)):
@@ -257,6 +258,9 @@ def _compare(
         recent[n, newest] = row
         if size[n] <= limit:
             good[n] = row[:J]
+        else:
+            some = True
+    return some
 
 
 @compiled

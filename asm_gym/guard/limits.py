@@ -65,6 +65,13 @@ class EpisodeLimits:
         self._places[which] = np.nan
         self._choose()
 
+    @property
+    def steady(self) -> bool:
+        """Whether they stay as they are while no arm presses."""
+        return self._usual is None or (
+            self._familiar is None and self.now[0] is self._usual and not self._careful.any()
+        )
+
     def follow(self, rows: NDArray[np.float32], acted: Mask, pressed: Mask) -> None:
         """Take account of a control step.
 
@@ -74,8 +81,6 @@ class EpisodeLimits:
             pressed: (n,) and has pressed too hard.
         """
         if self._usual is None:
-            return
-        if self._familiar is None and not (self._careful.any() or pressed.any()):
             return
         self._careful = np.where(
             acted, np.where(pressed, self._careful_steps, np.maximum(self._careful - 1, 0)), self._careful

@@ -96,11 +96,10 @@ class Motions:
             seen: the observation of a robot.
         """
         robots, failures = self._robots, {}
-        finite = np.isfinite(actions).all(axis=1)
+        finite: Mask = np.isfinite(actions).all(axis=1)
         executed = np.minimum(np.maximum(actions, robots.low), robots.high)  # np.clip takes three times as long
-        refused, brakes = ~finite & ~acts & ~idle, np.zeros(len(actions), bool)
-        for i in np.flatnonzero(refused | acts | idle):
-            robot = int(i)
+        refused, brakes = ~(finite | acts | idle), np.zeros(len(actions), bool)
+        for robot in np.flatnonzero(refused | acts | idle).tolist():
             if idle[robot]:
                 executed[robot] = np.clip(0.0, robots.low, robots.high)
                 continue

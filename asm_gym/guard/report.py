@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.events import EVENTS, KNOCK
-from asm_gym.guard.arbiter import STATES
+from asm_gym.guard.arbiter import ENDED, STATES, Decision
 from asm_gym.guard.observer import joined
 from asm_gym.guard.responses import NO_RESPONSE, Response
 from asm_gym.guard.severity import Severity
@@ -29,6 +30,27 @@ KNOCKED = EVENTS.index(KNOCK)
 
 Mask = NDArray[np.bool_]
 
+NOTHING: Mapping[int, Any] = MappingProxyType({})
+"""Where there is nothing to say of any robot."""
+
+
+class Outcome(NamedTuple):
+    """What became of the row of one robot about which there was something to decide.
+
+    Attributes:
+        alarm: for whatever reason.
+        reason: one of ``REASONS``; empty where there is no alarm.
+        event: a place in ``EVENTS``; 0 where there is no alarm.
+        response: what is done about it.
+        decision: what it has led to.
+    """
+
+    alarm: bool
+    reason: str
+    event: int
+    response: Response
+    decision: Decision
+
 
 class RowReport(NamedTuple):
     """What became of a row of each of n robots; mappings hold those robots alone of which there is something to say.
@@ -36,13 +58,13 @@ class RowReport(NamedTuple):
     Attributes:
         surprise: as it counts, repaired senses left out.
         threshold: (n,).
-        alarm, intervened, gave_up: (n,).
+        alarm, intervened: (n,).
         event: (n,) places in ``EVENTS``.
         state: (n,) who acts next, places in ``STATES``.
         severity: of each.
-        reason, transition, failure, response: by robot.
-        completed, unread, lost: by robot, the sensors that are not believed now, those of them that stand in no
-            observation, and the numbers that were not finite.
+        outcomes, failure: by robot.
+        repairs: by robot, the sensors that are not believed now, and those of them that stand in no observation.
+        lost: by robot, the numbers that were not finite.
         latency: of the monitor [s].
     """
 
@@ -50,54 +72,57 @@ class RowReport(NamedTuple):
     threshold: NDArray[np.float64]
     alarm: Mask
     intervened: Mask
-    gave_up: Mask
     event: NDArray[np.int8]
     state: NDArray[np.int8]
     severity: Severity
-    reason: Mapping[int, str]
-    transition: Mapping[int, str]
-    failure: Mapping[int, str]
-    response: Mapping[int, Response]
-    completed: Mapping[int, tuple[str, ...]]
-    unread: Mapping[int, tuple[str, ...]]
-    lost: Mapping[int, tuple[str, ...]]
+    outcomes: Mapping[int, Outcome] = NOTHING
+    failure: Mapping[int, str] = NOTHING
+    repairs: Mapping[int, tuple[tuple[str, ...], tuple[str, ...]]] = NOTHING
+    lost: Mapping[int, tuple[str, ...]] = NOTHING
     latency: float = 0.0
+
+    @property
+    def gave_up(self) -> Mask:
+        """(n,) the episode is to end."""
+        found: Mask = self.state == ENDED
+        return found
 
     @property
     def ends(self) -> Mask:
         """(n,) an alarm that ends the episode, where alarms do: a knock that passes no contact limit does not."""
-        if not self.alarm.any():
-            return self.alarm
-        contact = np.array([self.reason.get(i, "") == CONTACT for i in range(len(self.alarm))])
-        found: Mask = self.alarm & ((self.event != KNOCKED) | contact)
+        found = np.zeros(len(self.alarm), bool)
+        for i, outcome in self.outcomes.items():
+            found[i] = outcome.alarm and (outcome.event != KNOCKED or outcome.reason == CONTACT)
         return found
+
+    def outcome(self, robot: int) -> Outcome:
+        """Return what became of the row of a robot."""
+        return self.outcomes.get(robot, NO_OUTCOME)
 
     def with_failures(self, failures: Mapping[int, str]) -> RowReport:
         """Return the same with what failed before the rows, by robot."""
         both = {i: joined(said, self.failure.get(i, "")) for i, said in failures.items()}
         return self._replace(failure={**self.failure, **both}) if failures else self
 
-    def without(self, which: Mask) -> RowReport:
-        """Return the same with nothing to say of the robots of ``which`` (n,)."""
-        blank = RowReport.nothing(len(which), self.surprise.attribution.shape[1], self.threshold)
-        arrays = ("alarm", "intervened", "gave_up", "event", "state")
-        mappings = ("reason", "transition", "failure", "response", "completed", "unread", "lost")
-        severity = zip(blank.severity, self.severity, strict=True)
+    def of(self, which: Mask) -> RowReport:
+        """Return the same with nothing to say of all robots but those of ``which`` (n,)."""
+        mappings = ("outcomes", "failure", "repairs", "lost")
         return self._replace(
-            surprise=self.surprise.silenced(which),
-            severity=Severity(*(np.where(which, none, now) for none, now in severity)),
-            **{name: np.where(which, getattr(blank, name), getattr(self, name)) for name in arrays},
-            **{name: {i: said for i, said in getattr(self, name).items() if not which[i]} for name in mappings},
+            surprise=self.surprise.silenced(~which),
+            severity=self.severity.where(which),
+            **{name: np.where(which, getattr(self, name), 0) for name in ("alarm", "intervened", "event", "state")},
+            **{name: {i: said for i, said in getattr(self, name).items() if which[i]} for name in mappings},
         )
 
     @classmethod
     def nothing(cls, count: int, size: int, threshold: NDArray[np.float64]) -> RowReport:
         """Return the report of a row in which there was nothing to decide, before the first step of an episode."""
-        no, none = np.zeros(count, bool), np.full(count, np.nan)
-        severity = Severity(none, no, none, np.zeros(count), none, none, no, none)
+        no, codes = np.zeros(count, bool), np.zeros(count, np.int8)
         surprise = Surprise(np.zeros(count), np.zeros((count, size)))
-        codes = np.zeros(count, np.int8)
-        return cls(surprise, threshold.copy(), no, no, no, codes, codes, severity, *({},) * 7)
+        return cls(surprise, threshold.copy(), no, no, codes, codes, Severity.unknown(count))
+
+
+NO_OUTCOME = Outcome(False, "", 0, NO_RESPONSE, Decision())
 
 
 def report(
@@ -134,8 +159,10 @@ def report(
     """
     surprises = np.array([row.surprise.value[robot] for row in rows])
     largest, last = int(surprises.argmax()), rows[-1]
-    caused = next((r for row in reversed(rows) if (r := row.response.get(robot, NO_RESPONSE)).why), NO_RESPONSE)
-    worst, reasons = rows[largest].surprise, [row.reason[robot] for row in rows if robot in row.reason]
+    outcomes = [row.outcome(robot) for row in rows]
+    caused = next((o.response for o in reversed(outcomes) if o.response.why), NO_RESPONSE)
+    worst, reasons = rows[largest].surprise, [o.reason for o in outcomes if o.reason]
+    completed, unread = last.repairs.get(robot, ((), ()))
     return {
         "surprise": float(surprises[largest]),
         "surprise_body": _largest((row.surprise.of_body for row in rows), robot, float(surprises[largest])),
@@ -147,18 +174,18 @@ def report(
         "state": str(STATES[last.state[robot]]),
         "intervened": any(bool(row.intervened[robot]) for row in rows),
         "gave_up": any(bool(row.gave_up[robot]) for row in rows),
-        "transition": next((t for row in reversed(rows) if (t := row.transition.get(robot, ""))), ""),
+        "transition": next((t for o in reversed(outcomes) if (t := o.decision.transition)), ""),
         "failure": joined(failed, *(row.failure.get(robot, "") for row in rows)),
         "cause": caused.cause,
         "response": caused.name,
         "case": caused.case,
-        "severity": {name: part[robot].item() for name, part in zip(Severity._fields, last.severity, strict=True)},
+        "severity": {name: part[robot].item() for name, part in last.severity.named.items()},
         "executed_action": None if executed is None else np.array(executed),
         "attribution": dict(zip(spec.labels, worst.attribution[robot].tolist(), strict=True)),
         "surprises": surprises,
         "latency_us": 1e6 * max(row.latency for row in rows),
-        "completed": last.completed.get(robot, ()),
-        "unread": last.unread.get(robot, ()),
+        "completed": completed,
+        "unread": unread,
         "lost": last.lost.get(robot, ()),
     }
 
@@ -171,11 +198,9 @@ def _largest(parts: Iterable[NDArray[np.float64] | None], robot: int, unknown: f
 def side_by_side(row: RowReport, spec: StreamSpec) -> dict[str, Any]:
     """Return what ``report`` says of one row of each robot, in arrays whose first axis is n."""
     n, value = len(row.alarm), row.surprise.value
-    responses = [row.response.get(i, NO_RESPONSE) for i in range(n)]
-    caused = [response if response.why else NO_RESPONSE for response in responses]
-
-    def named(said: Mapping[int, str]) -> NDArray[np.str_]:
-        return np.array([said.get(i, "") for i in range(n)])
+    outcomes = [row.outcome(i) for i in range(n)]
+    caused = [o.response if o.response.why else NO_RESPONSE for o in outcomes]
+    completed, unread = zip(*(row.repairs.get(i, ((), ())) for i in range(n)), strict=True)
 
     def listed(values: Sequence[Any]) -> NDArray[Any]:
         array = np.empty(n, object)
@@ -183,31 +208,28 @@ def side_by_side(row: RowReport, spec: StreamSpec) -> dict[str, Any]:
             array[i] = value
         return array
 
-    def parts(said: Mapping[int, tuple[str, ...]]) -> NDArray[Any]:
-        return listed([said.get(i, ()) for i in range(n)])
-
     return {
         "surprise": value,
         "surprise_body": value if row.surprise.of_body is None else row.surprise.of_body,
         "surprise_skill": np.full(n, np.nan) if row.surprise.of_skill is None else row.surprise.of_skill,
         "threshold": row.threshold,
         "alarm": row.alarm,
-        "reason": named(row.reason),
+        "reason": np.array([o.reason for o in outcomes]),
         "event": np.array(EVENTS)[row.event],
         "state": np.array([str(state) for state in STATES])[row.state],
         "intervened": row.intervened,
         "gave_up": row.gave_up,
-        "transition": named(row.transition),
-        "failure": named(row.failure),
+        "transition": np.array([o.decision.transition for o in outcomes]),
+        "failure": np.array([row.failure.get(i, "") for i in range(n)]),
         "cause": listed([response.cause for response in caused]),
         "response": np.array([response.name for response in caused]),
         "case": np.array([response.case for response in caused]),
-        "severity": row.severity._asdict(),
+        "severity": row.severity.named,
         "executed_action": None,
         "attribution": dict(zip(spec.labels, row.surprise.attribution.T, strict=True)),
         "surprises": value[:, None],
         "latency_us": np.full(n, 1e6 * row.latency),
-        "completed": parts(row.completed),
-        "unread": parts(row.unread),
-        "lost": parts(row.lost),
+        "completed": listed(completed),
+        "unread": listed(unread),
+        "lost": listed([row.lost.get(i, ()) for i in range(n)]),
     }

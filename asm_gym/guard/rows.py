@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Mapping
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.compilation import compiled
 from asm_gym.guard.hand import NEEDS, Contradiction, HandAgainstJoints
 from asm_gym.guard.repair import Repair
 from asm_gym.guard.robots import NO_COLUMNS, Robots
@@ -86,29 +88,33 @@ class Rows:
 
     def next(self, rows: NDArray[np.float32], active: Mask) -> Believed:
         """Take in the next rows (n, D) as they were sensed, of which those of ``active`` (n,) robots count."""
-        unusual = {int(i) for i in self._repairs if active[i]}
+        if self._end == self._history.shape[1]:
+            self._history[:, : self._kept] = self._history[:, -self._kept :]
+            self._end = self._kept
         lost: dict[int, tuple[str, ...]] = {}
-        if not np.isfinite(rows).all():
-            for i in np.flatnonzero(~np.isfinite(rows).all(axis=1) & active):
-                lost[int(i)] = tuple(self._spec.labels[k] for k in np.flatnonzero(~np.isfinite(rows[i])))
-        contradictory = [hand.compare(rows) & active for hand in self._hands]
-        unusual |= lost.keys() | {int(i) for found in contradictory if found.any() for i in np.flatnonzero(found)}
+        if not _keep(rows, self._history, self._end, self._seen):
+            for i in np.flatnonzero(~np.isfinite(rows).all(axis=1) & active).tolist():
+                lost[i] = tuple(self._spec.labels[k] for k in np.flatnonzero(~np.isfinite(rows[i])))
+        contradictory = [hand.compare(rows) for hand in self._hands]
+        unusual = {i for i in (*self._repairs, *lost, *(i for found in contradictory for i in found)) if active[i]}
         if not unusual and not self._never.size:
-            self._keep(rows)
+            self._end += 1
             return Believed(rows, lost, {}, {})
         believed, contradictions, failures = rows.copy(), {}, {}
         for i in sorted(unusual):
             missing = self._missing(i)
             found = [
-                hand.contradiction(i, missing) for hand, said in zip(self._hands, contradictory, strict=True) if said[i]
+                hand.contradiction(i, missing)
+                for hand, said in zip(self._hands, contradictory, strict=True)
+                if i in said
             ]
             if first := next(filter(None, found), None):
                 contradictions[i] = first
-            believed[i] = self._repaired(i, rows[i], i in lost)
+            believed[i] = self._history[i, self._end] = self._repaired(i, rows[i], i in lost)
             repair = self._repairs.get(i)
             if repair is not None and not repair.trusted:
                 failures[i] = f"completion: too much is missing, or for too long: {', '.join(repair.names)}"
-        self._keep(believed)
+        self._end += 1
         for i in np.flatnonzero(active) if self._never.size else ():
             if self.suspect(int(i), self._never):
                 believed[i] = self._history[i, self._end - 1]
@@ -116,7 +122,7 @@ class Rows:
 
     def last(self, robot: int, count: int | None = None) -> NDArray[np.float32]:
         """Return (T, D) the last rows of a robot in this episode, all that are kept by default, the newest last."""
-        rows = min(int(self._seen[robot]), self._kept if count is None else count)
+        rows = min(int(self._seen[robot]), self._kept if count is None else count, self._end)
         return self._history[robot, self._end - rows : self._end]
 
     def suspect(self, robot: int, columns: NDArray[np.intp]) -> bool:
@@ -124,7 +130,7 @@ class Rows:
         to go by."""
         if self._completion is None:
             return False
-        repair = self._repairs.get(robot) or self._new_repair(robot)
+        repair = self._repairs.get(robot) or self._new_repair(robot, reading=False)
         row = repair.suspect(columns)
         if row is None:
             return False
@@ -166,7 +172,7 @@ class Rows:
     def _repaired(self, robot: int, row: NDArray[np.float32], lost: bool) -> NDArray[np.float32]:
         if self._completion is None or not (lost or robot in self._repairs):
             return row
-        repair = self._repairs.setdefault(robot, self._repairs.get(robot) or self._new_repair(robot))
+        repair = self._repairs.setdefault(robot, self._repairs.get(robot) or self._new_repair(robot, reading=True))
         known = repair.names
         try:
             row = repair.next(row)
@@ -178,18 +184,20 @@ class Rows:
             LOG.info("complete: %s says nothing any more", new)
         return row
 
-    def _new_repair(self, robot: int) -> Repair:
+    def _new_repair(self, robot: int, reading: bool) -> Repair:
         assert self._completion is not None
         assert self.read is not None
-        before = self.last(robot, 1)
-        return Repair(
-            self._completion, robot, before[0] if len(before) else None, self._trust_s, self.read, self._hands
-        )
+        before = self._history[robot, self._end - 1] if self._seen[robot] > reading else None
+        return Repair(self._completion, robot, before, self._trust_s, self.read, self._hands)
 
-    def _keep(self, rows: NDArray[np.float32]) -> None:
-        if self._end == self._history.shape[1]:
-            self._history[:, : self._kept] = self._history[:, -self._kept :]
-            self._end = self._kept
-        self._history[:, self._end] = rows
-        self._end += 1
-        self._seen += 1
+
+@partial(compiled, calls=(".",))
+def _keep(rows: Any, history: Any, end: int, seen: Any) -> bool:
+    """Write rows (n, D) into what is kept of each robot (n, T, D); return whether every number is finite."""
+    finite = True
+    for n in range(len(rows)):
+        seen[n] += 1
+        for i in range(rows.shape[1]):
+            history[n, end, i] = rows[n, i]
+            finite = finite and np.isfinite(rows[n, i])
+    return finite

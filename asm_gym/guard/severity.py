@@ -14,15 +14,12 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.detection.events import EVENTS, KNOCK
+from asm_gym.guard.arbiter import CALM, FREE, MOSTLY_AFTER, POLICY, ROWS, SINCE, STRIKES, Arbiter
 from asm_gym.monitors import Surprise
 from asm_gym.spec import Channel, StreamSpec
 
 FREE_FORCE = 40.0
 """Force that healthy motion of many tasks comes to; impulse is counted beyond it [N]."""
-
-LEANS_S = 0.4
-"""More than ``FREE_FORCE`` for longer than this is no blow: the arm leans on something [s]. Healthy motion of six tasks
-did so for 0.35 s, once 0.45; ISO/TS 15066 calls contact quasi-static from half a second on."""
 
 AGAIN = 4.0
 """Each time that the policy has pressed too hard before shortens that by as many times."""
@@ -46,45 +43,66 @@ class Felt(NamedTuple):
     """What n arms felt in the physics substeps of a control step; not a number where nothing feels there.
 
     Attributes:
-        load: (n,) the largest share of a contact limit.
-        left_s: (n,) when in the step a limit was passed [s]; not a number where none was.
-        mean: (n, F) mean of what was felt, in the order of ``Robots.felt_channels`` [N], [N m].
+        numbers: (n, 2 + F) the largest share of a contact limit, when in the step a limit was passed [s], and the mean
+            of what was felt, in the order of ``Robots.felt_channels`` [N], [N m].
     """
 
-    load: Floats
-    left_s: Floats
-    mean: Floats
+    numbers: Floats
 
     @classmethod
     def nothing(cls, count: int, size: int) -> Self:
         """Return that nothing was felt by ``count`` arms, in ``size`` numbers."""
-        none = np.full(count, np.nan)
-        return cls(none, none, np.full((count, size), np.nan))
+        return cls(np.full((count, 2 + size), np.nan))
 
 
 class Severity(NamedTuple):
     """How bad it is for each of n robots.
 
     Attributes:
-        load: (n,) the largest share of a contact limit that was felt in a physics substep of this step.
+        felt: in the substeps of this step.
+        numbers: (n, 3) contact force on the arm, estimated from wrist and joints, the mean of the step [N]; what that
+            force has added up to beyond ``FREE_FORCE`` in this episode [N s]; the speed of the fastest hand [m/s].
+            Force and speed are not a number where they are not sensed.
         presses: (n,) a limit was passed, or the arm leans on something.
-        force: (n,) contact force on the arm, estimated from wrist and joints, the mean of the step [N]; not a number
-            where neither is sensed.
-        impulse: (n,) what that force has added up to beyond ``FREE_FORCE`` in this episode [N s].
-        speed: (n,) of the fastest hand [m/s]; not a number where none is sensed.
-        predicted_force: (n,) of the blow if the hand met something stiff now [N].
         held: (n,) the arm is kept where it is.
-        left_s: (n,) when in the step a limit was passed [s]; not a number where none was.
     """
 
-    load: Floats
+    felt: Felt
+    numbers: Floats
     presses: Mask
-    force: Floats
-    impulse: Floats
-    speed: Floats
-    predicted_force: Floats
     held: Mask
-    left_s: Floats
+
+    @classmethod
+    def unknown(cls, count: int) -> Self:
+        """Return that nothing is known of ``count`` robots."""
+        no = np.zeros(count, bool)
+        return cls(Felt.nothing(count, 0), np.tile([np.nan, 0.0, np.nan], (count, 1)), no, no)
+
+    @property
+    def named(self) -> dict[str, NDArray[Any]]:
+        """What ``info["asm"]["severity"]`` says.
+
+        ``load``: (n,) the largest share of a contact limit that was felt in a physics substep; ``presses``; ``force``;
+        ``impulse``; ``speed``; ``predicted_force``: of the blow if the hand met something stiff now [N]; ``held``;
+        ``left_s``: when in the step a limit was passed [s].
+        """
+        (load, left_s), (force, impulse, speed) = self.felt.numbers.T[:2], self.numbers.T
+        return {
+            "load": load,
+            "presses": self.presses,
+            "force": force,
+            "impulse": impulse,
+            "speed": speed,
+            "predicted_force": BLOW * speed,
+            "held": self.held,
+            "left_s": left_s,
+        }
+
+    def where(self, known: Mask) -> Severity:
+        """Return it of those robots alone that are ``known`` (n,)."""
+        none, at = np.array([np.nan, 0.0, np.nan]), known[:, None]
+        felt = Felt(np.where(at, self.felt.numbers, np.nan))
+        return Severity(felt, np.where(at, self.numbers, none), self.presses & known, self.held & known)
 
 
 class ForceColumns(NamedTuple):
@@ -141,10 +159,8 @@ def contact_force(numbers: Any, wrists: Any, torques: Any) -> float:
 
 
 @partial(compiled, calls=("detection", "."))
-def weigh(
+def _weigh(
     rows: Any,
-    load: Any,
-    left_s: Any,
     felt: Any,
     felt_wrists: Any,
     felt_torques: Any,
@@ -154,44 +170,61 @@ def weigh(
     dt: float,
     leans_s: float,
     most_impulse: float,
-    impulse: Any,
-    leant: Any,
-    strikes: Any,
-    force: Any,
-    speed: Any,
-    presses: Any,
+    pressed: Any,
     value: Any,
     raw: Any,
     excuse: Any,
     threshold: Any,
-    over: Any,
-    knocked: Any,
+    state: Any,
+    counts: Any,
+    largest: Any,
+    active: Any,
     decides: Any,
-) -> None:
-    """Judge rows (n, D): severity, whether surprise is over the threshold, and whether there is anything to decide.
+    numbers: Any,
+    presses: Any,
+    over: Any,
+    event: Any,
+) -> int:
+    """Judge rows (n, D), and count those about which there is nothing to decide; return how many there are to decide.
 
     Args:
-        load, left_s, felt: as ``Felt``.
-        impulse, leant: (n,) the state: how much and for how long each arm has pressed; they are moved on.
-        strikes: (n,) how often the policy has pressed too hard.
+        felt: as in ``Felt``.
+        pressed: (2, n) impulse, and for how long each arm has leant; they are moved on.
         value, raw, excuse: (n,) as ``Surprise``.
-        force, speed, presses, over, knocked: (n,) are written.
+        threshold: (n,) of surprise.
+        state, counts, largest: of the arbiter.
+        active: (n,) whose rows count.
         decides: (n,) where something is known already that takes a decision; more are added.
+        numbers, presses, over, event: of ``Severity`` and ``Weighed``; they are written.
     """
+    some = 0
     for n in range(len(rows)):
+        load, left_s = felt[n, 0], felt[n, 1]
         # What the arm feels itself is not what a faulty sensor says of it; where it feels nothing, the row says.
-        force[n] = contact_force(felt[n], felt_wrists, felt_torques)
-        if force[n] != force[n]:
-            force[n] = contact_force(rows[n], wrists, torques)
-        more = max(force[n] - FREE_FORCE, 0.0) if np.isfinite(force[n]) else 0.0
-        impulse[n] += more * dt
-        leant[n] = leant[n] + dt if more > 0.0 else 0.0
-        speed[n] = largest_norm(rows[n], hands)
-        presses[n] = load[n] > 1.0 or np.isfinite(left_s[n]) or leant[n] > leans_s / (1.0 + AGAIN * strikes[n])
+        force = contact_force(felt[n, 2:], felt_wrists, felt_torques)
+        if force != force:
+            force = contact_force(rows[n], wrists, torques)
+        more = max(force - FREE_FORCE, 0.0) if np.isfinite(force) else 0.0
+        pressed[0, n] += more * dt
+        pressed[1, n] = pressed[1, n] + dt if more > 0.0 else 0.0
+        numbers[n, 0], numbers[n, 1], numbers[n, 2] = force, pressed[0, n], largest_norm(rows[n], hands)
+        leans = pressed[1, n] > leans_s / (1.0 + AGAIN * counts[STRIKES, n])
+        presses[n] = load > 1.0 or np.isfinite(left_s) or leans
         over[n] = not value[n] <= threshold[n]
-        knocked[n] = excuse[n] == KNOCKED and not over[n] and raw[n] > threshold[n]
-        if presses[n] or over[n] or knocked[n] or impulse[n] > most_impulse:
+        event[n] = excuse[n] if raw[n] > threshold[n] and not over[n] else 0
+        happens = presses[n] or over[n] or event[n] == KNOCKED or pressed[0, n] > most_impulse
+        if happens or state[n] != POLICY or counts[ROWS, n] == MOSTLY_AFTER - 1:
             decides[n] = True
+        decides[n] = decides[n] and active[n]
+        if decides[n]:
+            some += 1
+        elif active[n]:
+            counts[CALM, n] += 1
+            counts[FREE, n] = 0
+            counts[SINCE, n] += 1
+            counts[ROWS, n] += 1
+            largest[n] = max(largest[n], value[n])
+    return some
 
 
 class Weighed(NamedTuple):
@@ -199,13 +232,19 @@ class Weighed(NamedTuple):
 
     Attributes:
         over: (n,) surprise is over the threshold.
-        knocked: (n,) it is over the threshold but for what a knock excuses.
+        event: (n,) what excuses a surprise that is over the threshold but for that, a place in ``EVENTS``.
         decides: (n,) there is something to decide.
+        some: how many of them.
     """
 
     over: Mask
-    knocked: Mask
+    event: NDArray[np.int8]
     decides: Mask
+    some: int
+
+    def knocked(self, robot: int) -> bool:
+        """Return whether a knock, and nothing else, excuses the surprise at a robot's row."""
+        return bool(self.event[robot] == KNOCKED)
 
 
 class SeverityEstimator:
@@ -216,44 +255,32 @@ class SeverityEstimator:
         spec: of the streams.
         felt: what arms feel in physics substeps.
         leans_s: how long an arm may press with more than ``FREE_FORCE`` [s].
+        arbiter: counts the rows about which there is nothing to decide.
     """
 
-    def __init__(self, count: int, spec: StreamSpec, felt: Sequence[Channel], leans_s: float) -> None:
+    def __init__(self, count: int, spec: StreamSpec, felt: Sequence[Channel], leans_s: float, arbiter: Arbiter) -> None:
         columns = *ForceColumns.of(felt), *ForceColumns.of(spec.channels), hand_velocities(spec)
-        self._how: tuple[Any, ...] = *columns, spec.dt, leans_s
-        self._impulse, self._leant = np.zeros(count), np.zeros(count)
+        self._pressed, self._no_excuse = np.zeros((2, count)), np.zeros(count, np.int8)
+        self._how: tuple[Any, ...] = *columns, spec.dt, leans_s, arbiter.most_impulse, self._pressed
+        self._arbiter: tuple[Any, ...] = arbiter.threshold, arbiter.state, arbiter.counts, arbiter.largest
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
-        self._impulse[which] = self._leant[which] = 0.0
+        self._pressed[:, which] = 0.0
 
     def weigh(
-        self,
-        rows: NDArray[np.float32],
-        felt: Felt,
-        held: Mask,
-        surprise: Surprise,
-        threshold: Floats,
-        strikes: NDArray[np.int64],
-        most_impulse: float,
-        decides: Mask,
+        self, rows: NDArray[np.float32], felt: Felt, held: Mask, surprise: Surprise, active: Mask, decides: Mask
     ) -> tuple[Severity, Weighed]:
         """Judge the next rows (n, D), which may have numbers that are not finite.
 
         Args:
             held: (n,) the arm is kept where it is.
-            threshold: (n,) of surprise.
-            strikes: (n,) how often the policy has pressed too hard.
-            most_impulse: how much an arm may press [N s].
-            decides: (n,) where there is something to decide already.
+            active: (n,) whose rows count.
+            decides: (n,) where there is something to decide already; more are added.
         """
-        value, n = surprise.value, len(rows)
-        raw = value if surprise.raw is None else surprise.raw
-        excuse = np.zeros(n, np.int8) if surprise.excuse is None else surprise.excuse
-        force, speed = np.empty(n), np.empty(n)
-        presses, over, knocked, decides = np.empty(n, bool), np.empty(n, bool), np.empty(n, bool), decides.copy()
-        state = most_impulse, self._impulse, self._leant, strikes
-        judged = value, raw, excuse, threshold, over, knocked, decides
-        weigh(rows, *felt, *self._how, *state, force, speed, presses, *judged)
-        severity = Severity(felt.load, presses, force, self._impulse.copy(), speed, BLOW * speed, held, felt.left_s)
-        return severity, Weighed(over, knocked, decides)
+        value, raw, excuse, n = surprise.value, surprise.raw, surprise.excuse, len(rows)
+        presses, over, event, numbers = np.empty(n, bool), np.empty(n, bool), np.empty(n, np.int8), np.empty((n, 3))
+        judged = value, value if raw is None else raw, self._no_excuse if excuse is None else excuse
+        found = numbers, presses, over, event
+        some = _weigh(rows, felt.numbers, *self._how, *judged, *self._arbiter, active, decides, *found)
+        return Severity(felt, numbers, presses, held), Weighed(over, event, decides, some)
