@@ -180,7 +180,7 @@ def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | No
         infos: of one environment, or of n with arrays whose first axis is n.
         there: (n,) whose information is there; of all where None.
     """
-    n, size = robots.count, sum(c.size for c in robots.felt_channels)
+    n, size = robots.count, robots.felt_size
     if "contact_load" not in infos:
         return Felt.nothing(n, size)
     numbers = np.full((n, 2 + size), np.nan)

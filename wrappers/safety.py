@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection import AdaptiveThreshold
+from asm_gym.guard.arbiter import ENDED
 from asm_gym.guard.checks import LOG, Fitted, check_monitor, diagnosis_of, fitted_to
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.lazy_info import LazyInfo
@@ -248,7 +249,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._observation = observation
         info["overridden"] = overridden or bool(info.get("overridden"))
         self._report(info, self._rows, self._executed)
-        if any(row.gave_up[0] or (self._engine.ends_on_alarm and row.ends[0]) for row in self._rows):
+        gave_up = self._rows[-1].state[0] == ENDED
+        if gave_up or (self._engine.ends_on_alarm and any(row.ends[0] for row in self._rows)):
             terminated, truncated = terminated or not self._options.truncate, truncated or self._options.truncate
         self._ended = bool(terminated or truncated)
         return observation, reward, terminated, truncated, info

@@ -25,9 +25,9 @@ POLICY, TRIAL, REFLEX, ENDED = (STATES.index(s) for s in (State.POLICY, State.TR
 
 COUNTS = CALM, ACTED, HELD, FREE, RETURNED, SINCE, WENT_ON, STRIKES, ROWS, ALARMS = range(10)
 """What is counted of each robot in an episode, in rows: of low surprise, in a row; under the reflex, those before a
-hand-back that came too early included; under the reflex since it took over; without a contact, in a row; hand-backs that
-came too early, in a row; under the policy since control was handed back; in alarm under the policy; how often it has
-pressed too hard. In all episodes: rows under the policy, and how many of them alarmed."""
+hand-back that came too early included; under the reflex since it took over; without a contact, in a row; hand-backs
+that came too early, in a row; under the policy since control was handed back; in alarm under the policy; how often it
+has pressed too hard. In all episodes: rows under the policy, and how many of them alarmed."""
 
 MOSTLY_AFTER = 200
 """Rows under the policy after which it is said that most of them alarm."""

@@ -72,7 +72,8 @@ class Fitted(NamedTuple):
     @property
     def stale(self) -> bool:
         """Whether it was fitted since."""
-        return any(a is not b for a, b in zip(_parts(self.monitor), self.parts, strict=True))
+        _, now, also_now = _parts(self.monitor)
+        return now is not self.parts[1] or also_now is not self.parts[2]
 
     def differs(self, other: Fitted) -> bool:
         """Return whether it is another monitor, or was fitted or calibrated in between."""

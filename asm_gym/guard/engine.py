@@ -106,10 +106,10 @@ class Engine:
         """The threshold that follows a policy; None where it does not."""
         self.confirmed = np.zeros(n, bool)
         """(n,) an alarm in this episode was no false one."""
-        self._refused: Mask = np.zeros(n, bool)  # whose policy's action was none, in the step that runs
-        self._nothing_felt = Felt.nothing(n, sum(c.size for c in robots.felt_channels))
-        self._everyone = np.ones(n, bool)
-        self._command = Command(np.zeros((n, robots.rest.size), np.float32), ~self._everyone, ~self._everyone, {})
+        self._nothing_felt = Felt.nothing(n, robots.felt_size)
+        self._everyone, self._nobody = np.ones(n, bool), np.zeros(n, bool)
+        self._command = Command(np.zeros((n, robots.rest.size), np.float32), self._nobody, self._nobody, NOTHING)
+        self._refused = self._nobody  # whose policy's action was none, in the step that runs
         self._warm = self._said_late = False
         self._warned: set[tuple[int, str]] = set()
 
@@ -168,7 +168,7 @@ class Engine:
             idle: (n,) nothing is done, for an episode begins.
         """
         names = self._arbiter.response if self._graded else [self._name] * self._count
-        idle = ~self._everyone if idle is None else idle
+        idle = self._nobody if idle is None else idle
         self._command, self._refused = self._motions.choose(actions, self.overriding, idle, names, seen)
         return self._command
 
@@ -196,13 +196,14 @@ class Engine:
             bridged: (n,) whose missing numbers are no alarm.
         """
         active = self._everyone if active is None else active
-        refused, self._refused = self._refused & active, ~self._everyone
+        refused, self._refused = self._refused & active, self._nobody
         held = self.overriding
-        failed = self._failures(failures or {}, refused, active)
+        failed = self._failures(failures or NOTHING, refused, active)
         believed = self._rows.next(rows, active)
         if bridged is not None:
             believed = believed._replace(lost={i: lost for i, lost in believed.lost.items() if not bridged[i]})
-        failed |= {i: joined(failed.get(i, ""), said) for i, said in believed.failures.items()}
+        for i, said in believed.failures.items():
+            failed[i] = joined(failed.get(i, ""), said)
         observed = self._observed(believed, failed, held, active if bridged is None else active & ~bridged)
         intervened = held | refused if refused.any() else held
         decides = self._known_to_decide(believed, observed.failures, refused)
@@ -227,6 +228,8 @@ class Engine:
     @property
     def repaired(self) -> Mapping[int, tuple[NDArray[np.float32], Mask]]:
         """The last row (D,) as it should be, and which of its numbers were completed (D,), by robot."""
+        if not self._rows.repairs:
+            return NOTHING
         found = {i: (self._rows.last(i, 1)[0], repair.missing) for i, repair in self._rows.repairs.items()}
         return {i: (row, missing) for i, (row, missing) in found.items() if missing.any()}
 
@@ -250,8 +253,8 @@ class Engine:
 
     def _failures(self, failures: Mapping[int, str], refused: Mask, active: Mask) -> dict[int, str]:
         """Return all that is known to have failed before the rows are looked at, by robot."""
-        found = {i: said for i, said in failures.items() if active[i]}
-        for i in map(int, np.flatnonzero(refused)):
+        found = {i: said for i, said in failures.items() if active[i]} if failures else {}
+        for i in np.flatnonzero(refused).tolist() if self._command.failures else ():
             found[i] = joined(self._command.failures.get(i, ""), found.get(i, ""))
         if self.fitted.stale:
             found |= {i: joined(found.get(i, ""), STALE) for i in map(int, np.flatnonzero(active))}

@@ -95,11 +95,15 @@ class Motions:
             names: of the reflex that each is to do.
             seen: the observation of a robot.
         """
-        robots, failures = self._robots, {}
-        finite: Mask = np.isfinite(actions).all(axis=1)
+        robots, failures, brakes = self._robots, {}, np.zeros(len(actions), bool)
         executed = np.minimum(np.maximum(actions, robots.low), robots.high)  # np.clip takes three times as long
-        refused, brakes = ~(finite | acts | idle), np.zeros(len(actions), bool)
-        for robot in np.flatnonzero(refused | acts | idle).tolist():
+        finite: Mask = np.isfinite(actions).all(axis=1)
+        overridden: Mask = (acts | ~finite) & ~idle
+        if finite.all() and not (overridden.any() or idle.any()):
+            self._last[:] = executed
+            return Command(executed, brakes, overridden, failures), overridden
+        refused = overridden & ~acts
+        for robot in np.flatnonzero(overridden | idle).tolist():
             if idle[robot]:
                 executed[robot] = np.clip(0.0, robots.low, robots.high)
                 continue
@@ -117,7 +121,7 @@ class Motions:
             if said or failed:
                 failures[robot] = joined(said, failed)
         self._last[:] = executed
-        return Command(executed, brakes, (acts | refused) & ~idle, failures), refused
+        return Command(executed, brakes, overridden, failures), refused
 
     @property
     def _acts(self) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -51,6 +52,11 @@ class Robots:
     turn: Callable[[int, NDArray[np.floating[Any]]], NDArray[np.float32]] | None = None
     force_behind: Callable[[int, NDArray[np.floating[Any]]], tuple[str, NDArray[np.float64]]] | None = None
     refused: Mapping[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def felt_size(self) -> int:
+        """F, how many numbers the arms feel in physics substeps."""
+        return sum(c.size for c in self.felt_channels)
 
     @classmethod
     def unknown(cls, spec: StreamSpec, read: NDArray[np.bool_] | None = None) -> Self:
