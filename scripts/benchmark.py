@@ -37,7 +37,7 @@ from asm_gym.stream_source import StreamSource
 from asm_gym.tasks import env_id
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
-from asm_gym.wrappers.factory import body_memory
+from asm_gym.wrappers.robots import body_memory
 
 PARTS = 10
 """Parts of a measurement; a ratio's spread is that of the ratios of their medians."""

@@ -25,7 +25,7 @@ from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record, where
 from asm_gym.tasks import task as task_spec
-from asm_gym.wrappers.responses import SURE
+from asm_gym.guard.diagnosis import SURE
 
 KINDS_OF = {
     "sensor": ("backlash", "encoder_", "frozen_encoder"),
