@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from asm_gym.wrappers.arbiter import Arbiter, Sensed
+from asm_gym.wrappers.factory import make_fallback
+from asm_gym.wrappers.responses import RESPONSES
+from asm_gym.wrappers.transitions import GOING_ON, TRANSITIONS, ReleaseRule, Situation, State, following
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from asm_gym.policies.reflexes import Graded
-from asm_gym.wrappers.arbiter import Arbiter, Sensed
-from asm_gym.wrappers.factory import make_fallback
-from asm_gym.wrappers.responses import RESPONSES
-from asm_gym.wrappers.transitions import GOING_ON, TRANSITIONS, ReleaseRule, Situation, State, following
 from tests.fakes import FakeEnv
 
 ACTING = (State.POLICY, State.TRIAL)

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from asm_gym.wrappers.repair import ObservationMap, Repair
 from gymnasium import spaces
 
 from asm_gym.episode import Episode
@@ -12,7 +13,6 @@ from asm_gym.monitors.diagnosis import CLASSES, Diagnosis, Readout
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import CompletedObservation, NeuralASMSafety
-from asm_gym.wrappers.repair import ObservationMap, Repair
 from tests.fakes import CueMonitor
 
 SPEC = StreamSpec(

@@ -3,6 +3,8 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from asm_gym.wrappers.factory import limits_of
+from asm_gym.wrappers.substeps import SubstepGuard
 from gymnasium.vector import SyncVectorEnv
 
 from asm_gym import collect
@@ -12,9 +14,7 @@ from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
-from asm_gym.wrappers.factory import limits_of
 from asm_gym.wrappers.oracle import OracleReflex
-from asm_gym.wrappers.substeps import SubstepGuard
 from tests.fakes import SPEC, CueMonitor
 
 

@@ -4,12 +4,12 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from asm_gym.wrappers.hand import LIMIT, HandAgainstJoints
 from gymnasium.vector import SyncVectorEnv
 
 from asm_gym.kinematics import Chain
 from asm_gym.monitors import NeuralASM
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
-from asm_gym.wrappers.hand import LIMIT, HandAgainstJoints
 
 FORWARD = np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, -1.0], np.float32)
 

@@ -3,6 +3,11 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from asm_gym.wrappers.arbiter import Arbiter, Sensed
+from asm_gym.wrappers.factory import make_fallback
+from asm_gym.wrappers.responses import DEFAULT, Responder
+from asm_gym.wrappers.severity import Severity
+from asm_gym.wrappers.transitions import ReleaseRule
 
 from asm_gym.memory.completion import Completion
 from asm_gym.monitors.diagnosis import Diagnosis
@@ -10,11 +15,6 @@ from asm_gym.policies.reflexes import Graded
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.arbiter import Arbiter, Sensed
-from asm_gym.wrappers.factory import make_fallback
-from asm_gym.wrappers.responses import DEFAULT, Responder
-from asm_gym.wrappers.severity import Severity
-from asm_gym.wrappers.transitions import ReleaseRule
 from tests.fakes import FakeEnv
 from tests.needs import needs
 from tests.test_completion import SPEC, Judge, Named

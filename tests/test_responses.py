@@ -3,10 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, responses_from
 
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, responses_from
 from tests.fakes import CueMonitor, FakeEnv
 from tests.test_completion import MEMORY, SPEC, Arm, Judge, offset
 

@@ -5,6 +5,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from asm_gym.wrappers.factory import REFLEXES, make_rule
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,7 +13,6 @@ from hypothesis import strategies as st
 from asm_gym.policies.reflexes import Graded
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.factory import REFLEXES, make_rule
 from tests.fakes import SPEC, CueMonitor, FakeEnv
 
 ACT = np.array([0.3, -0.2, 1.0], np.float32)

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from asm_gym.wrappers.vector_utils import choose
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from asm_gym import collect
@@ -11,7 +12,6 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.policies.reflexes import Hold, Retract
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
-from asm_gym.wrappers.vector_utils import choose
 from tests.fakes import SPEC, FadingMonitor, FakeEnv, Remembered
 
 LENGTHS = (9, 7, 12)

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from asm_gym.episode import Episode, load_episode
 from asm_gym.evaluation.recordings import files_in
 from asm_gym.evaluation.tables import Table
+from asm_gym.guard.diagnosis import SURE
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.diagnosis import CLASSES, FAMILIES, WINDOW, Diagnosis, Readout, averaged
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record, where
 from asm_gym.tasks import task as task_spec
-from asm_gym.guard.diagnosis import SURE
 
 KINDS_OF = {
     "sensor": ("backlash", "encoder_", "frozen_encoder"),
