@@ -155,9 +155,9 @@ def _known(
     felt, chains = first("felt_channels", ()), ask("hand_chains") or ()
     robots = Robots(
         count=envs.count,
-        low=envs.actions.low,
-        high=envs.actions.high,
-        rest=rest,
+        low=envs.actions.low.ravel(),
+        high=envs.actions.high.ravel(),
+        rest=rest.ravel(),
         rests="hold" not in refused,
         brakes=ask("holding") is not None and ask("keeps_holding") is not None,
         grip=grip,

@@ -107,7 +107,8 @@ class Engine:
         self.confirmed = np.zeros(n, bool)
         """(n,) an alarm in this episode was no false one."""
         self._nothing_felt = Felt.nothing(n, robots.felt_size)
-        self._everyone, self._nobody = np.ones(n, bool), np.zeros(n, bool)
+        self._everyone, self._nobody = np.ones(n, bool), self._motions.nobody
+        self._held = self._nobody  # whose reflex acts next
         self._command = Command(np.zeros((n, robots.rest.size), np.float32), self._nobody, self._nobody, NOTHING)
         self._refused = self._nobody  # whose policy's action was none, in the step that runs
         self._warm = self._said_late = False
@@ -123,8 +124,7 @@ class Engine:
     @property
     def overriding(self) -> Mask:
         """(n,) whose reflex acts next."""
-        found: Mask = self._arbiter.state == REFLEX
-        return found
+        return self._held
 
     @property
     def limits(self) -> tuple[Any, ...]:
@@ -141,6 +141,7 @@ class Engine:
             part.begin(which)
         for i in np.flatnonzero(which):
             self._diagnostician.begin(int(i))
+        self._held = self._arbiter.state == REFLEX
         self._warned = {(i, who) for i, who in self._warned if not which[i]}
         return self.nothing()
 
@@ -169,7 +170,9 @@ class Engine:
         """
         names = self._arbiter.response if self._graded else [self._name] * self._count
         idle = self._nobody if idle is None else idle
-        self._command, self._refused = self._motions.choose(actions, self.overriding, idle, names, seen)
+        self._command, self._refused = self._motions.choose(actions, self._held, idle, names, seen)
+        if self._refused is not self._nobody:
+            self._held = self._arbiter.state == REFLEX
         return self._command
 
     # ------------------------------------------------------------------ what comes of it
@@ -196,8 +199,8 @@ class Engine:
             bridged: (n,) whose missing numbers are no alarm.
         """
         active = self._everyone if active is None else active
-        refused, self._refused = self._refused & active, self._nobody
-        held = self.overriding
+        held, refused, self._refused = self._held, self._refused, self._nobody
+        refused = refused if refused is self._nobody else refused & active
         failed = self._failures(failures or NOTHING, refused, active)
         believed = self._rows.next(rows, active)
         if bridged is not None:
@@ -205,7 +208,7 @@ class Engine:
         for i, said in believed.failures.items():
             failed[i] = joined(failed.get(i, ""), said)
         observed = self._observed(believed, failed, held, active if bridged is None else active & ~bridged)
-        intervened = held | refused if refused.any() else held
+        intervened = held if refused is self._nobody else held | refused
         decides = self._known_to_decide(believed, observed.failures, refused)
         severity, weighed = self._severity.weigh(
             believed.rows, felt or self._nothing_felt, held, observed.surprise, active, decides
@@ -216,6 +219,8 @@ class Engine:
         outcomes = (
             {i: self._decide(i, row) for i in np.flatnonzero(weighed.decides).tolist()} if weighed.some else NOTHING
         )
+        if outcomes:
+            self._held = self._arbiter.state == REFLEX
         if outcomes or not self._limits.steady:
             policy = active & ~intervened
             pressed = policy & severity.presses
@@ -254,7 +259,7 @@ class Engine:
     def _failures(self, failures: Mapping[int, str], refused: Mask, active: Mask) -> dict[int, str]:
         """Return all that is known to have failed before the rows are looked at, by robot."""
         found = {i: said for i, said in failures.items() if active[i]} if failures else {}
-        for i in np.flatnonzero(refused).tolist() if self._command.failures else ():
+        for i in np.flatnonzero(refused).tolist() if refused is not self._nobody else ():
             found[i] = joined(self._command.failures.get(i, ""), found.get(i, ""))
         if self.fitted.stale:
             found |= {i: joined(found.get(i, ""), STALE) for i in map(int, np.flatnonzero(active))}

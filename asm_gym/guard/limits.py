@@ -58,19 +58,14 @@ class EpisodeLimits:
         self._gentle = None if limits is None else limits.stricter(GENTLE, CAREFUL * limits.hand_speed)
         self.now = (self._usual,) * robots.count
         """Of each robot; the same objects as long as nothing has changed."""
+        self.steady = False
+        """They stay as they are while no arm presses."""
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
         self._careful[which] = 0
         self._places[which] = np.nan
         self._choose()
-
-    @property
-    def steady(self) -> bool:
-        """Whether they stay as they are while no arm presses."""
-        return self._usual is None or (
-            self._familiar is None and self.now[0] is self._usual and not self._careful.any()
-        )
 
     def follow(self, rows: NDArray[np.float32], acted: Mask, pressed: Mask) -> None:
         """Take account of a control step.
@@ -90,6 +85,7 @@ class EpisodeLimits:
         self._choose()
 
     def _choose(self) -> None:
+        self.steady = self._usual is None or (self._familiar is None and not self._careful.any())
         now = [self._gentle if careful else self._usual for careful in self._careful]
         if self._familiar is not None:
             speeds = [self._familiar.at(place) for place in self._places]

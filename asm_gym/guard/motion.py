@@ -58,11 +58,13 @@ class Motions:
         take_over: Callable[[int], None],
         warn: Callable[[int, str, str], None],
     ) -> None:
-        n, shape = robots.count, robots.rest.shape
+        n, size = robots.count, robots.rest.size
         self._robots, self._reflexes, self._policies = robots, reflexes, policies
         self._take_over, self._warn = take_over, warn
-        self._last = np.zeros((n, *shape), np.float32)  # executed last
-        self._before = np.zeros((n, *shape), np.float32)  # executed last before the override
+        self._last = np.zeros((n, size), np.float32)  # executed last
+        self._before = np.zeros((n, size), np.float32)  # executed last before the override
+        self.nobody: Mask = np.zeros(n, bool)
+        """(n,) never written to."""
         self._fresh = np.zeros(n, bool)  # the override has just begun
         self._memory: dict[int, Any] = {}  # the policies' own states
         self.begin(np.ones(n, bool))
@@ -95,13 +97,11 @@ class Motions:
             names: of the reflex that each is to do.
             seen: the observation of a robot.
         """
-        robots, failures, brakes = self._robots, {}, np.zeros(len(actions), bool)
-        executed = np.minimum(np.maximum(actions, robots.low), robots.high)  # np.clip takes three times as long
-        finite: Mask = np.isfinite(actions).all(axis=1)
-        overridden: Mask = (acts | ~finite) & ~idle
-        if finite.all() and not (overridden.any() or idle.any()):
-            self._last[:] = executed
-            return Command(executed, brakes, overridden, failures), overridden
+        robots, executed = self._robots, np.empty_like(actions)
+        if not _clip(actions, robots.low, robots.high, acts, idle, executed, self._last):
+            return Command(executed, self.nobody, self.nobody, {}), self.nobody
+        failures, brakes = {}, np.zeros(len(actions), bool)
+        overridden: Mask = (acts | ~np.isfinite(actions).all(axis=1)) & ~idle
         refused = overridden & ~acts
         for robot in np.flatnonzero(overridden | idle).tolist():
             if idle[robot]:
@@ -154,9 +154,9 @@ class Motions:
         robots, before = self._robots, self._before[robot]
         try:
             motion = self._asked(robot, name, seen)
-            action = as_float32(motion.action)
+            action = as_float32(motion.action).reshape(-1)
             if action.shape != robots.rest.shape or not np.isfinite(action).all():
-                raise ValueError(f"a finite action of shape {robots.rest.shape} was needed, got {action}")
+                raise ValueError(f"a finite action of {robots.rest.size} numbers was needed, got {action}")
             if motion.keeps_grip:
                 action[robots.grip] = before[robots.grip]
         except Exception as error:
@@ -187,6 +187,20 @@ class Motions:
         if self._robots.rests:
             action[self._robots.grip] = executed[self._robots.grip]
         return action, self._robots.brakes
+
+
+@partial(compiled, calls=(".",))
+def _clip(actions: Any, low: Any, high: Any, acts: Any, idle: Any, executed: Any, last: Any) -> bool:
+    """Write the actions (n, A) within their bounds, and keep them; return whether more is to be done about some."""
+    more = False
+    for n in range(len(actions)):
+        more = more or acts[n] or idle[n]
+        for i in range(len(low)):
+            executed[n, i] = min(max(actions[n, i], low[i]), high[i])
+            more = more or not np.isfinite(actions[n, i])
+    if not more:
+        last[:] = executed
+    return more
 
 
 @partial(compiled, calls=(".",))
