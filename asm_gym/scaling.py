@@ -14,7 +14,7 @@ and the change is taken over the l rows of a twentieth of a second.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Self
@@ -87,6 +87,16 @@ class StreamScaler:
         spread = _spread(rows, mean, spec.noise)
         change = np.maximum(steps.std(axis=0), _least_change(streams, spec.noise))
         return cls(spec, mean, spread, np.where(change > 0, change, spread), lag)
+
+    @classmethod
+    def of(cls, spec: StreamSpec, arrays: Mapping[str, Any], lag: int = 1) -> Self:
+        """Return the scaler whose ``arrays`` a file kept."""
+        return cls(spec, arrays["mean"], arrays["spread"], arrays["change"], lag)
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays to keep in a file."""
+        return {"mean": self.mean, "spread": self.spread, "change": self.change}
 
     @cached_property
     def slow(self) -> NDArray[np.intp]:

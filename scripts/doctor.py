@@ -96,8 +96,8 @@ def wanted_versions(name: str) -> SpecifierSet:
 
 COMPILED = """
 from asm_gym.compilation import kept_in, must_compile
-from asm_gym.monitors.fused import _observe
-print(int(must_compile(_observe)), kept_in(_observe) or "")
+from asm_gym.monitors.row_kernel import observe_rows
+print(int(must_compile(observe_rows)), kept_in(observe_rows) or "")
 """
 
 

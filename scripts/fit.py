@@ -40,9 +40,9 @@ from asm_gym.detection.hourly import least_per_hour
 from asm_gym.episode import Episode
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
-from asm_gym.monitors.baselines.arm_inputs import Derived
-from asm_gym.monitors.promise import Asked
-from asm_gym.monitors.registry import check_monitor
+from asm_gym.monitors.arm_inputs import Derived
+from asm_gym.monitors.calibration import AlarmRate
+from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
@@ -71,7 +71,7 @@ class Args:
     it, of JSON objects: it is recorded beside FILE."""
     out: Path = option(Path("runs/fit/memory.asm"), metavar="FILE")
     """File to write the memory to."""
-    monitor: str = option("neural_asm", check=check_monitor, listed=MONITORS)
+    monitor: str = option("neural_asm", check=check_monitor_name, listed=MONITORS)
     """Name of the monitor."""
     false_alarm_rate: float = option(FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of normal episodes that may raise an alarm."""
@@ -119,10 +119,10 @@ class Args:
             raise ValueError(f"out must be a file, and {self.out} is a folder")
 
     @property
-    def asked(self) -> Asked:
+    def asked(self) -> AlarmRate:
         """The promise of the threshold."""
         hourly = self.false_alarms_per_hour
-        return Asked.of(self.false_alarm_rate if hourly is None else None, hourly)
+        return AlarmRate.of(self.false_alarm_rate if hourly is None else None, hourly)
 
 
 def learned(

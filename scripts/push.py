@@ -1,6 +1,6 @@
 """Uploads a memory and its card to the Hugging Face hub, or to the server that HF_ENDPOINT names.
 
-NeuralASM.from_hub("OWNER/NAME") reads it there.
+asm_gym.monitors.hub.from_hub("OWNER/NAME") reads it there.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from rich.console import Console
 from asm_gym.compilation import kept_in
 from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.fused import _observe
+from asm_gym.monitors.row_kernel import observe_rows
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
 from asm_gym.spec import Channel, StreamSpec
@@ -61,7 +61,7 @@ def warm_up(args: Args, console: Console) -> None:
     for name, part in parts.items():
         with stage(f"compiling {name}", console, {}):
             part()
-    where = kept_in(_observe) or "memory only"
+    where = kept_in(observe_rows) or "memory only"
     console.print(f"Compiled after {time.perf_counter() - start:.0f} s; kept in {where}", soft_wrap=True, markup=False)
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM, make_monitor
+from asm_gym.monitors.skills import learn_skills
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.streams import sine_episodes
 
@@ -97,4 +98,4 @@ def test_skills_are_learned_from_one_episode_and_from_constant_and_copied_senses
     episodes = changed(changed(sine_episodes(6), constant), copied)
     asm = NeuralASM(episodes[0].spec, hidden_size=8, association_size=24, epochs=2).fit(episodes)
     for learned in (episodes, episodes[:1]):
-        assert np.isfinite(asm.learn_skills(learned).score(episodes[1]).of_skill).all()
+        assert np.isfinite(learn_skills(asm, learned).score(episodes[1]).of_skill).all()

@@ -10,7 +10,7 @@ from asm_gym.checkpoint import read_checkpoint
 from asm_gym.episode import Episode
 from asm_gym.monitors import MONITORS, load_monitor, make_monitor, monitor_class
 from asm_gym.monitors.baselines import gru, lstm_vae
-from asm_gym.monitors.monitor_file import restored
+from asm_gym.monitors.files import restored
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.needs import needs
 from tests.streams import sine_episodes, sine_spec

@@ -13,7 +13,8 @@ from asm_gym.detection.evidence_detection import EvidenceDetection
 from asm_gym.detection.tails import FEWEST_EPISODES, HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX
 from asm_gym.episode import EpisodeLabel
 from asm_gym.monitors import make_monitor
-from asm_gym.monitors.ceilings import worst_of
+from asm_gym.monitors.ceilings import learn_ceilings, learned_from, worst_of
+from asm_gym.monitors.skills import learn_skills
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.rollouts.pretraining.healthy import FOR_CEILINGS, for_threshold
 from tests.memories import SMALL, sine_memory
@@ -38,8 +39,8 @@ def shaken(episodes, column=3, by=4.0):
 def test_a_share_of_the_hours_stays_below_each_ceiling_and_tails_are_those_that_were_learned(asm):
     hours = list(shaken(sine_episodes(150, seed=20)))
     before, detection = asm.detection.detector_, asm.detection
-    maxima = worst_of(asm.model, detection, None, hours)
-    asm.learn_ceilings(hours)
+    maxima = worst_of(asm, detection, hours)
+    learn_ceilings(asm, hours)
     np.testing.assert_allclose((maxima <= asm.detector_.ceiling).mean(axis=0), HOURS_QUANTILE, atol=0.01)
     np.testing.assert_allclose(asm.detector_.tail, before.tail * HOURS_TAIL_INDEX / TAIL_INDEX)
     np.testing.assert_array_equal(asm.detector_.whitening, before.whitening)
@@ -59,7 +60,7 @@ def test_the_largest_evidence_is_that_of_the_detector_row_by_row(asm):
         vector += gains[:, None] * (whitened - vector)
         variance = gains / (2 - gains) * (1 - (1 - gains) ** (2 * t))
         most = np.maximum(most, vector**2 / variance[:, None])
-    np.testing.assert_allclose(worst_of(asm.model, asm.detection, None, [episode])[0], most, rtol=1e-5)
+    np.testing.assert_allclose(worst_of(asm, asm.detection, [episode])[0], most, rtol=1e-5)
 
 
 def test_a_sense_that_jumps_in_healthy_hours_sets_no_threshold_for_the_others(asm):
@@ -74,14 +75,14 @@ def test_a_sense_that_jumps_in_healthy_hours_sets_no_threshold_for_the_others(as
         return np.mean([(s.value > asm.threshold).any() for s in asm.score_episodes(faults)])
 
     as_it_was = found()
-    asm.learn_ceilings(hours[:350])
+    learn_ceilings(asm, hours[:350])
     assert found() > as_it_was + 0.5
 
 
 def test_learning_them_again_is_as_learning_them_once_and_a_file_keeps_them(asm, tmp_path):
     first, second = list(shaken(sine_episodes(120, seed=24))), sine_episodes(120, seed=25)
-    twice = deepcopy(asm).learn_ceilings(first).learn_ceilings(second)
-    once = asm.learn_ceilings(second)
+    twice = learn_ceilings(learn_ceilings(deepcopy(asm), first), second)
+    once = learn_ceilings(asm, second)
     for name in ("ceiling", "tail"):
         np.testing.assert_allclose(getattr(twice.detector_, name), getattr(once.detector_, name))
     once.calibrate(sine_episodes(99, seed=26), 0.05).save(tmp_path / "m.asm")
@@ -93,9 +94,9 @@ def test_learning_them_again_is_as_learning_them_once_and_a_file_keeps_them(asm,
 def test_what_ceilings_are_of_is_not_calibrated_on_by_the_hour(asm):
     hours = sine_episodes(120, seed=28)
     with pytest.raises(ValueError, match="was learned from"):
-        asm.learn_ceilings(hours).calibrate(hours, false_alarms_per_hour=60.0)
-    assert all(asm.knows(episode) for episode in hours)
-    assert not any(asm.knows(episode) for episode in sine_episodes(20, seed=31))
+        learn_ceilings(asm, hours).calibrate(hours, false_alarms_per_hour=60.0)
+    assert all(learned_from(asm, episode) for episode in hours)
+    assert not any(learned_from(asm, episode) for episode in sine_episodes(20, seed=31))
 
 
 def test_rows_that_the_senses_excuse_tell_little():
@@ -108,16 +109,16 @@ def test_rows_that_the_senses_excuse_tell_little():
 
 def test_bad_input_is_named(asm):
     with pytest.raises(ValueError, match=f"{FEWEST_EPISODES} healthy episodes or more, got 3"):
-        asm.learn_ceilings(sine_episodes(3, seed=0))
+        learn_ceilings(asm, sine_episodes(3, seed=0))
     with pytest.raises(ValueError, match="episode 119 was learned from"):
-        asm.learn_ceilings([*sine_episodes(119, seed=3), sine_episodes(50)[0]])
+        learn_ceilings(asm, [*sine_episodes(119, seed=3), sine_episodes(50)[0]])
     with pytest.raises(ValueError, match="episodes 0 and 120 overlap"):
-        asm.learn_ceilings([*(hours := sine_episodes(120, seed=3)), hours[0]])
+        learn_ceilings(asm, [*(hours := sine_episodes(120, seed=3)), hours[0]])
     with pytest.raises(RuntimeError, match="call fit"):
-        NeuralASM(sine_spec(), **SMALL).learn_ceilings(sine_episodes(120, seed=0))
+        learn_ceilings(NeuralASM(sine_spec(), **SMALL), sine_episodes(120, seed=0))
     other = make_monitor("kalman", sine_spec()).fit(sine_episodes(30, seed=0))
     with pytest.raises(TypeError, match="mahalanobis has no ceilings"):
-        other.learn_ceilings(sine_episodes(120, seed=0))
+        learn_ceilings(other, sine_episodes(120, seed=0))
     with pytest.raises(ValueError, match="tail_index must be"):
         EvidenceDetection(sine_spec(), tail_index=0.0)
 
@@ -125,16 +126,16 @@ def test_bad_input_is_named(asm):
 def test_a_rival_under_the_same_detection_learns_them_too():
     ridge = make_monitor("association_linear+evidence", sine_spec()).fit(sine_episodes(30, seed=0))
     before = ridge.detection.detector_.ceiling
-    ridge.learn_ceilings(list(shaken(sine_episodes(120, seed=29))))
+    learn_ceilings(ridge, list(shaken(sine_episodes(120, seed=29))))
     assert (ridge.detection.detector_.ceiling != before).all()
 
 
 def test_skills_that_were_weighed_against_it_are_to_be_learned_anew(asm):
-    asm.learn_skills(sine_episodes(20, seed=0))
+    learn_skills(asm, sine_episodes(20, seed=0))
     asm.about["alarm_on"] = "skill"
-    asm.learn_ceilings(sine_episodes(120, seed=30))
+    learn_ceilings(asm, sine_episodes(120, seed=30))
     assert asm.skill_ is None
-    assert asm.alarm_on == "body"
+    assert asm.alarm_on_ == "body"
 
 
 @pytest.mark.parametrize(("each", "told"), [(500, 100), (499, 0)])

@@ -17,16 +17,13 @@ from asm_gym.monitors import (
     DETECTIONS,
     MONITORS,
     CalibratedMonitor,
-    ExpectsActions,
-    ForgetsEvidence,
-    LearnsOnTheJob,
-    NamesSkills,
     NeuralASM,
     load_monitor,
     make_monitor,
     monitor_class,
     register_monitor,
 )
+from asm_gym.monitors.adaptation import adapt
 from asm_gym.monitors.stream_model import StreamModel
 from tests.streams import frozen, sine_episodes, sine_spec
 
@@ -186,7 +183,7 @@ def test_a_copy_does_not_learn_on_the_job_of_its_original():
     for row in episode.stream:
         last = state
         state, surprise = copy.observe(last, row[None])
-        copy.adapt(last, row[None], surprise, rate=0.5)
+        adapt(copy, last, row[None], surprise, rate=0.5)
     np.testing.assert_array_equal(asm.score(episode).value, before)
     assert np.abs(copy.score(episode).value[1:] / before[1:] - 1).max() > 0.01
 
@@ -220,13 +217,6 @@ def test_errors_of_no_channel_are_shared_out_among_the_senses_alone(kalman):
     np.testing.assert_allclose(attribution[:, 1:12], (errors[:, 1:] ** 2).sum(axis=1)[:, None].repeat(11, 1) / 12)
     np.testing.assert_allclose(attribution.sum(axis=1), (errors**2).sum(axis=1))
     assert not attribution[:, 12:].any()
-
-
-def test_optional_abilities_are_protocols():
-    asm, limit = NeuralASM(sine_spec()), make_monitor("kalman", sine_spec())
-    for ability in (ForgetsEvidence, ExpectsActions, LearnsOnTheJob, NamesSkills):
-        assert isinstance(asm, ability)
-        assert isinstance(limit, ability) == (ability is ForgetsEvidence)
 
 
 def test_a_file_keeps_the_maxima_beside_what_was_learned(kalman, tmp_path):

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from asm_gym.memory.recall import continued
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.acting import recall
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.scaling import StreamScaler
 from tests.streams import sine_episodes, sine_spec
@@ -75,15 +77,21 @@ def test_changes_are_standardised_over_as_many_rows():
     np.testing.assert_allclose(StreamScaler.fit(FAST, streams, LAG).change, by_hand)
 
 
+def with_second(state, begun):
+    """The state of two streams, of which the second is the one that ``begun`` has."""
+    if isinstance(state, np.ndarray):
+        return np.concatenate([state[:1], begun])
+    return type(state)(*map(with_second, state, begun))
+
+
 def test_side_by_side_is_as_one_by_one_whenever_each_began(fast):
     streams = [e.stream[:20].astype(np.float64) for e in sine_episodes(2, seed=5)]
     state = fast.model.start(2)
-    begun = fast.model.start(1)
     late = []
     for t in range(20):
         state, output = fast.model.predict(state, np.stack([s[t] for s in streams]))
         if t == 4:  # the second stream begins anew, as after a reset
-            state = type(state)(*(np.concatenate([a[:1], b]) for a, b in zip(state, begun, strict=True)))
+            state = with_second(state, fast.model.start(1))
         if t > 4:
             late.append(output.errors[1])
     np.testing.assert_allclose(late, told(fast.model, streams[1][5:]), rtol=1e-3, atol=1e-4)
@@ -91,12 +99,12 @@ def test_side_by_side_is_as_one_by_one_whenever_each_began(fast):
 
 def test_recall_goes_on_with_every_third_row(fast, slow):
     cue = sine_episodes(1, seed=6)[0].stream[:16]
-    rows = fast.recall(cue, 7)
+    rows = recall(fast, cue, 7)
     for turn in range(LAG):  # the cue's first row belongs to none of them
-        expected = slow.recall(cue[1 + turn :: LAG], 3)
+        expected = continued(slow.network, slow.senses_, cue[1 + turn :: LAG], 3)
         np.testing.assert_allclose(rows[turn::LAG], expected[: len(rows[turn::LAG])], rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match="at least 6 rows long"):
-        fast.recall(cue[:5], 1)
+        recall(fast, cue[:5], 1)
 
 
 def test_episodes_too_short_to_have_a_change_are_refused():

@@ -10,6 +10,7 @@ from asm_gym.memory.association import Association
 from asm_gym.memory.association_learning import association_change
 from asm_gym.memory.free_energy import FreeEnergy, _between
 from asm_gym.memory.precision import precision_change
+from asm_gym.monitors.acting import learn_to_act
 
 SPEC = StreamSpec(
     (
@@ -36,7 +37,7 @@ def known(request):
     rng = np.random.default_rng(0)
     healthy = [episode(rng) for _ in range(30)]
     asm = NeuralASM(SPEC, hidden_size=24, association_size=16, epochs=10, dynamics=request.param).fit(healthy[:20])
-    asm.learn_to_act(healthy[:20], units=16)
+    learn_to_act(asm, healthy[:20], units=16)
     return asm.model.free_energy(healthy[20:24]), healthy[24:]
 
 

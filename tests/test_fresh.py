@@ -9,7 +9,7 @@ import pytest
 
 from asm_gym.episode import Episode
 from asm_gym.monitors import CalibratedMonitor, load_monitor, make_monitor
-from asm_gym.monitors.overlap import KEPT, STRETCH, check_fresh, marks, sketch
+from asm_gym.monitors.training_data import KEPT, STRETCH, check_fresh, marks, sketch
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("sense", 3, group="a"), Channel("action", 2, group=MOTOR)), dt=0.05)
@@ -141,13 +141,3 @@ def test_a_loaded_memory_still_knows_what_it_learned_from(monitor, tmp_path):
     monitor.calibrate(NOMINAL, 0.1).save(tmp_path / "m.asm")
     with pytest.raises(ValueError, match="episode 0 was learned from"):
         load_monitor(tmp_path / "m.asm").calibrate([episode(3), *NOMINAL], false_alarms_per_hour=1.0)
-
-
-def test_what_an_older_version_saved_says_that_it_kept_no_hours(monitor, tmp_path):
-    asm = monitor.calibrate(NOMINAL, 0.1)
-    asm.blocks_ = None
-    asm.save(tmp_path / "old.asm")
-    old = load_monitor(tmp_path / "old.asm")
-    assert old.threshold_at(0.1) == old.threshold
-    with pytest.raises(RuntimeError, match="did not save it by the hour"):
-        old.threshold_at(false_alarms_per_hour=1.0)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from asm_gym import NeuralASM
-from asm_gym.monitors.hub import CARD, FILE, card_of
+from asm_gym.monitors.hub import CARD, FILE, card_of, from_hub
 from asm_gym.scripts.cli import main
 from tests.streams import sine_episodes
 
@@ -102,7 +102,7 @@ def test_a_memory_that_was_pushed_comes_back_the_same_with_its_card(server, memo
     assert f"/me/panda/commit/{COMMIT}" in capsys.readouterr().out
     assert server.files[FILE] == path.read_bytes()
     assert "| channel | numbers | unit | group |" in server.files[CARD].decode()
-    back = NeuralASM.from_hub("me/panda")
+    back = from_hub("me/panda")
     episode = sine_episodes(1)[0]
     np.testing.assert_array_equal(back.score(episode).value, asm.score(episode).value)
 
@@ -110,10 +110,10 @@ def test_a_memory_that_was_pushed_comes_back_the_same_with_its_card(server, memo
 @needs_hub
 def test_what_the_hub_refuses_is_one_line(server, memory, capsys):
     with pytest.raises(ConnectionError, match="on me/nothing: ") as said:
-        NeuralASM.from_hub("me/nothing")
+        from_hub("me/nothing")
     assert "\n" not in str(said.value)
     with pytest.raises(ValueError, match="repo must be owner/name"):
-        NeuralASM.from_hub("me/no/such thing")
+        from_hub("me/no/such thing")
     assert main(["push", "no.asm", "me/panda"]) == 2
     assert "no.asm" in capsys.readouterr().err
 
@@ -128,4 +128,4 @@ def test_a_card_says_what_the_file_says(memory):
 def test_without_its_library_the_hub_names_the_extra(memory, monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(ImportError, match="huggingface_hub"):
-        NeuralASM.from_hub("me/panda")
+        from_hub("me/panda")

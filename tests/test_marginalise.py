@@ -10,6 +10,7 @@ import pytest
 from asm_gym.episode import Episode
 from asm_gym.memory.marginalise import stand_in
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.adaptation import adapt, for_stream
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from tests.fakes import SPEC, FakeEnv
@@ -57,15 +58,15 @@ def test_what_stands_in_is_the_conditional_mean_of_a_gaussian():
 def test_a_memory_that_lacks_nothing_is_the_same_in_any_order(memory):
     turned = StreamSpec((COMMAND, WRIST, JOINT, HAND), dt=0.05)
     episode = sine_episodes(1, 5, WHOLE)[0]
-    whole, other = memory.score(episode), memory.for_stream(turned).score(without(episode, turned))
+    whole, other = memory.score(episode), for_stream(memory, turned).score(without(episode, turned))
     np.testing.assert_allclose(other.value, whole.value, rtol=2e-3)
-    assert memory.for_stream(turned).threshold == memory.threshold
+    assert for_stream(memory, turned).threshold == memory.threshold
 
 
 @pytest.mark.parametrize("lacks", [("wrist",), ("command",), ("hand", "command")])
 def test_what_is_left_is_watched_and_false_alarms_stay_few(memory, lacks):
     spec = StreamSpec(tuple(c for c in WHOLE.channels if c.name not in lacks), dt=0.05)
-    fewer = memory.for_stream(spec)
+    fewer = for_stream(memory, spec)
     nominal = sine_episodes(60, 9, WHOLE)
     # Of 60 at 10 %, calibrated on 30: beyond 20 once in a hundred.
     assert alarms(fewer, [without(e, spec) for e in nominal]) <= 20 / 60
@@ -76,7 +77,7 @@ def test_what_is_left_is_watched_and_false_alarms_stay_few(memory, lacks):
 def test_it_is_saved_calibrated_and_learns_on_the_job_as_any_other(memory, tmp_path):
     spec = StreamSpec((JOINT, WRIST), dt=0.05)
     before = {name: array.tobytes() for name, array in memory.learned_.items()}
-    fewer = memory.for_stream(spec)
+    fewer = for_stream(memory, spec)
     assert {name: array.tobytes() for name, array in memory.learned_.items()} == before
     episodes = [without(e, spec) for e in sine_episodes(20, 3, WHOLE)]
     fewer.save(tmp_path / "fewer.asm")
@@ -87,14 +88,14 @@ def test_it_is_saved_calibrated_and_learns_on_the_job_as_any_other(memory, tmp_p
     for row in episodes[0].stream[:10]:
         before = state
         state, surprise = again.observe(state, row[None])
-    assert again.adapt(before, episodes[0].stream[9:10], surprise).shape == (1,)
+    assert adapt(again, before, episodes[0].stream[9:10], surprise).shape == (1,)
     with pytest.raises(ValueError, match="lost senses before"):
-        again.for_stream(StreamSpec((JOINT,), dt=0.05))
+        for_stream(again, StreamSpec((JOINT,), dt=0.05))
 
 
 def test_commands_of_another_controller_are_not_looked_at(memory):
     spec = StreamSpec((JOINT, HAND, WRIST, Channel("command", 5, group="action")), dt=0.05)
-    fewer, rng = memory.for_stream(spec), np.random.default_rng(0)
+    fewer, rng = for_stream(memory, spec), np.random.default_rng(0)
     episode = sine_episodes(1, 4, WHOLE)[0]
     streams = [np.hstack([episode.stream[:, :12], rng.normal(size=(len(episode), 5))]) for _ in range(2)]
     first, second = (fewer.score(Episode.from_stream(s, spec)).value for s in streams)
@@ -111,14 +112,14 @@ def test_commands_of_another_controller_are_not_looked_at(memory):
 )
 def test_senses_that_it_never_met_are_refused_by_name(memory, channels, named):
     with pytest.raises(ValueError, match=named):
-        memory.for_stream(StreamSpec((*channels, COMMAND), dt=0.05))
+        for_stream(memory, StreamSpec((*channels, COMMAND), dt=0.05))
 
 
 def test_another_rate_and_a_memory_that_has_learned_nothing_are_refused(memory):
     with pytest.raises(ValueError, match=r"0\.01"):
-        memory.for_stream(StreamSpec((JOINT, COMMAND), dt=0.01))
+        for_stream(memory, StreamSpec((JOINT, COMMAND), dt=0.01))
     with pytest.raises(RuntimeError, match="fit"):
-        NeuralASM(WHOLE).for_stream(StreamSpec((JOINT,), dt=0.05))
+        for_stream(NeuralASM(WHOLE), StreamSpec((JOINT,), dt=0.05))
 
 
 def test_the_wrapper_watches_with_what_is_there_and_says_what_is_not():

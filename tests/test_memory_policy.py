@@ -15,6 +15,7 @@ from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.episode import Episode
 from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, situation
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.acting import learn_to_act
 from asm_gym.monitors.packing import unpacked
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.grip import ENOUGH, FORGETS, CommandReadout
@@ -68,7 +69,7 @@ def taught(env: Point, episodes: int = 30) -> list[Episode]:
 @pytest.fixture(scope="module")
 def pilot() -> NeuralASM:
     episodes = taught(Point())
-    return NeuralASM(episodes[0].spec, **SMALL).fit(episodes).learn_to_act(episodes, 64)
+    return learn_to_act(NeuralASM(episodes[0].spec, **SMALL).fit(episodes), episodes, 64)
 
 
 def test_what_is_linear_is_learned_as_least_squares_would():
@@ -260,9 +261,9 @@ def test_a_memory_that_does_not_fit_is_refused_with_what_differs(lift, pilot):
 def test_learning_to_act_refuses_what_it_cannot_learn_from(pilot):
     silent = memory_of(StreamSpec((Channel("x", 3),), 0.05))
     with pytest.raises(ValueError, match="nothing is commanded in this stream; it has: x"):
-        silent.learn_to_act([Episode.from_stream(np.zeros((5, 3)), silent.spec)])
+        learn_to_act(silent, [Episode.from_stream(np.zeros((5, 3)), silent.spec)])
     with pytest.raises(ValueError, match="units must be at least 1, got 0"):
-        pilot.learn_to_act(taught(Point(), 2), 0)
+        learn_to_act(pilot, taught(Point(), 2), 0)
 
 
 def test_a_damaged_motor_association_is_refused(pilot, tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
-from asm_gym.monitors import NeuralASM
+from asm_gym.monitors import MemoryConfig, NeuralASM
 from asm_gym.monitors.packing import unpacked
 from tests.memories import learned_bytes, sine_memory
 from tests.streams import sine_episodes, sine_spec
@@ -33,7 +33,8 @@ def test_save_and_load_keep_every_bit(asm, tmp_path):
 
 
 def test_a_memory_without_a_threshold_can_be_saved(tmp_path):
-    numbers = {"hidden_size": np.int64(8), "epochs": np.int64(1), "gains": (np.float32(0.5),)}
+    config = MemoryConfig(gains=(np.float32(0.5),), learning_rate=np.float32(1e-3))
+    numbers = {"hidden_size": np.int64(8), "epochs": np.int64(1), "config": config}
     NeuralASM(sine_spec(), **numbers).fit(sine_episodes(3)).save(tmp_path / "m.asm")
     with pytest.raises(RuntimeError, match="calibrate"):
         _ = NeuralASM.load(tmp_path / "m.asm").threshold
@@ -75,7 +76,7 @@ def test_a_checkpoint_without_what_the_detector_needs_is_refused(asm, tmp_path):
     with pytest.raises(ValueError, match="has no tail, so fit it anew"):
         NeuralASM.load(tmp_path / "older.asm")
     rewritten(tmp_path / "m.asm", tmp_path / "oldest.asm", without("remainder", "span_S"))
-    older = "of an older version, which had no span_S, remainder: make it anew, by asm-gym fit or asm-gym babble"
+    older = "this memory has no span_S, remainder: make it anew, by asm-gym fit or asm-gym babble"
     with pytest.raises(ValueError, match=older):
         NeuralASM.load(tmp_path / "oldest.asm")
 

@@ -9,6 +9,7 @@ import pytest
 
 from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.skills import name_skills, named_skills
 from tests.memories import SMALL, sine_memory
 from tests.streams import sine_episodes, sine_spec
 
@@ -29,7 +30,7 @@ def test_the_running_skill_is_told_by_name_and_changes_nothing_else(asm, tmp_pat
 
     memory = NeuralASM(sine_spec(), **SMALL).fit(labelled(30, 0))
     before = memory.score(labelled(1, 1)[0]).value
-    memory.name_skills(labelled(30, 0))
+    name_skills(memory, labelled(30, 0))
     np.testing.assert_array_equal(memory.score(labelled(1, 1)[0]).value, before)
     memory.save(tmp_path / "m.asm")
     memory = NeuralASM.load(tmp_path / "m.asm")
@@ -41,9 +42,9 @@ def test_the_running_skill_is_told_by_name_and_changes_nothing_else(asm, tmp_pat
         right.append(surprise.skill[0] == e.info["skill"])
     assert np.mean(right) > 0.95
     with pytest.raises(ValueError, match="does not say its skill"):
-        memory.name_skills(sine_episodes(2))
+        name_skills(memory, sine_episodes(2))
     with pytest.raises(ValueError, match="two skills"):
-        memory.name_skills(labelled(2, 0)[:1])
+        name_skills(memory, labelled(2, 0)[:1])
 
 
 def changing(count: int, seed: int, back: bool = False) -> list[Episode]:
@@ -69,11 +70,11 @@ def test_names_that_were_learned_from_changes_follow_one_that_single_skills_do_n
     memory = NeuralASM(sine_spec(), **SMALL).fit(shown)
 
     def right() -> float:
-        return float(np.mean([np.mean(memory.skills(e.stream)[len(e) // 2 + 20 :] == "far") for e in asked]))
+        return float(np.mean([np.mean(named_skills(memory, e.stream)[len(e) // 2 + 20 :] == "far") for e in asked]))
 
-    memory.name_skills([e for e in shown if "skill" in e.info])
+    name_skills(memory, [e for e in shown if "skill" in e.info])
     alone = right()
-    memory.name_skills(shown)
+    name_skills(memory, shown)
     assert memory.skills_ == ("far", "near")
     assert right() > 0.95 > alone + 0.3
 
@@ -95,4 +96,4 @@ def test_names_that_were_learned_from_changes_follow_one_that_single_skills_do_n
 def test_changes_that_cannot_be_are_refused(asm, info, message):
     first, second = sine_episodes(2)
     with pytest.raises(ValueError, match=message):
-        asm.name_skills([replace(first, info={"skill": "a"}), replace(second, info=info)])
+        name_skills(asm, [replace(first, info={"skill": "a"}), replace(second, info=info)])

@@ -21,7 +21,10 @@ from asm_gym.memory.settling_learning import (
     settling_change,
 )
 from asm_gym.memory.temporal import unassociated
-from asm_gym.monitors import NeuralASM, load_monitor
+from asm_gym.monitors import MemoryConfig, NeuralASM, load_monitor
+from asm_gym.monitors.acting import expected_action, recall
+from asm_gym.monitors.adaptation import for_stream
+from asm_gym.monitors.skills import name_skills, named_skills
 from asm_gym.spec import Channel, StreamSpec
 from tests.problems import some_rows
 from tests.streams import frozen, sine_episodes, sine_spec
@@ -207,18 +210,18 @@ def test_a_memory_that_settles_is_used_by_the_same_names(asm, tmp_path):
     assert (loaded.dynamics, loaded.iterations, loaded.prior_precision) == ("settling", 20, 1.0)
     assert loaded.score(episode).value.tobytes() == asm.score(episode).value.tobytes()
     cue, after = episode.stream[:20].astype(float), episode.stream[20:30]
-    np.testing.assert_array_equal(loaded.recall(cue, 10), asm.recall(cue, 10))
-    apart = np.abs(asm.recall(cue, 10) - after)[:, :12].mean(), np.abs(cue[-1] - after)[:, :12].mean()
+    np.testing.assert_array_equal(recall(loaded, cue, 10), recall(asm, cue, 10))
+    apart = np.abs(recall(asm, cue, 10) - after)[:, :12].mean(), np.abs(cue[-1] - after)[:, :12].mean()
     assert apart[0] < 0.7 * apart[1]
     alarms = [asm.score(frozen(e, 3, 15)).value.max() > asm.threshold for e in sine_episodes(20, 7)]
     assert np.mean(alarms) > 0.9
     named = [Episode.from_stream(e.stream, e.spec, info={"skill": str(n % 2)}) for n, e in enumerate(sine_episodes(8))]
     copy = load_monitor(tmp_path / "settling.asm")
-    assert set(copy.name_skills(named).skills(episode.stream)) <= {"0", "1"}
+    assert set(named_skills(name_skills(copy, named), episode.stream)) <= {"0", "1"}
     state = asm.initial_state()
     for row in episode.stream:
         state, _ = asm.observe(state, row[None])
-    assert asm.expected_action(state).shape == (1, 2)
+    assert expected_action(asm, state).shape == (1, 2)
 
 
 def test_more_inference_a_row_makes_it_expect_the_next_better(asm):
@@ -245,8 +248,8 @@ def test_a_memory_of_fewer_senses_settles_where_it_would_had_it_never_seen_them(
         commands = np.hstack([np.zeros((40, 1)), rng.normal(size=(40, 2))])
         senses = np.cumsum(commands[:, 1:], axis=0) @ mixing + 0.05 * rng.normal(size=(40, 5))
         episodes.append(Episode.from_stream(np.hstack([senses, commands]).astype(np.float32), spec))
-    whole = NeuralASM(spec, 8, 24, iterations=1000, epochs=5, dynamics="settling").fit(episodes)
-    fewer = whole.for_stream(StreamSpec((command, joint), dt=0.05))
+    whole = NeuralASM(spec, 8, 24, epochs=5, dynamics="settling", config=MemoryConfig(iterations=1000)).fit(episodes)
+    fewer = for_stream(whole, StreamSpec((command, joint), dt=0.05))
     assert fewer.dynamics == "settling"
     left = episodes[0].stream[:, [6, 7, 0, 1, 2]]
     full, part = whole.senses_.read_episode(episodes[0].stream), fewer.senses_.read_episode(left)
@@ -264,7 +267,7 @@ def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):
     with pytest.raises(ValueError, match=r"^unknown dynamics 'setling'; known: traces, settling; did you mean"):
         NeuralASM(sine_spec(), dynamics="setling")
     with pytest.raises(ValueError, match=r"^iterations must be a whole number in \[1, 1000\], got 0$"):
-        NeuralASM(sine_spec(), dynamics="settling", iterations=0)
+        NeuralASM(sine_spec(), dynamics="settling", config=MemoryConfig(iterations=0))
     asm.save(tmp_path / "settling.asm")
     saved = read_checkpoint(tmp_path / "settling.asm", NeuralASM.kind)
     with pytest.raises(ValueError, match=r"^this is a memory of dynamics='settling', .* cannot be loaded as 'traces'$"):

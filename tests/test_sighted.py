@@ -7,7 +7,7 @@ import pytest
 
 from asm_gym.episode import Episode
 from asm_gym.monitors import make_monitor
-from asm_gym.monitors.blindness import blind_to
+from asm_gym.monitors.calibration import blind_to
 from asm_gym.scaling import StreamScaler
 
 

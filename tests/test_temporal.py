@@ -21,7 +21,8 @@ from asm_gym.memory.readout import KEPT, add_up, certainty, learn_readout
 from asm_gym.memory.recall import follow, run_on
 from asm_gym.memory.temporal import unassociated
 from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
-from asm_gym.monitors import NeuralASM
+from asm_gym.monitors import MemoryConfig, NeuralASM
+from asm_gym.monitors.acting import recall
 from tests.problems import CHANGES, energy, problem, schedule, some_association, some_rows, trajectory
 from tests.streams import sine_episodes, sine_spec
 
@@ -367,7 +368,7 @@ def test_after_the_cue_the_traces_take_up_predictions(free):
 
 @pytest.fixture(scope="module")
 def asm() -> NeuralASM:
-    memory = NeuralASM(sine_spec(), 64, 10, iterations=10, epochs=80, free_running_probability=0.95)
+    memory = NeuralASM(sine_spec(), 64, 10, 80, 0.95, config=MemoryConfig(iterations=10))
     return memory.fit(sine_episodes(24, steps=(60, 60)))
 
 
@@ -375,13 +376,13 @@ def test_recall_is_in_the_units_of_the_stream_and_better_than_standing_still(asm
     errors, spread = [], asm.senses_.spread[asm.spec.sensory]
     for episode in sine_episodes(10, seed=9, steps=(60, 60)):
         true = episode.stream[20:35, asm.spec.sensory]
-        recalled = asm.model.recall(episode.stream[:20], 15)[:, asm.spec.sensory]
+        recalled = recall(asm, episode.stream[:20], 15)[:, asm.spec.sensory]
         errors.append([np.mean(((x - true) / spread) ** 2) for x in (recalled, true[:1] + 0 * true)])
     recalled, held = np.mean(errors, axis=0)
     assert recalled < 0.6 * held
     asm.save(tmp_path / "a.asm")
     cue = sine_episodes(1, seed=3)[0].stream[:10]
-    np.testing.assert_array_equal(NeuralASM.load(tmp_path / "a.asm").model.recall(cue, 6), asm.model.recall(cue, 6))
+    np.testing.assert_array_equal(recall(NeuralASM.load(tmp_path / "a.asm"), cue, 6), recall(asm, cue, 6))
 
 
 @pytest.mark.parametrize(
@@ -397,7 +398,7 @@ def test_recall_is_in_the_units_of_the_stream_and_better_than_standing_still(asm
 )
 def test_a_cue_that_cannot_be_recalled_from_is_refused(asm, rows, steps, message):
     with pytest.raises(ValueError, match=message):
-        asm.model.recall(rows, steps)
+        recall(asm, rows, steps)
 
 
 def test_a_broken_episode_is_refused_before_it_is_learned():

@@ -10,11 +10,10 @@ from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.scores import Largest
 from asm_gym.episode import Episode
 from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_monitor
+from asm_gym.monitors.arm_inputs import forces, motion, speeds
 from asm_gym.monitors.base import Surprise
-from asm_gym.monitors.baselines.arm_inputs import forces, motion, speeds
-from asm_gym.monitors.baselines.association_values import ValueAssociation
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
-from asm_gym.monitors.monitor import MonitorState
+from asm_gym.monitors.value_association import ValueAssociation
 from asm_gym.monitors.values import Values
 from asm_gym.spec import Channel, StreamSpec
 from tests.streams import pendulum_columns
@@ -114,18 +113,15 @@ def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_s
     one = Surprise(np.ones(1), np.full((1, 6), 1 / 6))
     state, found = values.start(1), []
     for row in cut[25].stream.astype(np.float64):
-        found.append(values._farther(state, row[None])[0])
-        now, judged = values.step(state, row[None], MonitorState((), ()), one)
-        state = now.values
+        found.append(values.spread(state, row[None])[0])
+        state, judged = values.join(state, row[None], one, np.ones(1))
         assert judged.value[0] >= 1 / found[-1] - 1e-12
     lag = senses.lag
     np.testing.assert_allclose(found[:lag], 1.0)  # no change is known yet
     np.testing.assert_allclose(found[lag:], root[lag:], rtol=1e-4)
     arrays = {name.removeprefix("values."): array for name, array in values.arrays.items()}
     again = Values.found(cut[0].spec, arrays, seed=0)
-    np.testing.assert_array_equal(again.far, values.far)
-    older = Values.found(cut[0].spec, {n: a for n, a in arrays.items() if n not in ("leverage", "usual")}, seed=0)
-    assert older._farther(older.start(1), cut[0].stream[:1].astype(np.float64)) == pytest.approx([1.0])
+    np.testing.assert_array_equal(again.leverage, values.leverage)
     with pytest.raises(ValueError, match="the leverage of values should be of shape"):
         Values.found(cut[0].spec, arrays | {"leverage": np.eye(3)}, seed=0)
 

@@ -12,6 +12,7 @@ import numpy as np
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.familiar_speed import FamiliarSpeed
 from asm_gym.monitors import CalibratedMonitor, ExplainsItself, Monitor, NeuralASM, pretrained_for
+from asm_gym.monitors.adaptation import for_stream
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, shown
@@ -39,17 +40,6 @@ class KnowsHealthyForces(Protocol):
 
     familiar_: FamiliarSpeed | None
     """How fast it went at each place; None where that is not known."""
-
-
-@runtime_checkable
-class DoesWithFewerSenses(Protocol):
-    """A monitor that can do without some of the channels it knows."""
-
-    spec: StreamSpec
-
-    def for_stream(self, spec: StreamSpec) -> Monitor:
-        """The monitor for a stream that lacks some. Raises ValueError where it has others."""
-        ...
 
 
 class Fitted(NamedTuple):
@@ -96,13 +86,13 @@ def fitted_to(monitor: Monitor, watched: StreamSpec) -> Monitor:
     """
     if isinstance(monitor, Watches) and not isinstance(monitor, CalibratedMonitor):
         _check_answer(monitor)
-    if not isinstance(monitor, DoesWithFewerSenses) or not monitor.spec.difference(watched):
+    if not isinstance(monitor, NeuralASM) or not monitor.spec.difference(watched):
         return monitor
-    fewer = monitor.for_stream(watched)
+    fewer = for_stream(monitor, watched)
     lacks = "; ".join(monitor.spec.difference(watched))
     warnings.warn(
         f"the monitor does without what this stream lacks ({lacks}); its threshold was set with all its senses: "
-        "for_stream(spec).calibrate(episodes) sets it anew",
+        "for_stream(memory, spec).calibrate(episodes) sets it anew",
         stacklevel=4,
     )
     return fewer

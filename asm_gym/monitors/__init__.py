@@ -1,4 +1,4 @@
-"""Everything that can watch a stream: the Neural ASM and its baselines, behind one protocol."""
+"""Monitors: the Neural ASM and its baselines, behind one protocol."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from asm_gym.monitors.base import (
     LearnsOnTheJob,
     Model,
     Monitor,
-    NamesSkills,
     Surprise,
 )
-from asm_gym.monitors.monitor import CalibratedMonitor
+from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
+from asm_gym.monitors.memory_config import MemoryConfig
 from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.monitors.registry import (
     DETECTIONS,
@@ -36,9 +36,9 @@ __all__ = [
     "ExplainsItself",
     "ForgetsEvidence",
     "LearnsOnTheJob",
+    "MemoryConfig",
     "Model",
     "Monitor",
-    "NamesSkills",
     "NeuralASM",
     "Surprise",
     "load_monitor",

@@ -1,8 +1,8 @@
-"""What everything that watches a stream has in common."""
+"""Surprise, and the protocols of a monitor and of a model."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.detection.events import EVENTS, KNOCK, STOP, Excused, event_of
+from asm_gym.detection.events import EVENTS, KNOCK, STOP, event_of
 from asm_gym.episode import Episode
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.notebook_display import lines_over_time
@@ -21,23 +21,20 @@ Progress = Callable[[int, int], object]
 """Called as ``progress(done, total)``."""
 
 State = Any
-"""A monitor's running state: a value, passed in and handed back, never kept in the monitor."""
-
-Told = Mapping[str, Any]
-"""What an episode says of itself, its ``info``; ``"skill"`` and ``"goal"`` are what models may have to be told."""
+"""A monitor's running state: a value, passed in and returned, never kept in the monitor."""
 
 
 class Surprise(NamedTuple):
     """How unexpected the last row of each stream in a batch was.
 
     Attributes:
-        value: (B,) what the threshold applies to; ``inf`` where the row was not finite.
-        attribution: (B, D) each number's share; adds up to ``value`` along the last axis.
-        skill: (B,) the name of the skill that seems to be running, for people to read; None where none was named.
-        of_body: (B,) at what no body does, where a monitor tells it from ``of_skill``; None where that is all of it.
-        of_skill: (B,) at what no skill that was shown does; None where nobody listens for it.
-        raw: (B,) what ``value`` would be without what the senses excuse; None where nothing is excused.
-        excuse: (B,) by what it is, a place in ``detection.events.EVENTS``; None likewise.
+        value: (B,) number that the threshold applies to; ``inf`` where the row is not finite.
+        attribution: (B, D) share of each number of the row; adds up to ``value`` along the last axis.
+        skill: (B,) name of the skill that seems to be running; None where no skill has a name.
+        of_body: (B,) surprise of the body, where a monitor tells it from ``of_skill``; None elsewhere.
+        of_skill: (B,) surprise of the skill; None where no skill model runs.
+        raw: (B,) ``value`` before knocks and stops excuse part of it; None where nothing is excused.
+        excuse: (B,) index in ``detection.events.EVENTS`` of the event that excuses it; None likewise.
     """
 
     value: NDArray[np.float64]
@@ -49,13 +46,13 @@ class Surprise(NamedTuple):
     excuse: NDArray[np.int8] | None = None
 
     def __repr__(self) -> str:
-        """In a line: of how many rows, the last and the largest."""
+        """Return one line: number of rows, last and largest value."""
         if not len(self.value):
             return "<Surprise of no row>"
         return f"<Surprise of {len(self.value)}: last {self.value[-1]:.4g}, largest {self.value.max():.4g}>"
 
     def _repr_html_(self) -> str:
-        """For notebooks: surprise over time, and the numbers that had the largest share."""
+        """Return a plot for notebooks: surprise over time, and the numbers with the largest share."""
         shares = np.nan_to_num(np.atleast_2d(self.attribution))
         most = np.argsort(-shares.sum(axis=0))[:4]
         lines = {"surprise": self.value} | {f"share of number {k}": shares[:, k] for k in most}
@@ -63,17 +60,17 @@ class Surprise(NamedTuple):
 
     @property
     def parts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(B,) at the body, and (B,) at the skill, not a number where nobody listens for that."""
+        """Surprise of the body (B,) and of the skill (B,); the latter is NaN where no skill model runs."""
         body = self.value if self.of_body is None else self.of_body
         return body, np.full(len(body), np.nan) if self.of_skill is None else self.of_skill
 
     def of(self, stream: int) -> Surprise:
-        """That of one stream, in a batch of one."""
+        """Return the surprise of one stream, as a batch of one."""
         at = slice(stream, stream + 1)
         return Surprise(*(None if part is None else part[at] for part in self))  # type: ignore[arg-type]
 
     def event(self, threshold: float) -> str:
-        """What the first of the batch is at this threshold, one of ``detection.events.EVENTS``."""
+        """Return the event of the first stream at this threshold, one of ``detection.events.EVENTS``."""
         value = float(self.value[0])
         if self.raw is None or self.excuse is None:
             return event_of(value, value, 0, threshold)
@@ -81,20 +78,13 @@ class Surprise(NamedTuple):
 
     @property
     def excused_by_event(self) -> dict[str, NDArray[np.float64]]:
-        """(B,) ``raw`` where it is excused by a knock, and by a stop, 0 elsewhere; empty where nothing is excused."""
+        """``raw`` (B,) of rows excused by a knock, and by a stop, 0 elsewhere; empty where nothing is excused."""
         if self.raw is None:
             return {}
         return {event: np.where(self.excuse == EVENTS.index(event), self.raw, 0.0) for event in (KNOCK, STOP)}
 
-    def excused(self, by: Excused) -> Surprise:
-        """What is left of it where the senses excuse some."""
-        shares, value = self.attribution, self.value
-        if (by.divisor != 1.0).any():
-            shares, value = shares / by.divisor[:, None], value / by.divisor
-        return self._replace(value=value, attribution=shares, raw=self.value, excuse=by.kind)
-
     def silenced(self, where: NDArray[np.bool_]) -> Surprise:
-        """No surprise ``where`` (B,) nothing is judged."""
+        """Return it with no surprise ``where`` (B,) nothing is judged."""
 
         def kept(value: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
             return None if value is None else np.where(where, 0.0, value)
@@ -104,7 +94,7 @@ class Surprise(NamedTuple):
         return self._replace(value=value, attribution=shares, of_body=body, of_skill=skill, raw=raw)
 
     def without(self, columns: NDArray[np.bool_]) -> Surprise:
-        """What is left of it where the precision of ``columns`` (D,) is 0."""
+        """Return what is left of it where the precision of ``columns`` (D,) is 0."""
         if not columns.any():
             return self
         shares = np.where(columns, 0.0, self.attribution)
@@ -126,13 +116,13 @@ class Surprise(NamedTuple):
 
 
 class Monitor(Protocol):
-    """Watches a stream and says how surprising it is."""
+    """Anything that watches a stream and returns a surprise a row."""
 
     spec: StreamSpec
 
     @property
     def threshold(self) -> float:
-        """What surprise must exceed for an alarm. Raises RuntimeError before ``calibrate``."""
+        """Surprise above which a row is an alarm. Raises RuntimeError before ``calibrate``."""
         ...
 
     def fit(self, episodes: Sequence[Episode]) -> Self: ...
@@ -147,16 +137,16 @@ class Monitor(Protocol):
 
 
 class Model(Protocol):
-    """Expects each row of a stream, and says by how much it was wrong; what that means is for a detection to say.
+    """Predicts each row of a stream, and returns its errors; a detection makes surprise of them.
 
     Arguments of ``__init__`` beside the stream's spec are hyperparameters, kept under their own names.
 
     Attributes:
         kind: its name, in ``make_monitor`` and in checkpoints.
-        shortest: steps that an episode must have to be learned from.
-        held_out: one in so many episodes is not learned, but shows how wrong the model usually is; 0 for none.
-        learned_: what ``fit`` has found, by name; empty before.
-        skills_: names of the skills it knows, where it was told any.
+        shortest: fewest steps of an episode to learn from.
+        held_out: one in so many episodes is not learned, but shows how large errors usually are; 0 for none.
+        learned_: arrays that ``fit`` has found, by name; empty before.
+        skills_: names of the skills it knows; empty where it was given none.
     """
 
     kind: str
@@ -168,91 +158,60 @@ class Model(Protocol):
 
     @property
     def error_columns(self) -> NDArray[np.intp]:
-        """(X,) the column of the stream that each error belongs to; -1 for none, of which all senses have a share."""
+        """(X,) the column of the stream that each error belongs to; -1 for an error that all senses share."""
         ...
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
-        """Learns from whole nominal episodes."""
+        """Learn from whole nominal episodes."""
         ...
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        """Takes what another has learned. Raises ValueError where that does not fit together."""
+        """Take over learned arrays. Raises ValueError where they do not fit together."""
         ...
 
-    def start(self, batch: int, told: Sequence[Told] = ()) -> State:
-        """Before the first row of ``batch`` streams: a NamedTuple of arrays whose first axis is B.
-
-        Args:
-            told: of each stream its skill and goal, for models that have to be told; others do not look.
-        """
+    def start(self, batch: int) -> State:
+        """Return the state before the first row of ``batch`` streams: a NamedTuple of arrays whose first axis is B."""
         ...
 
     def predict(self, state: State, rows: NDArray[np.float64]) -> tuple[State, ModelOutput]:
-        """The next rows (B, D), perhaps not all finite: the new state, and how wrong each expectation was."""
+        """Return the new state after the next rows (B, D), perhaps not all finite, and the errors."""
         ...
 
 
 @runtime_checkable
 class ForgetsEvidence(Protocol):
-    """A monitor that adds up evidence, and can be told to start anew after an alarm that was acted on."""
+    """A monitor that adds up evidence, and can start anew after an alarm that was acted on."""
 
     def reset_evidence(self, state: State) -> State:
-        """The state with the evidence so far forgotten; the model goes on."""
+        """Return the state without the evidence so far; the model goes on."""
         ...
 
 
 @runtime_checkable
 class ExpectsActions(Protocol):
-    """A monitor that knows what is likely to be commanded next."""
+    """A monitor that predicts the next command; of a memory ``acting.actor_of`` makes one."""
 
     def expected_action(self, state: State) -> NDArray[np.float32]:
-        """(B, A) in the units of the action, of the state as ``observe`` handed it back."""
-        ...
-
-
-@runtime_checkable
-class ExplainsItself(Protocol):
-    """A monitor that can say what causes its surprise, and complete what a faulty sense should say."""
-
-    @property
-    def diagnosis_(self) -> Diagnosis | None:
-        """None where it was not learned."""
+        """Return the command (B, A) in the units of the action, after the state that ``observe`` returned."""
         ...
 
 
 @runtime_checkable
 class LearnsOnTheJob(Protocol):
-    """A monitor that can learn from rows it has just observed, where they did not surprise it."""
+    """A monitor that learns from rows that did not surprise it; of a memory ``adaptation.learner_of`` makes one."""
 
     def adapt(
-        self,
-        before: State,
-        stream: NDArray[np.floating[Any]],
-        surprise: Surprise,
-        rate: float = ...,
-        below: float = ...,
+        self, before: State, stream: NDArray[np.floating[Any]], surprise: Surprise, rate: float = ...
     ) -> NDArray[np.bool_]:
-        """(B,) which of the rows (B, D) were learned from; ``before`` is the state that ``observe`` was given."""
+        """Return which of the rows (B, D) were learned from (B,); ``before`` is the state that ``observe`` got."""
         ...
 
 
 @runtime_checkable
-class Specialises(Protocol):
-    """A model that can go on from what it knows, with few episodes."""
+class ExplainsItself(Protocol):
+    """A monitor that can name the cause of its surprise, and complete a faulty sense."""
 
-    def specialise(self, episodes: Sequence[Episode]) -> Self:
-        """Learns what these nominal episodes have of their own."""
-        ...
-
-
-@runtime_checkable
-class NamesSkills(Protocol):
-    """A monitor that can be taught the names of skills, and says which one runs."""
-
-    def name_skills(self, episodes: Sequence[Episode]) -> Self:
-        """Learns the names from episodes that say them, as ``NeuralASM.name_skills`` does."""
-        ...
-
-    def skills(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.str_]:
-        """(T,) the skill that seems to run in each step of a stream (T, D)."""
+    @property
+    def diagnosis_(self) -> Diagnosis | None:
+        """None where it was not learned."""
         ...

@@ -1,4 +1,4 @@
-"""How far each sense goes at its worst in healthy episodes, as evidence counts it and the senses excuse it."""
+"""Ceilings: how far each sense goes at its worst in healthy hours, so that rare alarms are as rare in each."""
 
 from __future__ import annotations
 
@@ -6,32 +6,78 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
+from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.events import Excuses
-from asm_gym.detection.evidence_detection import EvidenceDetection
+from asm_gym.detection.tails import FEWEST_EPISODES
 from asm_gym.episode import Episode
-from asm_gym.monitors.base import Model
+from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
+from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.monitors.stream_model import model_outputs
+from asm_gym.monitors.training_data import check_fresh, check_nominal, overlaps, sketch
+from asm_gym.validation import typed
 
 AT_ONCE = 400
-"""Episodes: what is made of all rows of many hours would fill the memory."""
+"""Episodes: arrays of all rows of many hours would fill the memory."""
+
+
+@typed
+def learn_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> CalibratedMonitor:
+    """Learn from healthy hours how far each sense goes at its worst, and return the monitor.
+
+    The episodes it was fitted to, babbling say, are not like hours of operation. It has no threshold then: calibrate it
+    on other hours of the same policies and tasks. Skills are to be learned anew.
+
+    Args:
+        monitor: fitted, under the detection of evidence; it is changed.
+        episodes: healthy ones that ``fit`` has not seen, 100 at least, and one hit or so in each 50 at most.
+
+    Raises:
+        ValueError: too few, or bad ones; such as overlap, or as ``fit`` has learned from.
+        TypeError: its detection is not that of evidence.
+    """
+    monitor._require_fitted()
+    if not isinstance(monitor.detection, EvidenceDetection):
+        raise TypeError(f"the detection {monitor.detection.name} has no ceilings: learn those of evidence")
+    check_nominal(episodes, monitor.spec, monitor.model.shortest)
+    if len(episodes) < FEWEST_EPISODES:
+        raise ValueError(f"ceilings take {FEWEST_EPISODES} healthy episodes or more, got {len(episodes)}")
+    check_fresh(episodes, monitor.learned_from_)
+    with threadpool_limits(1):
+        maxima = worst_of(monitor, monitor.detection, episodes)
+    learned = monitor.detection.with_ceilings(maxima, anew=monitor.ceilings_from_ is None)
+    monitor.detection = learned
+    monitor.detections = {**monitor.detections, learned.name: learned}
+    monitor.ceilings_from_ = sketch(episodes)
+    monitor._uncalibrate()
+    if isinstance(monitor, NeuralASM):
+        monitor.skill_ = None  # it was weighed against the memory as it was
+        monitor.about = {name: value for name, value in monitor.about.items() if name != "alarm_on"}
+    return monitor
+
+
+@typed
+def learned_from(monitor: CalibratedMonitor, episode: Episode) -> bool:
+    """Return whether a stretch of it was learned from, by ``fit`` or ``learn_ceilings``: no promise is made of it."""
+    return overlaps(episode, monitor.learned_from_, monitor.ceilings_from_)
 
 
 def worst_of(
-    model: Model, detection: EvidenceDetection, excuses: Excuses | None, episodes: Sequence[Episode]
+    monitor: CalibratedMonitor, detection: EvidenceDetection, episodes: Sequence[Episode]
 ) -> NDArray[np.float64]:
-    """(N, G, X) the largest v in each of N episodes.
+    """Return the largest v (N, G, X) in each of N episodes.
 
-    Surprise is v to some power of a half or less, so that v counts less by the square of what divides surprise.
+    Surprise is v to a power of a half or less, so that v is divided by the square of what divides surprise.
     """
-    detector = detection.detector_
+    detector, excuses = detection.detector_, getattr(monitor, "excuses_", None)
     assert detector is not None
     found = []
     for first in range(0, len(episodes), AT_ONCE):
         some = episodes[first : first + AT_ONCE]
-        for episode, output in zip(some, model_outputs(model, some), strict=True):
+        for episode, output in zip(some, model_outputs(monitor.model, some), strict=True):
             strengths, _ = detector.strengths(output)
-            if excuses is not None:
+            if isinstance(excuses, Excuses):
                 strengths /= excuses.divisors(episode.stream)[:, None, None] ** 2
             found.append(strengths.max(axis=0))
     return np.array(found)

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
-from asm_gym.monitors.base import Progress, Told
-from asm_gym.monitors.baselines.base import Rows, no_context, no_rows, read
-from asm_gym.monitors.stream_model import StreamModel
+from asm_gym.memory.state import RowHistory
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.stream_model import StreamModel, no_context, read_next
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 
@@ -60,11 +60,10 @@ class EstimatorModel(StreamModel):
         rows = np.concatenate([_features(senses.read_episode(stream)) for stream in streams])
         chosen = rng.permutation(len(rows))[: 2 * MOST_ROWS]
         half = (len(chosen) + 1) // 2
-        arrays = {"mean": senses.mean, "spread": senses.spread, "change": senses.change}
-        return self.restore({**arrays, "rows": rows[chosen[:half]], "others": rows[chosen[half:]]})
+        return self.restore({**senses.arrays, "rows": rows[chosen[:half]], "others": rows[chosen[half:]]})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        self._senses = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"])
+        self._senses = StreamScaler.of(self.spec, learned)
         seeded = "random_state" in inspect.signature(self.estimator).parameters
         made = self.estimator(**({"random_state": self.seed} if seeded else {}))
         made.fit(np.asarray(learned["rows"], np.float32))
@@ -72,14 +71,14 @@ class EstimatorModel(StreamModel):
         self._fitted = _Fitted(made, float(usual.mean()), max(float(usual.std()), 1e-9))
         return super().restore(learned, skills)
 
-    def start(self, batch: int, told: Sequence[Told] = ()) -> Rows:
-        return no_rows(batch, self.spec.size)
+    def start(self, batch: int) -> RowHistory:
+        return RowHistory.empty(batch, 1, self.spec.size)
 
-    def predict(self, state: Rows, rows: NDArray[np.float64]) -> tuple[Rows, ModelOutput]:
-        reading = read(self._senses, state, rows)
+    def predict(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
+        state, reading, _ = read_next(self._senses, state, rows)
         scores = _scores(self._fitted.estimator, _features(reading))
         error = np.maximum(0.0, self._fitted.centre - scores) / self._fitted.spread
-        return state.then(rows), ModelOutput(reading.whole * error[:, None], no_context(rows))
+        return state, ModelOutput(reading.whole * error[:, None], no_context(rows))
 
 
 def adapted(kind: type[Any]) -> type[EstimatorModel]:

@@ -6,36 +6,39 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from asm_gym.checkpoint import read_header
 from asm_gym.extras import require
+from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_text, typed
 
 FILE, CARD = "memory.asm", "README.md"
-"""What a repository of a memory holds."""
+"""Files in a repository of a memory."""
 
 
 @typed
 def push(path: str | Path, repo: str, card: str | Path | None = None, private: bool = False) -> str:
-    """Uploads a memory and its card to the hub; where they are.
+    """Upload a memory and its card to the hub, and return their address.
 
     Args:
         path: of a file that ``save`` wrote.
-        repo: ``owner/name``, which is made where there is none.
+        repo: ``owner/name``; it is made where there is none.
         card: Markdown that says what it was learned from and how well it judges; where None, what the file says.
         private: of a repository that is made.
 
     Raises:
         ImportError: huggingface_hub is not installed.
         ValueError: the file is no monitor; the repository's name is none.
-        ConnectionError: the hub cannot be reached, or refuses; the message says what it said.
+        ConnectionError: the hub cannot be reached, or refuses; the message has its answer.
     """
     hub, text = _hub(), card_of(path) if card is None else Path(card).read_text(encoding="utf-8")
     check_text("repo", repo)
-    with _said(repo):
+    with _errors_in_one_line(repo):
         api = hub.HfApi(endpoint=_endpoint())
         api.create_repo(repo, private=private, exist_ok=True)
         files = {FILE: Path(path).read_bytes(), CARD: text.encode()}
@@ -45,8 +48,8 @@ def push(path: str | Path, repo: str, card: str | Path | None = None, private: b
 
 
 @typed
-def fetched(repo: str, revision: str | None = None) -> Path:
-    """Where the memory of a repository lies on this machine, downloaded where it is not there yet.
+def from_hub(repo: str, revision: str | None = None) -> NeuralASM:
+    """Return a memory that ``push`` or ``asm-gym push`` has put on the hub; it is downloaded once.
 
     Args:
         repo: ``owner/name``.
@@ -56,23 +59,24 @@ def fetched(repo: str, revision: str | None = None) -> Path:
         ImportError, ConnectionError: as ``push``.
     """
     hub = _hub()
-    with _said(check_text("repo", repo)):
-        return Path(hub.hf_hub_download(repo, FILE, revision=revision, endpoint=_endpoint()))
+    with _errors_in_one_line(check_text("repo", repo)):
+        path = Path(hub.hf_hub_download(repo, FILE, revision=revision, endpoint=_endpoint()))
+    return NeuralASM.load(path)
 
 
 def card_of(path: str | Path) -> str:
-    """A card in Markdown of what a file says of itself."""
+    """Return a card in Markdown from the header of a file."""
     header = read_header(path)
     spec, about = StreamSpec.from_json(header["spec"]), dict(header.get("about", {}))
     rows = [f"| {c.name} | {c.size} | {c.unit} | {c.group} |" for c in spec.channels]
-    said = [f"- {name}: {value}" for name, value in sorted(about.items()) if isinstance(value, str | int | float)]
+    facts = [f"- {name}: {value}" for name, value in sorted(about.items()) if isinstance(value, str | int | float)]
     lines = [
         "---\nlibrary_name: asm-gym\ntags: [robotics, anomaly-detection]\n---",
         f"# A monitor of {spec.source or 'a stream'} at {1 / spec.dt:g} Hz",
         f"It is of the kind `{header['kind']}`, and alarms above {header['threshold']}.",
-        '```python\nfrom asm_gym import NeuralASM\n\nasm = NeuralASM.from_hub("OWNER/NAME")\n```',
+        '```python\nfrom asm_gym.monitors.hub import from_hub\n\nasm = from_hub("OWNER/NAME")\n```',
         "\n".join(["| channel | numbers | unit | group |", "|---|---|---|---|", *rows]),
-        "\n".join(said),
+        "\n".join(facts),
     ]
     return "\n\n".join(filter(None, lines)) + "\n"
 
@@ -85,18 +89,13 @@ def _endpoint() -> str | None:
     return os.environ.get("HF_ENDPOINT") or None
 
 
-class _said:  # noqa: N801 (used as a function)
-    """What the hub's library raises becomes one line."""
-
-    def __init__(self, repo: str) -> None:
-        self._repo = repo
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if error is None or not isinstance(error, Exception):
-            return
+@contextmanager
+def _errors_in_one_line(repo: str) -> Iterator[None]:
+    """Turn what the hub's library raises into one line."""
+    try:
+        yield
+    except Exception as error:
         if type(error).__name__ == "HFValidationError":
-            raise ValueError(f"repo must be owner/name, got {self._repo!r}") from error
+            raise ValueError(f"repo must be owner/name, got {repo!r}") from error
         first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-        raise ConnectionError(f"the hub at {_endpoint() or 'huggingface.co'} on {self._repo}: {first}") from error
+        raise ConnectionError(f"the hub at {_endpoint() or 'huggingface.co'} on {repo}: {first}") from error

@@ -19,7 +19,7 @@ BITS, SCALE, ROOT = ".bits", ".scale", ".root"
 """Ends of the names of packed arrays."""
 
 OLDER = ".planes", ".half"
-"""What the names of packed arrays contained in files of older versions."""
+"""What names of arrays contain in files of older versions."""
 
 WEIGHTS = "V", "U", "W_S", "W_C", "W_D", "W_F"
 """Of association and of the traces' network."""
@@ -65,11 +65,9 @@ def packed(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
 
 
 def unpacked(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
-    """Return what ``packed`` was given. Raises ValueError for parts that do not fit, or of an older format."""
+    """Return what ``packed`` was given. Raises ValueError for parts that do not fit."""
     found: Arrays = {}
     for name, array in arrays.items():
-        if any(end in name for end in OLDER):
-            raise ValueError("an older asm-gym wrote it: make it anew, by asm-gym fit or asm-gym babble")
         own = name.removesuffix(BITS).removesuffix(ROOT)
         scale = arrays.get(own + SCALE, np.zeros(0))
         if name.endswith(BITS):
@@ -86,6 +84,11 @@ def unpacked(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
         elif not name.endswith(SCALE):
             found[name] = array
     return found
+
+
+def is_older(arrays: Mapping[str, NDArray[Any]]) -> bool:
+    """Return whether an older version has packed the arrays."""
+    return any(end in name for name in arrays for end in OLDER)
 
 
 def _quantised(W: NDArray[np.float32]) -> tuple[NDArray[np.int8], NDArray[np.float32]]:

@@ -9,16 +9,16 @@ from typing import Any
 from asm_gym.checkpoint import kind_of, read_checkpoint
 from asm_gym.detection import Detection, EvidenceDetection
 from asm_gym.extras import needed_for
+from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.estimators import adapted
-from asm_gym.monitors.monitor import CalibratedMonitor
-from asm_gym.monitors.monitor_file import restored
-from asm_gym.monitors.stream_model import parameter_names
+from asm_gym.monitors.files import restored
+from asm_gym.monitors.stream_model import made, parameter_names
 from asm_gym.registries import Registry, target
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, typed
 
 EVIDENCE = "+evidence"
-"""What the name of a monitor ends in where its errors are judged by the detection of the Neural ASM."""
+"""End of the name of a monitor whose errors are judged by the detection of the Neural ASM."""
 
 DETECTIONS: dict[str, Any] = {
     "evidence": EvidenceDetection,
@@ -29,7 +29,7 @@ DETECTIONS: dict[str, Any] = {
     "per_dimension": "asm_gym.detection.scores:PerDimension",
     "latent_threshold": "asm_gym.monitors.baselines.lstm_vae:LatentThreshold",
 }
-"""The class of each detection, or where it stands."""
+"""The class of each detection, or ``module:class``."""
 
 
 @dataclass(frozen=True)
@@ -59,32 +59,34 @@ class MonitorKind:
 
     @property
     def hyperparameters(self) -> tuple[str, ...]:
-        """What ``make_monitor`` takes beside the spec."""
+        """Names that ``make_monitor`` takes beside the spec."""
         parts = [self.model_class] if self._whole else [self.model_class, *self.detection_classes]
         return tuple(dict.fromkeys([*(n for part in parts for n in parameter_names(part)), "seed"]))
 
     def __call__(self, spec: StreamSpec, **hyperparameters: Any) -> CalibratedMonitor:
-        """The monitor, not yet fitted."""
+        """Return the monitor, not yet fitted."""
 
-        def part(kind: Any) -> Any:
-            return kind(spec, **{n: hyperparameters[n] for n in parameter_names(kind) if n in hyperparameters})
-
-        if self._whole:
-            made: CalibratedMonitor = self.model_class(spec, **hyperparameters)
-            used = self.detection if self.detection in made.detections else part(self.detection_classes[0])
-            return made if used == made.detection.name else made.with_detection(used)
         unknown = hyperparameters.keys() - set(self.hyperparameters)
         if unknown:
             raise TypeError(f"{self.model_class.kind} has no hyperparameter {', '.join(sorted(unknown))}")
+
+        def part(kind: Any) -> Any:
+            return made(kind, spec, {n: hyperparameters[n] for n in parameter_names(kind) if n in hyperparameters})
+
+        own = part(self.model_class)
+        if self._whole:
+            used = self.detection if self.detection in own.detections else part(self.detection_classes[0])
+            monitor: CalibratedMonitor = own if used == own.detection.name else own.with_detection(used)
+            return monitor
         detections = map(part, self.detection_classes)
-        return CalibratedMonitor(part(self.model_class), *detections, seed=hyperparameters.get("seed", 0))
+        return CalibratedMonitor(own, *detections, seed=hyperparameters.get("seed", 0))
 
     def load(self, path: str | Path) -> CalibratedMonitor:
-        """Reads what a monitor of this model has saved, under any detection; raises as ``load_monitor``."""
+        """Read what a monitor of this model has saved, under any detection; raises as ``load_monitor``."""
         return restored(path, read_checkpoint(path, self.model_class.kind), self)
 
     def under(self, detection: str) -> MonitorKind:
-        """The same, with another detection in use."""
+        """Return the same, with another detection in use."""
         return replace(self, detection=detection)
 
     @property
@@ -105,14 +107,16 @@ _BASELINES = {
     "rapt": _row("rapt:RAPT", "per_dimension"),
     "kalman": _row("kalman:Kalman", "mahalanobis"),
     "association_linear": _row("association_linear:LinearAssociation", "mahalanobis"),
-    "association_values": _row("association_values:ValueAssociation", "mahalanobis"),
+    "association_values": MonitorKind(
+        "asm_gym.monitors.value_association:ValueAssociation", "mahalanobis", "mahalanobis"
+    ),
     "window_pca": _row("window_pca:WindowPCA", "squares"),
 }
 
 PARTS = {
     "memory_temporal": MonitorKind("asm_gym.monitors.baselines.memory_parts:TemporalPart"),
     "memory_association": MonitorKind("asm_gym.monitors.baselines.memory_parts:AssociationPart"),
-    "memory_skill": MonitorKind("asm_gym.monitors.skill:SkillModel"),
+    "memory_skill": MonitorKind("asm_gym.monitors.skill_surprise:SkillModel"),
 }
 """Of the Neural ASM, each alone: for an ablation."""
 
@@ -126,7 +130,7 @@ MONITORS: Registry[MonitorKind] = Registry(
         },
         "external_torque_limit": _row("limits:ExternalTorqueLimit", "largest"),
         "force_limit": _row("limits:ForceLimit", "squares"),
-        "channel_limit": _row("friction_rule:ChannelLimit", "largest"),
+        "channel_limit": _row("limits:ChannelLimit", "largest"),
         **PARTS,
     },
 )
@@ -136,7 +140,7 @@ as those of the Neural ASM are. ``+`` and the name of any other detection will d
 
 @typed
 def register_monitor(name: str, model: type[Any] | str, detection: str = "evidence") -> None:
-    """Makes a model of one's own known, here and in worker processes, by its name and by ``name+evidence``.
+    """Make a model of your own known, here and in worker processes, by its name and by ``name+evidence``.
 
     Args:
         name: the ``kind`` of the model, by which its files are known too.
@@ -161,12 +165,12 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
 
 
 def model_of(name: str) -> str:
-    """The name of a monitor without that of a detection, as in ``gru`` of ``gru+evidence``."""
+    """Return the name of a monitor without that of a detection, as in ``gru`` of ``gru+evidence``."""
     return name.partition("+")[0]
 
 
-def check_monitor(name: str) -> None:
-    """Raises ValueError unless there is such a monitor, or such a model and detection.
+def check_monitor_name(name: str) -> None:
+    """Raise ValueError unless there is such a monitor, or such a model and detection.
 
     A model that goes by ``module:class`` is imported and registered by its kind, by which its files are known; nothing
     else is imported. An estimator of scikit-learn becomes a model.
@@ -184,7 +188,7 @@ def check_monitor(name: str) -> None:
 
 
 def _model_class(own: Any, name: str) -> Any:
-    """A class of models or of whole monitors. Raises ValueError where it lacks what it takes."""
+    """Return a class of models or of whole monitors. Raises ValueError where a method is missing."""
     if hasattr(own, "score_samples") and hasattr(own, "fit") and not hasattr(own, "kind"):
         return adapted(own)
     whole = isinstance(own, type) and issubclass(own, CalibratedMonitor)
@@ -199,13 +203,13 @@ def _model_class(own: Any, name: str) -> Any:
 
 @typed
 def monitor_class(name: str) -> MonitorKind:
-    """What makes and loads the monitors of that name; torch is imported only for those that need it.
+    """Return what makes and loads the monitors of that name; torch is imported only for those that need it.
 
     Raises:
         ValueError: there is no monitor of that name, or no such detection; the message lists what exists.
         ImportError: a package that it needs is not installed; the message says what to install.
     """
-    check_monitor(name)
+    check_monitor_name(name)
     model, _, detection = name.partition("+")
     kind = MONITORS[name] if name in MONITORS else MONITORS[model].under(detection)
     with needed_for(f"monitor {name}"):
@@ -221,12 +225,12 @@ def make_monitor(
     device: str = "cpu",
     **hyperparameters: Any,
 ) -> CalibratedMonitor:
-    """A monitor by name, not yet fitted.
+    """Return a monitor by name, not yet fitted.
 
     Args:
         name: for example ``neural_asm``, or ``gru+evidence``, which is ``gru`` with the detection ``evidence``.
-        spec: the stream it is to watch.
-        detection: what judges the model's errors, by name or one's own; where None, what the name says.
+        spec: the stream to watch.
+        detection: judges the model's errors, by name or your own; where None, that of the name.
         device: where it learns and predicts, as in ``cuda``, if its model is a PyTorch network.
         **hyperparameters: of that monitor.
 
@@ -253,7 +257,7 @@ def make_monitor(
 
 @typed
 def load_monitor(path: str | Path, device: str = "cpu") -> CalibratedMonitor:
-    """Reads what any monitor has saved, with the detection that it had, to predict on a device as in ``make_monitor``.
+    """Read what any monitor has saved, with the detection that it had, to predict on a device as in ``make_monitor``.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -265,7 +269,7 @@ def load_monitor(path: str | Path, device: str = "cpu") -> CalibratedMonitor:
 
 
 def _placed(monitor: CalibratedMonitor, device: str) -> CalibratedMonitor:
-    """The same, its model on the device."""
+    """Return it with its model on the device."""
     if device != "cpu":
         if not hasattr(monitor.model, "to"):
             raise ValueError(f"{monitor.model.kind} runs on a CPU alone, got device {device!r}")

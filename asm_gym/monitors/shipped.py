@@ -13,7 +13,7 @@ from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, typed
 
 SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
-"""Where they lie.
+"""Their folder.
 
 :meta hide-value:
 """
@@ -24,12 +24,12 @@ USUAL = 20
 
 
 def pretrained() -> dict[str, Path]:
-    """The file of each shipped memory, by name."""
+    """Return the file of each shipped memory, by name."""
     return {path.stem: path for path in sorted(SHIPPED.glob("*.asm"))}
 
 
 def pretrained_file(name: str) -> Path:
-    """The file of the memory called ``name``, such as ``"panda"``.
+    """Return the file of the memory called ``name``, such as ``"panda"``.
 
     Raises:
         ValueError: there is none; the message lists those that there are.
@@ -41,7 +41,7 @@ def pretrained_file(name: str) -> Path:
 
 @typed
 def pretrained_for(spec: StreamSpec, controller: str) -> str:
-    """The name of the shipped memory of this body; a stream may lack channels that it knows.
+    """Return the name of the shipped memory of this body; a stream may lack channels that it knows.
 
     Args:
         spec: of the stream to be watched; its source says whose body it is.
@@ -72,12 +72,12 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
 
 
 def made_by(spec: StreamSpec) -> str:
-    """The command that makes a memory of this body at this rate."""
+    """Return the command that makes a memory of this body at this rate."""
     rate = round(1.0 / spec.dt)
     return f"{MAKE} --robot {spec.source or 'ROBOT'}" + (f" --stream-freq {rate}" if rate != USUAL else "")
 
 
 def _named(known: StreamSpec, about: dict[str, Any], spec: StreamSpec, controller: str) -> list[tuple[str, str, str]]:
-    """What differs by name where channels need not."""
+    """Return the names that differ where channels need not."""
     pairs = [("robot", known.source, spec.source), ("controller", str(about.get("controller", "")), controller)]
     return [pair for pair in pairs if pair[1] != pair[2]]

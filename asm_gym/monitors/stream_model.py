@@ -1,9 +1,10 @@
-"""What models share, and running them over many episodes side by side."""
+"""The base class of models, and running one over many episodes side by side."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields
 from functools import partial
 from typing import Any, Self
 
@@ -13,22 +14,23 @@ from numpy.typing import NDArray
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
-from asm_gym.monitors.base import Model, State, Told
+from asm_gym.memory.state import RowHistory
+from asm_gym.monitors.base import Model, State
+from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_number, shown
 
 HELD_OUT = 5
-"""One in so many training episodes is not learned by the model, but shows how surprised it usually is."""
+"""One in so many training episodes is not learned by the model, but shows how large its errors usually are."""
 
 AT_ONCE = 64
 """Episodes run side by side; with more the arrays no longer fit the cache."""
 
 
 class StreamModel:
-    """What most models have in common: an error for each sense, and arrays that are used as they are.
+    """Base class of models: an error for each sense, and arrays that are used as they are.
 
     Args:
-        spec: the stream it is to expect.
+        spec: the stream to predict.
     """
 
     kind: str
@@ -45,7 +47,7 @@ class StreamModel:
         return self.spec.sensory
 
     def state(self) -> Arrays:
-        """Arrays of floats that a file keeps and ``restore`` is given; what learned anything else has its own."""
+        """Return the arrays of floats that a file keeps and ``restore`` is given."""
         return self.learned_
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
@@ -54,10 +56,10 @@ class StreamModel:
 
 
 class ErrorPlaces:
-    """Where in the stream each error belongs.
+    """The column of the stream that each error belongs to.
 
     Args:
-        columns: (X,) of the stream; -1 for none, of which all senses have a share.
+        columns: (X,) of the stream; -1 for an error that all senses share.
         spec: of the stream.
     """
 
@@ -67,7 +69,7 @@ class ErrorPlaces:
         self._places[np.flatnonzero(~self._nowhere), columns[~self._nowhere]] = 1.0
 
     def __call__(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Each number's share (B, D), from each error's (B, X)."""
+        """Return the share of each number (B, D) from that of each error (B, X)."""
         found: NDArray[np.float64] = parts @ self._places
         if self._nowhere.any():
             common = np.where(self._nowhere, parts, 0.0).sum(axis=1, keepdims=True)
@@ -75,50 +77,51 @@ class ErrorPlaces:
         return found
 
 
-def parameter_names(kind: Callable[..., Any]) -> tuple[str, ...]:
-    """The hyperparameters of a model, a detection or a monitor: what its constructor takes beside the spec."""
-    taken = inspect.signature(kind).parameters.values()
-    return tuple(p.name for p in taken if p.name != "spec" and p.kind is p.POSITIONAL_OR_KEYWORD)
+def read_next(
+    senses: StreamScaler, history: RowHistory, rows: NDArray[np.float64]
+) -> tuple[RowHistory, ScaledRows, NDArray[np.float32]]:
+    """Read the next rows (B, D).
 
-
-def skills_of(episodes: Sequence[Episode]) -> list[str]:
-    """What each says of its skill; empty where it says nothing."""
-    return [str(e.info.get("skill", "")) for e in episodes]
-
-
-def running(episode: Episode) -> NDArray[np.str_]:
-    """(T,) the skill that runs in each row, by what the episode says of itself.
-
-    ``info["skill"]`` names the one that runs all through it. Where one follows another, ``info["skills"]`` names them
-    in order, and ``info["changed"]`` says in which row each next one begins.
-
-    Raises:
-        ValueError: it says neither; or of not as many skills where they begin; or they cannot begin there.
+    Returns:
+        The new history, what was read, and 1 (B, 1) where all is known that a change is predicted from, else 0.
     """
-    told = episode.info.get("skills")
-    if told is None:
-        (name,) = skills_of([episode])
-        if not name:
-            raise ValueError("does not say its skill: set info['skill']")
-        return np.repeat(name, len(episode))
-    if not isinstance(told, list | tuple) or not told or not all(isinstance(name, str) and name for name in told):
-        raise ValueError(f"must name its skills in order, info['skills'], got {shown(told)}")
-    changed = episode.info.get("changed", [])
-    rows = changed if isinstance(changed, list | tuple) else [changed]
-    begins = [0, *(check_number("info['changed']", row, low=1, whole=True) for row in rows)]
-    if len(begins) != len(told):
-        raise ValueError(f"names {len(told)} skills, and says of {len(begins) - 1} where they begin: info['changed']")
-    lengths = np.diff([*begins, len(episode)])
-    if (lengths < 1).any():
-        raise ValueError(f"has {len(episode)} rows, in which skills cannot begin at {', '.join(map(str, begins))}")
-    return np.repeat(told, lengths)
+    reading = senses.read(rows, *history.past(rows))
+    known = (reading.whole * (history.steps >= senses.lag)[:, None]).astype(np.float32)
+    return history.followed_by(rows), reading, known
+
+
+def no_context(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the contexts (B, 0) of a model that knows none."""
+    return np.zeros((len(rows), 0))
+
+
+def parameter_names(kind: Callable[..., Any]) -> tuple[str, ...]:
+    """Return the hyperparameters of a model, a detection or a monitor: arguments of its constructor beside the spec.
+
+    Of a class with a ``config_class``, the fields of that stand for the argument ``config``.
+    """
+    taken = inspect.signature(kind).parameters.values()
+    names = [p.name for p in taken if p.name not in ("spec", "config") and p.kind is p.POSITIONAL_OR_KEYWORD]
+    config = getattr(kind, "config_class", None)
+    return (*names, *(() if config is None else (f.name for f in fields(config))))
+
+
+def made(kind: Callable[..., Any], spec: StreamSpec, parameters: Mapping[str, Any]) -> Any:
+    """Return what a class makes with some of its hyperparameters, by name. Raises TypeError for any other name."""
+    if unknown := sorted(parameters.keys() - set(parameter_names(kind))):
+        raise TypeError(f"{kind.__name__} has no hyperparameter {', '.join(unknown)}")
+    known, config = dict(parameters), getattr(kind, "config_class", None)
+    if config is None:
+        return kind(spec, **known)
+    own = {f.name: known.pop(f.name) for f in fields(config) if f.name in known}
+    return kind(spec, **known, config=config(**own))
 
 
 def model_outputs(model: Model, episodes: Sequence[Episode]) -> list[ModelOutput]:
-    """What a model says of each episode, whose numbers are finite: errors (T, X) and contexts (T, C).
+    """Return errors (T, X) and contexts (T, C) of each episode, whose numbers are finite.
 
     Raises:
-        ValueError: it says anything else, as a model of others may.
+        ValueError: the model returns anything else.
     """
     outputs: dict[int, ModelOutput] = {}
     for group, steps in side_by_side(episodes, model.start, partial(_predicted, model)):
@@ -129,48 +132,48 @@ def model_outputs(model: Model, episodes: Sequence[Episode]) -> list[ModelOutput
 
 
 def _predicted(model: Model, state: State, rows: NDArray[np.float64]) -> tuple[State, ModelOutput]:
-    said: Any = model.predict(state, rows)
+    found: Any = model.predict(state, rows)
     asked, wanted = f"predict of {model.kind} must give", (len(rows), len(model.error_columns))
-    if not isinstance(said, tuple) or len(said) != 2 or not isinstance(said[1], ModelOutput):
-        got = [type(part).__name__ for part in (said if type(said) is tuple else [said])]
+    if not isinstance(found, tuple) or len(found) != 2 or not isinstance(found[1], ModelOutput):
+        got = [type(part).__name__ for part in (found if type(found) is tuple else [found])]
         raise ValueError(f"{asked} a state and a ModelOutput, got {', '.join(got)}")
-    errors, contexts = said[1]
+    errors, contexts = found[1]
     if np.shape(errors) != wanted:
         raise ValueError(f"{asked} errors {wanted}, got {np.shape(errors)}")
     if np.ndim(contexts) != 2 or len(contexts) != len(rows):
         raise ValueError(f"{asked} contexts ({len(rows)}, C), got {np.shape(contexts)}")
     if not np.isfinite(errors).all():
         raise ValueError(f"{asked} errors that are finite where the rows are")
-    return said[0], said[1]
+    return found[0], found[1]
 
 
 def side_by_side(
     episodes: Sequence[Episode],
-    start: Callable[[int, Sequence[Told]], State],
+    start: Callable[[int], State],
     advance: Callable[[State, NDArray[np.float64]], tuple[State, Any]],
 ) -> Iterator[tuple[list[int], list[Any]]]:
-    """Runs many episodes together, the longest first; those that have ended are left out.
+    """Run many episodes together, the longest first; those that have ended are left out.
 
-    Yields, for each group of episodes, their indices and what ``advance`` said of each step.
+    Yields, for each group of episodes, their indices and what ``advance`` returned beside the state in each step.
     """
     order = sorted(range(len(episodes)), key=lambda i: -len(episodes[i]))
     for first in range(0, len(order), AT_ONCE):
         group = order[first : first + AT_ONCE]
-        state, said = start(len(group), [episodes[i].info for i in group]), []
+        state, steps = start(len(group)), []
         for t in range(len(episodes[group[0]])):
             rows = np.stack([episodes[i].stream[t] for i in group if t < len(episodes[i])]).astype(np.float64)
             state, step = advance(first_of(state, len(rows)), rows)
-            said.append(step)
-        yield group, said
+            steps.append(step)
+        yield group, steps
 
 
 def first_of(state: State, count: int) -> State:
-    """The state of the first ``count`` streams."""
+    """Return the state of the first ``count`` streams."""
     if not isinstance(state, tuple):
         return state[:count]
     return type(state)(*(first_of(s, count) for s in state))
 
 
 def batch_of(state: State) -> int:
-    """B."""
+    """Return the number of streams B of a state."""
     return batch_of(state[0]) if isinstance(state, tuple) else len(state)

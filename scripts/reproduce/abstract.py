@@ -28,6 +28,7 @@ from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.statistics import auroc
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.skills import name_skills, named_skills
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import FREE, Backpropagated, Expresser, ExpressionMemory
@@ -165,9 +166,9 @@ def one(job: tuple[str, int], config: Config) -> tuple[list[Record], dict[str, C
         courses[way] = closed_loop(driver, cues, way, seed, energy, asm.threshold)
         note(way, **reached(courses[way], given))
     note("surprise", **noticed(courses, asm.threshold))
-    named = asm.name_skills(given.train)
+    named = name_skills(asm, given.train)
     for row in (CUE, EVENT, STEPS - 1):
-        right = [named.skills(e.stream[: row + 1])[-1] == e.info["skill"] for e in given.tests]
+        right = [named_skills(named, e.stream[: row + 1])[-1] == e.info["skill"] for e in given.tests]
         note("named", row=row, right=float(np.mean(right)))
     return made, courses
 

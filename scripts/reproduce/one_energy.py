@@ -27,6 +27,7 @@ from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import DYNAMICS
 from asm_gym.memory.free_energy import Before, FreeEnergy
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.acting import learn_to_act
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.handwriting import DT, NOISE, copybook, repertoire
@@ -168,7 +169,8 @@ def reactions(energy: FreeEnergy, models: Sequence[Episode], seed: int) -> list[
 def one(job: tuple[str, int], roles: Roles, config: Config) -> list[Record]:
     """Measure everything for one dynamics and one seed."""
     dynamics, seed = job
-    asm = NeuralASM(roles["fit"][0].spec, dynamics=dynamics, seed=seed).fit(roles["fit"]).learn_to_act(roles["fit"])
+    asm = NeuralASM(roles["fit"][0].spec, dynamics=dynamics, seed=seed).fit(roles["fit"])
+    learn_to_act(asm, roles["fit"])
     energy = asm.model.free_energy(roles["spreads"])
     judged = {name: roles[name] for name in ("calibration", "nominal", "faulty")}
     courses = {name: [by_part(energy, e) for e in own] for name, own in judged.items()}
@@ -180,7 +182,8 @@ def one(job: tuple[str, int], roles: Roles, config: Config) -> list[Record]:
     rng = np.random.default_rng(seed)
     letters = repertoire(LETTERS, 2, rng)
     learned, fresh = (copybook(letters, n, 2, rng) for n in (WRITINGS, -(-config.written // LETTERS)))
-    pen = NeuralASM(learned[0].spec, 64, 64, dynamics=dynamics, seed=seed).fit(learned).learn_to_act(learned, units=64)
+    pen = NeuralASM(learned[0].spec, 64, 64, dynamics=dynamics, seed=seed).fit(learned)
+    learn_to_act(pen, learned, units=64)
     of_pen = pen.model.free_energy(copybook(letters, 1, 2, rng))
     records += reactions(of_pen, fresh[: config.written], seed)
     return [{"dynamics": dynamics, "seed": seed, **r} for r in records]

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from asm_gym.episode import Episode
 from asm_gym.memory.free_energy import Before, FreeEnergy
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.monitor import MonitorState
+from asm_gym.monitors.acting import expected_action
+from asm_gym.monitors.calibrated_monitor import MonitorState
 from asm_gym.scripts.reproduce.expression import Backpropagated
 from asm_gym.scripts.reproduce.handwriting import DT as PEN_DT
 from asm_gym.scripts.reproduce.handwriting import NOISE, Letter, written
@@ -126,7 +127,7 @@ class MemoryDriver:
         self.attribution = np.zeros((batch, SPEC.size))
 
     def command(self) -> Floats:
-        return self.asm.model.expected_action(self.state.model).astype(np.float64)
+        return expected_action(self.asm, self.state).astype(np.float64)
 
     def read(self, rows: Floats) -> Floats:
         self.state, surprise = self.asm.observe(self.state, rows)
@@ -215,4 +216,5 @@ def most_surprising(attribution: Floats) -> str:
 def moment(state: MonitorState, n: int) -> Before:
     """Return what was known before the next row of stream ``n``."""
     at, memory = slice(n, n + 1), state.model
-    return Before(memory.traces[at], memory.before[at, 0], memory.earlier[at, 0], memory.before[at, 0])
+    before = memory.history.before[at, 0]
+    return Before(memory.traces[at], before, memory.history.earlier[at, 0], before)

@@ -18,9 +18,9 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
-from asm_gym.monitors.base import Progress, Told
-from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
-from asm_gym.monitors.stream_model import StreamModel
+from asm_gym.memory.state import RowHistory
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.stream_model import StreamModel, no_context, read_next
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 
@@ -45,17 +45,16 @@ class LinearAssociation(StreamModel):
         a = np.concatenate([senses.read_episode(s).inputs[self.lag :] for s in streams])
         D = learn_linear(a, senses.groups, senses.changes)
         left = np.sqrt(np.mean((a[:, senses.changes] - a @ D.T) ** 2, axis=0))
-        standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change}
-        return self.restore({**standard, "D": D, "remainder": np.maximum(left, FAINTEST)})
+        return self.restore({**senses.arrays, "D": D, "remainder": np.maximum(left, FAINTEST)})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        self.senses_ = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
+        self.senses_ = StreamScaler.of(self.spec, learned, self.lag)
         return super().restore(learned, skills)
 
-    def start(self, batch: int, told: Sequence[Told] = ()) -> Lagged:
-        return nothing_before(batch, self.lag, self.spec.size)
+    def start(self, batch: int) -> RowHistory:
+        return RowHistory.empty(batch, self.lag, self.spec.size)
 
-    def predict(self, state: Lagged, rows: NDArray[np.float64]) -> tuple[Lagged, ModelOutput]:
-        state, r, known = associated(self.senses_, state, rows)
+    def predict(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
+        state, r, known = read_next(self.senses_, state, rows)
         error = known * (r.changes - r.inputs @ self.learned_["D"].T) / self.learned_["remainder"]
         return state, ModelOutput(error, no_context(rows))

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from asm_gym.detection import ModelOutput
-from asm_gym.monitors.base import Progress, Told
-from asm_gym.monitors.baselines.base import Rows, no_context, no_rows, read
+from asm_gym.memory.state import RowHistory
+from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.torch_model import TorchModel, adam, descend, steps_of
+from asm_gym.monitors.stream_model import no_context, read_next
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
@@ -56,17 +57,17 @@ class _Rowwise(TorchModel):
         self.width = check_number("width", width, low=1, whole=True)
         self.updates = check_number("updates", updates, low=1, whole=True)
 
-    def start(self, batch: int, told: Sequence[Told] = ()) -> Rows:
-        return no_rows(batch, self.spec.size)
+    def start(self, batch: int) -> RowHistory:
+        return RowHistory.empty(batch, 1, self.spec.size)
 
     @abstractmethod
     def errors(self, x: Tensor) -> Tensor:
         """(B, X) of rows (B, N)."""
 
-    def advance(self, state: Rows, rows: NDArray[np.float64]) -> tuple[Rows, ModelOutput]:
-        reading = read(self.senses_, state, rows)
+    def advance(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
+        state, reading, _ = read_next(self.senses_, state, rows)
         error = self.errors(torch.as_tensor(_features(reading))).cpu().numpy().astype(np.float64)
-        return state.then(rows), ModelOutput(error, no_context(rows))
+        return state, ModelOutput(error, no_context(rows))
 
     def size(self, senses: StreamScaler) -> int:
         """N, numbers in a row as it is scored."""

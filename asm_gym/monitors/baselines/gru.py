@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from asm_gym.detection import ModelOutput
-from asm_gym.monitors.base import Progress, Told
+from asm_gym.memory.state import RowHistory
+from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.torch_model import TorchModel, converge, descend, padded, parted
+from asm_gym.monitors.stream_model import read_next
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
@@ -35,8 +37,7 @@ CLOSEST = 20.0
 class _Memory(NamedTuple):
     hidden: NDArray[np.float32]  # (B, H)
     last: NDArray[np.float32]  # (B, S) what was sensed last
-    before: NDArray[np.float64]  # (B, D) the row seen last
-    steps: NDArray[np.int64]  # (B,)
+    history: RowHistory
 
 
 class _Module(nn.Module):
@@ -99,23 +100,22 @@ class GRU(TorchModel):
 
         converge(module, epoch, lambda: loss(fresh), EPOCHS, tell, self.learning_rate)
 
-    def start(self, batch: int, told: Sequence[Told] = ()) -> _Memory:
+    def start(self, batch: int) -> _Memory:
         hidden, rows = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.spec.size))
         last = self.sensed(self.senses_.read(rows, rows, rows))
-        return _Memory(hidden, last, rows, np.zeros(batch, np.int64))
+        return _Memory(hidden, last, RowHistory.empty(batch, 1, self.spec.size))
 
     def advance(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
-        before = np.where(state.steps[:, None] > 0, state.before, rows)
-        r = self.senses_.read(rows, before, before)
+        history, r, _ = read_next(self.senses_, state.history, rows)
         sensed = self.sensed(r)
-        last = np.where(state.steps[:, None] > 0, state.last, sensed)
+        last = np.where(state.history.steps[:, None] > 0, state.last, sensed)
         inputs = torch.as_tensor(np.hstack([last, r.commands]))[:, None]
         mean, log_variance, hidden = (
             y.cpu().numpy()[:, 0]
             for y in self.module_(inputs, torch.as_tensor(np.ascontiguousarray(state.hidden))[None])
         )
         error = r.whole * (self.judged(r) - mean) * np.exp(-0.5 * log_variance)
-        return _Memory(hidden, sensed, rows, state.steps + 1), ModelOutput(error, hidden)
+        return _Memory(hidden, sensed, history), ModelOutput(error, hidden)
 
 
 def _loss(module: _Module, inputs: Tensor, changes: Tensor, real: Tensor) -> Tensor:

@@ -18,9 +18,8 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 from asm_gym.detection import ModelOutput
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs
-from asm_gym.monitors.base import Progress, Told
-from asm_gym.monitors.baselines.base import Standard, no_context
-from asm_gym.monitors.stream_model import StreamModel
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.stream_model import StreamModel, no_context
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 
@@ -51,15 +50,17 @@ class Kalman(StreamModel):
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         check_inputs(self.spec.size + 1)
         streams = [e.stream for e in episodes]
-        standard = Standard.fit(self.spec, streams)
-        xs = [standard(s.astype(np.float64)) for s in streams]
+        sensed = [s[:, self.spec.sensory].astype(np.float64) for s in streams]
+        rows = np.concatenate(sensed)
+        mean, spread = rows.mean(axis=0), np.maximum(rows.std(axis=0), 1e-6)
+        xs = [(x - mean) / spread for x in sensed]
         before, after = (np.concatenate([x[k : len(x) - 1 + k] for x in xs]) for k in (0, 1))
         u = np.concatenate([s[1:, self.spec.motor] for s in streams]).astype(np.float64)
         Z = np.hstack([before, u, np.ones((len(u), 1))])
         weights = np.linalg.solve(Z.T @ Z + self.ridge * len(Z) * np.eye(Z.shape[1]), Z.T @ after)  # (X + A + 1, X)
         X = len(self.spec.sensory)
         A, residual = weights[:X].T, after - Z @ weights
-        R = np.diag(np.maximum((self.spec.noise[self.spec.sensory] / standard.spread) ** 2, FAINTEST))
+        R = np.diag(np.maximum((self.spec.noise[self.spec.sensory] / spread) ** 2, FAINTEST))
         # A residual holds the new measurement's noise and, through A, that of the last.
         Q = _positive(residual.T @ residual / len(residual) - R - A @ R @ A.T)
         try:
@@ -69,13 +70,14 @@ class Kalman(StreamModel):
         S = P + R
         gain = np.linalg.solve(S.T, P.T).T
         filtered = {"weights": weights, "gain": gain, "deviation": np.sqrt(np.diag(S))}
-        return self.restore(standard.arrays | filtered)
+        return self.restore({"mean": mean, "spread": spread, **filtered})
 
-    def start(self, batch: int, told: Sequence[Told] = ()) -> _State:
+    def start(self, batch: int) -> _State:
         return _State(np.zeros((batch, len(self.spec.sensory))), np.zeros(batch, np.int64))
 
     def predict(self, state: _State, rows: NDArray[np.float64]) -> tuple[_State, ModelOutput]:
-        y, u = Standard.of(self.spec, self.learned_)(rows), rows[:, self.spec.motor]
+        y = (rows[:, self.spec.sensory] - self.learned_["mean"]) / self.learned_["spread"]
+        u = rows[:, self.spec.motor]
         begun = (state.steps > 0)[:, None]
         inputs = np.hstack([state.estimate, np.where(np.isfinite(u), u, 0.0), np.ones((len(u), 1))])
         expected = np.where(begun, inputs @ self.learned_["weights"], np.where(np.isfinite(y), y, 0.0))

@@ -1,4 +1,4 @@
-"""What robots are guarded by today: fixed limits on forces and torques."""
+"""What robots are guarded by today: fixed limits on forces, torques, and each channel."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.episode import Episode
-from asm_gym.monitors.base import Progress, Told
-from asm_gym.monitors.baselines.base import no_context
-from asm_gym.monitors.stream_model import StreamModel
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.stream_model import StreamModel, no_context
 from asm_gym.spec import StreamSpec
 
 
@@ -24,7 +23,7 @@ class _Nothing(NamedTuple):
 
 
 class _Limit(StreamModel):
-    """A constant to be expected of some channels.
+    """A constant prediction for some channels.
 
     Args:
         spec: of a stream that has them.
@@ -36,26 +35,33 @@ class _Limit(StreamModel):
     shortest = 1
     held_out = 0  # so few numbers are not learned by heart
     channel: str
-    """What their names end in."""
+    """End of their names; empty for all senses."""
 
     def __init__(self, spec: StreamSpec) -> None:
         super().__init__(spec)
-        self._columns = columns(spec, self.channel)
+        named = [i for name, s in spec.slices.items() if name.endswith(self.channel) for i in range(spec.size)[s]]
+        self._columns = np.array(named, np.intp) if self.channel else spec.sensory
+        if not len(self._columns):
+            raise ValueError(f"this stream has no {self.channel}; it has: {', '.join(spec.slices)}")
 
     @property
     def error_columns(self) -> NDArray[np.intp]:
         return self._columns
 
-    def start(self, batch: int, told: Sequence[Told] = ()) -> _Nothing:
+    def start(self, batch: int) -> _Nothing:
         return _Nothing(np.zeros(batch, np.bool_))
 
     def predict(self, state: _Nothing, rows: NDArray[np.float64]) -> tuple[_Nothing, ModelOutput]:
         error = self.error(rows[:, self._columns])
         return state, ModelOutput(np.where(np.isfinite(error), error, 0.0), no_context(rows))
 
+    def rows(self, episodes: Sequence[Episode]) -> NDArray[np.float64]:
+        """Return what these channels measured (N, X)."""
+        return np.concatenate([e.stream for e in episodes])[:, self._columns].astype(np.float64)
+
     @abstractmethod
     def error(self, measured: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(B, X) of what was measured (B, X)."""
+        """Return the error (B, X) of what was measured (B, X)."""
 
 
 class ForceLimit(_Limit):
@@ -70,8 +76,7 @@ class ForceLimit(_Limit):
     channel = "wrist_force_peak"
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
-        force = np.concatenate([e.stream for e in episodes])[:, self._columns]
-        return self.restore({"weight": force.mean(axis=0, dtype=np.float64)})
+        return self.restore({"weight": self.rows(episodes).mean(axis=0)})
 
     def error(self, measured: NDArray[np.float64]) -> NDArray[np.float64]:
         return measured - self.learned_["weight"]
@@ -89,20 +94,23 @@ class ExternalTorqueLimit(_Limit):
     channel = "external_torque_peak"
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
-        torque = np.concatenate([e.stream for e in episodes])[:, self._columns].astype(np.float64)
+        torque = self.rows(episodes)
         return self.restore({"mean": torque.mean(axis=0), "spread": np.maximum(torque.std(axis=0), 1e-6)})
 
     def error(self, measured: NDArray[np.float64]) -> NDArray[np.float64]:
         return (measured - self.learned_["mean"]) / self.learned_["spread"]
 
 
-def columns(spec: StreamSpec, suffix: str) -> NDArray[np.intp]:
-    """Where the channels whose name ends in ``suffix`` stand in a row; one for each arm.
+class ChannelLimit(_Limit):
+    """A limit on each channel: its distance from the middle of its nominal range, in halves of that range."""
 
-    Raises:
-        ValueError: there is none.
-    """
-    found = [i for name, s in spec.slices.items() if name.endswith(suffix) for i in range(spec.size)[s]]
-    if not found:
-        raise ValueError(f"this stream has no {suffix}; it has: {', '.join(spec.slices)}")
-    return np.array(found, dtype=np.intp)
+    kind = "channel_limit"
+    channel = ""
+
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        rows = self.rows(episodes)
+        low, high = rows.min(axis=0), rows.max(axis=0)
+        return self.restore({"middle": (low + high) / 2, "half": np.maximum((high - low) / 2, 1e-9)})
+
+    def error(self, measured: NDArray[np.float64]) -> NDArray[np.float64]:
+        return (measured - self.learned_["middle"]) / self.learned_["half"]

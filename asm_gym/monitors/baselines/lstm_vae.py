@@ -19,9 +19,10 @@ from torch import Tensor, nn
 
 from asm_gym.detection import ModelOutput, Nominal
 from asm_gym.detection.scores import Squares
-from asm_gym.monitors.base import Progress, Told
-from asm_gym.monitors.baselines.base import Rows, no_rows, read
+from asm_gym.memory.state import RowHistory
+from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.torch_model import TorchModel, converge, descend, padded, parted
+from asm_gym.monitors.stream_model import read_next
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
@@ -43,7 +44,7 @@ class _Cell(NamedTuple):
 class _Memory(NamedTuple):
     encoder: _Cell
     decoder: _Cell
-    seen: Rows
+    history: RowHistory
 
 
 class _Module(nn.Module):
@@ -119,19 +120,17 @@ class LSTMVAE(TorchModel):
 
         converge(module, epoch, lambda: loss(fresh, noise=0.0), EPOCHS, tell, self.learning_rate)
 
-    def start(self, batch: int, told: Sequence[Told] = ()) -> _Memory:
+    def start(self, batch: int) -> _Memory:
         nothing = _Cell(*np.zeros((2, batch, self.hidden_size), np.float32))
-        return _Memory(nothing, nothing, no_rows(batch, self.spec.size))
+        return _Memory(nothing, nothing, RowHistory.empty(batch, 1, self.spec.size))
 
     def advance(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
         assert isinstance(self.module_, _Module)
-        r = read(self.senses_, state.seen, rows)
+        history, r, _ = read_next(self.senses_, state.history, rows)
         z, _, encoder = self.module_.encode(torch.as_tensor(r.senses)[:, None], _torch(state.encoder))
         mean, log_variance, decoder = self.module_.decode(z, _torch(state.decoder))
         error = r.seen * (r.senses - mean.cpu().numpy()[:, 0]) * np.exp(-0.5 * log_variance.cpu().numpy()[:, 0])
-        return _Memory(_numpy(encoder), _numpy(decoder), state.seen.then(rows)), ModelOutput(
-            error, z.cpu().numpy()[:, 0]
-        )
+        return _Memory(_numpy(encoder), _numpy(decoder), history), ModelOutput(error, z.cpu().numpy()[:, 0])
 
 
 class LatentThreshold(Squares):

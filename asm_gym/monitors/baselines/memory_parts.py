@@ -18,11 +18,10 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.dynamics import TRACES
-from asm_gym.memory.state import MemoryState, past
-from asm_gym.monitors.base import Progress, Told
-from asm_gym.monitors.baselines.base import no_context
+from asm_gym.memory.state import MemoryState
+from asm_gym.monitors.base import Progress
 from asm_gym.monitors.neural_asm import NeuralASM
-from asm_gym.monitors.stream_model import StreamModel, model_outputs
+from asm_gym.monitors.stream_model import StreamModel, model_outputs, no_context
 from asm_gym.spec import StreamSpec
 
 FAINTEST = 1e-4
@@ -45,7 +44,7 @@ class _Part(StreamModel):
         self.memory.restore(learned)
         return super().restore(learned, skills)
 
-    def start(self, batch: int, told: Sequence[Told] = ()) -> MemoryState:
+    def start(self, batch: int) -> MemoryState:
         return self.memory.start(batch)
 
 
@@ -81,10 +80,11 @@ class TemporalPart(_Part):
         return StreamModel.restore(self, learned, skills)
 
     def predict(self, state: MemoryState, rows: NDArray[np.float64]) -> tuple[MemoryState, ModelOutput]:
-        reading = self.memory.senses_.read(rows, *past(state, rows))
+        reading = self.memory.senses_.read(rows, *state.history.past(rows))
         expected = self.memory.network.predict(state.traces, reading.commands)
         error = (reading.senses - expected[:, : self.memory.senses_.size]) * reading.seen
         # Nothing is expected of the first row, nor of rows in between, which the traces do not take up.
-        error[(state.steps == 0) | (state.steps % self.memory.lag != 0)] = 0.0
+        steps = state.history.steps
+        error[(steps == 0) | (steps % self.memory.lag != 0)] = 0.0
         state, output = self.memory.predict(state, rows)
         return state, ModelOutput(error / self.learned_["temporal_spread"], output.contexts)

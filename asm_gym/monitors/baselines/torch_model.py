@@ -31,8 +31,6 @@ class TorchModel(StreamModel):
         module_: the network, once it is fitted.
     """
 
-    lag: int = 1
-    """How many rows later the change of a row is taken."""
     device: str = "cpu"
     """Where it learns and predicts, in PyTorch's words; no file keeps it."""
 
@@ -66,7 +64,7 @@ class TorchModel(StreamModel):
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams = [e.stream for e in episodes]
-        senses = StreamScaler.fit(self.spec, streams, self.lag)
+        senses = StreamScaler.fit(self.spec, streams)
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # as for every other monitor, so that times compare
         try:
@@ -76,10 +74,8 @@ class TorchModel(StreamModel):
                 self.train(module, [senses.read_episode(s) for s in streams], rng, progress)
         finally:
             torch.set_num_threads(threads)
-        standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change}
-        return self.restore(
-            {**standard, **{name: tensor.cpu().numpy() for name, tensor in module.state_dict().items()}}
-        )
+        weights = {name: tensor.cpu().numpy() for name, tensor in module.state_dict().items()}
+        return self.restore({**senses.arrays, **weights})
 
     def predict(self, state: Any, rows: NDArray[np.float64]) -> tuple[Any, ModelOutput]:
         with self.placed():
@@ -90,7 +86,7 @@ class TorchModel(StreamModel):
         """As ``Model.predict``: on from the state by rows (B, D)."""
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        senses = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
+        senses = StreamScaler.of(self.spec, learned)
         with torch.random.fork_rng(devices=[]), self.placed():
             module = self.module(senses)
         state = {name: torch.from_numpy(np.array(learned[name], np.float32)) for name in module.state_dict()}

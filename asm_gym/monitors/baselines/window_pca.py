@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from asm_gym.detection import ModelOutput
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs
-from asm_gym.monitors.base import Progress, Told
-from asm_gym.monitors.baselines.base import no_context
-from asm_gym.monitors.stream_model import StreamModel
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.stream_model import StreamModel, no_context
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 
@@ -64,7 +63,7 @@ class WindowPCA(StreamModel):
         deviation = np.maximum(np.sqrt(np.mean(left**2, axis=0)), FAINTEST)
         return self.restore({"mean": mean, "spread": spread, "components": W, "deviation": deviation})
 
-    def start(self, batch: int, told: Sequence[Told] = ()) -> _Window:
+    def start(self, batch: int) -> _Window:
         return _Window(np.zeros((batch, self.rows - 1, self.spec.size)), np.zeros(batch, np.int64))
 
     def predict(self, state: _Window, rows: NDArray[np.float64]) -> tuple[_Window, ModelOutput]:

@@ -13,7 +13,9 @@ from asm_gym.data.crashes import CRASH, peak_force, peak_torques
 from asm_gym.detection.tails import FEWEST_EPISODES
 from asm_gym.episode import Episode, spans
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.adaptation import rounded
 from asm_gym.monitors.base import Progress
+from asm_gym.monitors.ceilings import learn_ceilings
 from asm_gym.spec import StreamSpec
 
 EXPERT = "scripted"
@@ -162,7 +164,7 @@ def learn_body(lessons: Lessons, spec: StreamSpec, seed: int, progress: Progress
         progress: is called as (done, total).
     """
     memory = NeuralASM(spec, hidden_size=HIDDEN, epochs=PASSES, habituates=False, excuses=True, seed=seed)
-    return memory.fit(lessons.fit, progress).rounded()
+    return rounded(memory.fit(lessons.fit, progress))
 
 
 def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode], per_hour: float) -> NeuralASM:
@@ -180,7 +182,7 @@ def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode]
     """
     whole, for_ceilings = for_threshold([*lessons.whole, *hours])
     if for_ceilings:
-        memory.learn_ceilings(for_ceilings)
+        learn_ceilings(memory, for_ceilings)
     memory.calibrate(whole, false_alarms_per_hour=per_hour, each=tasks_apart(whole, per_hour))
     memory.healthy_ = healthy_forces([episode.stream for episode in lessons.calibration], memory.spec)
     return memory

@@ -1,10 +1,10 @@
-"""Skill surprise: whether this is how any skill that was shown goes on, whatever the body does.
+"""Skill surprise: whether a row is how any skill that was shown goes on, whatever the body does.
 
     [x̂_t, â_t] = D [c_{t-1}, 1]        c: the traces of ``memory.traces``; D by ridge regression, in closed form
     ε_t = ([x_t, a_t] - [x̂_t, â_t]) / s
 
-There is no efference copy: what is commanded is judged too. A body does what it always does under a policy that is
-lost, after a grasp that failed, or where a thing is missing; but no skill that was shown goes on like that.
+There is no efference copy: the command is judged too. The body moves as always under a policy that is lost, after a
+grasp that failed, or where an object is missing; but no skill that was shown goes on like that.
 
 Source: Hoerl and Kennard 1970 for ridge regression; ``memory.linear`` for how its penalty is chosen.
 """
@@ -18,17 +18,17 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checkpoint import Checkpoint
 from asm_gym.detection import Blocks, EvidenceDetection, ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.conformal import HOUR
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
-from asm_gym.memory.state import newest, past
+from asm_gym.memory.state import RowHistory
 from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
-from asm_gym.monitors.base import Progress, Surprise, Told
-from asm_gym.monitors.monitor import CalibratedMonitor
-from asm_gym.monitors.stream_model import StreamModel
+from asm_gym.monitors.base import Progress, Surprise
+from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
+from asm_gym.monitors.files import taken_up
+from asm_gym.monitors.stream_model import StreamModel, no_context, read_next
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number
@@ -37,13 +37,14 @@ FAINTEST = 1e-4
 """Smallest spread of an error, in standard deviations of what is expected."""
 
 GAINS = (0.8, 0.2, 0.05)
-"""Of the evidence that errors add up to."""
+"""Of the evidence."""
 
-ALARMS_ON = ("body", "skill", "either", "both")
-"""Which surprise an alarm may be about."""
+BODY = "body"
+ALARMS_ON = (BODY, "skill", "either", "both")
+"""The surprise that an alarm goes by: of the body, of the skill, the larger or the smaller of the two."""
 
 PREFIX = "skill."
-"""What the names of its arrays begin with in a checkpoint."""
+"""Prefix of the names of its arrays in a checkpoint."""
 
 SMALLEST = 1e-9
 """Lower bound of a surprise that another is divided by."""
@@ -55,13 +56,11 @@ class SkillState(NamedTuple):
     """Where a skill is, one entry a stream; a value, never changed in place."""
 
     traces: NDArray[np.float32]  # (B, I) c
-    before: Rows  # (B, l, D) the rows seen last, the oldest first
-    earlier: Rows  # (B, l, D) those before
-    steps: NDArray[np.int64]  # (B,) how many rows were seen
+    history: RowHistory
 
 
 class SkillModel(StreamModel):
-    """Ridge regression of the next row on the traces; it has no context.
+    """Ridge regression of the next row on the traces; no context.
 
     Attributes:
         senses_: how it reads a row.
@@ -92,45 +91,42 @@ class SkillModel(StreamModel):
         known = np.hstack([now, before, np.ones((len(now), 1), np.float32)])
         D = learn_linear(known, np.zeros(N, np.intp), slice(0, N))[:, N:]
         left = np.sqrt(np.mean((now - known[:, N:] @ D.T) ** 2, axis=0))
-        standard = {"mean": senses.mean, "spread": senses.spread, "change": senses.change}
-        return self.restore({**standard, "gains": gains, "D": D, "remainder": np.maximum(left, FAINTEST)})
+        return self.restore({**senses.arrays, "gains": gains, "D": D, "remainder": np.maximum(left, FAINTEST)})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        self.senses_ = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
+        self.senses_ = StreamScaler.of(self.spec, learned, self.lag)
         N = self.senses_.size + len(self.spec.motor)
         shape = N, len(DECAYS) * (N + 1) + 1
         if learned["D"].shape != shape:
             raise ValueError(f"D of a skill should be of shape {shape}, found {learned['D'].shape}")
         return super().restore(learned, skills)
 
-    def start(self, batch: int, told: Sequence[Told] = ()) -> SkillState:
-        nothing = np.zeros((batch, self.lag, self.spec.size))
+    def start(self, batch: int) -> SkillState:
         width = self.senses_.size + len(self.spec.motor) + 1
-        return SkillState(at_rest(batch, width), nothing, nothing, np.zeros(batch, np.int64))
+        return SkillState(at_rest(batch, width), RowHistory.empty(batch, self.lag, self.spec.size))
 
     def predict(self, state: SkillState, rows: Rows) -> tuple[SkillState, ModelOutput]:
-        before, earlier = past(state, rows)
-        reading, found = self.senses_.read(rows, before, earlier), self.learned_
+        (history, reading, _), found = read_next(self.senses_, state.history, rows), self.learned_
+        steps = state.history.steps
         row, N = _row(reading), found["D"].shape[0]
         expected = state.traces @ found["D"][:, :-1].T + found["D"][:, -1]  # (B, N)
         seen = np.hstack([reading.seen, reading.finite[:, self.spec.motor]])
         error = seen * (row[:, :N] - expected) / found["remainder"]
         # Nothing is expected of the first row, nor of rows in between, which the traces do not take up.
-        due = (state.steps % self.lag == 0)[:, None]
-        error[~due[:, 0] | (state.steps == 0)] = 0.0
-        row[:, :N] = np.where((seen > 0) | (state.steps == 0)[:, None], row[:, :N], expected)
+        due = (steps % self.lag == 0)[:, None]
+        error[~due[:, 0] | (steps == 0)] = 0.0
+        row[:, :N] = np.where((seen > 0) | (steps == 0)[:, None], row[:, :N], expected)
         traces = np.where(due, advance(state.traces, row, found["gains"]), state.traces)
-        rows_seen = newest(state.before, rows), newest(state.earlier, before), state.steps + 1
-        return SkillState(traces, *rows_seen), ModelOutput(error, np.zeros((len(rows), 0)))
+        return SkillState(traces, history), ModelOutput(error, no_context(rows))
 
 
 def _row(reading: ScaledRows) -> NDArray[np.float32]:
-    """(B, N + 1) what the traces take up: senses, command and 1."""
+    """Return what the traces take up (B, N + 1): senses, command and 1."""
     return np.hstack([reading.senses, reading.commands])
 
 
 def _traces(rows: NDArray[np.float32], gains: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(T, I) c_t of rows (T, R)."""
+    """Return the traces c_t (T, I) of rows (T, R)."""
     c, found = at_rest(1, rows.shape[1]), []
     for row in np.ascontiguousarray(rows):
         c = advance(c, row[None], gains)
@@ -140,13 +136,13 @@ def _traces(rows: NDArray[np.float32], gains: NDArray[np.float32]) -> NDArray[np
 
 @dataclass(frozen=True)
 class SkillSurprise:
-    """What listens for skills beside a memory of the body.
+    """The surprise of skills beside that of the body.
 
     Args:
         monitor: of skills, fitted.
-        weight: what brings skill surprise to the scale of the body's, where the two are compared.
+        weight: factor that brings skill surprise to the scale of the body's, where the two are compared.
         maxima: (4, n) the largest surprise of each of ``ALARMS_ON`` in the n episodes of the calibration; None before.
-        blocks: (4, m) the same in the m blocks that are counted by the hour; None before, and where it was not kept.
+        blocks: (4, m) the same in the m blocks that are counted by the hour; None before.
     """
 
     monitor: CalibratedMonitor
@@ -156,33 +152,33 @@ class SkillSurprise:
 
     @classmethod
     def learned(cls, episodes: Sequence[Episode], body: Sequence[Surprise], seed: int) -> Self:
-        """From nominal episodes, and the surprise of the body at each."""
+        """Learn it from nominal episodes, and the surprise of the body at each."""
         monitor = _monitor(episodes[0].spec, seed).fit(episodes)
         skill = monitor.score_episodes(episodes)
         at_worst = [float(np.median([s.value.max() for s in scores])) for scores in (body, skill)]
         return cls(monitor, at_worst[0] / max(at_worst[1], SMALLEST))
 
     def ways(self, body: NDArray[np.float64], skill: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(4, …) what each of ``ALARMS_ON`` goes by."""
+        """Return the surprise (4, …) of each of ``ALARMS_ON``."""
         weighed = self.weight * skill
         return np.array([body, skill, np.maximum(body, weighed), np.minimum(body, weighed)])
 
     def joined(self, body: Surprise, skill: Surprise, alarm_on: str) -> Surprise:
-        """The surprise that one of ``ALARMS_ON`` goes by, attributed as that part of it is which it comes from."""
+        """Return the surprise of one of ``ALARMS_ON``, attributed as the part is that it comes from."""
         value = self.ways(body.value, skill.value)[ALARMS_ON.index(alarm_on)]
         first = value == body.value if alarm_on != "skill" else np.zeros(len(value), np.bool_)
         scale = 1.0 if alarm_on == "skill" else self.weight
         shares = np.where(first[:, None], body.attribution, scale * skill.attribution)
-        excused = body if alarm_on == "body" else body._replace(raw=None, excuse=None)
+        excused = body if alarm_on == BODY else body._replace(raw=None, excuse=None)
         return excused._replace(value=value, attribution=shares, of_body=body.value, of_skill=skill.value)
 
-    def heard(self, scores: Sequence[Surprise], dt: float) -> Self:
-        """With the maxima of what was made of nominal episodes, a row each ``dt`` [s]."""
+    def calibrated_on(self, scores: Sequence[Surprise], dt: float) -> Self:
+        """Return it with the maxima of the surprise of nominal episodes, whose rows are ``dt`` [s] apart."""
         ways = [self.ways(*s.parts) for s in scores]  # (4, T) each
         blocks = np.array([Blocks.of(own, dt).maxima for own in zip(*ways, strict=True)])
         return replace(self, maxima=np.array([w.max(axis=1) for w in ways]).T, blocks=blocks)
 
-    def calibrated(
+    def threshold_for(
         self,
         which: str,
         threshold: float | None,
@@ -190,14 +186,14 @@ class SkillSurprise:
         blocks: Blocks | None,
         promised: str,
     ) -> tuple[float | None, NDArray[np.float64] | None, Blocks | None]:
-        """The threshold of one of ``ALARMS_ON``, the maxima that it is one of, and blocks; None where nobody can say.
+        """Return the threshold of one of ``ALARMS_ON``, the maxima that it is one of, and blocks; None before.
 
         Args:
             which: of ``ALARMS_ON``.
-            threshold: of another of them, whose rate this is to have.
+            threshold: of another of them, at the same rate.
             maxima: (n,) the largest surprise in the episodes that it was set by.
             blocks: the same by the hour.
-            promised: ``"episode"`` or ``"hour"``, which of the two it was set by.
+            promised: ``"episode"`` or ``"hour"``, the unit of that rate.
         """
         if self.maxima is None or threshold is None or maxima is None:
             return None, None, None
@@ -205,50 +201,33 @@ class SkillSurprise:
         own, by_hour = self.maxima[row], None
         if blocks is not None and self.blocks is not None:
             by_hour = blocks._replace(maxima=self.blocks[row])
-        if promised == HOUR:
-            if blocks is None or by_hour is None:
-                return None, own, None
-            return same_rank(threshold, blocks.maxima, by_hour.maxima), own, by_hour
-        return same_rank(threshold, maxima, own), own, by_hour
+        if promised != HOUR:
+            return same_rank(threshold, maxima, own), own, by_hour
+        if blocks is None or by_hour is None:
+            return None, own, None
+        return same_rank(threshold, blocks.maxima, by_hour.maxima), own, by_hour
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All that a checkpoint needs of it, by name."""
-        heard = {"maxima": self.maxima, "blocks": self.blocks}
-        found = {name: array for name, array in heard.items() if array is not None}
+        """Arrays to keep in a checkpoint, by name."""
+        calibrated = {"maxima": self.maxima, "blocks": self.blocks}
+        found = {name: array for name, array in calibrated.items() if array is not None}
         kept = {**self.monitor.learned_, **found, "weight": np.array(self.weight)}
         return {PREFIX + name: array for name, array in kept.items()}
 
     @classmethod
     def found(cls, spec: StreamSpec, arrays: Arrays, seed: int) -> Self:
-        """As arrays by their names without the prefix say. Raises ValueError or KeyError where they do not fit."""
+        """Restore it from arrays by their names without the prefix. Raises where they do not fit."""
         weight = check_number("the weight of skill surprise", float(arrays["weight"]), above=0.0)
         learned = {n: a for n, a in arrays.items() if n not in ("maxima", "blocks", "weight")}
-        heard = arrays.get("maxima"), arrays.get("blocks")
-        return cls(taken_up(_monitor(spec, seed), learned), weight, *heard)
+        return cls(taken_up(_monitor(spec, seed), learned), weight, arrays.get("maxima"), arrays.get("blocks"))
 
 
 def same_rank(threshold: float, of: NDArray[np.float64], among: NDArray[np.float64]) -> float:
-    """The number ``among`` (n,) that as many do not exceed as do not exceed ``threshold`` in ``of`` (n,)."""
+    """Return the number ``among`` (n,) of the rank that ``threshold`` has in ``of`` (n,)."""
     below = int((of <= threshold).sum())
     return float(np.sort(among)[below - 1]) if below else 0.0
 
 
-def apart(saved: Checkpoint, prefix: str = PREFIX) -> tuple[Checkpoint, Arrays]:
-    """A memory's checkpoint without what is judged beside it, and the arrays of that."""
-    beside = {n.removeprefix(prefix): a for n, a in saved.arrays.items() if n.startswith(prefix)}
-    shapes = {n: s for n, s in saved.header["shapes"].items() if not n.startswith(prefix)}
-    arrays = {n: a for n, a in saved.arrays.items() if not n.startswith(prefix)}
-    return Checkpoint({**saved.header, "shapes": shapes}, arrays), beside
-
-
-def taken_up(monitor: CalibratedMonitor, learned: Arrays) -> CalibratedMonitor:
-    """A monitor that a memory keeps beside it, with what it had learned; it has no threshold of its own."""
-    shapes = {name: array.shape for name, array in learned.items()}
-    header = {"shapes": shapes, "skills": (), "threshold": None, "detection": EvidenceDetection.name, "about": {}}
-    return monitor.restore(Checkpoint(header, dict(learned)))
-
-
 def _monitor(spec: StreamSpec, seed: int) -> CalibratedMonitor:
-    """Not yet fitted."""
     return CalibratedMonitor(SkillModel(spec), EvidenceDetection(spec, GAINS, habituates=False), seed=seed)

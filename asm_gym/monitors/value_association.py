@@ -1,4 +1,4 @@
-r"""Ridge regression on values: each group of senses from what the others say and do now, its own past left out.
+r"""Ridge regression of values: each group of senses from the values and changes of the others, without its own past.
 
     x̂_g,t = D_g [x_{¬g,t}, Δ_{¬g,t}, φ_{¬g,t}, u_t, 1]       judged: torques, and what a cross-fitted R² of 1/2 tells
     Δ̂_g,t = E_g [x_{t-l}, Δ_{¬g,t}, φ_{¬g,t}, u_t, 1]        judged where it exceeds 0.99
@@ -28,10 +28,10 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs
-from asm_gym.monitors.base import Progress, Told
-from asm_gym.monitors.baselines.arm_inputs import Derived, forces, motion
-from asm_gym.monitors.baselines.base import Lagged, associated, no_context, nothing_before
-from asm_gym.monitors.stream_model import StreamModel
+from asm_gym.memory.state import RowHistory
+from asm_gym.monitors.arm_inputs import Derived, forces, motion
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.stream_model import StreamModel, no_context, read_next
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, typed
@@ -51,7 +51,7 @@ FAINTEST = 1e-4
 STIFFNESS = 1e-2
 """λ."""
 
-MOST_FAR = 1024
+MOST_INPUTS = 1024
 """Of more inputs it is not asked how far they are from what was learned: the matrices would be too large."""
 
 
@@ -116,11 +116,11 @@ class ValueAssociation(StreamModel):
         if not len(told) + len(certain):
             certain = np.arange(len(self.spec.sensory))  # nothing can be told: the changes are all there is
         left = np.concatenate([given.left[told], moved.left[certain]])
-        judging = np.unique(senses.groups[told]) if inputs.shape[1] <= MOST_FAR else ()
+        judging = np.unique(senses.groups[told]) if inputs.shape[1] <= MOST_INPUTS else ()
         far = [_far(inputs, fold, own[g]) for g in judging]
         return self.restore(
             {
-                **{"mean": senses.mean, "spread": senses.spread, "change": senses.change},
+                **senses.arrays,
                 **{"derived_mean": middle, "derived_spread": width},
                 **{
                     "judged_values": told * 1.0,
@@ -133,15 +133,15 @@ class ValueAssociation(StreamModel):
         )
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        self.senses_ = StreamScaler(self.spec, learned["mean"], learned["spread"], learned["change"], self.lag)
+        self.senses_ = StreamScaler.of(self.spec, learned, self.lag)
         self._told, self._certain = (learned[f"judged_{what}"].astype(np.intp) for what in ("values", "changes"))
         return super().restore(learned, skills)
 
-    def start(self, batch: int, told: Sequence[Told] = ()) -> Lagged:
-        return nothing_before(batch, self.lag, self.spec.size)
+    def start(self, batch: int) -> RowHistory:
+        return RowHistory.empty(batch, self.lag, self.spec.size)
 
-    def predict(self, state: Lagged, rows: NDArray[np.float64]) -> tuple[Lagged, ModelOutput]:
-        state, read, known = associated(self.senses_, state, rows)
+    def predict(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
+        state, read, known = read_next(self.senses_, state, rows)
         values, steps, before, derived, commands = self._read(read)
         found = self.learned_
         derived = (derived - found["derived_mean"]) / found["derived_spread"]

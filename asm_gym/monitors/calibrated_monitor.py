@@ -1,0 +1,336 @@
+"""A monitor: a model, a detection on its errors, a threshold from nominal episodes, and a file to keep them in."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from asm_gym.checkpoint import Checkpoint
+from asm_gym.contact_limits import healthy_forces
+from asm_gym.detection import Detection, Nominal
+from asm_gym.detection.conformal import HOUR
+from asm_gym.episode import Episode
+from asm_gym.familiar_speed import FamiliarSpeed
+from asm_gym.monitors.base import Model, Progress, State, Surprise
+from asm_gym.monitors.calibration import LOG, AlarmRate, Calibrated, require_sight, warn_of_crashes
+from asm_gym.monitors.files import SavedMonitor, write_monitor
+from asm_gym.monitors.stream_model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
+from asm_gym.monitors.training_data import Marks, check_fresh, check_nominal, sketch
+from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
+
+
+class MonitorState(NamedTuple):
+    """What is carried from step to step, one row a stream; a value, never changed in place."""
+
+    model: State
+    detection: State
+    excuses: State = ()  # of knocks and stops
+    values: State = ()  # of the monitor of values
+    skill: State = ()  # of the monitor of skills
+
+
+class CalibratedMonitor(Calibrated):
+    """Any model under any detection, with a threshold that is conformal on the maxima of nominal episodes.
+
+    Args:
+        model: predicts the stream.
+        detections: make surprise of its errors. The first is in use; the others are fitted and saved beside it.
+        seed: of all random draws while learning.
+
+    Attributes:
+        about: anything else to keep, such as its ``name``; JSON-serialisable, and saved with it.
+        learned_from_: marks of the episodes that ``fit`` was given; None before.
+        ceilings_from_: marks of the episodes that ``learn_ceilings`` was given; None where there were none.
+    """
+
+    model: Model
+
+    def __init__(self, model: Model, *detections: Detection, seed: int = 0) -> None:
+        if not detections:
+            raise ValueError("a monitor needs a detection, got none")
+        self.seed = check_number("seed", seed, low=0, whole=True)
+        self.spec, self.model, self.detection = model.spec, model, detections[0]
+        self.detections = {d.name: d for d in detections}
+        self._uncalibrate()
+        self.learned_from_: Marks | None = None
+        self.ceilings_from_: Marks | None = None
+        self.about: dict[str, Any] = {}
+
+    def __repr__(self) -> str:
+        """Return its name, body and threshold in one line."""
+        name = f"{self.about['name']!r}, " if "name" in self.about else ""
+        limit = "no threshold" if self.threshold_ is None else f"threshold {self.threshold_:.4g}"
+        return f"<{type(self).__name__} {name}{self.spec.source or 'a stream'} at {1 / self.spec.dt:g} Hz, {limit}>"
+
+    @property
+    def learned_(self) -> dict[str, NDArray[Any]]:
+        """All arrays that ``fit`` has found, by name; empty before."""
+        model: Any = self.model
+        found = dict(model.state() if hasattr(model, "state") else model.learned_)
+        for detection in self.detections.values():
+            found |= detection.learned_
+        return found
+
+    @property
+    def skills_(self) -> tuple[str, ...]:
+        """Names of the skills it knows."""
+        return self.model.skills_
+
+    def get_params(self) -> dict[str, Any]:
+        """Return the hyperparameters by name, in one order whichever detection is in use."""
+        parts = (self.model, *(self.detections[name] for name in sorted(self.detections)))
+        found = {n: getattr(p, n) for p in parts for n in parameter_names(type(p)) if n != "seed"}
+        return found | {"seed": self.seed}
+
+    @typed
+    def with_threshold(self, value: float) -> Self:
+        """Return the same monitor with another threshold, ``inf`` for no alarm; this one keeps its own."""
+        other = self._copy()
+        other.threshold_ = check_number("threshold", value, infinite=True)
+        return other
+
+    @typed
+    def with_detection(self, detection: str | Detection) -> Self:
+        """Return the same model under another detection, without a threshold.
+
+        Args:
+            detection: a new one, which needs ``fit``, or the name of one that was fitted beside it.
+        """
+        other = self._copy()
+        if isinstance(detection, str):
+            check_choice(f"detection of this {self._name}", detection, self.detections)
+            detection = other.detections[detection]
+        other.detection = other.detections[detection.name] = detection
+        other._uncalibrate()
+        return other
+
+    @typed
+    def fit(self, episodes: Sequence[Episode], progress: Progress | None = None, *, warm_start: bool = False) -> Self:
+        """Learn from whole nominal episodes of any number of skills; no labels.
+
+        Args:
+            episodes: of this spec.
+            progress: called as ``progress(done, total)`` while learning.
+            warm_start: go on from what it knows, for a model that can: 10 to 50 episodes are enough then. Its detection
+                stays as it is, for so few episodes do not show how large errors can be.
+
+        Raises:
+            ValueError: no episode, one that is too short or of another spec, or a number that is not finite.
+            TypeError: the model cannot go on from what it knows.
+            RuntimeError: it is to go on, and knows nothing yet.
+        """
+        if check_flag("warm_start", warm_start):
+            if not hasattr(self.model, "specialise"):
+                raise TypeError(f"a {self._name} learns all anew: leave warm_start out")
+            self._require_fitted()
+        check_nominal(episodes, self.spec, self.model.shortest)
+        new = self._copy()  # an interrupt leaves this one as it was
+        new._learn(episodes, progress or (lambda done, total: None), warm_start)
+        new.about = {**self.about, "specialised_on": len(episodes)} if warm_start else {}
+        vars(self).update(vars(new))
+        return self
+
+    def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
+        rng, one_in = np.random.default_rng(self.seed), self.model.held_out
+        order = rng.permutation(len(episodes)) if one_in else np.arange(len(episodes))
+        kept = len(episodes) // one_in if one_in else 0
+        held_out, learned = ([episodes[i] for i in part] for part in (order[:kept], order[kept:]))
+        self._uncalibrate()
+        if not warm_start:
+            self.learned_from_ = self.ceilings_from_ = None
+        self._remember(episodes)
+        model: Any = self.model
+        with threadpool_limits(1):  # products this small are slower on several threads
+            if warm_start:
+                model.specialise(episodes)
+                self._place_errors()
+                return
+            self.model.fit(learned, rng, progress)
+            self._place_errors()
+            nominal = Nominal(episodes, learned, held_out or learned, lambda own: model_outputs(self.model, own))
+            for detection in self.detections.values():
+                taken = self.model.learned_.keys() & set(detection.arrays)
+                if taken:
+                    raise ValueError(f"{self.model.kind} and {detection.name} both learn {', '.join(sorted(taken))}")
+                detection.fit(nominal, rng)
+
+    @typed
+    def calibrate(
+        self,
+        episodes: Sequence[Episode],
+        false_alarm_rate: float | None = None,
+        *,
+        false_alarms_per_hour: float | None = None,
+        each: Sequence[str] = (),
+    ) -> Self:
+        """Set the threshold from nominal episodes that ``fit`` has not seen, for one of two promises.
+
+        ``threshold_at`` then knows the threshold of every other rate too.
+
+        Args:
+            episodes: at least ``conformal_episodes(false_alarm_rate)`` of them: 99 for 0.01, 19 for 0.05; or together
+                one hour for each false alarm in so many: 10 hours for 0.1 an hour.
+            false_alarm_rate: largest P(any alarm in a nominal episode); ``promise`` says how surely.
+            false_alarms_per_hour: largest mean number of alarms in an hour of nominal episodes. One that persists, or
+                comes back within a minute of the same episode, is one alarm.
+            each: task or policy of each episode. Then the promise holds in each of them, by the greatest threshold that
+                one needs; without it, it holds over all of them together.
+
+        Raises:
+            ValueError: too few episodes or hours for this rate (the message says which they can promise), or bad ones;
+                by the hour also episodes that overlap, or that ``fit`` has learned from, which are only logged where
+                the rate is per episode. Or not exactly one rate.
+        """
+        self._require_fitted()
+        asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)  # refuses a bad rate before the work begins
+        check_nominal(episodes, self.spec, self.model.shortest)
+        if each and len(each) != len(episodes):
+            raise ValueError(f"each must name one group an episode, got {len(each)} for {len(episodes)} episodes")
+        asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
+        try:
+            check_fresh(episodes, self.learned_from_, self.ceilings_from_)
+        except ValueError as error:
+            if asked.per == HOUR:
+                raise
+            LOG.warning("%s; the promise by the episode does not hold for these", error)
+        scores = self.score_episodes(episodes)
+        self._set_threshold(scores, asked, each)
+        warn_of_crashes(episodes, [s.value for s in scores], self.threshold, asked, each)
+        streams = [episode.stream for episode in episodes]
+        self.healthy_ = healthy_forces(streams, self.spec)
+        self.familiar_ = FamiliarSpeed.learned(streams, self.spec)
+        return self
+
+    def _check_threshold(self, threshold: float) -> None:
+        require_sight(self.detection, self.model.error_columns, self.spec, threshold)
+
+    @typed
+    def initial_state(self, batch: int = 1) -> MonitorState:
+        """Return the state before the first row of ``batch`` streams."""
+        check_number("batch", batch, low=1, whole=True)
+        self._require_fitted()
+        return MonitorState(self.model.start(batch), self.detection.start(batch, len(self.model.error_columns)))
+
+    def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
+        """Return the new state after the next row of each stream, and how surprising the row was.
+
+        A number that is not finite makes the value and its own attribution infinite; it counts as unseen, so that
+        later rows can be judged again.
+
+        Args:
+            state: as returned last; it is not changed.
+            stream: (B, D) one row a stream.
+        """
+        self._require_fitted()
+        rows = self._rows(state, stream)
+        model, output = self.model.predict(state.model, rows)
+        detection, attribution = self.detection.attribute_step(state.detection, output, rows, self._places)
+        finite = np.isfinite(rows)
+        broken = ~finite.all(axis=1)
+        if broken.any():
+            attribution[broken] = np.where(finite[broken], 0.0, np.inf)
+        return MonitorState(model, detection), Surprise(attribution.sum(axis=1), attribution)
+
+    @typed
+    def reset_evidence(self, state: MonitorState) -> MonitorState:
+        """Return the state without the evidence so far, after an alarm that was acted on; the model goes on."""
+        return state._replace(detection=self.detection.reset(state.detection))
+
+    @typed
+    def score(self, episode: Episode) -> Surprise:
+        """Return the surprise of each step of an episode: value (T,), attribution (T, D); no names of skills."""
+        return self.score_episodes([episode])[0]
+
+    def score_episodes(self, episodes: Sequence[Episode]) -> list[Surprise]:
+        """Return ``score`` of many episodes, which are run side by side."""
+        for episode in episodes:
+            self.spec.require(episode.spec, "the episode")
+        self._require_fitted()
+        scores: list[Surprise] = [Surprise(np.zeros(0), np.zeros((0, self.spec.size)))] * len(episodes)
+        with threadpool_limits(1):
+            for group, steps in side_by_side(episodes, self.initial_state, self.observe):
+                for n, i in enumerate(group):
+                    own = steps[: len(episodes[i])]
+                    fields = {
+                        name: np.array([getattr(s, name)[n] for s in own])
+                        for name in Surprise._fields
+                        if name != "skill" and own and getattr(own[0], name) is not None
+                    }
+                    scores[i] = Surprise(**fields) if own else scores[i]
+        return scores
+
+    @typed
+    def save(self, path: str | Path) -> None:
+        """Write everything learned to one file of arrays and JSON."""
+        self._require_fitted()
+        write_monitor(path, self)
+
+    def restore(self, saved: Checkpoint) -> Self:
+        """Take over what ``save`` wrote of a monitor of the same spec, model and hyperparameters.
+
+        A file may hold several detections; where it was calibrated for another one than this, it has no threshold here.
+
+        Raises:
+            ValueError: something is missing, or does not fit together.
+        """
+        found = SavedMonitor.of(saved)
+        theirs = {n for d in self.detections.values() for n in d.arrays}
+        missing = [n for n in self.detection.arrays if n not in found.arrays]
+        if missing:
+            raise ValueError(f"the checkpoint has no {', '.join(missing)}, so fit it anew")
+        self.model.restore({n: a for n, a in found.arrays.items() if n not in theirs}, found.skills)
+        self._place_errors()
+        for detection in self.detections.values():
+            if found.arrays.keys() >= set(detection.arrays):
+                detection.restore({n: found.arrays[n] for n in detection.arrays})
+        self.about, self.learned_from_, self.ceilings_from_ = found.about, found.learned_from, found.ceilings_from
+        self.familiar_, self.healthy_ = found.familiar, found.healthy
+        if found.detection == self.detection.name:
+            self.threshold_, self.promised_ = found.threshold_below(self.detection.reach), found.promised
+            self.maxima_, self.blocks_ = found.maxima, found.blocks
+        return self
+
+    @property
+    def _name(self) -> str:
+        return f"{self.model.kind} monitor"
+
+    def _copy(self) -> Self:
+        """Return another that shares nothing that learning changes; learned arrays are never changed in place."""
+        other = copy.copy(self)
+        other.model = copy.copy(self.model)
+        other.detections = {name: copy.copy(d) for name, d in self.detections.items()}
+        other.detection = other.detections[self.detection.name]
+        return other
+
+    def _remember(self, episodes: Sequence[Episode]) -> None:
+        """Keep marks of episodes that were learned from, so that no promise by the hour is made of them."""
+        before = np.zeros(0) if self.learned_from_ is None else self.learned_from_
+        self.learned_from_ = np.union1d(before, sketch(episodes))
+
+    def _require_fitted(self) -> None:
+        if not self.model.learned_ or (self.detection.arrays and not self.detection.learned_):
+            raise RuntimeError(f"this {self._name} has learned nothing yet: call fit(episodes) first")
+
+    def _rows(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+        """Return the rows (B, D) in one piece. Raises where they or the state are not what ``observe`` takes."""
+        if not isinstance(state, MonitorState):
+            raise TypeError(f"state must be what initial_state or observe gave, got {shown(state)}")
+        try:
+            rows = np.ascontiguousarray(stream, np.float64)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"stream must be rows of numbers, got {shown(stream)}") from error
+        batch = batch_of(state)
+        if rows.shape != (batch, self.spec.size):
+            self.spec.check_row(rows)
+            raise ValueError(f"stream must have the shape {(batch, self.spec.size)}, got {rows.shape}")
+        return rows
+
+    def _place_errors(self) -> None:
+        """Find the column of the stream that each error belongs to, once the model knows."""
+        self._places = ErrorPlaces(self.model.error_columns, self.spec)

@@ -1,0 +1,236 @@
+"""Calibration: the threshold that keeps a rate of false alarms, what it promises, and whether it can be trusted."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.crashes import CRASH, crashes
+from asm_gym.detection import (
+    Blocks,
+    Promise,
+    check_per_hour,
+    conformal_episodes,
+    conformal_threshold,
+    hourly_promise,
+    hourly_threshold,
+)
+from asm_gym.detection.base import Array
+from asm_gym.detection.conformal import EPISODE, HOUR
+from asm_gym.detection.hourly import check_hours
+from asm_gym.episode import Episode
+from asm_gym.familiar_speed import FamiliarSpeed
+from asm_gym.monitors.base import Surprise
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import typed
+
+LOG = logging.getLogger("asm_gym.monitors")
+
+MOST_BLIND = 0.6
+"""A monitor that is blind to more than this share of the channels is refused."""
+
+MOST_NAMED = 6
+"""Channels that a message names."""
+
+RAISED = 1.5
+"""Crashes are reported if they raise the threshold by this factor."""
+
+
+class AlarmRate(NamedTuple):
+    """A rate of false alarms, by the ``"episode"`` or by the ``"hour"``."""
+
+    rate: float
+    per: str
+
+    @classmethod
+    def of(cls, false_alarm_rate: float | None, false_alarms_per_hour: float | None) -> Self:
+        """Return the one of two that is given. Raises ValueError unless exactly one is, and is a rate."""
+        if (false_alarm_rate is None) == (false_alarms_per_hour is None):
+            raise ValueError(
+                "which promise: give false_alarm_rate (such as 0.01, by the episode) or false_alarms_per_hour (such as "
+                f"1.0), got {'neither' if false_alarm_rate is None else 'both'}"
+            )
+        if false_alarms_per_hour is not None:
+            return cls(check_per_hour(false_alarms_per_hour), HOUR)
+        assert false_alarm_rate is not None
+        conformal_episodes(false_alarm_rate)
+        return cls(false_alarm_rate, EPISODE)
+
+    @property
+    def named(self) -> dict[str, float]:
+        """The argument of ``calibrate``."""
+        return {"false_alarms_per_hour" if self.per == HOUR else "false_alarm_rate": self.rate}
+
+    def check_hours(self, hours: float) -> None:
+        """Raise ValueError where the hours are too few for a rate by the hour."""
+        if self.per == HOUR:
+            check_hours(self.rate, hours)
+
+    def threshold(self, maxima: Array, blocks: Blocks | None) -> float:
+        """Return the threshold from the maxima of nominal episodes, or from their blocks by the hour."""
+        if self.per == EPISODE:
+            return conformal_threshold(maxima, self.rate)
+        assert blocks is not None
+        return hourly_threshold(blocks, self.rate)
+
+    def threshold_of(self, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> float:
+        """Return the threshold from the values (T,) of nominal episodes; with ``each``, the greatest of its groups.
+
+        Raises:
+            ValueError: there are too few episodes, or too few hours, in all of them or in a group.
+        """
+        threshold = self.threshold(np.array([v.max() for v in values]), Blocks.of(values, dt, each))
+        for name in dict.fromkeys(each):
+            own = [v for v, of in zip(values, each, strict=True) if of == name]
+            try:
+                threshold = max(threshold, self.threshold_of(own, dt))
+            except ValueError as error:
+                raise ValueError(f"{name} by itself: {error}") from None
+        return threshold
+
+
+class Calibrated:
+    """A threshold, conformal on the maxima of nominal episodes.
+
+    Attributes:
+        threshold_: surprise above which a row is an alarm; None before it is set.
+        maxima_: (n,) largest surprise in each episode that it was set by; None before.
+        blocks_: the same by the hour, as ``detection.hourly`` counts it; None before.
+        promised_: ``"episode"`` or ``"hour"``, the unit that the promise counts by.
+        healthy_: (N,) largest force of each of ``felt_channels`` in the calibration episodes [N m], [N]; contact limits
+            are no less. Empty before, and where the stream has no such channels.
+        familiar_: speed of the hand at each place in them; None before, and where the stream has no hand.
+    """
+
+    spec: StreamSpec
+    threshold_: float | None
+    maxima_: NDArray[np.float64] | None
+    blocks_: Blocks | None
+    promised_: str
+    healthy_: tuple[float, ...]
+    familiar_: FamiliarSpeed | None
+
+    @property
+    def threshold(self) -> float:
+        """Surprise above which a row is an alarm. Raises RuntimeError before ``calibrate``."""
+        if self.threshold_ is None:
+            raise RuntimeError(f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first")
+        return self.threshold_
+
+    @typed
+    def threshold_at(
+        self, false_alarm_rate: float | None = None, *, false_alarms_per_hour: float | None = None
+    ) -> float:
+        """Return the threshold of another rate, from the episodes that ``calibrate`` was given.
+
+        Raises:
+            ValueError: there were too few of them for this rate; the message says how many it takes. Or not one rate.
+            RuntimeError: it is not calibrated.
+        """
+        asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
+        kept = self.blocks_ if asked.per == HOUR else self.maxima_
+        if kept is None or self.maxima_ is None:
+            raise RuntimeError(f"this {self._name} knows no calibration: call calibrate(nominal_episodes) first")
+        return asked.threshold(self.maxima_, self.blocks_)
+
+    @property
+    def promise(self) -> Promise:
+        """How often the threshold promises an alarm in nominal operation, by which unit, and how surely.
+
+        Raises:
+            RuntimeError: it is not calibrated, or keeps no surprise of nominal episodes.
+        """
+        if self.maxima_ is None:
+            raise RuntimeError(f"this {self._name} knows no calibration: call calibrate(nominal_episodes) first")
+        if self.promised_ == HOUR and self.blocks_ is not None:
+            return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
+        return Promise.of(self.maxima_, self.threshold)
+
+    def _set_threshold(self, scores: Sequence[Surprise], asked: AlarmRate, each: Sequence[str]) -> None:
+        """Set it by the surprise of nominal episodes. Raises ValueError, and changes nothing, for too few."""
+        values = [s.value for s in scores]
+        threshold = asked.threshold_of(values, self.spec.dt, each)
+        self._check_threshold(threshold)
+        self.threshold_, self.promised_ = threshold, asked.per
+        self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
+
+    def _check_threshold(self, threshold: float) -> None:
+        """Raise ValueError for a threshold that will not do."""
+
+    def _uncalibrate(self) -> None:
+        self.threshold_ = self.maxima_ = self.blocks_ = self.familiar_ = None
+        self.promised_, self.healthy_ = EPISODE, ()
+
+    @property
+    def _name(self) -> str:
+        return type(self).__name__
+
+
+def blind_to(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, threshold: float) -> list[str]:
+    """Return the labels of the senses whose errors alone could never pass the threshold, however large and lasting.
+
+    Args:
+        detection: one whose ``reach_of`` says how far each error can go; others know nothing of it.
+        errors: (X,) column of each error in the stream; -1 for none.
+        spec: of the stream.
+        threshold: of the surprise.
+    """
+    if not hasattr(detection, "reach_of"):
+        return []
+    reach = np.zeros(spec.size)
+    own = np.flatnonzero(errors >= 0)
+    np.maximum.at(reach, errors[own], detection.reach_of(own))
+    judged = np.unique(errors[own])
+    return [spec.labels[i] for i in judged if not reach[i] > threshold]
+
+
+def require_sight(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, threshold: float) -> None:
+    """Log the channels in which no fault could pass the threshold. Raises ValueError where they are most."""
+    blind = blind_to(detection, errors, spec, threshold)
+    if not blind:
+        return
+    named = ", ".join(blind[:MOST_NAMED])
+    named += f" and {len(blind) - MOST_NAMED} more" if len(blind) > MOST_NAMED else ""
+    message = (
+        f"the threshold came to {threshold:.3g}, which no fault of {named} could pass, however strong: an episode "
+        "to calibrate on is unlike those learned from, or a channel hardly moved in them: learn from more"
+    )
+    if len(blind) > MOST_BLIND * len(np.unique(errors[errors >= 0])):
+        raise ValueError(message)
+    LOG.warning(message)
+
+
+def warn_of_crashes(
+    episodes: Sequence[Episode], values: Sequence[Array], threshold: float, asked: AlarmRate, each: Sequence[str]
+) -> None:
+    """Log a warning where crashes among nominal episodes have raised the threshold, which hides milder faults.
+
+    Args:
+        episodes: the calibration set.
+        values: (T,) surprise of each.
+        threshold, asked: the threshold that keeps the rate asked for.
+        each: task of each episode, where a promise is to hold in each; else its own label names the task.
+    """
+    tasks = list(each) or [e.label.task if e.label else str(e.info.get("skill", "")) for e in episodes]
+    hit = crashes(episodes, tasks)
+    if not hit:
+        return
+    others = [n for n in range(len(episodes)) if n not in hit]
+    try:
+        own = [each[n] for n in others if each]
+        without = asked.threshold_of([values[n] for n in others], episodes[0].spec.dt, own)
+    except ValueError:  # too few are left for a promise
+        without = float(np.max([values[n].max() for n in others]))
+    if threshold <= RAISED * without:
+        return
+    worst = max(hit, key=lambda n: float(values[n].max()))
+    LOG.warning(
+        "%d of %d episodes press more than %g times as hard as is usual; with them the threshold is %.3g, without "
+        "%.3g. The worst is episode %d, %.1f times as hard: look at it, and leave out what is not healthy, as "
+        "asm_gym.harmless(episodes) does",
+        *(len(hit), len(episodes), CRASH, threshold, without, worst, hit[worst]),
+    )

@@ -1,0 +1,65 @@
+"""Hyperparameters of a memory that seldom need a change."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from asm_gym.detection.detector import BOUND, GAINS
+from asm_gym.detection.tails import TAIL_INDEX
+from asm_gym.memory.association_learning import FEEDBACK, LEARNED
+from asm_gym.validation import check_choice, check_number
+
+MOST_ITERATIONS = 1000
+"""Of inference in a row: twenty are enough, and a damaged file must not ask for a thousand million."""
+
+
+@dataclass(frozen=True)
+class MemoryConfig:
+    """How a memory learns, infers and adds up evidence, beside the arguments of ``NeuralASM``.
+
+    Args:
+        iterations: largest number of inference steps, which end sooner where nothing moves any more. By default 5 by
+            traces, while learning and where a sense is missing, for a row that is seen needs none; 20 by settling, on
+            every row.
+        learning_rate: largest change of a synapse in one step, decaying to 0 along a cosine; scaled by 256 / H where H
+            is larger, so that a unit's input does not change more for having more synapses.
+        batch_size: episodes it learns from side by side.
+        prior_precision: Π_z, trust in what was expected. By default 30 by traces, for the firmer, the closer local
+            learning is to the gradient; 1 by settling, where the senses are to move the state.
+        sensory_precision: Π_x, trust in what is sensed.
+        feedback: how errors come back to the hidden units of association, a name of ``association_learning.FEEDBACK``.
+        gains: a in (0, 1], weights of the newest step in the accumulated evidence; several, for faults that come as
+            a knock and faults that creep.
+        bound: ν > 0, how many standard deviations an error counts at most, so that a knock that is soon over counts
+            less than what stays.
+        shrinkage: λ in [0, 1] of the whitening, towards no correlation between errors.
+        tail_index: ξ_0 in (0, 1]: surprise falls off as probability to this power. The smaller, the more senses add up.
+    """
+
+    iterations: int | None = None
+    learning_rate: float = 3e-3
+    batch_size: int = 64
+    prior_precision: float | None = None
+    sensory_precision: float = 1.0
+    feedback: str = LEARNED
+    gains: Sequence[float] = GAINS
+    bound: float = BOUND
+    shrinkage: float = 1e-3
+    tail_index: float = TAIL_INDEX
+
+    def __post_init__(self) -> None:
+        checked: dict[str, Any] = {
+            "learning_rate": check_number("learning_rate", self.learning_rate, above=0.0),
+            "batch_size": check_number("batch_size", self.batch_size, low=1, whole=True),
+            "sensory_precision": check_number("sensory_precision", self.sensory_precision, above=0.0),
+            "gains": tuple(self.gains),  # checked by EvidenceDetection, as are all that follow
+        }
+        if self.iterations is not None:
+            checked["iterations"] = check_number("iterations", self.iterations, low=1, high=MOST_ITERATIONS, whole=True)
+        if self.prior_precision is not None:
+            checked["prior_precision"] = check_number("prior_precision", self.prior_precision, above=0.0)
+        check_choice("feedback", self.feedback, FEEDBACK)
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)

@@ -1,0 +1,167 @@
+"""A row in one compiled call, against the same equations in NumPy."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info
+
+from asm_gym.detection.detector import EvidenceState
+from asm_gym.detection.evidence import POWER, TINY, accumulate, pool, strength
+from asm_gym.detection.repetition import Repetition, evidence_steps, improbability
+from asm_gym.detection.whitening import bounded
+from asm_gym.memory.readout import KEPT, SMALLEST, certainty
+from asm_gym.memory.state import UNSURE, MemoryState
+from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.adaptation import adapt
+from asm_gym.monitors.calibrated_monitor import MonitorState
+from asm_gym.monitors.row_kernel import _ONE_THREAD
+from asm_gym.monitors.skills import name_skills
+from tests.streams import sine_episodes, sine_spec
+
+
+def expected_by(asm, state, rows):
+    """The memory's errors (B, X) and its next state."""
+    model, history = asm.model, state.history
+    network, lag = model.network, model.lag
+    reading = model.senses_.read(rows, *history.past(rows))
+    due = history.steps % lag == 0
+    traces, expected = state.traces.copy(), state.expected.copy()
+    if due.any():
+        read = reading.commands[due], reading.senses[due], reading.seen[due]
+        expected[due], traces[due] = network.carry_on(traces[due], *read)
+    a = network.association
+    units = np.tanh(reading.inputs @ a.V.T)
+    spread = np.clip(units @ a.W_S.T + a.b_S, *a.span_S)
+    left = (reading.changes - reading.inputs @ a.D.T - units @ a.U.T) / a.remainder
+    sure = np.where(history.steps < lag, 0.0, np.where(history.steps < 2 * lag, UNSURE, 1.0))
+    errors = reading.whole * left * np.exp(-0.5 * spread) * sure[:, None]
+    skill = state.skill
+    if asm.skills_:
+        p = certainty(np.hstack([units, expected]), model.learned_["W_K"], model.learned_["b_K"])
+        skill = KEPT * skill + np.log(p + SMALLEST)
+    return errors, MemoryState(traces, expected, history.followed_by(rows), skill)
+
+
+def observed_by(asm, state, rows):
+    """The value (B,), the attribution (B, D), and the next state."""
+    errors, memory = expected_by(asm, state.model, rows)
+    d, senses, (was, before) = asm.detector_, asm.spec.sensory, state.detection
+    evidence = accumulate(was, bounded(errors, d.bound) @ d.whitening, memory.expected, d.gains)
+    ratios = (strength(evidence, d.gains) / d.ceiling) ** d.tail
+    _, parts = pool(ratios.reshape(len(rows), -1))
+    drive = np.hstack([memory.expected, evidence.context]) @ d.context_quantile[:-1] + d.context_quantile[-1]
+    parts = parts.reshape(ratios.shape).sum(axis=1) / np.exp(np.clip(drive, *d.context_range))[:, None]
+
+    counted = asm.learned_["repetition"]
+    now = rows[:, senses]
+    again, steps = now == before.row, evidence_steps(counted[:2])
+    added = steps[before.again.astype(int), again.astype(int), np.arange(len(senses))]
+    unlikely = np.clip(before.unlikely + added, 0.0, counted[2] + 24.0)
+    repetition = Repetition(now, again, unlikely)
+    attribution, stuck = np.zeros(rows.shape), np.zeros(rows.shape)
+    attribution[:, senses], stuck[:, senses] = parts, improbability(repetition, counted[2])
+    total = attribution.sum(axis=1, keepdims=True)
+    pooled = pool(np.hstack([total, stuck]), POWER)[1]
+    attribution = attribution * (pooled[:, :1] / np.maximum(total, TINY)) + pooled[:, 1:]
+    finite = np.isfinite(rows)
+    broken = ~finite.all(axis=1)
+    attribution[broken] = np.where(finite[broken], 0.0, np.inf)
+    return (
+        attribution.sum(axis=1),
+        attribution,
+        MonitorState(memory, EvidenceState(evidence, repetition), state.excuses),
+    )
+
+
+def memory(dt=0.05, **settings):
+    """A fitted memory, and rows (T, B, D) with which much is wrong."""
+    spec = replace(sine_spec(), dt=dt)
+    episodes = sine_episodes(12, spec=spec, steps=(60, 60))
+    asm = NeuralASM(spec, hidden_size=16, association_size=30, epochs=1, **settings).fit(episodes[:8])
+    rows = np.stack([e.stream.astype(np.float64) for e in episodes[-4:] + episodes[:1]], axis=1)
+    rows[20, 1, 3] = np.nan
+    rows[30:32, 2] = -np.inf
+    rows[40:46, 3, 4] = rows[40, 3, 4]
+    rows[50, 4, 2] = 1e12
+    return asm, rows, episodes
+
+
+def leaves(state):
+    return [state] if isinstance(state, np.ndarray) else [leaf for part in state for leaf in leaves(part)]
+
+
+def both(asm, rows, start):
+    """Runs both ways side by side, and compares after every row."""
+    ours = theirs = start
+    for t, row in enumerate(rows):
+        ours, found = asm.observe(ours, row)
+        value, attribution, theirs = observed_by(asm, theirs, row)
+        np.testing.assert_allclose(found.value, value, rtol=1e-3, err_msg=f"row {t}")
+        scale = np.where(np.isfinite(value), value, 1.0).max()
+        np.testing.assert_allclose(found.attribution, attribution, rtol=5e-3, atol=1e-3 * scale)
+        for mine, other in zip(leaves(ours), leaves(theirs), strict=True):
+            assert mine.shape == other.shape
+            np.testing.assert_allclose(mine, other, rtol=1e-3, atol=1e-4, err_msg=f"row {t}")
+        theirs = ours  # rounding must not add up
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.02, 0.01])
+@pytest.mark.parametrize("batch", [1, 5])
+def test_one_call_gives_what_the_equations_give(dt, batch):
+    asm, rows, _ = memory(dt)
+    for first in range(0, 5, batch):
+        both(asm, rows[:, first : first + batch], asm.initial_state(batch))
+
+
+@pytest.mark.parametrize("dynamics", ["traces", "settling"])
+def test_streams_that_began_at_different_times_and_named_skills_make_no_difference(dynamics):
+    asm, rows, episodes = memory(0.01, dynamics=dynamics)
+    name_skills(asm, [e.__class__(**{**vars(e), "info": {"skill": str(n % 2)}}) for n, e in enumerate(episodes[:8])])
+    state = asm.initial_state(5)
+    history = state.model.history._replace(steps=np.array([0, 1, 2, 5, 11]))
+    both(asm, rows, state._replace(model=state.model._replace(history=history)))
+
+
+def test_without_habituation_the_context_is_not_computed_and_surprise_is_the_same():
+    asm, rows, _ = memory(habituates=False)
+    state = other = asm.initial_state(1)
+    for row in rows[:, 0]:
+        state, found = asm.observe(state, row[None])
+        value, _, other = observed_by(asm, other, row[None])
+    assert not state.model.expected.any()
+    assert other.model.expected.any()
+    np.testing.assert_allclose(found.value, value, rtol=1e-3)
+
+
+def test_neither_the_rows_nor_the_state_are_written_to_and_later_changes_of_a_row_do_not_matter():
+    asm, rows, _ = memory()
+    state, _ = asm.observe(asm.initial_state(1), rows[0, :1])
+    kept, row = [p.copy() for p in leaves(state)], rows[1, :1].copy()
+    after, _ = asm.observe(state, row)
+    for now, then in zip(leaves(state), kept, strict=True):
+        np.testing.assert_array_equal(now, then)
+    np.testing.assert_array_equal(row, rows[1, :1])
+    row += 1.0
+    np.testing.assert_array_equal(after.model.history.before[0, -1], rows[1, 0])
+
+
+def test_what_was_learned_since_counts():
+    asm, rows, episodes = memory()
+    state = asm.initial_state(1)
+    for row in rows[:10, :1]:
+        state, before = asm.observe(state, row)
+    asm.fit(episodes[4:])
+    both(asm, rows[:, :1], asm.initial_state(1))
+    other = asm.with_threshold(1.0)
+    adapt(other, state, rows[10, :1], before._replace(value=np.zeros(1)), rate=1.0)
+    both(other, rows[:, :1], other.initial_state(1))
+
+
+def test_many_streams_leave_the_threads_of_blas_as_they_were():
+    before = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+    inside = []
+    with _ONE_THREAD, _ONE_THREAD:
+        inside = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+    assert set(inside) == {1}
+    assert [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"] == before
