@@ -9,7 +9,6 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markup import escape
-from rich.measure import Measurement
 from rich.table import Table as RichTable
 
 from asm_gym.evaluation.statistics import Share
@@ -59,12 +58,16 @@ class ConsoleTable:
         """Render; rich calls this."""
         style: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0)} if self.plain else {}
         made = RichTable(title=escape(self.table.caption), **style)
-        for i, heading in enumerate(self.table.headings):
-            made.add_column(escape(heading), justify="left" if i < self.left else "right", overflow="fold")
+        columns = zip(self.table.headings, *self.table.rows, strict=True)
+        widest = [max(map(len, " ".join(map(str, cells)).split() or [""])) for cells in columns]  # word of each column
+        if sum(widest) + 3 * len(widest) + 1 > options.max_width:
+            yield self._list()
+            return
+        for i, (heading, width) in enumerate(zip(self.table.headings, widest, strict=True)):
+            made.add_column(escape(heading), justify="left" if i < self.left else "right", min_width=width)
         for row in self.table.rows:
             made.add_row(*(escape(str(cell)) for cell in row))
-        fits = Measurement.get(console, options, made).minimum <= options.max_width
-        yield made if fits else self._list()
+        yield made
 
     def _list(self) -> str:
         """Return a paragraph per row: its name, then a line for each cell that is not empty."""

@@ -1,0 +1,516 @@
+"""Scored episodes, metrics, statistics, the ideal observer and tables, against values by hand and published tables."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy import stats
+
+from asm_gym.detection import conformal_threshold
+from asm_gym.episode import EpisodeLabel, spans
+from asm_gym.evaluation import comparison, metrics, scoring
+from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
+from asm_gym.evaluation.detection_tables import (
+    UNLIKELY,
+    brief_monitors_table,
+    harmless_table,
+    kept_table,
+    kinds_table,
+    lead_table,
+    monitors_table,
+)
+from asm_gym.evaluation.ideal import auroc_bound, earliest, noise_floor, power_bound, separation
+from asm_gym.evaluation.metrics import (
+    Delays,
+    DetectionMetrics,
+    by_condition,
+    delays_ms,
+    detected,
+    false_alarms,
+    hourly_alarms,
+    placements,
+    time_matched_auroc,
+    typical,
+)
+from asm_gym.evaluation.resampling import Calibration, interval, resample
+from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode, TraceDetail, window_steps
+from asm_gym.evaluation.scoring import CODE, code_digest, fitted
+from asm_gym.evaluation.statistics import (
+    Estimate,
+    Rate,
+    Share,
+    Spread,
+    auroc,
+    binomial_interval,
+    poisson_interval,
+    wilson_interval,
+)
+from asm_gym.evaluation.tables import Column, ConsoleTable, Table, tabulate
+from tests.streams import sine_episodes
+
+
+def a_trace(surprise: Any, onset: int | None = None, kind: str | None = None, **fields: Any) -> ScoredEpisode:
+    """An episode of 0.1 s steps and the threshold 10."""
+    kind = kind or ("nominal" if onset is None else "push")
+    values: dict[str, Any] = {"dt": 0.1, "threshold": 10.0, "seed": 0, "onset": onset, **fields}
+    outcome = [values.pop(name, default) for name, default in (("success", True), ("ended", False), ("force", 0.0))]
+    surprise = np.asarray(surprise, np.float64)
+    return ScoredEpisode(kind=kind, surprise=surprise, outcome=InterventionOutcome(*outcome), **values)
+
+
+# ------------------------------------------------------------------ scored episodes
+
+
+def test_spans_are_the_runs_of_true():
+    assert spans(np.array([True, True, False, True])) == [(0, 2), (3, 4)]
+    assert spans(np.zeros(0, bool)) == []
+
+
+@pytest.mark.parametrize(
+    ("surprise", "onset", "false", "after"),
+    [
+        ([1, 1, 1, 1, 20, 20], 2, (), 2),
+        ([1, 20, 1, 1, 1], 3, (1,), None),
+        ([20, 20, 20, 20], 2, (0,), None),  # up before the onset
+        ([20, 20, 20, 1, 20], 2, (0,), 2),  # raised again
+        ([1, 1, 20, 1], 2, (), 0),
+        ([20, 1, 20, 20], None, (0, 2), None),
+    ],
+)
+def test_an_alarm_is_false_before_the_onset_and_a_detection_when_raised_since(surprise, onset, false, after):
+    trace = a_trace(surprise, onset)
+    assert (trace.false_alarms, trace.detected_after) == (false, after)
+    assert trace.delay == (None if after is None else pytest.approx(0.1 * (after + 1)))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"surprise": np.zeros((3, 2))}, r"surprise.*\(3, 2\)"),
+        ({"surprise": []}, r"surprise.*\(0,\)"),
+        ({"surprise": np.array([1.0, np.nan, 1.0])}, "NaN"),
+        ({"onset": -1}, "onset"),
+        ({"onset": 1, "kind": "nominal"}, "onset"),
+        ({"dt": 0.0}, "dt"),
+        ({"detail": TraceDetail(np.zeros((2, 1)), ("a",), np.zeros(2, bool))}, "3 rows, got 2"),
+    ],
+)
+def test_an_episode_refuses_what_it_cannot_mean(fields, message):
+    with pytest.raises(ValueError, match=message):
+        a_trace(fields.pop("surprise", [1, 1, 1]), **fields)
+
+
+@pytest.mark.parametrize(
+    "fields", [{"attribution": np.zeros((3, 5))}, {"fault": np.zeros(2, bool)}, {"fault": np.zeros(3, int)}]
+)
+def test_the_detail_has_a_row_for_every_step(fields):
+    with pytest.raises(ValueError, match=next(iter(fields))):
+        TraceDetail(**{"attribution": np.zeros((3, 2)), "channels": ("a", "b"), "fault": np.zeros(3, bool), **fields})
+
+
+def test_another_threshold_changes_the_alarms_and_nothing_else():
+    trace = a_trace([1, 20, 30], onset=1).attributed(np.eye(3), ("a", "b", "c"))
+    other = trace.at(25.0)
+    assert (trace.alarms, trace.top_channel) == ((1,), "b")
+    assert (other.alarms, other.detected_after, other.top_channel) == ((2,), 1, "")
+
+
+def test_a_window_holds_whole_steps_whatever_the_rounding():
+    assert [window_steps(s, dt) for s, dt in ((0.3, 0.1), (1.0, 0.05), (0.01, 0.05))] == [3, 20, 1]
+    with pytest.raises(ValueError, match="window_s"):
+        window_steps(0, 0.05)
+
+
+def test_the_top_channel_is_read_at_the_first_alarm_since_the_onset():
+    attribution = np.array([[0, 0], [20, 0], [0, 0], [0, 20]])
+    for onset, top in ((2, "loud"), (None, "calm")):
+        assert a_trace([1, 20, 1, 20], onset).attributed(attribution, ("calm", "loud")).top_channel == top
+    assert a_trace([1, 1]).attributed(attribution, ("calm", "loud")).top_channel == ""
+
+
+# ------------------------------------------------------------------ metrics
+
+
+def test_time_matching_compares_each_fault_with_the_same_steps_of_nominal_episodes_of_its_task():
+    # Every episode is surprised at step 0, the nominal ones at step 3 too: only steps 1 and 2 may count.
+    faulty = a_trace([99, 5, 7, 1], onset=1)
+    nominal = [a_trace([90, 6, 1, 90]), a_trace([90, 1, 8, 90]), a_trace([90, 7, 1, 90]), a_trace([90, 1, 1, 90])]
+    nominal.append(a_trace([90, 90, 90, 90], task="Door"))
+    assert placements([faulty], nominal, window_s=0.2) == pytest.approx([(1 + 0.5) / 4])  # 8 above, 7 tied
+    assert time_matched_auroc([faulty], nominal, window_s=0.2) == pytest.approx(1 - 1.5 / 4)
+    assert math.isnan(time_matched_auroc([faulty], [a_trace([99])], window_s=1.0))  # it ended before the onset
+    assert placements([a_trace([0, 9], onset=2)], nominal, 0.2).size == 0
+
+
+def test_time_matching_of_one_common_window_is_the_plain_auroc():
+    rng = np.random.default_rng(0)
+    faulty = [a_trace(rng.random(8) + 0.2, onset=3) for _ in range(9)]
+    nominal = [a_trace(rng.random(8)) for _ in range(7)]
+    plain = auroc([t.surprise[3:7].max() for t in faulty], [t.surprise[3:7].max() for t in nominal])
+    assert time_matched_auroc(faulty, nominal, window_s=0.4) == pytest.approx(plain)
+
+
+def test_a_delay_is_at_least_one_step_and_a_late_alarm_is_a_miss():
+    at_once, late = a_trace([1, 20, 1, 1, 1], onset=1), a_trace([1, 1, 1, 20, 1], onset=1)
+    never, nominal = a_trace([1, 1, 1, 1, 1], onset=1), a_trace([20, 20])
+    assert delays_ms([late, at_once, never, nominal], window_s=0.3) == pytest.approx([100, 300, math.inf])
+    assert detected([late, at_once, never], window_s=0.2) == Share(1, 3)
+
+
+def test_quantiles_of_the_delay_count_misses_as_infinitely_late():
+    traces = [a_trace([1] * k + [20] + [1] * 30, onset=0) for k in range(20)]  # 100, 200, … 2000 ms
+    assert Delays.of(delays_ms(traces, window_s=5.0)) == pytest.approx(Delays(1000.0, 1900.0, 20, 0))
+    assert Delays.of(delays_ms(traces, window_s=1.5)) == pytest.approx(Delays(1000.0, math.inf, 15, 5))
+    assert Delays.of([]) is None
+
+
+def test_alarms_an_hour_count_only_the_time_before_the_fault_and_one_a_minute():
+    faulty = np.ones(1400)
+    faulty[[5, 6, 20, 50, 60, 661, 1310]] = 20  # the fifth and the sixth are more than a minute apart
+    nominal = np.ones(60)
+    nominal[3] = 20
+    found = hourly_alarms([a_trace(faulty, onset=1300), a_trace(nominal)])
+    assert found == (3, pytest.approx(136 / 3600))
+    excused = {"knock": np.full(60, 99.0)}
+    assert hourly_alarms([a_trace(np.ones(60), excused=excused)], "knock").k == 1
+    assert hourly_alarms([a_trace(np.full(60, 20), excused=excused)], "knock").k == 0  # a fault is no knock beside it
+    assert math.isnan(hourly_alarms([a_trace([1, 1], onset=0)]).value)
+
+
+def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_response():
+    traces = [
+        a_trace([1, 1, 20, 1], onset=1, success=False, top_channel="loud", force=50.0),
+        a_trace([1, 1, 1, 1], onset=1, success=False, force=70.0),
+        a_trace([20, 1, 1, 20], onset=1, top_channel="loud", force=90.0),
+        # The wrapped episodes see an alarm at once, which must not touch the results of detection.
+        a_trace([1, 20, 1, 1], onset=1, acting="hold", force=10.0),
+        a_trace([1, 20, 1, 1], onset=1, acting="hold", ended=True, force=20.0),
+        a_trace([1, 2, 3, 4]),
+        a_trace([1, 2, 30, 4]),
+    ]
+    nominal, push = by_condition(traces, window_s=0.2)
+    assert (nominal.name, len(nominal.watched), nominal.delays) == ("nominal", 2, None)
+    assert (false_alarms(nominal.watched), nominal.detected) == (Share(1, 2), Share(0, 0))
+    assert (push.name, len(push.watched), push.detected) == ("push", 3, Share(1, 3))  # the third alarm is late
+    assert push.delays == pytest.approx(Delays(math.inf, math.inf, 1, 2))
+    assert push.auroc == pytest.approx(1 / 6)  # maxima 20, 1, 1 against 3, 30
+    assert push.top_channels == [("loud", 2)]
+    alone, held = push.outcomes
+    assert (alone.acting, alone.success, alone.peak_force) == ("policy alone", Share(1, 3), 70.0)
+    assert (held.acting, held.success, held.ended_by_alarm, held.peak_force) == ("hold", Share(2, 2), Share(1, 2), 15.0)
+
+
+def test_attribution_counts_alarms_alone_and_the_typical_episode_has_the_median_peak():
+    affected = frozenset({"a", "b"})
+    faulty = [a_trace([20], onset=0, top_channel=c, affected_channels=affected) for c in ("a", "c", "")]
+    assert metrics.attribution_accuracy(faulty) == Share(1, 2)
+    assert typical([a_trace([99, 0, peak], onset=1, seed=peak) for peak in (5, 1, 9)]).seed == 5
+
+
+# ------------------------------------------------------------------ statistics
+
+
+@pytest.mark.parametrize(
+    ("k", "n", "low", "high"),
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718), (0, 0, 0, 1)],
+)
+def test_wilson_gives_the_intervals_of_newcombe_1998(k, n, low, high):
+    assert wilson_interval(k, n) == pytest.approx((low, high), abs=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("k", "low", "high"),
+    [(0, 0.0, 3.6889), (1, 0.0253, 5.5716), (5, 1.6235, 11.6683), (10, 4.7954, 18.3904), (100, 81.3640, 121.6268)],
+)
+def test_poisson_gives_the_intervals_of_garwood_1936(k, low, high):
+    assert poisson_interval(k) == pytest.approx((low, high), abs=5e-5)
+
+
+def test_a_rate_is_by_the_hour_and_unknown_without_time():
+    assert Rate(5, 2.0).interval == pytest.approx((1.6235 / 2, 11.6683 / 2), abs=5e-5)
+    assert (Rate(5, 2.0).text, Rate(0, 0.0).text, Rate(0, 0.0).interval) == ("2.5 (0.8 to 5.8)", "", (0.0, math.inf))
+    assert math.isnan(Rate(0, 0.0).value)
+
+
+def test_the_binomial_interval_of_four_coins_by_hand():
+    # P(0) = P(4) = 1/16: with tails of at most 5 % both stay in, with tails of at most 10 % both fall out.
+    assert [binomial_interval(4, 0.5, c) for c in (0.9, 0.8)] == [(0, 4), (1, 3)]
+    assert [binomial_interval(7, p) for p in (0.0, 1.0)] == [(0, 0), (7, 7)]
+
+
+def test_auroc_is_the_mann_whitney_statistic_takes_infinity_and_refuses_nan():
+    rng = np.random.default_rng(0)
+    pos, neg = rng.integers(0, 9, 40), rng.integers(0, 7, 60)
+    assert auroc(pos, neg) == pytest.approx(stats.mannwhitneyu(pos, neg).statistic / (40 * 60))
+    assert auroc([math.inf, math.inf], [1.0, math.inf]) == pytest.approx(0.75)
+    for wrong, message in (([math.nan], "NaN"), ([], "hold some"), ([[1], [2, 3]], "shape")):
+        with pytest.raises(ValueError, match=message):
+            auroc(wrong, [1.0])
+
+
+@pytest.mark.parametrize(
+    ("use", "name"),
+    [
+        (lambda: poisson_interval(-1), "k"),
+        (lambda: poisson_interval(1.5), "k"),
+        (lambda: wilson_interval(3, 2), "k"),
+        (lambda: wilson_interval(1, 2, confidence=95), "confidence"),
+        (lambda: binomial_interval(3, 1.5), "p"),
+    ],
+)
+def test_impossible_counts_are_refused(use, name):
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        use()
+
+
+def test_a_spread_and_an_estimate_are_formatted():
+    assert Spread.of([1.0, 2.0, 3.0]).text(digits=1) == "2.0 ± 1.0"
+    assert Spread.of([0.5]).text(100, 1) == "50.0"
+    assert Estimate(0.5, 0.25, 0.75).percent() == "50 % (25 to 75)"
+    assert Estimate(math.nan, math.nan, math.nan).percent("none") == "none"
+
+
+# ------------------------------------------------------------------ the ideal observer
+
+
+def test_the_bounds_are_what_the_likelihood_ratio_reaches():
+    """A known signal in white noise, drawn many times: AUROC and power of its log likelihood ratio."""
+    rng = np.random.default_rng(0)
+    signal, noise = np.array([[0.4, -0.2], [0.1, 0.3], [0.5, 0.0]]), np.array([0.5, 0.2])
+    S = separation(signal, np.zeros((3, 2)), noise, onset=0)
+    assert S[-1] == pytest.approx(((signal / noise) ** 2).sum())
+    draws = rng.standard_normal((2, 40_000, 3, 2)) * noise
+    ratio = [((x * signal - signal**2 / 2) / noise**2).sum(axis=(1, 2)) for x in (draws[0], draws[1] + signal)]
+    assert ratio[1].mean() == pytest.approx(S[-1] / 2, rel=0.03)
+    assert auroc(ratio[1], ratio[0]) == pytest.approx(float(auroc_bound(S[-1])), abs=0.005)
+    threshold = np.quantile(ratio[0], 0.95)
+    assert (ratio[1] > threshold).mean() == pytest.approx(float(power_bound(S[-1], 0.05)), abs=0.01)
+
+
+def test_what_changes_nothing_cannot_be_detected_and_a_broken_reading_at_once():
+    x = np.random.default_rng(0).standard_normal((5, 3))
+    S = separation(x, x.copy(), np.ones(3), onset=2)
+    assert (auroc_bound(S)[-1], earliest(S)) == (0.5, None)
+    broken = x.copy()
+    broken[2, 1] = np.nan
+    assert earliest(separation(broken, x, np.ones(3), onset=1)) == 1
+
+
+def test_the_earliest_step_is_where_the_power_suffices():
+    """√S must reach z(0.99) + z(0.95) = 3.971, which steps of √S = 2, 2.83, 3.46, 4 do at the fourth."""
+    faulty = np.zeros((9, 1))
+    faulty[3:] = 2.0
+    assert earliest(separation(faulty, np.zeros((9, 1)), np.ones(1), onset=3)) == 3
+    assert len(separation(np.zeros((6, 1)), np.zeros((9, 1)), np.ones(1), onset=2)) == 4
+    with pytest.raises(ValueError, match="not twins"):
+        separation(np.ones((4, 1)), np.zeros((4, 1)), np.ones(1), onset=2)
+
+
+def test_channels_without_noise_get_a_thousandth_of_their_spread():
+    stream = np.column_stack([np.tile([-1.0, 1.0], 50), np.tile([-1.0, 1.0], 50), np.zeros(100)])
+    np.testing.assert_allclose(noise_floor(np.array([0.5, 0.0, 0.0]), [stream]), [0.5, 1e-3, 1e-9])
+
+
+# ------------------------------------------------------------------ monitors side by side
+
+
+def judged(peak, kind="nominal", severity="", onset=None):
+    surprise = np.zeros(10)
+    surprise[5] = peak
+    affected = frozenset("a")
+    trace = ScoredEpisode(kind, 0, 0.05, 3.5, surprise, onset, severity, "Lift", "asm", affected_channels=affected)
+    return trace.attributed(np.ones((10, 1)), ("a",))
+
+
+def visibility(separation, kind="push", severity="strong", earliest=0):
+    return Detectability("Lift", kind, severity, 0, separation, earliest, 0.05)
+
+
+TRACES = [
+    *(judged(p) for p in (1.0, 2.0, 3.0, 4.0)),
+    judged(5.0, "push", "strong", onset=5),
+    judged(2.5, "push", "mild", onset=5),
+    judged(0.0, "noise", "mild", onset=5),
+]
+RESULT = MonitorResult(TRACES, [judged(9.0, "touch"), judged(0.0, "touch")], Calibration({0.01: 3.5, 0.05: 2.2}))
+
+
+def test_a_kind_is_visible_where_an_ideal_observer_finds_half_of_it():
+    # Power at 1 %: Φ(√S - 2.326), one half at S = 5.41.
+    found = [visibility(6.0), visibility(5.0, "touch"), visibility(100.0, "shove"), visibility(0.0, "shove")]
+    assert list(comparison.visible_kinds(found).values()) == [True, False, True]
+    ideal = comparison.ideal_metrics("ideal", [visibility(2.0, earliest=None), visibility(np.inf, earliest=1)])
+    assert ideal.auroc == pytest.approx((0.8413447 + 1) / 2)  # Φ(√(2/2)) and 1
+    assert ideal.delays == pytest.approx((100.0, math.inf, 1, 1))
+
+
+def test_scores_are_means_over_the_kinds_that_can_be_seen():
+    asm = RESULT.metrics("asm", 1.0, {("push", "strong"): True, ("push", "mild"): True, ("noise", "mild"): False})
+    assert asm.auroc == pytest.approx((1.0 + 0.5) / 2)
+    assert (asm.found[0.01].k, asm.found[0.05].k, asm.found[0.05].n) == (1, 2, 2)
+    assert metrics.attribution_accuracy(asm.faulty) == (1, 1)
+    assert [k.auroc for k in RESULT.metrics("asm", 1.0).kinds.values()] == [1.0, 0.5, 0.0]
+
+
+def test_the_tables_of_a_benchmark_put_the_ideal_observer_first_and_hide_what_nobody_sees():
+    seen = [visibility(100.0), visibility(100.0, severity="mild"), visibility(0.1, "noise", "mild")]
+    result = BenchmarkResult({"asm": RESULT}, seen, rate=0.01, window_s=1.0)
+    table = monitors_table(result)
+    ideal, asm = (dict(zip(table.headings, row, strict=True)) for row in table.rows)
+    assert (ideal["Monitor"], ideal["AUROC, same steps"], ideal["False alarms"]) == ("ideal observer", "1.000", "")
+    assert asm["AUROC, same steps"].startswith("0.750 (")
+    # Whole nominal episodes peak at 1, 2, 3 and 4: the push of 5 is above all, the one of 2.5 above half.
+    assert asm["AUROC, whole episodes"] == "0.750"
+    assert (asm["Found at 1 %"], asm["Found at 0.5 %"]) == ("50 %", "needs 199")
+    assert (asm["False alarms"], asm["Median delay [ms]"], asm["p95 [ms]"]) == ("1 of 4 (5–70 %)", "50", "missed")
+    assert "noise mild" in table.caption
+    assert set(brief_monitors_table(result).headings) < set(table.headings)
+    assert brief_monitors_table(result).rows[1][1] == "0.750"
+    assert kinds_table(result).rows[2] == ("(noise mild)", "0.59 / 0 %", "0.00 / 0 %")
+    assert harmless_table(result, ["asm"]).rows == [("touch", "1 of 2")]
+
+
+def promised(calibrated, tested):
+    """One monitor, by its maxima."""
+    nominal = [ScoredEpisode("nominal", s, 0.1, 1.0, np.array([0.0, p])) for s, p in enumerate(tested)]
+    threshold = conformal_threshold(calibrated, 0.05)
+    one = MonitorResult(nominal, [], Calibration({0.05: threshold}, maxima=calibrated))
+    return kept_table(BenchmarkResult({"asm": one}, [], 0.05, 0.5)).rows[0][1]
+
+
+def test_a_kept_promise_is_called_broken_as_seldom_as_is_said_and_a_broken_one_is():
+    rng, broken = np.random.default_rng(0), 0
+    for _ in range(400):
+        broken += "broken" in promised(rng.exponential(size=99), rng.exponential(size=300))
+    assert 0 < broken <= stats.binom.ppf(0.999, 400, UNLIKELY)
+    assert "broken" in promised(rng.exponential(size=99), 2 * rng.exponential(size=300))
+
+
+# ------------------------------------------------------------------ resampled intervals
+
+
+def peaked(peak: float, seed: int, onset: int | None = None, before: float = 0.0) -> ScoredEpisode:
+    surprise = np.zeros(10)
+    surprise[5], surprise[4] = peak, before
+    return ScoredEpisode("nominal" if onset is None else "push", seed, 0.1, 1.0, surprise, onset, task="Lift")
+
+
+def scenes(rng, faults: int, n: int = 60):
+    """``faults`` faulty twins of each of ``n`` nominal episodes, which share what their scene adds."""
+    height = rng.standard_normal(n)
+    nominal = [peaked(float(np.exp(0.2 * h)), s) for s, h in enumerate(height)]
+    return [peaked(float(np.exp(h)), s, onset=5) for s, h in enumerate(height) for _ in range(faults)], nominal
+
+
+def test_more_faults_of_the_same_scenes_do_not_narrow_the_interval():
+    widths = []
+    for faults in (1, 20):
+        calibration = Calibration({0.05: 1.0}, maxima=np.ones(200))
+        drawn = resample(*scenes(np.random.default_rng(0), faults), calibration, 0.5, draws=200).found[0.05]
+        widths.append(interval(0.5, drawn).high - interval(0.5, drawn).low)
+    assert widths[1] == pytest.approx(widths[0], rel=0.05)
+    assert widths[0] == pytest.approx(4 * np.sqrt(0.25 / 60), rel=0.25)  # ± 2 standard errors of 60 scenes
+
+
+def test_the_interval_holds_what_calibration_adds():
+    # Peaks lie close about the threshold, so the threshold decides.
+    rng = np.random.default_rng(1)
+    nominal = [peaked(1.0, s) for s in range(60)]
+    faulty = [peaked(float(p), s, onset=5) for s, p in enumerate(1.0 + 0.01 * rng.standard_normal(60))]
+    certain, unsure = (
+        resample(faulty, nominal, Calibration({0.5: 1.0}, maxima=maxima), 0.5, draws=200).found[0.5]
+        for maxima in (np.ones(40), 1 + 0.05 * rng.standard_normal(40))
+    )
+    assert np.std(unsure) > 1.5 * np.std(certain)
+
+
+def test_resamples_agree_with_the_results_that_they_are_about():
+    faulty, nominal = scenes(np.random.default_rng(2), 2)
+    calibration = Calibration({0.05: 1.0, 0.001: 2.0}, maxima=np.linspace(0.5, 1.01, 200))
+    found = DetectionMetrics("asm", faulty, nominal, 0.5, calibration)
+    assert np.mean(found.draws.auroc) == pytest.approx(found.auroc, abs=0.02)
+    assert np.mean(found.draws.found[0.05]) == pytest.approx(found.found[0.05].value, abs=0.03)
+    assert 0.001 not in found.draws.found  # too few episodes for that rate
+    up = [peaked(3.0, s, onset=5, before=2.0) for s in range(4)]  # an alarm that was up already is no detection
+    assert not resample(up, nominal, calibration, 0.5, draws=20).found[0.05].any()
+
+
+def test_the_lead_over_a_monitor_that_judged_alike_is_nothing():
+    faulty, nominal = scenes(np.random.default_rng(4), 1)
+    one = MonitorResult([*nominal, *faulty], [], Calibration({0.05: 1.0}, maxima=np.linspace(0.5, 1.1, 60)))
+    seen = [Detectability("Lift", "push", "", t.seed, 100.0, 0, 0.1) for t in faulty]
+    table = lead_table(BenchmarkResult({"asm": one, "twin": one}, seen, 0.05, 0.5))
+    assert table.rows == [("twin", "+0.000 (+0.000 to +0.000), within chance", "+0.0 (+0.0 to +0.0), within chance")]
+
+
+# ------------------------------------------------------------------ fitted monitors
+
+
+def recordings():
+    return [replace(episode, label=EpisodeLabel("Sines", "fit", seed=n)) for n, episode in enumerate(sine_episodes(8))]
+
+
+def test_a_fitted_monitor_is_kept_and_a_damaged_one_is_fitted_anew(tmp_path):
+    first = fitted(tmp_path, "kalman", recordings(), 0)
+    (kept,) = (tmp_path / "monitors").glob("*")
+    written = kept.stat().st_mtime_ns
+    again = fitted(tmp_path, "kalman+evidence", recordings(), 0)
+    assert kept.stat().st_mtime_ns == written
+    assert set(again.learned_) == set(first.learned_)
+    kept.write_bytes(kept.read_bytes()[:100])
+    fitted(tmp_path, "kalman", recordings(), 0)
+    assert kept.stat().st_size > 1000
+
+
+def test_what_other_code_has_fitted_is_fitted_anew_with_a_warning(tmp_path, monkeypatch):
+    fitted(tmp_path, "kalman", recordings(), 0)
+    monkeypatch.setattr(scoring, "code_digest", lambda: "01234567")
+    with pytest.warns(UserWarning, match="kalman was fitted by other code"):
+        fitted(tmp_path, "kalman", recordings(), 0)
+    with warnings.catch_warnings(action="error"):
+        fitted(tmp_path, "kalman", recordings(), 0)
+
+
+def test_any_change_of_what_learns_is_other_code_and_nothing_else_is(tmp_path):
+    for name in (*CODE, "faults"):
+        path = tmp_path / name if name.endswith(".py") else tmp_path / name / "deeper" / "part.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("a = 1")
+    before = code_digest.__wrapped__(tmp_path)
+    (tmp_path / "faults" / "deeper" / "part.py").write_text("a = 2")
+    assert code_digest.__wrapped__(tmp_path) == before
+    (tmp_path / "detection" / "deeper" / "part.py").write_text("a = 2")
+    assert code_digest.__wrapped__(tmp_path) != before
+
+
+# ------------------------------------------------------------------ tables
+
+
+def printed(table: Table, width: int) -> str:
+    console = Console(width=width, color_system=None)
+    with console.capture() as caught:
+        console.print(ConsoleTable(table))
+    return caught.get()
+
+
+def test_a_new_column_is_a_heading_and_a_function():
+    table = tabulate("numbers", (Column("n", str), Column("squared", lambda n: f"{n * n:d}")), [2, 3])
+    assert (table.headings, table.rows) == (["n", "squared"], [("2", "4"), ("3", "9")])
+    with pytest.raises(ValueError, match="2 columns, but a row of 1"):
+        Table("t", ("a", "b"), [("x",)])
+
+
+def test_a_terminal_shows_a_row_in_a_line_and_a_narrow_one_a_cell_in_a_line():
+    headings = ("guard", "harm of hostile policies avoided", "in the worst cell", "healthy [episodes]")
+    table = Table("Harm avoided", headings, [("default", "99.7 %", "91.8 %", "1156 of 1200")])
+    assert any("99.7 %" in line and "1156 of 1200" in line for line in printed(table, 200).splitlines())
+    for width in (36, 60, 100):
+        assert max(map(len, printed(table, width).splitlines())) <= width
+        assert {"default", "hostile", "[episodes]"} <= set(printed(table, width).replace(":", " ").split())
+    assert "  in the worst cell: 91.8 %" in printed(table, 36).splitlines()
