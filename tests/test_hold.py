@@ -20,8 +20,12 @@ AT = 8
 
 def joints(env):
     """Angles [rad] and speeds [rad/s]."""
-    sim = env.unwrapped.simulation
-    return sim.data.qpos[sim._joints].copy(), sim.data.qvel[sim._dofs].copy()
+    inner = env.unwrapped
+    data, robots = inner.simulation.data, inner.robosuite_env.robots
+    places = [
+        np.concatenate([getattr(robot, f"_ref_joint_{what}_indexes") for robot in robots]) for what in ("pos", "vel")
+    ]
+    return data.qpos[places[0]].copy(), data.qvel[places[1]].copy()
 
 
 def motion(env, held=30):
