@@ -93,7 +93,14 @@ def train(
     network, energy = DYNAMICS[dynamics].learn(trajectories, hidden, schedule, rng, tick)
     inputs, lengths = np.concatenate([t.inputs for t in trajectories]), [len(t.inputs) for t in trajectories]
     deltas, layout = np.ascontiguousarray(inputs[:, changes]), (groups, changes, units)
-    independent = sum(len(t.senses) for t in trajectories)  # changes over several rows overlap
-    how = {"feedback": feedback, "lengths": lengths, "independent": independent}
-    association = learn_association(inputs, deltas, *layout, rng, tick, **how)
+    association = learn_association(
+        inputs,
+        deltas,
+        *layout,
+        rng,
+        tick,
+        feedback=feedback,
+        lengths=lengths,
+        independent=sum(len(t.senses) for t in trajectories),  # changes over several rows overlap
+    )
     return Trained(network.with_association(association), energy)

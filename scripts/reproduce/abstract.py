@@ -154,7 +154,7 @@ def one(job: tuple[str, int], config: Config) -> tuple[list[Record], dict[str, C
         note("recalled", **predicted(gru, given, CUE))
         note(WAYS[0], **reached(course, given))
         return made, {WAYS[0]: course}
-    sizes = {"hidden_size": UNITS[name], "association_size": 64}
+    sizes: dict[str, Any] = {"hidden_size": UNITS[name], "association_size": 64}
     asm = NeuralASM(SPEC, dynamics=name, seed=seed, epochs=config.epochs, free_running_probability=FREE, **sizes)
     asm = asm.fit(given.train).calibrate(given.calibration, RATE)
     memory, energy = ExpressionMemory(asm.senses_, asm.model.network), asm.model.free_energy(given.calibration[::4])
