@@ -23,7 +23,6 @@ from asm_gym.evaluation.alarms import traces_of
 from asm_gym.monitors import load_monitor, make_monitor
 from asm_gym.scripts import watch
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.unlike_pieces import kind_of, unlike
 
 RATE, ROWS = 50.0, 80
 
@@ -70,20 +69,6 @@ def test_normal_episodes_are_cut_into_pieces_and_split_by_the_seed():
     assert sorted(map(id, fitting + calibration)) == sorted(map(id, episodes))
     assert split_at_random(episodes, 0.05, 0.5, seed=1)[1] == calibration
     assert split_at_random(episodes, 0.05, 0.5, seed=2)[1] != calibration
-
-
-@pytest.mark.parametrize(
-    ("maxima", "odd"),
-    [
-        ([33, 2, 3, 4, 31, 6, 7, 5], [0, 4]),
-        ([1, 2, 3, 4, 5, 6, 7, 8], []),
-        ([1, 1, 1, 9, 9, 9, 9, 9], []),
-        ([5.0], []),
-    ],
-)
-def test_pieces_whose_surprise_is_far_above_all_others_are_found(maxima, odd):
-    assert unlike(np.array(maxima, float)).tolist() == odd
-    assert [kind_of(log) for log in ("a.csv", "pick/a.csv")] == ["a.csv", "pick"]
 
 
 def test_the_head_of_a_log_is_learned_from_and_its_tail_calibrated_on():
@@ -220,7 +205,7 @@ def test_a_promise_by_the_hour_takes_the_hours_and_says_so(logs, tmp_path, capsy
     assert "0.5 false alarms an hour need at least 2 hours of nominal episodes" in said
     assert not out.exists()
     assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarms-per-hour", "5000"]) == 0
-    assert "at most 5000 alarms an hour of normal ones" in " ".join(capsys.readouterr().out.split())
+    assert "at most 5000 alarms an hour" in " ".join(capsys.readouterr().out.split())
     assert load_monitor(out).promise.per == "hour"
 
 
@@ -366,44 +351,15 @@ def test_a_memory_is_fitted_from_a_pipe(tmp_path, monkeypatch, capsys):
 # ------------------------------------------------------------------ few and long logs
 
 
-def write(path, seed, seconds, weight=1.0, jolt=None):
+def write(path, seed, seconds):
     rng, rows = np.random.default_rng(seed), int(seconds * 50)
     q = np.sin(np.outer(np.arange(rows) / 50, [1.0, 1.7]) + rng.uniform(0, 6, 2)) + 1e-3 * rng.normal(size=(rows, 2))
-    torque = weight * 3 * q + 0.01 * rng.normal(size=q.shape)
-    if jolt is not None:
-        torque[int(50 * jolt) :][:10] += 5.0
+    torque = 3 * q + 0.01 * rng.normal(size=q.shape)
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         out = csv.writer(file)
         out.writerow(["time", "q_0", "q_1", "torque_0", "torque_1"])
         out.writerows(np.column_stack([np.arange(rows) / 50, q, torque]).tolist())
-
-
-SPLIT = ["--monitor", "association_values+evidence", "--split", "2"]
-
-
-def test_fit_names_the_piece_that_sets_the_threshold(tmp_path, capsys):
-    for n in range(3):
-        write(tmp_path / "logs" / f"{n}.csv", n, 60, jolt=45 if n == 1 else None)
-    fit = ["fit", str(tmp_path / "logs"), "--out", str(tmp_path / "m.asm"), *SPLIT, "--false-alarms-per-hour", "80"]
-    assert main(fit) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "1 of 42 pieces are unlike the others" in said
-    assert "1.csv from 44 s" in said
-
-
-def test_a_kind_that_was_left_out_is_surprising_where_it_differs(tmp_path, capsys):
-    for kind, weight in (("empty", 1.0), ("light", 1.0), ("heavy", 2.0)):
-        write(tmp_path / "logs" / kind / "a.csv", len(kind), 60, weight)
-    fit = ["fit", str(tmp_path / "logs"), "--out", str(tmp_path / "m.asm"), *SPLIT, "--false-alarm-rate", "0.1"]
-    assert main([*fit, "--leave-out"]) == 0
-    said = {
-        line.split()[2].rstrip(":"): line for line in capsys.readouterr().out.splitlines() if "Learned without" in line
-    }
-    assert set(said) == {"empty", "light", "heavy"}
-    share = {kind: float(line.split(" min, ")[1].split(" %")[0]) for kind, line in said.items()}
-    assert share["heavy"] > 50
-    assert max(share["light"], share["empty"]) < 5
 
 
 def test_a_long_log_is_learned_from_between_its_marked_rows(tmp_path, capsys):
