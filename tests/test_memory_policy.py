@@ -168,8 +168,8 @@ def test_an_episode_that_starts_forgets_the_last(pilot):
     _, state = policy.predict(observation)
     _, later = policy.predict(observation, state)
     _, again = policy.predict(observation, state, np.array([True]))
-    assert later.memory.model.steps.tolist() == [2]
-    assert again.memory.model.steps.tolist() == [1]
+    assert later.memory.model.history.steps.tolist() == [2]
+    assert again.memory.model.history.steps.tolist() == [1]
 
 
 def test_learning_to_act_leaves_the_surprise_as_it_was(pilot):
