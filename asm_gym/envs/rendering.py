@@ -7,91 +7,30 @@ import os
 import sys
 import time
 import weakref
-from collections.abc import Sequence
 from contextlib import suppress
 from copy import copy
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-import gymnasium as gym
 import mujoco
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
-RENDER_MODES = ("rgb_array", "depth_array", "human")
+RENDER_MODES = ("rgb_array", "human")
 
 _live: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
-class Pictures:
-    """Frames for people, and camera images for a policy, of one environment.
-
-    Args:
-        mode: None or one of ``RENDER_MODES``.
-        camera, size: camera of ``frame``, and its (height, width) [pixels].
-        cameras, camera_size: the same for ``images``.
-        dt: real time between two frames of mode ``human`` [s].
-    """
-
-    def __init__(
-        self,
-        mode: str | None,
-        camera: str,
-        size: tuple[int, int],
-        cameras: Sequence[str],
-        camera_size: tuple[int, int],
-        dt: float,
-    ) -> None:
-        self._mode, self._cameras, self._camera_size, self._dt = mode, tuple(cameras), camera_size, dt
-        self._renderer = OffscreenRenderer(camera, size[1], size[0])
-        self._window = Window(camera)
-        self._next = 0.0
-
-    @property
-    def spaces(self) -> dict[str, spaces.Space[Any]]:
-        """The space of each of ``images``."""
-        return {f"{name}_image": spaces.Box(0, 255, (*self._camera_size, 3), np.uint8) for name in self._cameras}
-
-    def images(self, model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, NDArray[np.uint8]]:
-        """Return (height, width, 3) uint8 from each camera, as ``<camera>_image``."""
-        return {f"{n}_image": self._renderer.render(model, data, n, self._camera_size) for n in self._cameras}
-
-    def frame(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[Any] | None:
-        """Return a frame of the render mode; ``human`` shows it in a window instead, in real time."""
-        if self._mode == "rgb_array":
-            return self._renderer.render(model, data)
-        if self._mode == "depth_array":
-            return self._renderer.depth(model, data)
-        if self._mode == "human":
-            self._window.show(model, data)
-            self._next = max(self._next + self._dt, time.perf_counter())
-            time.sleep(max(0.0, self._next - time.perf_counter()))
-        else:
-            gym.logger.warn("render() does nothing without a render_mode: gym.make(…, render_mode='rgb_array')")
-        return None
-
-    def close(self) -> None:
-        """Free renderer and window; may be called more than once."""
-        self._renderer.close()
-        self._window.close()
-
-
-def _close_all() -> None:
-    for renderer in list(_live):
-        renderer.close()
-
-
 class OffscreenRenderer:
-    """Pictures without a display, of any camera and size through one OpenGL context; follows a model's replacement.
+    """Pictures without a display; follows a model's replacement.
 
     OpenGL comes from EGL, or from OSMesa where the environment variable ``MUJOCO_GL`` says ``osmesa``. Shadows,
     reflections and multisampling are off: on a CPU they cost three times the rest.
 
     Args:
-        camera: the camera of a picture that names none.
-        width, height: the size of a picture that names none [pixels].
+        camera: a camera of the model.
+        width, height: the size of a picture [pixels].
     """
 
     def __init__(self, camera: str, width: int, height: int) -> None:
@@ -103,66 +42,24 @@ class OffscreenRenderer:
         self._options = mujoco.MjvOption()
         self._options.geomgroup[0] = 0  # collision shapes
 
-    def render(
-        self,
-        model: mujoco.MjModel,
-        data: mujoco.MjData,
-        camera: str | None = None,
-        size: tuple[int, int] | None = None,
-    ) -> NDArray[np.uint8]:
+    def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
         """Return a picture (height, width, 3) uint8.
-
-        Args:
-            size: (height, width) [pixels].
 
         Raises:
             ValueError: the model has no such camera.
             RuntimeError: this machine has no OpenGL.
         """
-        viewport = self._draw(model, data, camera, size)
-        picture = np.empty((viewport.height, viewport.width, 3), np.uint8)
-        mujoco.mjr_readPixels(picture, None, viewport, self._context)
-        return np.flipud(picture).copy()
-
-    def depth(
-        self,
-        model: mujoco.MjModel,
-        data: mujoco.MjData,
-        camera: str | None = None,
-        size: tuple[int, int] | None = None,
-    ) -> NDArray[np.float32]:
-        """Return (height, width) float32 distances along the viewing direction [m], not along each ray.
-
-        The buffer holds b, which is linear in 1/z from 1 at the near plane to 0 at the far one, so
-
-            1/z = 1/far + b (1/near - 1/far).
-
-        Where there is nothing, z is the far plane's. Arguments and errors are those of ``render``.
-        """
-        viewport = self._draw(model, data, camera, size)
-        buffer = np.empty((viewport.height, viewport.width), np.float32)
-        mujoco.mjr_readPixels(None, buffer, viewport, self._context)
-        near, far = (plane * model.stat.extent for plane in (model.vis.map.znear, model.vis.map.zfar))
-        inverse = 1 / far + buffer.astype(np.float64) * (1 / near - 1 / far)
-        return np.flipud(1 / inverse).astype(np.float32)
-
-    def _draw(
-        self, model: mujoco.MjModel, data: mujoco.MjData, camera: str | None, size: tuple[int, int] | None
-    ) -> mujoco.MjrRect:
-        height, width = size or (self.height, self.width)
-        self._camera.fixedcamid = camera_id(model, self.camera if camera is None else camera)
+        self._camera.fixedcamid = camera_id(model, self.camera)
         if self._model is not model:
             self._open(model)
         self._gl.make_current()
-        if width > self._context.offWidth or height > self._context.offHeight:
-            mujoco.mjr_resizeOffscreen(
-                max(width, self._context.offWidth), max(height, self._context.offHeight), self._context
-            )
         every = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self._options, None, self._camera, every, self._scene)
-        viewport = mujoco.MjrRect(0, 0, width, height)
+        viewport = mujoco.MjrRect(0, 0, self.width, self.height)
         mujoco.mjr_render(viewport, self._scene, self._context)
-        return viewport
+        picture = np.empty((self.height, self.width, 3), np.uint8)
+        mujoco.mjr_readPixels(picture, None, viewport, self._context)
+        return np.flipud(picture).copy()
 
     def _open(self, model: mujoco.MjModel) -> None:
         self.close()
@@ -175,8 +72,6 @@ class OffscreenRenderer:
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[flag] = 0
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
-        # Zero far away, where floats are dense, keeps depth exact at a distance.
-        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._model = model
 
@@ -190,18 +85,20 @@ class OffscreenRenderer:
 
 
 class Window:
-    """A window that shows a copy of the simulation's state; a model's replacement opens a new one.
+    """A window that shows a copy of the simulation's state in real time; a model's replacement opens a new one.
 
     Once its user has closed it, it stays closed.
 
     Args:
         camera: where it looks from at first.
+        dt: real time between two states [s].
     """
 
-    def __init__(self, camera: str) -> None:
-        self.camera = camera
+    def __init__(self, camera: str, dt: float) -> None:
+        self.camera, self.dt = camera, dt
         self._model: mujoco.MjModel | None = None
         self._viewer: Any = None
+        self._next = 0.0
 
     @property
     def is_open(self) -> bool:
@@ -209,7 +106,7 @@ class Window:
         return self._viewer is not None and bool(self._viewer.is_running())
 
     def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Bring the window up to date.
+        """Bring the window up to date, and wait until the next state is due.
 
         Raises:
             RuntimeError: there is no display to open a window on.
@@ -219,6 +116,8 @@ class Window:
         elif self.is_open:
             mujoco.mj_copyData(self._data, model, data)
             self._viewer.sync()
+        self._next = max(self._next + self.dt, time.perf_counter())
+        time.sleep(max(0.0, self._next - time.perf_counter()))
 
     def _open(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self.close()
@@ -249,6 +148,11 @@ class Window:
                 while self._viewer.m is not None and time.monotonic() < deadline:
                     time.sleep(0.01)
         self._viewer = self._model = None
+
+
+def _close_all() -> None:
+    for renderer in list(_live):
+        renderer.close()
 
 
 def close_at_exit(renderer: Any) -> None:

@@ -13,15 +13,14 @@ from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.envs import backend, shapes
-from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.edits import SimulatorEdits
-from asm_gym.envs.layout import Layout
-from asm_gym.envs.rendering import RENDER_MODES, Pictures
+from asm_gym.envs.rendering import RENDER_MODES, OffscreenRenderer, Window
 from asm_gym.envs.robots import PHYSICS_FREQ, chains_of, force_behind, free_first_joints, robots_for
+from asm_gym.envs.senses import Reading, Senses
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Corruption
 from asm_gym.envs.simulation import Simulation
-from asm_gym.spec import MOTOR, Channel, StreamSpec
+from asm_gym.spec import StreamSpec
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_choice, check_flag, check_number, check_numbers, check_text, shown
 
@@ -51,11 +50,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     Args:
         task: a name in ``asm_gym.tasks.TASKS``.
         robot: the arm, one of ``asm_gym.tasks.ROBOTS``; for a task with two arms a pair, or one name for both.
-        render_mode: ``None``, ``"rgb_array"``, ``"depth_array"`` or ``"human"``.
+        render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
         observation: ``"flat"`` for one Box, ``"dict"`` for named arrays.
-        cameras: adds a picture of each, ``<camera>_image`` (height, width, 3) uint8; a flat observation then becomes
-            ``state`` in a dict.
-        camera_size: (height, width) of these pictures [pixels].
         control_freq: actions a second [Hz]; must divide 500.
         controller: one of ``asm_gym.envs.backend.CONTROLLERS``, or a robosuite controller configuration.
         horizon: control steps before truncation; the task's own where None.
@@ -81,8 +77,6 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         robot: str | Sequence[str] | None = None,
         render_mode: str | None = None,
         observation: Literal["flat", "dict"] = "flat",
-        cameras: Sequence[str] = (),
-        camera_size: tuple[int, int] = (84, 84),
         control_freq: int = 20,
         controller: str | dict[str, Any] = "OSC_POSE",
         horizon: int | None = None,
@@ -98,9 +92,8 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.robots = robots_for(self.task, robot)
         check_choice("render_mode", render_mode, (None, *RENDER_MODES))
         check_choice("observation", observation, ("flat", "dict"))
-        for name, names in (("stream", stream), ("cameras", cameras)):
-            if isinstance(names, str) or not isinstance(names, Sequence):
-                raise ValueError(f"{name} must be a sequence of names, got {shown(names)}")
+        if isinstance(stream, str) or not isinstance(stream, Sequence):
+            raise ValueError(f"stream must be a sequence of names, got {shown(stream)}")
         for group in stream:
             check_choice("stream group", check_text("stream group", group), (*GROUPS, *EXTRA_GROUPS))
         if check_number("control_freq", control_freq, low=1, whole=True) and PHYSICS_FREQ % control_freq:
@@ -109,34 +102,32 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
             check_number("stream_freq", stream_freq, low=1, whole=True)
         self._row_substeps = backend.row_substeps(control_freq if stream_freq is None else stream_freq, control_freq)
         self.horizon = self.task.horizon if horizon is None else check_number("horizon", horizon, low=1, whole=True)
-        for name, size in (("camera_size", camera_size), ("render_size", render_size)):
-            if (check_numbers(name, size, 2, low=1, high=LARGEST_PICTURE) % 1).any():
-                raise ValueError(f"{name} must be two whole numbers, got {shown(size)}")
+        if (check_numbers("render_size", render_size, 2, low=1, high=LARGEST_PICTURE) % 1).any():
+            raise ValueError(f"render_size must be two whole numbers, got {shown(render_size)}")
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": control_freq}
         self.terminate_on_success = check_flag("terminate_on_success", terminate_on_success)
         self.sensor_noise = check_number("sensor_noise", sensor_noise, low=0, high=1e3)
         self.corruptions: list[Corruption] = []
-        """Sensor faults: each edits the measured row (channels of ``measured_spec``) in place, after the noise."""
+        """Sensor faults: each edits the measured row in place, after the noise."""
         self.deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]] = []
-        """Action faults: each makes of the action that was sent the one that arrives."""
+        """Action faults: each replaces the commanded action."""
         self.edits = SimulatorEdits()
-        """Changes of the simulator's numbers that are to be undone."""
+        """Changes of the simulator's numbers that will be undone."""
         self.substep_hooks: list[Callable[[int], None]] = []
-        """Called after every physics substep with its number in the control step; ``measure()`` says what the sensors
-        read then, and ``command()`` gives the controllers another action for the rest of the step."""
+        """Called after every physics substep with its number in the control step; a hook may call ``measure()`` and
+        ``command()``."""
         self.row_hooks: list[Callable[[NDArray[np.float32]], None]] = []
-        """Called with every row of the stream that is sensed within a control step, all but the last; ``command()``
-        gives the controllers another action from the next physics substep on."""
+        """Called with every row of the stream within a control step but the last; a hook may call ``command()``."""
         self.holding = False
-        """Set, the arms stay in the next control step, and the grippers keep what they were told, whatever action
-        arrives; from within a hook, in the rest of the step that runs. The step unsets it."""
+        """Set, the arms stay in the next control step, and the grippers keep their command, whatever action arrives;
+        from within a hook, in the rest of the step. The step unsets it."""
         self.keeps_holding = False
         """Set, ``holding`` lasts until both are unset, however many steps a wrapper in between makes of one."""
         self.contact_limits: ContactLimits | None = None
-        """What the arms may feel and how fast they may go in this episode; ``reset`` forgets it. ``info`` then holds
-        ``contact_load``, the largest share of a limit that was felt within the step, ``contact_left_s``, when in it a
-        limit was passed [s], not a number where none was, and ``contact_felt``, the step's mean of what was felt."""
+        """Limits of load and hand speed in this episode; ``reset`` removes them. ``info`` then holds ``contact_load``,
+        the largest share of a limit that was reached within the step, ``contact_left_s``, when in it a limit was passed
+        [s], NaN where none was, and ``contact_felt``, the step's mean load."""
         self.substeps = PHYSICS_FREQ // control_freq
         self._groups = tuple(stream)
         self._flat = observation == "flat"
@@ -145,23 +136,23 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._steps_taken = 0
 
         self.controller = controller if isinstance(controller, str) else "custom"
-        """Of the arms, by name."""
+        """Name of the arms' controller."""
         self.robosuite_env: Any = backend.make(
             self.task, self.robots, controller, control_freq, check_flag("reward_shaping", reward_shaping)
         )
         """The simulator underneath."""
-        for name in (camera, *cameras):
-            check_choice("camera", check_text("camera", name), self.robosuite_env.sim.model.camera_names)
-        self._pictures = Pictures(render_mode, camera, render_size, cameras, camera_size, 1.0 / control_freq)
+        check_choice("camera", check_text("camera", camera), self.robosuite_env.sim.model.camera_names)
+        self._renderer = OffscreenRenderer(camera, render_size[1], render_size[0])
+        self._window = Window(camera, 1.0 / control_freq)
         # Episodes are given their motion by the joints alone, so the initial noise is one number for every robot.
         self._qpos_noise = self.robosuite_env.robots[0].initialization_noise["magnitude"]
         self._bind()
         self.hand_chains = chains_of(self.simulation.parts, self.simulation.model, self.sensor_noise)
-        """Of the arms, as they were made."""
+        """Kinematic chains of the arms, as they were made."""
         self._actions = Actions(self.robosuite_env, self.task.name, self.controller)
         self.action_space = self._actions.space
         self.gripper_actions = self._actions.grippers
-        """Which numbers of the action command grippers."""
+        """Indices of the action that command grippers."""
         self._build_spaces()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
@@ -175,7 +166,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     # ------------------------------------------------------------------ spaces
 
     def _bind(self) -> None:
-        """Takes up what belongs to the present model, which a hard reset replaces."""
+        """Take up the present model, which a hard reset replaces."""
         free_first_joints(self.robosuite_env)
         self.simulation = Simulation(self.robosuite_env, self.substeps)
         """Physics, controllers and sensors of the loaded model."""
@@ -185,21 +176,18 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.simulation.keeps_history = self.task.name == "Wipe"  # whose reward reads it
 
     def _build_spaces(self) -> None:
-        action = Channel("action", self._actions.size, "1", 0.0, MOTOR)
-        everything = (*self.simulation.proprioception.channels, *self._objects.channels, action)
+        channels = (*self.simulation.proprioception.channels, *self._objects.channels)
         dt, source = self._row_substeps / PHYSICS_FREQ, "+".join(self.robots)
-        self.measured_spec = StreamSpec(everything, dt, source)
+        self._senses = Senses(
+            channels, self._actions.size, dt, source, self._groups, self.sensor_noise, flat=self._flat
+        )
+        self.measured_spec = self._senses.measured_spec
         """Everything that is measured, whether or not the stream carries it."""
-        ends = "external_torque", "wrist_force"
-        self.felt_channels = tuple(c for c in everything if c.name.endswith(ends))
-        """Of what the arms feel: external torque of the joints and force at the wrist, of one arm after another."""
-        self._noise = self.measured_spec.noise * self.sensor_noise
-        self._steps = self.measured_spec.resolution if self.sensor_noise else np.zeros(self.measured_spec.size)
-        self._layout = Layout(self.measured_spec, self._groups, self._flat)
-        self._overlooked = "object" not in self._groups
-        self.observation_layout = self._layout.sizes
+        self.felt_channels = tuple(c for c in channels if c.name.endswith(("external_torque", "wrist_force")))
+        """Channels that contact limits apply to, of one arm after another."""
+        self.observation_layout = self._senses.sizes
         """The observation's parts in order, and how many numbers each has."""
-        self.observation_space = self.laid_out_space = self._layout.space(self._pictures.spaces)
+        self.observation_space = self.laid_out_space = self._senses.space()
 
     @property
     def stream_freq(self) -> int:
@@ -216,7 +204,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._build_spaces()
 
     def stream_spec_at(self, rate: int) -> StreamSpec:
-        """``stream_spec`` as it would be at another rate [Hz]; nothing is changed.
+        """Return ``stream_spec`` as it would be at another rate [Hz]; nothing is changed.
 
         Raises:
             ValueError: a rate that does not fit physics or control.
@@ -227,7 +215,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     # ------------------------------------------------------------------ episodes
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode.
+        """Start an episode.
 
         Args:
             seed: makes the episode exact: same seed, same episode to the last bit, whatever ran before. Where a task
@@ -266,19 +254,19 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._steps_taken, self.holding = 0, False
         self.contact_limits = None
         self._action = np.zeros(self._actions.size, np.float32)
-        self._row = self.measure()
+        self._reading = self._read()
         self._ended = False
         if self.render_mode == "human":
             self.render()
-        return self._observation(), self._info(bool(env._check_success()))
+        return self._senses.observation(self._reading.row), self._info(bool(env._check_success()))
 
     def _is_edited(self) -> bool:
-        """Whether somebody has changed numbers of the model that would be mixed up with those that are drawn."""
+        """Whether numbers of the model are edited, which would be mixed up with those that are drawn."""
         nominal = self.simulation.nominal
         return len(self.edits) > 0 or nominal.now() is not nominal.unedited
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Runs one control step.
+        """Run one control step.
 
         Args:
             action: (A,) in [-1, 1]; clipped to it.
@@ -304,10 +292,10 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         env.cur_time += env.control_timestep
         self._steps_taken += 1
         reward, success = float(env._post_action(self._action)[0]), bool(env._check_success())
-        self._row = self.measure()
-        if unstable := self._bad_count() != self._warnings or not (self._finite and self._row_finite):
+        self._reading = self._read()
+        if unstable := self._bad_count() != self._warnings or not (self._finite and self._reading.row_finite):
             # The simulation then holds MuJoCo's initial state as a rule, which no sensor of the robot could read.
-            self._row[:] = self._stream[:] = np.nan
+            self._reading.row[:] = self._reading.stream[:] = np.nan
             reward, success = 0.0, False
         info = self._info(success, unstable)
         if self._row_substeps < self.substeps and "stream" in info:
@@ -317,25 +305,25 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._ended = terminated or truncated
         if self.render_mode == "human":
             self.render()
-        return self._observation(), reward, terminated, truncated, info
+        return self._senses.observation(self._reading.row), reward, terminated, truncated, info
 
     def _advance(self) -> None:
-        """The substeps of a control step, and the rows of the stream that come before its end."""
+        """Run the substeps of a control step, and read the rows of the stream before its end."""
         stride = 1 if self.substep_hooks else self._row_substeps
         for done in range(stride, self.substeps + 1, stride):
             self.simulation.advance(stride)
             for hook in self.substep_hooks:
                 hook(done - 1)
             if done % self._row_substeps == 0 and done < self.substeps:
-                self._read(within=True)
-                self._finite &= self._stream_finite
+                reading = self._read(within_step=True)
+                self._finite &= reading.stream_finite
                 self.simulation.begin_row()
-                self._rows.append(self._stream)
-                for hook_of_row in self.row_hooks:
-                    hook_of_row(self._stream)
+                self._rows.append(reading.stream)
+                for row_hook in self.row_hooks:
+                    row_hook(reading.stream)
 
     def command(self, action: NDArray[np.float32]) -> None:
-        """From within a hook: another action for the rest of the control step, efference copy included.
+        """From within a hook: command another action for the rest of the control step, efference copy included.
 
         Raises:
             ValueError: a wrong shape, or an action that is not finite.
@@ -348,7 +336,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self.simulation.command(self._delivered(self._action), held)
 
     def slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(A,) what is commanded in the place of ``action``, by the speed that the limits allow a hand."""
+        """Return the action (A,) at the hand speed that the contact limits allow."""
         limits = self.contact_limits
         if limits is None or not limits.limits_speed:
             return action
@@ -356,11 +344,11 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
 
     @property
     def felt(self) -> NDArray[np.float64]:
-        """(K, N) what the arms felt in each physics substep since the row began, noiseless; see ``felt_channels``."""
+        """(K, N) noiseless loads in each physics substep since the row began; see ``felt_channels``."""
         return self.simulation.felt
 
     def action_for(self, turns: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-        """The action that moves the arms' joints by ``turns`` from where they are, as nearly as one step can.
+        """Return the action that moves the arms' joints by ``turns`` from where they are, as nearly as one step can.
 
         Args:
             turns: [rad] for every joint of every arm, from the base on.
@@ -374,7 +362,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         return self._actions.turning(self.simulation, np.asarray(turns, np.float64))
 
     def _delivered(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
-        """What arrives of the action, in robosuite's units."""
+        """Return the action that arrives, in robosuite's units."""
         for deliver in self.deliveries:
             action = np.clip(deliver(action), -1.0, 1.0)
         return self._actions.scaled(action)
@@ -382,30 +370,19 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     # ------------------------------------------------------------------ senses
 
     def measure(self) -> NDArray[np.float64]:
-        """Reads every sensor once, over the time since the last row of the stream: noise, faults, resolution.
+        """Read every sensor once, over the time since the last row of the stream: noise, faults, resolution.
 
         Returns:
             (M,) as ``measured_spec`` names it.
         """
-        return self._read()
+        return self._read().row
 
-    def _read(self, within: bool = False) -> NDArray[np.float64]:
-        """As ``measure``; ``within`` a control step objects keep their last pose, if the stream does not carry them."""
-        if self.corruptions or not (within and self._overlooked):
-            self._object_poses = np.concatenate([*self._objects.read(), np.zeros(0)])
-        beside = np.concatenate([self._object_poses, self._action])
-        row = self.simulation.sense(beside, self._noise, self.np_random)
-        for corrupt in self.corruptions:
-            corrupt(row)
-        self._stream = np.empty(len(self._layout.carried), np.float32)
-        self._row_finite, self._stream_finite = kernels.quantise(row, self._steps, self._layout.carried, self._stream)
-        return row
-
-    def _observation(self) -> Any:
-        return self._layout.observation(self._row, self._pictures.images(self.simulation.model, self.simulation.data))
+    def _read(self, within_step: bool = False) -> Reading:
+        rest = self._action, self.corruptions, self.np_random
+        return self._senses.read(self.simulation, self._objects, *rest, within_step=within_step)
 
     def _info(self, success: bool, unstable: bool = False) -> dict[str, Any]:
-        info: dict[str, Any] = {"stream": self._stream} if self._layout.stream_spec else {}
+        info: dict[str, Any] = {"stream": self._reading.stream} if self._senses.stream_spec else {}
         sim = self.simulation
         felt = sim.contact_force, sim.external_force, sim.mean_external_force / self.metadata["render_fps"]
         names = "contact_force", "external_force", "external_impulse"
@@ -418,7 +395,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         return info | {"success": success, **forces, "unstable": unstable}
 
     def _bad_count(self) -> int:
-        """How often MuJoCo found the simulation unstable; it resets itself then, and says so nowhere else."""
+        """Return how often MuJoCo found the simulation unstable; it resets itself then, and says so nowhere else."""
         return sum(int(self._warning_counts[w]) for w in _BAD)
 
     @property
@@ -428,14 +405,14 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         Raises:
             AttributeError: there is no stream.
         """
-        if self._layout.stream_spec is None:
+        if self._senses.stream_spec is None:
             raise AttributeError("this environment was made with stream=(), so it has no stream")
-        return self._layout.stream_spec
+        return self._senses.stream_spec
 
     @property
     def measured(self) -> NDArray[np.float64]:
         """The row measured last, laid out as ``measured_spec`` says; a copy."""
-        return self._row.copy()
+        return self._reading.row.copy()
 
     def force_behind(self, torques: NDArray[np.floating[Any]]) -> tuple[str, NDArray[np.float64]]:
         """Return the link on which a force explains external torques (J,) [N m] best, and that force (3,) [N]."""
@@ -450,19 +427,24 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
     # ------------------------------------------------------------------ pictures
 
     def render(self) -> NDArray[Any] | None:
-        """One picture of the environment, by its ``render_mode``.
-
-        ``rgb_array`` gives (height, width, 3) uint8, ``depth_array`` (height, width) float32 [m]; ``human`` gives None,
-        and its window keeps to real time.
+        """Return a picture (height, width, 3) uint8; show it in a window where the ``render_mode`` is ``human``.
 
         Raises:
             RuntimeError: this machine has nothing to draw with.
         """
-        return self._pictures.frame(self.simulation.model, self.simulation.data)
+        state = self.simulation.model, self.simulation.data
+        if self.render_mode == "rgb_array":
+            return self._renderer.render(*state)
+        if self.render_mode == "human":
+            self._window.show(*state)
+        else:
+            gym.logger.warn("render() does nothing without a render_mode: gym.make(…, render_mode='rgb_array')")
+        return None
 
     def close(self) -> None:
-        """Frees the renderer and the simulation; may be called more than once."""
-        self._pictures.close()
+        """Free the renderer and the simulation; may be called more than once."""
+        self._renderer.close()
+        self._window.close()
         if self.robosuite_env is not None:
             self.robosuite_env.close()
             self.robosuite_env = None

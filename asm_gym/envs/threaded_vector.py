@@ -32,14 +32,14 @@ class ThreadVectorEnv(SyncVectorEnv[Any, Any]):
         self._members = [env for env in self.envs if isinstance(env, ThreadedEnv)]
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Every member steps, or is reset where its episode had ended, as the mode of autoreset has it."""
+        """Step every member, or reset it where its episode had ended, as the mode of autoreset has it."""
         each = list(iterate(self.action_space, actions))
         if len(each) != self.num_envs:
             raise ValueError(f"{self.num_envs} environments need as many actions, got {len(each)}")
         try:
             for member, action, ended in zip(self._members, each, self._autoreset_envs, strict=True):
                 if not ended or self.autoreset_mode is AutoresetMode.SAME_STEP:
-                    member.begin(action)
+                    member.begun = member.thread.submit(member.env.step, action)
             return super().step(actions)
         finally:
             wait([member.begun for member in self._members if member.begun is not None])
@@ -48,38 +48,29 @@ class ThreadVectorEnv(SyncVectorEnv[Any, Any]):
 
 
 class ThreadedEnv(gym.Wrapper[Any, Any, Any, Any]):
-    """One environment, made, stepped, rendered and closed on one thread, which graphics contexts ask for."""
+    """One environment, made, stepped, rendered and closed on one thread, as graphics contexts require."""
 
     def __init__(self, make: Callable[[], gym.Env[Any, Any]]) -> None:
-        self._thread = ThreadPoolExecutor(1)
-        super().__init__(self._thread.submit(make).result())
+        self.thread = ThreadPoolExecutor(1)
+        super().__init__(self.thread.submit(make).result())
         self.begun: Future[Any] | None = None
-        """The step that its thread does or has done, until it is asked for."""
-
-    def begin(self, action: Any) -> None:
-        """Begins a step, whose outcome the next call of ``step`` returns."""
-        self.begun = self._thread.submit(self.env.step, action)
+        """The step that its thread does or has done."""
 
     def step(self, action: Any) -> Any:
-        """The outcome of the step that was begun, or of one that is done now."""
-        if self.begun is None:
-            self.begin(action)
-        begun, self.begun = self.begun, None
-        assert begun is not None
+        """Return the outcome of the step that was begun, or of one that is done now."""
+        begun, self.begun = self.begun or self.thread.submit(self.env.step, action), None
         return begun.result()
 
     def reset(self, **arguments: Any) -> Any:
-        """Starts an episode."""
-        return self._thread.submit(self.env.reset, **arguments).result()
+        return self.thread.submit(self.env.reset, **arguments).result()
 
     def render(self) -> Any:
-        """What the environment shows."""
-        return self._thread.submit(self.env.render).result()
+        return self.thread.submit(self.env.render).result()
 
     def close(self) -> None:
-        """Closes the environment and ends its thread; more than once does no harm."""
+        """Close the environment and end its thread; may be called more than once."""
         try:
-            self._thread.submit(self.env.close).result()
+            self.thread.submit(self.env.close).result()
         except RuntimeError:  # the thread has ended already
             return
-        self._thread.shutdown()
+        self.thread.shutdown()
