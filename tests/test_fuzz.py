@@ -154,8 +154,8 @@ def test_faults_for_an_environment_are_a_sequence_of_them(lift, value):
 
 # Those that are checked before a simulator is made, which takes seconds.
 EARLY = (
-    "task", "robot", "render_mode", "observation", "camera_size", "render_size", "control_freq", "horizon", "stream",
-    "stream_freq", "sensor_noise", "terminate_on_success", "controller", "reward_shaping", "cameras", "camera",
+    "task", "robot", "render_mode", "observation", "render_size", "control_freq", "horizon", "stream",
+    "stream_freq", "sensor_noise", "terminate_on_success", "controller", "reward_shaping", "camera",
 )  # fmt: skip
 
 

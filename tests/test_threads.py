@@ -107,7 +107,7 @@ def test_a_member_that_raises_leaves_none_under_way():
 @pytest.mark.skipif(rendering_backend() is None, reason="this machine has no OpenGL to render with")
 def test_pictures_on_threads_are_those_taken_one_after_another():
     """Each from a context of its own thread, of the shape that was drawn last."""
-    options = {"cameras": ("agentview",), "camera_size": (32, 32), "render_mode": "rgb_array", "render_size": (48, 48)}
+    options = {"render_mode": "rgb_array", "render_size": (48, 48)}
     make = [partial(gym.make, "asm_gym/Lift-v0", **options)] * 2
     one, other = SyncVectorEnv(make), ThreadVectorEnv(make)
     other.reset(seed=7)
