@@ -152,7 +152,8 @@ class NeuralASM(CalibratedMonitor):
             FileNotFoundError: there is no such file.
             ValueError: the file is damaged, from another version, or something else.
         """
-        return restored(path, read_checkpoint(path, cls.kind), lambda spec, **how: made(cls, spec, how))
+        memory: Self = restored(path, read_checkpoint(path, cls.kind), lambda spec, **how: made(cls, spec, how))
+        return memory
 
     @classmethod
     @typed

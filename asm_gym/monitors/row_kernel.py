@@ -65,11 +65,11 @@ class LearnedMemory(NamedTuple):
         unused: Any = weight_shapes(1, 1, 1) if settles else settling_shapes(1, 1, 1)
         other = (Weights if settles else SettlingWeights)(**{n: np.zeros(s, np.float32) for n, s in unused.items()})
         weights = (other, network.weights) if settles else (network.weights, other)
-        scale = (np.ascontiguousarray(a, np.float64) for a in (scaler.mean, scaler.spread, scaler.change))
+        scale = [np.ascontiguousarray(a, np.float64) for a in (scaler.mean, scaler.spread, scaler.change)]
+        named = [np.ascontiguousarray(a, np.float32) for a in names]
+        inference = weights[0], weights[1], settles, *network.inference
         columns = spec.sensory, spec.motor, scaler.slow
-        named = (np.ascontiguousarray(a, np.float32) for a in names)
-        inference = network.inference
-        return cls(*scale, *columns, *weights, settles, *inference, network.association, network.spans, *named, True)
+        return cls._make([*scale, *columns, *inference, network.association, network.spans, *named, True])
 
 
 class LearnedEvidence(NamedTuple):
@@ -133,7 +133,8 @@ class RowKernel:
             print("asm-gym: compiling the memory, once on this machine (about a minute)", file=sys.stderr)
         steps, most, offset = detection.repeating
         arrays = d.whitening, d.ceiling, d.tail, d.context_quantile, d.context_range, d.gains
-        evidence = LearnedEvidence(*map(np.ascontiguousarray, arrays), float(d.bound), steps, most, offset)
+        whole = map(np.ascontiguousarray, arrays)
+        evidence = LearnedEvidence._make([*whole, float(d.bound), steps, most, offset])
         looks = bool(d.context_quantile[:-1].any())
         self._excuses = excuses
         self._learned = memory._replace(context=looks), evidence, _learned_excuses(excuses)
@@ -274,9 +275,9 @@ def observe_rows(
     was, now = old.detection.evidence, new.detection.evidence
     errors, context = error.astype(np.float64), new.memory.expected.astype(np.float64)
     white = evidence.whitening, evidence.ceiling, evidence.tail
-    usual = evidence.context_quantile, evidence.context_range, evidence.gains, evidence.bound
+    usual = evidence.context_quantile, evidence.context_range, evidence.gains
     (now.vector[:], now.context[:], now.steps[:]), _, shares = _step(
-        was.vector, was.context, was.steps, errors, context, *white, *usual
+        was.vector, was.context, was.steps, errors, context, *white, *usual, evidence.bound
     )
     before, after = old.detection.repetition, new.detection.repetition
     after.row[:], after.again[:], after.unlikely[:] = repeated(
