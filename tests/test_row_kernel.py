@@ -7,7 +7,7 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from asm_gym.detection.detector import EvidenceState
-from asm_gym.detection.evidence import POWER, TINY, accumulate, pool, strength
+from asm_gym.detection.evidence import POWER, TINY, pool, strength
 from asm_gym.detection.repetition import Repetition, evidence_steps, improbability
 from asm_gym.detection.whitening import bounded
 from asm_gym.memory.readout import KEPT, SMALLEST, certainty
@@ -47,7 +47,9 @@ def observed_by(asm, state, rows):
     """The value (B,), the attribution (B, D), and the next state."""
     errors, memory = expected_by(asm, state.model, rows)
     d, senses, (was, before) = asm.detector_, asm.spec.sensory, state.detection
-    evidence = accumulate(was, bounded(errors, d.bound) @ d.whitening, memory.expected, d.gains)
+    white = bounded(errors, d.bound) @ d.whitening
+    vector = was.vector + d.gains[:, None] * (white[:, None] - was.vector)
+    evidence = Evidence(vector, was.context + CONTEXT_GAIN * (memory.expected - was.context), was.steps + 1)
     ratios = (strength(evidence, d.gains) / d.ceiling) ** d.tail
     _, parts = pool(ratios.reshape(len(rows), -1))
     drive = np.hstack([memory.expected, evidence.context]) @ d.context_quantile[:-1] + d.context_quantile[-1]
