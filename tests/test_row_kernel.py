@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from asm_gym.detection.detector import EvidenceState
-from asm_gym.detection.evidence import POWER, TINY, pool, strength
+from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, pool, strength
+from asm_gym.detection.evidence_detection import EvidenceState
 from asm_gym.detection.repetition import Repetition, evidence_steps, improbability
 from asm_gym.detection.whitening import bounded
 from asm_gym.memory.readout import KEPT, SMALLEST, certainty
