@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from functools import partial
 
 import gymnasium as gym
@@ -110,14 +109,6 @@ def test_a_log_is_written_for_the_viewer_by_a_command(arm, tmp_path):
         column(tmp_path / "log.rrd", "surprise").ravel(), asm.score(episode(500)).value, rtol=1e-9
     )
     assert origins(tmp_path / "log.rrd") == {"log"}  # there is neither a robot nor a camera
-
-
-def test_rows_that_come_slowly_share_a_chunk(tmp_path):
-    with LiveView(tmp_path / "a.rrd", SPEC) as view:
-        for t in range(60):
-            view.row(t / 20, np.ones(SPEC.size), 0.1, 1.0, np.zeros(SPEC.size))
-            time.sleep(0.02)
-    assert (tmp_path / "a.rrd").stat().st_size < 300_000  # 776 kB with a chunk for each row
 
 
 def test_what_cannot_be_drawn_is_refused(tmp_path):
