@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from asm_gym.policies import make_policy, rollout
-from asm_gym.policies.reflexes import Comply, Hold, Retract
+from asm_gym.policies.reflexes import Hold
 from asm_gym.policies.scripted.base import Style
 from tests.fakes import FakeEnv
 from tests.rates import failures
@@ -77,61 +77,6 @@ def test_what_cannot_be_made_is_refused_with_what_exists(lift, tmp_path):
     for bad in ({"noise": -1}, {"speed": 0}):
         with pytest.raises(ValueError, match="must be"):
             Style(**bad)
-
-
-def test_retract_undoes_the_last_actions_newest_first_and_then_stays(lift):
-    retract = Retract(lift, steps=2)
-    retract.reset()
-    for x in (0.1, 0.2, 0.3):
-        retract.feel(np.zeros(3), np.full(7, x, np.float32), acting=False)
-    retract.feel(np.zeros(3), np.full(7, 0.9, np.float32), acting=True)  # its own doing is not undone
-    state, moves = retract.begin(np.full(7, 0.3, np.float32)), []
-    for _ in range(3):
-        action, state = retract.predict(None, state)
-        assert action[6] == np.float32(0.3)  # the grip is kept
-        moves.append(float(action[0]))
-    np.testing.assert_allclose(moves, [-0.3, -0.2, 0.0], rtol=1e-6)
-
-
-@pytest.mark.parametrize("controller", ["OSC_POSE", "JOINT_POSITION"])
-def test_comply_moves_the_joints_the_way_they_are_pressed(controller):
-    env = gym.make("asm_gym/Lift-v0", controller=controller).unwrapped
-    env.reset(seed=0)
-    comply = Comply(env, compliance=2.0, tolerated=1.0)
-    row = np.zeros(env.stream_spec.size)
-    at = env.stream_spec.slices["external_torque"].start
-    row[at + 3] = 3.0
-    comply.feel(row, np.zeros(7), acting=False)
-    assert comply.load.tolist() == [0, 0, 0, 2.0, 0, 0, 0]
-    before = env.simulation.data.qpos[:7].copy()
-    for _ in range(5):
-        action, _ = comply.predict(None, comply.begin(np.zeros(env.action_space.shape, np.float32)))
-        env.step(action)
-    moved = env.simulation.data.qpos[:7] - before
-    # Under OSC_POSE other joints help to move the hand as the pressed one would.
-    assert moved[3] > 0.01
-    if controller == "JOINT_POSITION":
-        assert np.abs(np.delete(moved, 3)).max() < 0.3 * moved[3]
-    env.close()
-
-
-def test_what_is_always_carried_is_not_yielded_to(lift):
-    comply = Comply(lift)
-    row = np.zeros(lift.get_wrapper_attr("stream_spec").size)
-    row[lift.get_wrapper_attr("stream_spec").slices["external_torque"]] = 5.0
-    for _ in range(100):
-        comply.feel(row, np.zeros(7), acting=False)
-    assert not comply.load.any()
-
-
-def test_reflexes_that_need_changes_refuse_other_actions():
-    for reflex in (Retract, Comply):
-        with pytest.raises(ValueError, match=r"OSC_POSE or JOINT_POSITION.*safe_action"):
-            reflex(FakeEnv())
-    env = gym.make("asm_gym/Lift-v0", stream=("joint", "hand"))
-    with pytest.raises(ValueError, match="external_torque"):
-        Comply(env)
-    env.close()
 
 
 class Overridden(FakeEnv):
