@@ -1,4 +1,4 @@
-"""Optional packages: what is missing is named with the extra that brings it."""
+"""Optional packages: a missing one is named with the extra that installs it."""
 
 from __future__ import annotations
 
@@ -11,40 +11,40 @@ from typing import Any
 
 from packaging.version import Version
 
-BROUGHT_BY = {
-    **dict.fromkeys(("mujoco", "robosuite"), "robosuite"),
-    **dict.fromkeys(("torch", "stable_baselines3", "tensorboard"), "agents"),
-    **dict.fromkeys(("minari", "h5py"), "data"),
-    **dict.fromkeys(("matplotlib", "imageio", "imageio_ffmpeg", "PIL"), "report"),
-    **dict.fromkeys(("pyarrow", "sklearn", "loky"), "report"),
-    **dict.fromkeys(("distributed", "dask", "ray"), "cluster"),
-    **dict.fromkeys(("moviepy",), "video"),
-    **dict.fromkeys(("gymnasium_robotics", "shimmy", "dm_control"), "environments"),
-    **dict.fromkeys(("torchrl", "wandb"), "learners"),
-    **dict.fromkeys(("huggingface_hub",), "hub"),
-    **dict.fromkeys(("ipywidgets", "ipykernel", "nbclient", "nbformat"), "notebooks"),
-    **dict.fromkeys(("rosbags",), "ros"),
-    **dict.fromkeys(("cyclonedds",), "dds"),
-    **dict.fromkeys(("rerun",), "rerun"),
+EXTRAS = {
+    "robosuite": ("mujoco", "robosuite"),
+    "agents": ("torch", "stable_baselines3", "tensorboard"),
+    "data": ("minari", "h5py"),
+    "report": ("matplotlib", "imageio", "imageio_ffmpeg", "PIL", "pyarrow", "sklearn", "loky"),
+    "cluster": ("distributed", "dask", "ray"),
+    "video": ("moviepy",),
+    "environments": ("gymnasium_robotics", "shimmy", "dm_control"),
+    "learners": ("torchrl", "wandb"),
+    "hub": ("huggingface_hub",),
+    "notebooks": ("ipywidgets", "ipykernel", "nbclient", "nbformat"),
+    "ros": ("rosbags",),
+    "dds": ("cyclonedds",),
+    "rerun": ("rerun",),
 }
-"""The extra of asm-gym that installs a package, by the name it is imported under."""
+"""Packages that each extra of asm-gym installs, by the names they are imported under."""
+BROUGHT_BY = {package: extra for extra, packages in EXTRAS.items() for package in packages}
+"""Extra that installs a package."""
 
 NOT_ON_3_13 = {
     "robosuite": "its mink asks for NumPy below 2, of which there is no build",
     "dm_control": "its labmaze has no build",
 }
-"""Why no extra brings a package to Python 3.13 and later."""
-
+"""Reasons why no extra installs a package on Python 3.13 and later."""
 
 MUJOCO_BELOW = "3.10"
-"""The first version of MuJoCo with which robosuite's environments are not tried; with 4.0 they cannot be made."""
+"""First version of MuJoCo with which robosuite's environments are not tested; with 4.0 they cannot be made."""
 
 
 def check_mujoco() -> None:
-    """Raises ImportError where another package has brought a MuJoCo that robosuite does not work with."""
+    """Raise ImportError where the installed MuJoCo does not work with robosuite."""
     try:
         found = version("mujoco")
-    except PackageNotFoundError:  # which whoever imports it says
+    except PackageNotFoundError:  # its importer says so
         return
     if Version(found) >= Version(MUJOCO_BELOW):
         raise ImportError(
@@ -53,12 +53,12 @@ def check_mujoco() -> None:
 
 
 def require(module: str, *, what: str, extra: str = "") -> Any:
-    """The module, imported.
+    """Return an imported module.
 
     Args:
-        module: its dotted name.
-        what: needs it, for the message.
-        extra: that installs it; looked up where it is not said.
+        module: dotted name.
+        what: feature that needs it, for the message.
+        extra: extra that installs it; looked up by default.
 
     Raises:
         ImportError: it is not installed; the message says what to install.
@@ -69,7 +69,7 @@ def require(module: str, *, what: str, extra: str = "") -> Any:
 
 @contextmanager
 def needed_for(what: str, extra: str = "") -> Iterator[None]:
-    """Says what to install where a package turns out to be missing inside; any other error passes as it is.
+    """Say what to install where the block misses a package; other errors pass.
 
     Raises:
         ImportError: a package that an extra brings is not installed.
