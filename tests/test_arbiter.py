@@ -1,25 +1,21 @@
 """Who acts next: one table of transitions, searched by a machine that tries whatever rows there may be."""
 
 import math
-import warnings
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
-from asm_gym.wrappers.arbiter import Arbiter, Sensed
-from asm_gym.wrappers.factory import make_fallback
-from asm_gym.wrappers.responses import RESPONSES
-from asm_gym.wrappers.transitions import GOING_ON, TRANSITIONS, ReleaseRule, Situation, State, following
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from asm_gym.policies.reflexes import Graded
-from tests.fakes import FakeEnv
+from asm_gym.guard.arbiter import STATES, Arbiter, Judged
+from asm_gym.guard.options import GuardOptions, ReleaseRule
+from asm_gym.guard.responses import GOING_ON, NO_RESPONSE, RESPONSES
+from asm_gym.guard.transitions import TRANSITIONS, Situation, State, following
 
 ACTING = (State.POLICY, State.TRIAL)
-ACT = np.array([0.5, -0.5, 1.0], np.float32)
+EVERYONE = np.ones(1, bool)
 
 
 def situations():
@@ -29,7 +25,7 @@ def situations():
 
 def reachable(situation):
     """What ``Arbiter`` never says together: control is handed back only where nothing presses."""
-    return not (situation.presses and (situation.quiet or situation.free or situation.waited or situation.goes_on))
+    return not (situation.presses and (situation.calm or situation.free or situation.waited or situation.goes_on))
 
 
 @pytest.mark.parametrize("state", State)
@@ -61,6 +57,15 @@ def test_an_ended_episode_stays_ended():
     assert all(following(State.ENDED, s) is None for s in situations())
 
 
+def decided(arbiter, surprise, presses=False, response="", touched=None, impulse=0.0):
+    """Whether a row is an alarm, and what it led to."""
+    over = not surprise <= 1.0
+    intervened = STATES[arbiter.state[0]] is State.REFLEX
+    said = NO_RESPONSE._replace(name=response, touched=touched)
+    row = Judged(surprise, over, False, over or presses, presses, impulse, intervened, False, said)
+    return row.alarm, arbiter.decide(0, row)
+
+
 @given(
     st.lists(
         st.tuples(
@@ -68,45 +73,37 @@ def test_an_ended_episode_stays_ended():
             st.booleans(),
             st.sampled_from(["", *RESPONSES]),
             st.sampled_from([None, True, False]),
-            st.booleans(),
         ),
         max_size=60,
     )
 )
 @settings(max_examples=200, deadline=None)
 def test_whatever_the_rows_a_pressing_arm_is_never_left_to_the_policy(rows):
-    env = FakeEnv()
-    arbiter = Arbiter(
-        Graded(env), 1.0, ReleaseRule(3, try_after=3, max_override=9, strikes=3), make_fallback(env), env.action_space
-    )
+    arbiter = Arbiter(1, ReleaseRule(3, try_after=3, max_override=9, strikes=3), 1.0)
     strikes = 0
-    for surprise, presses, response, touched, ends in rows:
-        if arbiter.state is State.ENDED:
+    for surprise, presses, response, touched in rows:
+        before = STATES[arbiter.state[0]]
+        if before is State.ENDED:
             break
-        before = arbiter.state
-        said = arbiter.decide(
-            Sensed(surprise, np.zeros(5), ACT, presses=presses, response=response, touched=touched, ends_step=ends)
-        )
+        alarm, said = decided(arbiter, surprise, presses, response, touched)
+        after = STATES[arbiter.state[0]]
         strikes += presses and before in ACTING
-        assert said.alarm == (presses or not surprise <= 1.0)
         if presses:
-            assert arbiter.state in (State.REFLEX, State.ENDED)
-        if before is State.REFLEX and arbiter.state is not State.REFLEX:
+            assert after in (State.REFLEX, State.ENDED)
+        if before is State.REFLEX and after is not State.REFLEX:
             assert said.transition in ("release", "trial", "give_up", *GOING_ON)
-        if said.alarm and before in ACTING and arbiter.state in ACTING:
+        if alarm and before in ACTING and after in ACTING:
             assert response in GOING_ON
         assert strikes <= 3
-        assert (arbiter.state is State.ENDED) == said.gave_up
 
 
 class Episodes(RuleBasedStateMachine):
-    """Rows, commands and resets in any order."""
+    """Rows and resets in any order."""
 
     def __init__(self):
         super().__init__()
-        self.env = FakeEnv()
         self.limits = ReleaseRule(2, try_after=2, max_override=6, strikes=3, impulse=5.0, go_on=4)
-        self.arbiter = Arbiter(Graded(self.env), 1.0, self.limits, make_fallback(self.env), self.env.action_space)
+        self.arbiter = Arbiter(1, self.limits, 1.0)
         self.went_on = 0
 
     @rule(
@@ -117,32 +114,20 @@ class Episodes(RuleBasedStateMachine):
         impulse=st.sampled_from([0.0, 4.9, 5.1]),
     )
     def row(self, surprise, presses, response, touched, impulse):
-        arbiter = self.arbiter
-        if arbiter.state is State.ENDED:
+        if STATES[self.arbiter.state[0]] is State.ENDED:
             return
-        if response == "go on" and not arbiter.may_go_on:
-            response = "hold"  # as the responder does
-        said = arbiter.decide(Sensed(surprise, np.zeros(5), ACT, None, presses, impulse, response, touched))
+        if response == "go on" and not self.arbiter.may_go_on(0):
+            response = "hold"  # as the diagnostician does
+        _, said = decided(self.arbiter, surprise, presses, response, touched, impulse)
         self.went_on += said.transition == "go on"
         if impulse > 5.0:
-            assert arbiter.state is State.ENDED
-
-    @rule(action=st.sampled_from([ACT, 9 * ACT, np.full(3, np.nan, np.float32)]))
-    def command(self, action):
-        if self.arbiter.state is State.ENDED:
-            return
-        acts = self.arbiter.state in ACTING and np.isfinite(action).all()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that such an action is none is said, which other tests ask for
-            done = self.arbiter.command(action, np.zeros(2, np.float32))
-        assert self.env.action_space.contains(done.action)
-        np.testing.assert_array_equal(done.action, np.clip(action, -1, 1) if acts else [0, 0, done.action[2]])
+            assert STATES[self.arbiter.state[0]] is State.ENDED
 
     @rule()
     def begin(self):
-        self.arbiter.reset()
+        self.arbiter.begin(EVERYONE)
         self.went_on = 0
-        assert self.arbiter.state is State.POLICY
+        assert STATES[self.arbiter.state[0]] is State.POLICY
 
     @invariant()
     def nobody_goes_on_for_longer_than_is_allowed(self):
@@ -153,14 +138,33 @@ TestEpisodes = Episodes.TestCase
 TestEpisodes.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
 
 
-def test_the_documentation_has_every_transition_in_order():
-    page = (Path(__file__).parents[1] / "docs" / "guides" / "the_guard.md").read_text(encoding="utf-8")
-    rows = [
-        line.strip("| ").split(" | ")
-        for line in page.splitlines()
-        if line.startswith(("| policy", "| trial", "| reflex"))
-    ]
-    assert [row[1] for row in rows] == [t.why for t in TRANSITIONS]
-    for row, t in zip(rows, TRANSITIONS, strict=True):
-        assert row[0].split(", ") == [str(state) for state in t.within]
-        assert row[2] == ("the same" if t.to is None else str(t.to))
+def held_by_a_contact():
+    arbiter = Arbiter(1, ReleaseRule(10, try_after=10), 1.0)
+    assert decided(arbiter, 2.0, response="hold")[1].transition == "override"
+    return lambda surprise, **kw: decided(arbiter, surprise, **kw)[1].transition
+
+
+def test_control_goes_back_once_nothing_presses_though_surprise_is_not_low_and_later_each_time_it_was_too_early():
+    decide = held_by_a_contact()
+    assert [decide(0.9, touched=False) for _ in range(5)] == [*[""] * 4, "release"]
+    assert decide(2.0, response="hold") == "override"
+    assert [decide(0.9, touched=False) for _ in range(10)] == [*[""] * 9, "release"]
+
+
+def test_control_does_not_go_back_while_something_presses_though_surprise_is_low():
+    decide = held_by_a_contact()
+    assert {decide(0.0, touched=True) for _ in range(30)} == {""}
+    assert decide(0.0, touched=None) == "release"
+
+
+def test_graded_gives_up_after_seconds_and_not_steps():
+    rules = [GuardOptions().rule(True, dt, 1) for dt in (0.05, 0.01)]
+    assert [(r.try_after, r.max_override) for r in rules] == [(10, 60), (50, 300)]
+
+
+def test_an_episode_that_begins_leaves_the_other_robots_as_they_are():
+    arbiter = Arbiter(2, ReleaseRule(), 1.0)
+    for robot in range(2):
+        arbiter.decide(robot, Judged(2.0, True, False, True, False, 0.0, False, False, NO_RESPONSE))
+    arbiter.begin(np.array([True, False]))
+    assert [STATES[s] for s in arbiter.state] == [State.POLICY, State.REFLEX]

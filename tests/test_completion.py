@@ -3,44 +3,15 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from asm_gym.wrappers.repair import ObservationMap, Repair
 from gymnasium import spaces
 
 from asm_gym.episode import Episode
 from asm_gym.memory.completion import Completion, sensors_of
 from asm_gym.monitors import NeuralASM, Surprise
 from asm_gym.monitors.diagnosis import CLASSES, Diagnosis, Readout
-from asm_gym.scaling import StreamScaler
-from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import CompletedObservation, NeuralASMSafety
-from tests.fakes import CueMonitor
-
-SPEC = StreamSpec(
-    (
-        Channel("joint_position", 2, "rad", 0.001, "joint"),
-        Channel("hand_position", 2, "m", 0.001, "hand"),
-        Channel("lone", 1, "1", 0.001, "alone"),
-        Channel("action", 2, group=MOTOR),
-    ),
-    dt=0.05,
-)
-"""A planar arm of two joints: the hand is bent by sines and cosines; nothing tells of ``lone``."""
-
-
-def arm(steps: int, seed: int) -> np.ndarray:
-    """(T, 7) an episode of it: joints swing, and the hand is where they say."""
-    rng = np.random.default_rng(seed)
-    t = 0.05 * np.arange(steps)[:, None] + rng.uniform(0, 6, 2)
-    q = np.array([0.4, 0.9]) + 0.35 * np.sin(t * np.array([1.0, 1.6]))
-    hand = np.stack([np.cos(q[:, 0]) + np.cos(q.sum(axis=1)), np.sin(q[:, 0]) + np.sin(q.sum(axis=1))], axis=1)
-    lone = np.cumsum(0.1 * rng.standard_normal((steps, 1)), axis=0)
-    sensed = np.hstack([q, hand, lone]) + 0.001 * rng.standard_normal((steps, 5))
-    return np.hstack([sensed, np.cos(t)]).astype(np.float32)
-
-
-STREAMS = [arm(120, seed) for seed in range(12)]
-SENSES = StreamScaler.fit(SPEC, STREAMS)
-MEMORY = Completion.fit(SENSES, STREAMS)
+from asm_gym.wrappers.robots import robots_of
+from tests.arms import MEMORY, SENSES, SPEC, STREAMS, Arm, Judge, Repaired, arm, offset
 
 
 def missing(*columns: int) -> np.ndarray:
@@ -91,7 +62,7 @@ def test_a_joint_and_the_wrist_are_one_sensor_each():
 
 
 def test_a_sense_is_repaired_until_it_is_well_again():
-    repair, rows = Repair(MEMORY), arm(120, 7)
+    repair, rows = Repaired(), arm(120, 7)
     for t, row in enumerate(rows):
         faulty = row.copy()
         faulty[0] += 0.3 * (20 <= t < 60)
@@ -102,12 +73,12 @@ def test_a_sense_is_repaired_until_it_is_well_again():
         assert abs(seen[0] - row[0] - expected) < 0.05, t
         np.testing.assert_array_equal(seen[1:], row[1:])  # whatever else is sensed is handed on to the bit
         assert repair.names == (("encoder[0]",) if 22 <= t < 79 else ()), t
-    repair.reset()
-    assert not repair.missing.any()
+    repair.rows.begin(np.ones(1, bool))
+    assert not repair.names
 
 
 def test_numbers_that_are_none_are_completed_at_once_and_several_together():
-    repair, rows = Repair(MEMORY), arm(30, 8)
+    repair, rows = Repaired(), arm(30, 8)
     for t, row in enumerate(rows):
         faulty = row.copy()
         if t >= 10:
@@ -116,11 +87,11 @@ def test_numbers_that_are_none_are_completed_at_once_and_several_together():
         assert np.isfinite(seen).all()
         np.testing.assert_allclose(seen, row, atol=0.06)
     lost = np.full(SPEC.size, np.nan, np.float32)
-    assert not np.isfinite(Repair(MEMORY).read(lost)).all()  # nothing is left to go by, and nobody pretends
+    assert not np.isfinite(Repaired().read(lost)).all()  # nothing is left to go by, and nobody pretends
 
 
 def test_what_nothing_else_tells_of_is_trusted_for_a_second_only():
-    repair, rows = Repair(MEMORY, trust_s=1.0), arm(60, 9)
+    repair, rows = Repaired(trust_s=1.0), arm(60, 9)
     trusted = []
     for t, row in enumerate(rows):
         faulty = row.copy()
@@ -151,62 +122,6 @@ def test_a_sense_that_is_completed_is_the_cause_no_more():
     without = diagnosis(rows, attribution, missing(0))
     assert without.part.startswith("observation")
     assert 0 not in without.columns
-
-
-class Arm(gym.Env):
-    """Plays an episode of the arm back; what is sensed is the observation, and there is no stream."""
-
-    metadata = {"render_fps": 20}  # noqa: RUF012
-
-    def __init__(self, broken=lambda t, row: None):
-        self.observation_space = spaces.Box(-50, 50, (5,), np.float32)
-        self.action_space = spaces.Box(-1, 1, (2,), np.float32)
-        self.broken = broken
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return self._observe(), {}
-
-    def step(self, action):
-        self.t += 1
-        return self._observe(), 0.0, False, False, {}
-
-    def _observe(self):
-        row = arm(120, 31)[self.t, :5].copy()
-        self.broken(self.t, row)
-        return row
-
-
-class Named:
-    """Says which family it was; a read-out that needs no learning."""
-
-    def __init__(self, family):
-        self.p = 0.9 * np.eye(len(CLASSES))[list(CLASSES).index(family)] + 0.1 / len(CLASSES)
-
-    def __call__(self, evidence):
-        return self.p[None]
-
-
-GENERIC = StreamSpec.from_spaces(Arm().observation_space, Arm().action_space, 0.05)
-
-
-class Judge(CueMonitor):
-    """Surprised in the steps of ``cue``; its diagnosis is that of the family it is given."""
-
-    def __init__(self, cue, family="sensor"):
-        super().__init__(cue, GENERIC)
-        streams = STREAMS
-        self.diagnosis_ = Diagnosis(Completion.fit(StreamScaler.fit(GENERIC, streams), streams), Named(family))
-
-    def observe(self, state, stream):
-        attribution = np.zeros((1, self.spec.size))
-        attribution[0, 0] = 10.0 if state in self.cue else 0.1
-        return state + 1, Surprise(attribution.sum(axis=1), attribution)
-
-
-def offset(t, row):
-    row[0] += 0.3 * (t >= 20)
 
 
 def played(env, steps):
@@ -253,8 +168,9 @@ def test_a_named_sensor_is_never_believed_and_an_unknown_one_is_refused():
 def test_an_observation_that_a_wrapper_has_changed_is_refused():
     env = gym.make("asm_gym/Lift-v0")
     shorter = gym.wrappers.TransformObservation(env, lambda o: o[:5], spaces.Box(-100, 100, (5,), np.float32))
-    with pytest.raises(ValueError, match="has changed the observation"):
-        ObservationMap(shorter, env.unwrapped.stream_spec)
+    robots, places = robots_of(shorter, env.unwrapped.stream_spec)
+    assert places is None
+    assert "has changed the observation" in robots.refused["complete"]
     env.close()
 
 
@@ -264,8 +180,9 @@ def test_the_numbers_of_an_observation_are_found_in_the_stream(observation):
     spec = env.unwrapped.stream_spec
     seen, info = env.reset(seed=0)
     everything = np.ones(spec.size, bool)
-    same = ObservationMap(env, spec).repaired(seen, info["stream"], everything)
-    other = ObservationMap(env, spec).repaired(seen, info["stream"] + 1, everything)
+    _, places = robots_of(env, spec)
+    same = places.repaired(seen, info["stream"], everything)
+    other = places.repaired(seen, info["stream"] + 1, everything)
     if observation == "flat":
         np.testing.assert_array_equal(same, seen)
         assert (other != seen).sum() == 7 + 7 + 3 + 6 + 2 + 2

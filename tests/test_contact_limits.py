@@ -3,18 +3,19 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from asm_gym.wrappers.factory import limits_of
-from asm_gym.wrappers.substeps import SubstepGuard
 from gymnasium.vector import SyncVectorEnv
 
 from asm_gym import collect
 from asm_gym.contact_limits import ContactLimits, healthy_forces
 from asm_gym.familiar_speed import UNKNOWN, FamiliarSpeed
+from asm_gym.guard.checks import limits_of
+from asm_gym.guard.limits import EpisodeLimits
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from asm_gym.wrappers.oracle import OracleReflex
+from asm_gym.wrappers.robots import robots_of
 from tests.fakes import SPEC, CueMonitor
 
 
@@ -99,14 +100,14 @@ def test_a_force_range_that_was_never_calibrated_is_the_usual_one():
 
 
 def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_third_as_fast_for_a_second(lift):
-    lift.reset(seed=0)
-    guard = SubstepGuard(lift, ContactLimits(), True, CueMonitor())
-    guard.begin()
-    guard.pressed()
+    spec, yes, no = lift.unwrapped.stream_spec, np.ones(1, bool), np.zeros(1, bool)
+    limits, rows = EpisodeLimits(robots_of(lift, spec)[0], spec, ContactLimits(), True, None), np.zeros((1, spec.size))
+    limits.begin(yes)
+    limits.follow(rows, yes, yes)
     told = []
     for _ in range(21):
-        told.append(lift.unwrapped.contact_limits)
-        guard.acted()
+        told.append(limits.now[0])
+        limits.follow(rows, yes, no)
     assert told[:20] == [ContactLimits(wrist_force=40.0, external_torque=20.0, hand_speed=0.15 / 3)] * 20
     assert told[20] == ContactLimits()
 

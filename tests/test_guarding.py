@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
-from asm_gym.policies.reflexes import Hold, Retract
+from asm_gym.policies.reflexes import Hold
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
+from tests.arms import ACT as ARM_ACT
+from tests.arms import Acting, Judge, infos
 from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
-from tests.test_completion import Judge
-from tests.test_responses import ACT as ARM_ACT
-from tests.test_responses import Acting, infos
 
 ACT = np.array([0.5, -0.5, 1.0], np.float32)
 
@@ -131,15 +130,6 @@ def test_a_policy_that_uses_one_buffer_changes_nothing_that_was_said_or_kept():
         said.append(guarded.step(buffer)[4]["asm"]["executed_action"])
     np.testing.assert_allclose([s[0] for s in said], [0, 0.1, 0.2, 0.3, 0, 0], atol=1e-6)
     np.testing.assert_allclose([s[2] for s in said], 1.0)  # the grip of before the alarm, whatever came into the buffer
-
-
-def test_going_back_undoes_what_was_done_whatever_became_of_the_buffer(lift):
-    reflex = Retract(lift, steps=3)
-    buffer = np.zeros(7, np.float32)
-    for x in (0.1, 0.2, 0.3):
-        buffer[0] = x
-        reflex.feel(np.zeros(1), buffer, acting=False)
-    np.testing.assert_allclose([reflex.move()[0] for _ in range(3)], [-0.3, -0.2, -0.1])
 
 
 class Driver(FakeEnv):

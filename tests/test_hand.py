@@ -4,9 +4,9 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from asm_gym.wrappers.hand import LIMIT, HandAgainstJoints
 from gymnasium.vector import SyncVectorEnv
 
+from asm_gym.guard.hand import LIMIT, HandAgainstJoints
 from asm_gym.kinematics import Chain
 from asm_gym.monitors import NeuralASM
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
@@ -51,6 +51,23 @@ def rows(arm, count, seed=0):
     return found, angles
 
 
+class Check:
+    """One arm's hand against its joints."""
+
+    def __init__(self, lift):
+        self.hands = HandAgainstJoints((lift.unwrapped.hand_chains[0],), lift.unwrapped.stream_spec)
+
+    def read(self, row, missing):
+        return self.hands.contradiction(0, missing) if self.hands.compare(row[None].astype(np.float32)) else None
+
+    def reset(self):
+        self.hands.begin(np.ones(1, bool))
+
+    @property
+    def vouched(self):
+        return self.hands.vouched(0)
+
+
 def said(check, stream, since=0, missing=None):
     missing = np.zeros(stream.shape[1], bool) if missing is None else missing
     found = [check.read(row, missing) for row in stream]
@@ -59,33 +76,35 @@ def said(check, stream, since=0, missing=None):
 
 
 def test_healthy_senses_contradict_nothing(lift):
-    (check,) = HandAgainstJoints.of(lift, lift.unwrapped.stream_spec)
+    check = Check(lift)
     assert said(check, rows(lift.unwrapped, 3000)[0]) is None
 
 
 @pytest.mark.parametrize("joint", range(7))
 def test_an_encoder_that_is_five_thousandths_off_is_named_and_its_angle_found_by_the_hand(lift, joint):
     spec = lift.unwrapped.stream_spec
-    (check,) = HandAgainstJoints.of(lift, spec)
+    check = Check(lift)
     stream, angles = rows(lift.unwrapped, 60, seed=joint)
     stream[30:, joint] += 0.005
     at, cause = said(check, stream, since=30)
     assert at < 36
     assert cause.part == f"encoder[{joint}]"
     missing = np.zeros(spec.size, bool)
-    assert all(check.read(row, missing) == cause for row in stream[40:45])  # said again until somebody completes it
+    assert all(
+        check.read(row, missing).part == cause.part for row in stream[40:45]
+    )  # said again until somebody completes it
     missing[cause.columns] = True
     assert check.read(stream[50], missing) is None  # that explains it
-    assert check.accused[cause.columns].all()
+    assert check.hands.accused(0)[cause.columns].all()
     guessed = stream[50].copy()
     guessed[joint] += 0.03  # what a memory may be off
-    found = check.refined(guessed, missing, np.full(spec.size, 0.05))
+    found = check.hands.refined(0, guessed, missing, np.full(spec.size, 0.05))
     assert abs(found[joint] - angles[50, joint]) < 0.002
 
 
 def test_a_number_of_the_hand_is_named_and_what_no_single_sensor_explains_is_not(lift):
     spec = lift.unwrapped.stream_spec
-    (check,) = HandAgainstJoints.of(lift, spec)
+    check = Check(lift)
     stream, _ = rows(lift.unwrapped, 60)
     stream[30:, spec.slices["hand_position"].start + 1] += 0.01
     assert said(check, stream, since=30)[1].part == "hand_position[1]"
@@ -96,7 +115,7 @@ def test_a_number_of_the_hand_is_named_and_what_no_single_sensor_explains_is_not
 
 
 def test_one_reading_that_is_far_off_is_over_soon(lift):
-    (check,) = HandAgainstJoints.of(lift, lift.unwrapped.stream_spec)
+    check = Check(lift)
     stream, _ = rows(lift.unwrapped, 60)
     stream[30, 3] = 0.0
     none = np.zeros(stream.shape[1], bool)
@@ -109,7 +128,7 @@ def test_one_reading_that_is_far_off_is_over_soon(lift):
 def test_what_hand_and_joints_agree_upon_is_no_sensor_at_fault(lift):
     """A memory that named a healthy encoder completed it, and was blind to what the arm did (IIWA, Door, 2,572 N)."""
     spec = lift.unwrapped.stream_spec
-    (check,) = HandAgainstJoints.of(lift, spec)
+    check = Check(lift)
     none = np.zeros(spec.size, bool)
     stream, _ = rows(lift.unwrapped, 60)
     assert not check.vouched.any()  # nothing was seen yet

@@ -3,22 +3,17 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from asm_gym.wrappers.arbiter import Arbiter, Sensed
-from asm_gym.wrappers.factory import make_fallback
-from asm_gym.wrappers.responses import DEFAULT, Responder
-from asm_gym.wrappers.severity import Severity
-from asm_gym.wrappers.transitions import ReleaseRule
 
+from asm_gym.guard.diagnosis import Alarm, Diagnostician
+from asm_gym.guard.responses import DEFAULT
+from asm_gym.guard.robots import Robots
 from asm_gym.memory.completion import Completion
 from asm_gym.monitors.diagnosis import Diagnosis
-from asm_gym.policies.reflexes import Graded
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
-from tests.fakes import FakeEnv
+from tests.arms import ACT, Acting, Judge, Named, infos
 from tests.needs import needs
-from tests.test_completion import SPEC, Judge, Named
-from tests.test_responses import ACT, Acting, infos
 
 SOLID = StreamSpec(
     (
@@ -162,11 +157,12 @@ def test_the_policy_goes_on_only_where_somebody_would_feel_and_the_cause_is_sure
 @pytest.mark.parametrize(("force", "goes_on"), [(39.0, True), (41.0, False)])
 def test_the_policy_goes_on_in_alarm_only_while_it_presses_no_harder_than_free_motion(force, goes_on):
     monitor = Judge({10}, "object")
-    responder = Responder(Acting(), monitor, DEFAULT, repairs=True)
-    for _ in range(3):
-        responder.read(np.zeros(SPEC.size, np.float32))
-    said = responder.respond(True, False, np.full(SPEC.size, 1.0 / SPEC.size), Severity(load=0.5, force=force))
-    assert said.name == ("go on" if goes_on else "hold")
+    diagnosis, spec = monitor.diagnosis_, monitor.spec
+    diagnostician = Diagnostician(Robots.unknown(spec), spec, diagnosis, DEFAULT, asked=True)
+    no, shares = np.zeros(spec.size, bool), np.full(spec.size, 1.0 / spec.size)
+    rows = np.zeros((3, spec.size), np.float32)
+    alarm = Alarm(rows, shares, no, None, False, False, True, force, 0.1, True, ~no)
+    assert diagnostician.respond(0, alarm)[0].name == ("go on" if goes_on else "hold")
 
 
 def test_the_policy_goes_on_for_a_bounded_time_and_is_held_then():
@@ -184,27 +180,6 @@ def test_the_policy_goes_on_for_a_bounded_time_and_is_held_then():
 def test_a_table_that_lets_a_pressing_arm_go_on_is_refused(cause, response):
     with pytest.raises(ValueError, match=f"'{response}' would let an arm go on that presses: {cause} takes hold"):
         NeuralASMSafety(Acting(), Judge(()), responses={cause: response})
-
-
-def held_by_a_contact():
-    env = FakeEnv()
-    arbiter = Arbiter(Graded(env), 1.0, ReleaseRule(10, try_after=10), make_fallback(env), env.action_space)
-    row, act = np.zeros(5), np.ones(3, np.float32)
-    assert arbiter.decide(Sensed(2.0, row, act, response="hold")).transition == "override"
-    return lambda surprise, **kw: arbiter.decide(Sensed(surprise, row, act, **kw)).transition
-
-
-def test_control_goes_back_once_nothing_presses_though_surprise_is_not_quiet_and_later_each_time_it_was_too_early():
-    decide = held_by_a_contact()
-    assert [decide(0.9, touched=False) for _ in range(5)] == [*[""] * 4, "release"]
-    assert decide(2.0, response="hold") == "override"
-    assert [decide(0.9, touched=False) for _ in range(10)] == [*[""] * 9, "release"]
-
-
-def test_control_does_not_go_back_while_something_presses_though_surprise_is_quiet():
-    decide = held_by_a_contact()
-    assert {decide(0.0, touched=True) for _ in range(30)} == {""}
-    assert "release" in [decide(0.0, touched=None) for _ in range(1)]
 
 
 def test_the_force_of_a_push_is_found_where_it_pushes():

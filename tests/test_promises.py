@@ -7,8 +7,9 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
 import asm_gym  # noqa: F401
-from asm_gym.policies.reflexes import Hold, Recall, Retract
+from asm_gym.policies.reflexes import Hold
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
+from tests.arms import reflexes_of
 from tests.fakes import SPEC, CueMonitor, FadingMonitor, FakeEnv
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*which counts as an alarm", "ignore:.*is done instead")
@@ -336,9 +337,9 @@ def test_an_environment_without_rest_asks_for_a_safe_action():
 
 
 def test_reflexes_that_speak_to_the_robot_refuse_wrappers_that_change_what_they_say(lift):
-    for reflex in (Recall, Retract):
+    for name in ("recall", "retract"):
         with pytest.raises(ValueError, match="Shifted changes actions"):
-            reflex(Shifted(lift))
+            reflexes_of(Shifted(lift), name)
 
 
 def test_a_refused_wrapper_leaves_the_environment_at_its_rate(lift):

@@ -3,34 +3,12 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from asm_gym.wrappers.responses import CAUSES, DEFAULT, RESPONSES, responses_from
 
+from asm_gym.guard.responses import CAUSES, DEFAULT, RESPONSES, responses_from
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.wrappers import NeuralASMSafety
+from tests.arms import ACT, MEMORY, SPEC, Acting, Judge, infos, offset
 from tests.fakes import CueMonitor, FakeEnv
-from tests.test_completion import MEMORY, SPEC, Arm, Judge, offset
-
-ACT = np.array([0.5, -0.5], np.float32)
-
-
-class Acting(Arm):
-    """Keeps the actions it was given, and feels that nothing presses, unless it is told to say something else."""
-
-    felt: float | None = 0.1
-
-    def reset(self, **kwargs):
-        self.actions = []
-        return super().reset(**kwargs)
-
-    def step(self, action):
-        self.actions.append(np.array(action))
-        *out, info = super().step(action)
-        return *out, info if self.felt is None else info | {"contact_load": self.felt}
-
-
-def infos(env, steps):
-    env.reset(seed=0)
-    return [env.step(ACT)[4]["asm"] for _ in range(steps)]
 
 
 def test_every_cause_has_a_response_and_every_response_is_known():
@@ -44,7 +22,7 @@ def test_every_cause_has_a_response_and_every_response_is_known():
     ("table", "message"),
     [
         ({"weather": "hold"}, "weather.*lasting contact"),
-        ({"contact": "dance"}, "dance.*yield"),
+        ({"contact": "dance"}, "dance.*comply"),
         (["hold"], "must map causes to responses"),
     ],
 )

@@ -5,12 +5,11 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from asm_gym.wrappers.factory import REFLEXES, make_rule
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asm_gym.policies.reflexes import Graded
+from asm_gym.guard.reflexes import GRADED, REFLEXES
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from tests.fakes import SPEC, CueMonitor, FakeEnv
@@ -278,7 +277,7 @@ def test_an_overrun_warns_once_or_counts_as_an_alarm(monkeypatch):
             return super().observe(state, stream)
 
     clock = [0.0]
-    monkeypatch.setattr("asm_gym.wrappers.observer.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("asm_gym.guard.observer.time.perf_counter", lambda: clock[0])
     with pytest.warns(UserWarning, match=r"took 200\.0 ms for a row that lasts 50\.0 ms"):
         infos = run(NeuralASMSafety(FakeEnv(), Slow()), 6)
     assert not any(i["asm"]["alarm"] for i in infos)
@@ -318,16 +317,6 @@ def test_what_is_no_number_is_an_alarm():
         infos = run(NeuralASMSafety(FakeEnv(), Lost()), 3)
     assert [i["asm"]["alarm"] for i in infos[1:]] == [True] * 3
     assert infos[-1]["asm"]["intervened"]
-
-
-def test_graded_gives_up_after_seconds_and_not_steps():
-    reflex, patience = Graded.__new__(Graded), {}
-    for fps in (20, 100):
-        env = FakeEnv()
-        env.metadata = {"render_fps": fps}
-        patience[fps] = make_rule(reflex, env, 10, 0.8, None, None)
-    assert (patience[20].try_after, patience[20].max_override) == (10, 60)
-    assert (patience[100].try_after, patience[100].max_override) == (50, 300)
 
 
 def test_a_reflex_takes_over_within_a_control_step():
@@ -377,7 +366,7 @@ class Foreseeing(CueMonitor):
         return np.zeros((1, 7), np.float32)
 
 
-@pytest.mark.parametrize("name", REFLEXES)
+@pytest.mark.parametrize("name", [*REFLEXES, GRADED])
 def test_every_reflex_acts_in_the_step_after_an_alarm_by_an_action_of_its_own(name, lift):
     env = NeuralASMSafety(lift, Foreseeing([3], lift.unwrapped.stream_spec), on_alarm=name)
     env.reset(seed=0)

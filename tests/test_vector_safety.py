@@ -3,13 +3,13 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from asm_gym.wrappers.vector_utils import choose
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from asm_gym import collect
 from asm_gym.envs.threaded_vector import ThreadVectorEnv
+from asm_gym.guard.observer import choose
 from asm_gym.monitors import NeuralASM
-from asm_gym.policies.reflexes import Hold, Retract
+from asm_gym.policies.reflexes import Hold
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from tests.fakes import SPEC, FadingMonitor, FakeEnv, Remembered
@@ -180,7 +180,7 @@ def test_what_makes_no_sense_is_refused(lift):
     with pytest.raises(ValueError, match=r"freeze.*hold"):
         VectorNeuralASMSafety(many, monitor(), on_alarm="freeze")
     with pytest.raises(ValueError, match="give its name"):
-        VectorNeuralASMSafety(many, monitor(), on_alarm=Retract(lift))
+        VectorNeuralASMSafety(many, monitor(), on_alarm=Hold(lift))
     VectorNeuralASMSafety(many, monitor(), on_alarm=Hold(FakeEnv(), safe_action=np.full(3, 0.5)))  # has no memory
     with pytest.raises(ValueError, match="release_below"):
         VectorNeuralASMSafety(many, monitor(), release_below=2.0)

@@ -184,7 +184,7 @@ def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | No
     if "contact_load" not in infos:
         return Felt.nothing(n, size)
     numbers = np.full((n, 2 + size), np.nan)
-    numbers[:, 0], numbers[:, 1] = infos["contact_load"], infos["contact_left_s"]
+    numbers[:, 0], numbers[:, 1] = infos["contact_load"], infos.get("contact_left_s", np.nan)
     if "contact_felt" in infos:
         numbers[:, 2:] = infos["contact_felt"]
     if there is not None:
