@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from asm_gym.guard.repair import Repair
 from asm_gym.guard.responses import CAUSES, DEFAULT, RESPONSES, responses_from
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.wrappers import NeuralASMSafety
@@ -238,10 +239,14 @@ def test_a_diagnosis_that_raises_is_answered_as_the_unknown_is():
 
 
 def test_a_completion_that_raises_loses_the_row_and_not_the_guard(monkeypatch):
-    env = NeuralASMSafety(Acting(offset), Judge({21}, "sensor"), on_alarm="graded")
-    monkeypatch.setattr(env._guard.responder.repair, "read", lambda row, whole: 1 / 0)
+    def lost(t, row):
+        row[0] = np.nan if t == 2 else row[0]
+
+    env = NeuralASMSafety(Acting(lost), Judge({21}, "sensor"), on_alarm="graded")
+    monkeypatch.setattr(Repair, "next", lambda repair, row: 1 / 0)
     with pytest.warns(UserWarning, match="completion: ZeroDivisionError"):
-        infos(env, 2)
+        said = infos(env, 4)
+    assert said[1]["alarm"]
 
 
 def test_a_monitor_without_a_diagnosis_is_held_and_its_causes_are_unknown():

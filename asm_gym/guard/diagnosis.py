@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import logging
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -17,8 +17,6 @@ from asm_gym.guard.robots import Robots
 from asm_gym.guard.severity import FAST, FREE_FORCE
 from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, Diagnosis, as_info, averaged
 from asm_gym.spec import StreamSpec
-
-LOG = logging.getLogger("asm_gym.safety")
 
 CALM_S = 1.0
 """After so long without an alarm, what comes next has a cause of its own [s]."""
@@ -192,7 +190,7 @@ class Diagnostician:
             newest = self._diagnosis(rows, alarm.attribution, alarm.known)
         except Exception as error:
             # Whatever goes wrong here, an alarm is answered: by what is done about the unknown.
-            LOG.warning("diagnosis: %r; the cause counts as unknown", error)
+            warnings.warn(f"diagnosis: {error!r}; the cause counts as unknown", stacklevel=2)
             return None
         return _believed(incident, newest)
 
