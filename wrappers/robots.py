@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -106,7 +107,8 @@ def askable(envs: VectorEnv[Any, Any, Any]) -> Askable:
     return inner
 
 
-class _Asked(NamedTuple):
+@dataclass(frozen=True)
+class _Asked:
     """n environments that can be asked."""
 
     count: int
@@ -155,8 +157,8 @@ def _known(
     felt, chains = first("felt_channels", ()), ask("hand_chains") or ()
     robots = Robots(
         count=envs.count,
-        low=envs.actions.low.ravel(),
-        high=envs.actions.high.ravel(),
+        low=np.float32(envs.actions.low).ravel(),
+        high=np.float32(envs.actions.high).ravel(),
         rest=rest.ravel(),
         rests="hold" not in refused,
         brakes=ask("holding") is not None and ask("keeps_holding") is not None,

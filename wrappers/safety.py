@@ -308,7 +308,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         limits = self._engine.limits[0]
         if self._robots.limits_contact and (anew or limits is not self._limits):
             self._inner.contact_limits = limits
-        self._limits = limits
+        self._limits: Any = limits
 
     def _report(self, info: dict[str, Any], rows: Sequence[RowReport], executed: Any) -> None:
         """Say in ``info`` what became of a step."""

@@ -113,8 +113,8 @@ class HandAgainstJoints:
 
     def compare(self, rows: NDArray[np.float32]) -> list[int]:
         """Take in the next rows (n, D) as they were sensed; return which robots' contradict themselves."""
-        state = self._mean, self._size_of, self._whole, self._recent, self._kept, self._good
-        how = self._at, *self._geometry, self._late, self._weights, self._gain, self._cap, LIMIT
+        state: tuple[Any, ...] = self._mean, self._size_of, self._whole, self._recent, self._kept, self._good
+        how: tuple[Any, ...] = self._at, *self._geometry, self._late, self._weights, self._gain, self._cap, LIMIT
         some = _compare(rows, *how, *state)
         for robot in [robot for robot in self._cases if 0.0 <= self._size_of[robot] <= LIMIT]:
             del self._cases[robot]

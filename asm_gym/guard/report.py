@@ -106,13 +106,10 @@ class RowReport(NamedTuple):
 
     def of(self, which: Mask) -> RowReport:
         """Return the same with nothing to say of all robots but those of ``which`` (n,)."""
-        mappings = ("outcomes", "failure", "repairs", "lost")
-        return self._replace(
-            surprise=self.surprise.silenced(~which),
-            severity=self.severity.where(which),
-            **{name: np.where(which, getattr(self, name), 0) for name in ("alarm", "intervened", "event", "state")},
-            **{name: {i: said for i, said in getattr(self, name).items() if which[i]} for name in mappings},
-        )
+        mappings, arrays = ("outcomes", "failure", "repairs", "lost"), ("alarm", "intervened", "event", "state")
+        parts: dict[str, Any] = {name: np.where(which, getattr(self, name), 0) for name in arrays}
+        parts |= {name: {i: said for i, said in getattr(self, name).items() if which[i]} for name in mappings}
+        return self._replace(surprise=self.surprise.silenced(~which), severity=self.severity.where(which), **parts)
 
     @classmethod
     def nothing(cls, count: int, size: int, threshold: NDArray[np.float64]) -> RowReport:

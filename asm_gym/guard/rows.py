@@ -140,7 +140,8 @@ class Rows:
 
     def explained(self, robot: int) -> Mask:
         """Return (D,) what is completed, or right by the hand and its joints."""
-        return np.logical_or.reduce([self._missing(robot), *(hand.vouched(robot) for hand in self._hands)])
+        known: Mask = np.logical_or.reduce([self._missing(robot), *(hand.vouched(robot) for hand in self._hands)])
+        return known
 
     def counted(self, surprise: Surprise, failures: Mapping[int, str]) -> Surprise:
         """Return what counts of the surprise at the last rows: nothing is surprised by what was completed."""

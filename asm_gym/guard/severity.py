@@ -280,7 +280,8 @@ class SeverityEstimator:
         """
         value, raw, excuse, n = surprise.value, surprise.raw, surprise.excuse, len(rows)
         presses, over, event, numbers = np.empty(n, bool), np.empty(n, bool), np.empty(n, np.int8), np.empty((n, 3))
-        judged = value, value if raw is None else raw, self._no_excuse if excuse is None else excuse
-        found = numbers, presses, over, event
-        some = _weigh(rows, felt.numbers, *self._how, *judged, *self._arbiter, active, decides, *found)
+        judged: tuple[Any, ...] = value, value if raw is None else raw, self._no_excuse if excuse is None else excuse
+        found: tuple[Any, ...] = numbers, presses, over, event
+        arguments: tuple[Any, ...] = rows, felt.numbers, *self._how, *judged, *self._arbiter, active, decides, *found
+        some = _weigh(*arguments)
         return Severity(felt, numbers, presses, held), Weighed(over, event, decides, some)
