@@ -29,10 +29,10 @@ from asm_gym.evaluation.rerun_view import LiveView
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
+from asm_gym.guard.live import follow
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
-from asm_gym.scripts.live_watching import follow
 from asm_gym.scripts.options import check_options, fixed, option
 from asm_gym.validation import check_number
 
@@ -175,7 +175,8 @@ def watch(args: Args, console: Console) -> int:
     if live is not None:
         opened = partial(lines_from, args.source, sys.stdin, args.silence)
         again = opened if live.returns else None
-        return follow(opened(), monitor, console, args.bridge, again, args.wait)
+        say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
+        return BAD_NEWS if follow(opened(), monitor, say, args.bridge, again, args.wait) else DONE
     return review(args, monitor, console)
 
 

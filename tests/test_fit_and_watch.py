@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from rich.console import Console
 
 from asm_gym.data.commands import REACTS, feedback
 from asm_gym.data.inspection import inspected
@@ -20,8 +19,8 @@ from asm_gym.data.selection import normal_episodes, pieces, split_at_random, spl
 from asm_gym.data.text import read_text
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.alarms import traces_of
+from asm_gym.guard.live import follow
 from asm_gym.monitors import load_monitor, make_monitor
-from asm_gym.scripts import watch
 from asm_gym.scripts.cli import main
 
 RATE, ROWS = 50.0, 80
@@ -231,7 +230,7 @@ def streamed(monitor, columns, form=lambda row: json.dumps(row.tolist())):
     """What following these rows prints, and its exit code."""
     rows = Episode.from_table(columns, channels=monitor.spec).stream
     said = io.StringIO()
-    code = watch.follow([form(row) for row in rows], monitor, Console(file=said))
+    code = int(follow([form(row) for row in rows], monitor, lambda line: print(line, file=said)) > 0)
     return code, said.getvalue()
 
 
@@ -266,7 +265,7 @@ def test_a_number_that_is_lost_is_an_alarm(memory):
     del lost["torque"]
     for line in (json.dumps(lost), json.dumps({**lost, "torque": None})):
         said = io.StringIO()
-        assert watch.follow([*lines[:5], line], monitor, Console(file=said)) == 1
+        assert follow([*lines[:5], line], monitor, lambda line, said=said: print(line, file=said)) == 1
         assert "torque  inf thresholds" in said.getvalue()
 
 
@@ -284,7 +283,7 @@ def test_a_number_that_is_lost_is_an_alarm(memory):
 )
 def test_a_line_that_is_no_row_is_refused_with_its_number(lines, message, memory):
     with pytest.raises(ValueError, match=message):
-        watch.follow(lines, load_monitor(memory), Console(file=io.StringIO()))
+        follow(lines, load_monitor(memory), print)
 
 
 def test_standard_input_is_watched_as_a_command(memory, monkeypatch, capsys):

@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from asm_gym.data.live import SourceDied
 from asm_gym.data.logs import Log
@@ -19,9 +18,9 @@ from asm_gym.detection.events import EVENTS, KNOCK
 from asm_gym.episode import Episode
 from asm_gym.evaluation.alarms import alarms_of, excused_in, traces_of
 from asm_gym.evaluation.scored_episode import ScoredEpisode
+from asm_gym.guard.live import follow
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.watch import follow
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.streams import swing
 
@@ -47,20 +46,20 @@ def lines(rows, stamps=None, dies=False):
 
 
 def watched(source, monitor, *how):
-    """The exit code, and what was printed."""
-    out = io.StringIO()
-    return follow(source, monitor, Console(file=out, width=200), *how), out.getvalue()
+    """The number of alarms, and what was said."""
+    said = list[str]()
+    return follow(source, monitor, said.append, *how), "\n".join(said)
 
 
 def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
     rows = episode(500).stream[:30]
-    code, said = watched(lines(rows, dies=True), monitor)
-    assert code == 1
+    count, said = watched(lines(rows, dies=True), monitor)
+    assert count
     assert "0.600 s  the source has died, nothing came for 2 s: an alarm" in said
     assert "30 rows, 1 alarm;" in said
     kept = np.delete(np.arange(30), [12, 13])
-    code, said = watched(lines(rows[kept], DT * kept), monitor)
-    assert code == 1
+    count, said = watched(lines(rows[kept], DT * kept), monitor)
+    assert count
     assert "0.260 s  2 rows lost: an alarm (late)" in said
     assert said.splitlines()[-1].startswith("30 rows, ")
     assert watched(lines(rows[kept], DT * kept), monitor, 0.05)[0] == 0
@@ -82,8 +81,8 @@ def test_missing_numbers_are_bridged_or_an_alarm_that_says_why(monitor):
     assert alarms(with_gap(50, 2), bridge=0.05) == []
     assert alarms(with_gap(50, 5), bridge=0.05) == [("missing data", "")]
     assert alarms(with_gap(50, 1, 0, np.inf), bridge=0.05) == [("not finite", "q[0]")]
-    code, said = watched(lines(with_gap(50, 1, 1)), monitor)
-    assert code == 1
+    count, said = watched(lines(with_gap(50, 1, 1)), monitor)
+    assert count
     assert "q[1]  inf thresholds" in said
     assert "(missing data)" in said
     assert watched(lines(with_gap(50, 1, 1)), monitor, 0.05)[0] == 0
@@ -100,8 +99,8 @@ def test_a_knock_that_excuses_surprise_is_said_once_and_is_no_alarm(monitor, mon
         return state, surprise._replace(raw=surprise.value + 2 * asm.threshold * felt, excuse=kind)
 
     monkeypatch.setattr(asm, "observe", knocked)
-    code, said = watched(lines(episode(501).stream[:30]), asm)
-    assert code == 0
+    count, said = watched(lines(episode(501).stream[:30]), asm)
+    assert not count
     assert said.count("knock") == 1
     assert "0.120 s  knock: no alarm" in said
     trace = ScoredEpisode("log", 0, 0.1, 1.0, np.zeros(6), excused={KNOCK: np.array([0, 2, 2, 0, 2, 0.5])})
@@ -109,7 +108,7 @@ def test_a_knock_that_excuses_surprise_is_said_once_and_is_no_alarm(monitor, mon
 
 
 def test_rows_are_watched_in_constant_memory(monitor, monkeypatch):
-    monkeypatch.setattr("asm_gym.scripts.live_watching.LATENCIES", 100)
+    monkeypatch.setattr("asm_gym.guard.live.LATENCIES", 100)
     line = json.dumps(episode(500).stream[20].tolist())
     peaks = []
     for rows in (400, 2000):
@@ -134,8 +133,8 @@ def test_a_pipe_and_a_file_are_watched_as_a_command(monitor, tmp_path, monkeypat
 
 def test_another_rate_is_said_once_and_is_an_alarm_where_it_is_slower(monitor):
     rows = episode(500).stream
-    code, said = watched(lines(np.resize(rows, (200, 4)), 0.05 * np.arange(200)), monitor)
-    assert code == 1
+    count, said = watched(lines(np.resize(rows, (200, 4)), 0.05 * np.arange(200)), monitor)
+    assert count
     assert said.count("rows come at 20 a second, and the memory reads 50: they are not judged") == 1
     said = watched(lines(np.repeat(rows, 2, axis=0), 0.01 * np.arange(160)), monitor)[1]
     assert said.count("rows come at 100 a second, and are read at 50, by their clock") == 1
@@ -150,8 +149,8 @@ def test_a_source_is_watched_anew_after_its_death_and_after_its_clock_went_back(
             raise ConnectionRefusedError
         return lines(rows, [5.0, 5.02, 1.0] if len(opened) == 2 else None)
 
-    code, said = watched(lines(rows, dies=True), monitor, 0.0, again, 5.0)
-    assert code == 1
+    count, said = watched(lines(rows, dies=True), monitor, 0.0, again, 5.0)
+    assert count
     assert said.count("the source is back") == 2
     assert "time must increase, got 1 s after 5.02 s: an alarm, and a new beginning" in said
     assert "42 rows" in said

@@ -1,22 +1,19 @@
-"""Watches rows as they come, in constant memory, over lost rows, other rates and sources that die and come back."""
+"""Watch rows as they come, in constant memory, over lost rows, other rates and sources that die and come back."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
 from itertools import chain
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
 from asm_gym.data.live import Row, RowReader, SourceDied
 from asm_gym.data.pace import ClockWentBack
 from asm_gym.detection.events import KNOCK, NO_EVENT, STOP
-from asm_gym.scripts.command import BAD_NEWS, DONE
 from asm_gym.spec import StreamSpec
 
 MOST_LOST = 1000
@@ -34,33 +31,40 @@ Opened = Callable[[], Iterator[str]]
 def follow(
     lines: Iterable[str],
     monitor: Any,
-    console: Console,
+    say: Callable[[str], None],
     seconds: float = 0.0,
     again: Opened | None = None,
     wait: float = 0.0,
 ) -> int:
-    """Prints every alarm as it is raised, and why.
+    """Say every alarm as it is raised, and why; return how many there were.
 
     Args:
+        lines: rows, as ``asm_gym.data.sources.lines_from`` yields them.
+        monitor: calibrated.
+        say: takes a line for the user.
         seconds: that something may be missing without an alarm.
         again: opens the source anew after it has died, or its clock went back.
         wait: for how long that is tried [s].
+
+    Raises:
+        ValueError: no row came, or a line is no row.
     """
-    watching = _Watch(monitor, partial(console.print, soft_wrap=True, highlight=False, markup=False), seconds)
-    there: Iterable[str] | None = lines
+    watching = _Watch(monitor, say, seconds)
+    source: Iterable[str] | None = lines
     try:
-        while there is not None:
-            died = watching.all_of(there, again is not None)
-            there = None if not died or again is None or not watching.rows else watching.back(again, wait)
+        while source is not None:
+            died = watching.follow(source, again is not None)
+            source = None if not died or again is None or not watching.rows else watching.reopened(again, wait)
     except KeyboardInterrupt:
         if watching.rows:
-            watching.summed()
+            watching.summarise()
         raise
-    return watching.summed()
+    watching.summarise()
+    return watching.alarms
 
 
 class _Watch:
-    """What is known of a source while it is watched.
+    """The state of a source while it is watched.
 
     Args:
         monitor: calibrated.
@@ -77,22 +81,22 @@ class _Watch:
         self.monitor.observe(self.state, np.zeros((1, self.spec.size)))  # compiles; the state is a value and stays
 
     def _begin(self) -> None:
-        """Nothing came before: what was is no past of what comes next."""
+        """Begin anew: rows before are no past of those that follow."""
         self.state = self.monitor.initial_state(1)
         self.bridge = Bridge(self.seconds, self.spec.dt, self.spec.size)
         self.above = self.late = False
         self.event = NO_EVENT
 
     def alarm(self, what: str) -> None:
-        """One more, said with when it was."""
+        """Count an alarm, and say when it was."""
         self.alarms += 1
         self.say(f"{self.rows * self.spec.dt:.3f} s  {what}")
 
-    def all_of(self, lines: Iterable[str], returns: bool) -> bool:
-        """Watches what comes. Returns whether the source died, rather than ended."""
+    def follow(self, lines: Iterable[str], returns: bool) -> bool:
+        """Watch rows until the source ends or dies; return whether it died."""
         try:
-            for row, came in RowReader(self.spec).rows(lines):
-                self._row(row, came)
+            for row, arrived in RowReader(self.spec).rows(lines):
+                self._row(row, arrived)
         except SourceDied as error:
             self.alarm(f"the source has died, {error}: an alarm")
             return True
@@ -103,8 +107,8 @@ class _Watch:
             return True
         return False
 
-    def back(self, again: Opened, wait: float) -> Iterable[str] | None:
-        """The lines of the source once it is there again; None where it did not come back."""
+    def reopened(self, again: Opened, wait: float) -> Iterable[str] | None:
+        """Return the lines of the source once it is there again; None where it did not come back."""
         start = time.monotonic()
         while time.monotonic() - start < wait:
             try:
@@ -120,7 +124,7 @@ class _Watch:
         self.say(f"the source did not come back within {wait:g} s")
         return None
 
-    def _row(self, row: Row, came: float) -> None:
+    def _row(self, row: Row, arrived: float) -> None:
         if row.change:
             if row.read:
                 self.say(f"{self.rows * self.spec.dt:.3f} s  {row.change}")
@@ -136,7 +140,7 @@ class _Watch:
         numbers = row.numbers
         self.state, surprise = self.monitor.observe(self.state, numbers[None])
         value = 0.0 if self.bridge.over(np.isnan(numbers)) else float(surprise.value[0])
-        self.latencies.append(1e3 * (time.perf_counter() - came))
+        self.latencies.append(1e3 * (time.perf_counter() - arrived))
         threshold = self.monitor.threshold
         if value > threshold and not self.above:
             at, why = blamed(numbers, surprise.attribution[0]), reason(numbers)
@@ -160,11 +164,10 @@ class _Watch:
             when = (self.rows + 1) * self.spec.dt
             self.say(f"{when:.3f} s  {lost} row{'s' * (lost != 1)} lost: an alarm ({LATE})")
 
-    def summed(self) -> int:
-        """Says how much came, and returns the exit code."""
+    def summarise(self) -> None:
+        """Say how many rows and alarms there were, and how long a row took."""
         if not self.rows:
             raise ValueError("no row came")
         median, late = np.percentile(self.latencies, [50, 99])
         counted = f"{self.rows} rows, {self.alarms} alarm{'s' * (self.alarms != 1)}"
         self.say(f"{counted}; a row took {median:.2f} ms, 99 % of the newest under {late:.2f} ms")
-        return BAD_NEWS if self.alarms else DONE
