@@ -207,7 +207,7 @@ def test_a_memory_that_settles_is_used_by_the_same_names(asm, tmp_path):
     loaded, episode = load_monitor(tmp_path / "settling.asm"), sine_episodes(1, 5)[0]
     assert isinstance(loaded, NeuralASM)
     assert loaded.get_params() == asm.get_params()
-    assert (loaded.dynamics, loaded.iterations, loaded.prior_precision) == ("settling", 20, 1.0)
+    assert (loaded.dynamics, loaded.config.iterations, loaded.config.prior_precision) == ("settling", 20, 1.0)
     assert loaded.score(episode).value.tobytes() == asm.score(episode).value.tobytes()
     cue, after = episode.stream[:20].astype(float), episode.stream[20:30]
     np.testing.assert_array_equal(recall(loaded, cue, 10), recall(asm, cue, 10))
