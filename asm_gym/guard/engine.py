@@ -393,7 +393,7 @@ class Engine:
             row.believed.lost,
             row.observed.latency,
         )
-        return said if row.active is self._everyone else said.of(row.active)
+        return said if row.active.all() else said.of(row.active)
 
     def _late(self, latency: float) -> bool:
         """Return whether the monitor took so long that it counts as an alarm."""

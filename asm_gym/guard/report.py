@@ -107,7 +107,9 @@ class RowReport(NamedTuple):
     def of(self, which: Mask) -> RowReport:
         """Return the same with nothing to say of all robots but those of ``which`` (n,)."""
         mappings, arrays = ("outcomes", "failure", "repairs", "lost"), ("alarm", "intervened", "event", "state")
-        parts: dict[str, Any] = {name: np.where(which, getattr(self, name), 0) for name in arrays}
+        parts: dict[str, Any] = {
+            name: np.where(which, part := getattr(self, name), np.zeros_like(part)) for name in arrays
+        }
         parts |= {name: {i: said for i, said in getattr(self, name).items() if which[i]} for name in mappings}
         return self._replace(surprise=self.surprise.silenced(~which), severity=self.severity.where(which), **parts)
 
