@@ -18,7 +18,7 @@ import pytest
 from asm_gym.extras import BROUGHT_BY
 from tests.wheel import LINKS, ROOT, build_wheel
 
-CORE = ("filelock", "gymnasium", "numpy", "numba", "packaging", "rich", "scipy", "threadpoolctl", "tyro")
+CORE = ("filelock", "gymnasium", "numpy", "numba", "packaging", "pandas", "rich", "scipy", "threadpoolctl", "tyro")
 LARGEST = 500e6
 """[bytes] that a core install may take."""
 
