@@ -28,7 +28,7 @@ COMMANDS = {
     "babble": Command("babble", "learn one memory of a body, for any policy"),
     "evaluate": Command("evaluate", "compare monitors on tasks and faults"),
     "watch": Command("watch", "watch a log or live rows with a memory"),
-    "train": Command("train", "train an agent: cloned, then improved by SAC, TD3 or PPO"),
+    "train": Command("train", "train an agent: cloned from an expert, then improved by SAC"),
     "push": Command("push", "upload a memory and its card to the Hugging Face hub"),
     "warmup": Command("warmup", "compile now what the first guarded step would wait for"),
     "doctor": Command("doctor", "say what this machine lacks, and what installs it"),

@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 import zipfile
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -24,36 +23,8 @@ from asm_gym.monitors import (
     register_monitor,
 )
 from asm_gym.monitors.adaptation import adapt
-from asm_gym.monitors.stream_model import StreamModel
+from tests.models import Persistence
 from tests.streams import frozen, sine_episodes, sine_spec
-
-"""Files that asm-gym saved before models and detections were parts, and what it made of a stream."""
-
-
-class Seen(NamedTuple):
-    last: np.ndarray  # (B, X)
-
-
-class Persistence(StreamModel):
-    """A model of one's own: each sense stays where it is, to ``margin`` standard deviations of its change."""
-
-    kind = "persistence"
-
-    def __init__(self, spec, margin=1.0):
-        super().__init__(spec)
-        self.margin = margin
-
-    def fit(self, episodes, rng, progress):
-        steps = np.concatenate([np.diff(e.stream[:, self.spec.sensory].astype(float), axis=0) for e in episodes])
-        return self.restore({"spread": self.margin * steps.std(axis=0)})
-
-    def start(self, batch, told=()):
-        return Seen(np.full((batch, len(self.spec.sensory)), np.nan))
-
-    def predict(self, state, rows):
-        now = rows[:, self.spec.sensory]
-        errors = np.nan_to_num((now - state.last) / self.learned_["spread"])
-        return Seen(now), ModelOutput(errors, np.zeros((len(rows), 0)))
 
 
 @pytest.fixture

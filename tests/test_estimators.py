@@ -10,8 +10,8 @@ from asm_gym.episode import Episode
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
 from asm_gym.monitors.estimators import adapted
 from asm_gym.rollouts import parallel_map
+from tests.models import Persistence
 from tests.streams import sine_episodes
-from tests.test_composition import Persistence
 
 NAME = "sklearn.ensemble:IsolationForest"
 

@@ -16,8 +16,8 @@ from asm_gym.rollouts import parallel_map
 from asm_gym.scripts.evaluate import Args
 from asm_gym.synthetic_arm import SyntheticArm
 from asm_gym.tasks import OWN, env_id
+from tests.models import Persistence
 from tests.streams import sine_spec
-from tests.test_composition import Persistence
 
 
 class Still:

@@ -128,8 +128,8 @@ def test_a_model_that_learned_no_arrays_is_saved_by_its_own_state(tmp_path, regi
     np.testing.assert_array_equal(loaded.score(episodes[0]).value, monitor.score(episodes[0]).value)
 
 
-def test_an_argument_of_robosuite_is_answered_with_ours():
-    with pytest.raises(TypeError, match=r"asm_gym/Lift-v0 takes robot=, got robots='Panda'"):
+def test_an_argument_of_robosuite_is_refused_by_name():
+    with pytest.raises(TypeError, match="robots"):
         gym.make("asm_gym/Lift-v0", robots="Panda")
 
 
