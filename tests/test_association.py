@@ -42,7 +42,7 @@ from asm_gym.memory.precision import (
     unbounded,
     usual_span,
 )
-from asm_gym.monitors import NeuralASM, make_monitor
+from asm_gym.monitors import MemoryConfig, NeuralASM, make_monitor
 from asm_gym.scaling import ScaledRows
 from asm_gym.spec import Channel, StreamSpec
 from tests.problems import CHANGES, energy, some_association
@@ -237,11 +237,11 @@ def test_the_delta_rule_approaches_the_closed_form():
 
 def test_a_memory_keeps_its_feedback_and_refuses_an_unknown_one(tmp_path):
     episodes = sine_episodes(16)
-    asm = NeuralASM(episodes[0].spec, 8, 16, epochs=1, feedback=TRANSPORTED).fit(episodes)
+    asm = NeuralASM(episodes[0].spec, 8, 16, epochs=1, config=MemoryConfig(feedback=TRANSPORTED)).fit(episodes)
     asm.save(tmp_path / "a.asm")
     assert NeuralASM.load(tmp_path / "a.asm").model.feedback == TRANSPORTED
     with pytest.raises(ValueError, match=r"feedback 'none'; known: .*learned"):
-        NeuralASM(episodes[0].spec, feedback="none")
+        MemoryConfig(feedback="none")
 
 
 def test_thirds_are_of_whole_episodes_and_of_similar_size():
