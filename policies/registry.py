@@ -14,7 +14,6 @@ from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.reflexes import Hold
 from asm_gym.policies.sb3 import read_archive
 from asm_gym.policies.scripted.door import DoorExpert
-from asm_gym.policies.scripted.handover import HandoverExpert
 from asm_gym.policies.scripted.lift import LiftExpert
 from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
 from asm_gym.policies.scripted.peg_in_hole import PegInHoleExpert
@@ -22,8 +21,6 @@ from asm_gym.policies.scripted.pick_place import PickPlaceExpert
 from asm_gym.policies.scripted.stack import StackExpert
 from asm_gym.policies.scripted.sway import EXPERTS as OTHER_EXPERTS
 from asm_gym.policies.scripted.sway import Swaying
-from asm_gym.policies.scripted.tool_hang import ToolHangExpert
-from asm_gym.policies.scripted.transport import TransportExpert
 from asm_gym.policies.scripted.two_arm_lift import TwoArmLiftExpert
 from asm_gym.policies.scripted.wipe import WipeExpert
 from asm_gym.registries import Registry, target
@@ -35,11 +32,8 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
     "Stack": StackExpert,
     "Door": DoorExpert,
     "Wipe": WipeExpert,
-    "ToolHang": ToolHangExpert,
     "TwoArmLift": TwoArmLiftExpert,
     "TwoArmPegInHole": PegInHoleExpert,
-    "TwoArmHandover": HandoverExpert,
-    "TwoArmTransport": TransportExpert,
     **{f"NutAssembly{which}": NutAssemblyExpert for which in ("", "Single", "Square", "Round")},
     **{f"PickPlace{which}": PickPlaceExpert for which in ("", "Single", "Can", "Milk", "Bread", "Cereal")},
 }
@@ -134,7 +128,7 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
         task = getattr(env.unwrapped, "task", None)
         key = task.name if isinstance(task, TaskSpec) else env.spec.id if env.spec else ""
         if key not in experts:
-            raise ValueError(f"no scripted expert for {key or env}; there are: {', '.join(experts)}; 'sway' moves any")
+            raise ValueError(f"{key or env} has no scripted expert, use 'sway'; these have one: {', '.join(experts)}")
         return experts[key](env, seed=seed, **kwargs)
     if name == "sway":
         return Swaying(env, seed=seed)

@@ -31,11 +31,14 @@ def draw(env: Any) -> bool:
     Generator, object and every number of the model are then as loading would leave them; the data must be reset.
 
     Returns:
-        Whether it was done. Where others edit the model's text it is not: only loading knows what they make of it.
+        Whether it was done: not for tasks that this module does not know, nor where others edit the model's text.
     """
     if env._xml_processors != [env.edit_model_xml]:
         return False
-    thing, anew = _made(env)
+    made = _made(env)
+    if made is None:
+        return False
+    thing, anew = made
     vars(thing).update(vars(anew))
     model, data, alone = env.sim.model._model, env.sim.data._data, _compiled_alone(env, anew)
     bodies = (m.body(thing.root_body).id for m in (model, alone))
@@ -48,8 +51,8 @@ def draw(env: Any) -> bool:
     return True
 
 
-def _made(env: Any) -> tuple[Any, Any]:
-    """The object whose shape is drawn, and the same drawn anew; sizes as robosuite 1.5.2 has them [m]."""
+def _made(env: Any) -> tuple[Any, Any] | None:
+    """Return the object whose shape is drawn, and the same drawn anew, sized as robosuite 1.5.2 does [m]."""
     objects = importlib.import_module("robosuite.models.objects")
     task = type(env).__name__
     if task == "Lift":
@@ -57,12 +60,7 @@ def _made(env: Any) -> tuple[Any, Any]:
     if task == "TwoArmPegInHole":
         least, most = ((radius, env.peg_length) for radius in env.peg_radius)
         return env.peg, objects.CylinderObject("peg", size_min=least, size_max=most, joints=None, rng=env.rng)
-    if task == "TwoArmHandover":
-        return env.hammer, objects.HammerObject("hammer", rng=env.rng)
-    if task == "TwoArmTransport":
-        handle = {"handle_radius": 0.015, "handle_length": 0.20, "handle_density": 150.0, "handle_friction": 4.0}
-        return env.transport.payload, objects.HammerObject("payload", **handle, head_density_ratio=1.5, rng=env.rng)
-    raise ValueError(f"{task} draws no shapes")
+    return None
 
 
 def _compiled_alone(env: Any, thing: Any) -> mujoco.MjModel:

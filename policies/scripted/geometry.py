@@ -123,9 +123,3 @@ def move(hand: Pose, target: Vector, turned: Vector, speed: float, gain: float =
         step *= speed / norm
     turn = 0.5 * np.cross(hand.turned, turned, axis=0).sum(axis=1) / RADIANS
     return np.concatenate([step, np.clip(turn, -0.5, 0.5)])
-
-
-def carried(hand: Pose, thing: Pose, own: Vector, goal: Vector, turned: Vector) -> Pose:
-    """Return the hand's pose at which the object in it is ``turned`` (3, 3), a point of its ``own`` at the ``goal``."""
-    turn = turned @ thing.turned.T
-    return Pose(goal + turn @ (hand.at - thing.point(own)), turn @ hand.turned)
