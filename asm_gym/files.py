@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from asm_gym.validation import shown
+from asm_gym.validation import short_repr
 
 UNFINISHED = ".unfinished"
 
@@ -90,7 +90,7 @@ def require_space(folder: Path, needed: int) -> None:
 
 def _checked(path: str | Path) -> Path:
     if not Path(path).name or "\x00" in str(path):
-        raise ValueError(f"a path must name a file, got {shown(str(path))}")
+        raise ValueError(f"a path must name a file, got {short_repr(str(path))}")
     return Path(path)
 
 

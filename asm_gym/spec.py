@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.validation import check_number, shown, typed
+from asm_gym.validation import check_number, short_repr, typed
 
 MOTOR = "action"
 """The group that holds the commanded action."""
@@ -60,12 +60,14 @@ class Channel:
         check_number(f"channel {self.name!r}: noise", self.noise, low=0.0, infinite=True)
         check_number(f"channel {self.name!r}: resolution", self.resolution, low=0.0)
         if not isinstance(self.elements, tuple):
-            raise TypeError(f"channel {self.name!r}: elements must be a tuple of names, got {shown(self.elements)}")
+            raise TypeError(
+                f"channel {self.name!r}: elements must be a tuple of names, got {short_repr(self.elements)}"
+            )
         if self.elements and len(self.elements) != self.size:
             raise ValueError(f"channel {self.name!r} has size {self.size} but {len(self.elements)} element names")
         if not isinstance(self.stops, tuple) or not all(map(_is_pair, self.stops)):
             raise TypeError(
-                f"channel {self.name!r}: stops must be a tuple of pairs (least, most), got {shown(self.stops)}"
+                f"channel {self.name!r}: stops must be a tuple of pairs (least, most), got {short_repr(self.stops)}"
             )
         if self.stops and len(self.stops) != self.size:
             raise ValueError(f"channel {self.name!r} has size {self.size} but {len(self.stops)} pairs of stops")
@@ -107,7 +109,7 @@ class StreamSpec:
 
     def __post_init__(self) -> None:
         if not isinstance(self.channels, tuple) or not all(isinstance(c, Channel) for c in self.channels):
-            raise TypeError(f"channels must be a tuple of Channel objects, got {shown(self.channels)}")
+            raise TypeError(f"channels must be a tuple of Channel objects, got {short_repr(self.channels)}")
         names = [c.name for c in self.channels]
         if len(set(names)) != len(names):
             raise ValueError(f"channel names must be unique, got {names}")
@@ -239,7 +241,7 @@ class StreamSpec:
             )
             return cls(channels, raw["dt"], raw["source"])
         except (ValueError, TypeError, KeyError) as error:
-            raise ValueError(f"the text of a stream's spec is damaged ({error}): {shown(text)}") from error
+            raise ValueError(f"the text of a stream's spec is damaged ({error}): {short_repr(text)}") from error
 
     @classmethod
     @typed

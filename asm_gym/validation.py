@@ -86,13 +86,13 @@ def check_number(
     """
     wanted = _described("whole number" if whole else "number", low, high, above, below)
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral if whole else Real):
-        raise ValueError(f"{name} must be a {wanted}, got {shown(value)}")
+        raise ValueError(f"{name} must be a {wanted}, got {short_repr(value)}")
     number: float = int(value) if isinstance(value, Integral) else float(value)
     # NaN alone differs from itself.
     if number != number or not _within(number, low, high, above, below):
-        raise ValueError(f"{name} must be a {wanted}, got {shown(value)}")
+        raise ValueError(f"{name} must be a {wanted}, got {short_repr(value)}")
     if not infinite and abs(number) > np.finfo(np.float64).max:
-        raise ValueError(f"{name} must be finite, got {shown(value)}")
+        raise ValueError(f"{name} must be finite, got {short_repr(value)}")
     return number
 
 
@@ -116,25 +116,25 @@ def check_numbers(
     except ValueError:  # rows of several lengths
         given = np.array(None)
     if given.dtype.kind not in "iuf" or given.shape != shape:
-        raise ValueError(f"{name} must be {wanted}, got {shown(values)}")
+        raise ValueError(f"{name} must be {wanted}, got {short_repr(values)}")
     array = given.astype(np.float64)
     bad = [v for v in array.ravel().tolist() if not math.isfinite(v) or not _within(v, low, high, above, below)]
     if bad:
-        raise ValueError(f"{name} must be {wanted}, got {shown(bad[0])} among them")
+        raise ValueError(f"{name} must be {wanted}, got {short_repr(bad[0])} among them")
     return array
 
 
 def check_text(name: str, value: object) -> str:
     """``value``, once it is a string that is not empty. Raises ValueError."""
     if not isinstance(value, str) or not value:
-        raise ValueError(f"{name} must be a name, got {shown(value)}")
+        raise ValueError(f"{name} must be a name, got {short_repr(value)}")
     return value
 
 
 def check_flag(name: str, value: object) -> bool:
     """``value``, once it is True or False. Raises ValueError."""
     if not isinstance(value, (bool, np.bool_)):
-        raise ValueError(f"{name} must be True or False, got {shown(value)}")
+        raise ValueError(f"{name} must be True or False, got {short_repr(value)}")
     return bool(value)
 
 
@@ -148,7 +148,7 @@ def check_choice(what: str, got: Any, known: Iterable[Any]) -> None:
         pass
     near = difflib.get_close_matches(got[:SHOWN], map(str, names), 1, 0.75) if isinstance(got, str) else []
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise ValueError(f"unknown {what} {shown(got)}; known: {', '.join(map(str, names))}{hint}")
+    raise ValueError(f"unknown {what} {short_repr(got)}; known: {', '.join(map(str, names))}{hint}")
 
 
 def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
@@ -160,7 +160,7 @@ def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
     if type(values) is np.ndarray and values.dtype == np.float32:
         return values
     if isinstance(values, np.ma.MaskedArray) and bool(np.any(values.mask)):
-        raise ValueError(f"{name} must be numbers, and some are masked: {shown(values)}")
+        raise ValueError(f"{name} must be numbers, and some are masked: {short_repr(values)}")
     try:
         given: NDArray[Any] = np.asarray(values)
         if given.dtype.kind not in "biufO":  # complex numbers would lose a part, and text would pass for numbers
@@ -168,10 +168,10 @@ def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
         with np.errstate(over="ignore"):
             return given.astype(np.float32)
     except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{name} must be numbers, got {shown(values)}") from error
+        raise ValueError(f"{name} must be numbers, got {short_repr(values)}") from error
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """``value`` as a message shows it: in full where it is short."""
     try:
         text = repr(value.item() if isinstance(value, np.generic) else value)
@@ -193,7 +193,9 @@ def typed(call: Callable[P, R]) -> Callable[P, R]:
         kinds = _kinds(call)
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if name in kinds and not _fits(value, kinds[name]):
-                raise ArgumentTypeError(f"{name} must be {signature.parameters[name].annotation}, got {shown(value)}")
+                raise ArgumentTypeError(
+                    f"{name} must be {signature.parameters[name].annotation}, got {short_repr(value)}"
+                )
         return call(*args, **kwargs)
 
     return checked

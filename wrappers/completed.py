@@ -14,7 +14,7 @@ from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import TRUST_S, GuardOptions
 from asm_gym.monitors import Monitor
 from asm_gym.stream_source import StreamSource
-from asm_gym.validation import as_float32, shown, typed
+from asm_gym.validation import as_float32, short_repr, typed
 from asm_gym.wrappers.robots import robots_of
 
 
@@ -50,11 +50,11 @@ class CompletedObservation(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArg
         check_monitor(monitor, self._source.spec)
         diagnosis = diagnosis_of(monitor)
         if diagnosis is None:
-            raise ValueError(f"{shown(monitor)} knows no completion: fit it anew")
+            raise ValueError(f"{short_repr(monitor)} knows no completion: fit it anew")
         known = dict(diagnosis.completion.sensors)
         for name in sensors:
             if name not in known:
-                raise ValueError(f"unknown sensor {shown(name)}; known: {', '.join(known)}")
+                raise ValueError(f"unknown sensor {short_repr(name)}; known: {', '.join(known)}")
         self._never = np.concatenate([np.zeros(0, np.intp), *(known[name] for name in sensors)]).astype(np.intp)
         robots, places = robots_of(env, monitor.spec)
         if places is None:

@@ -12,7 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import Fault
 from asm_gym.faults.anywhere import FaultyInterface
-from asm_gym.validation import shown, typed
+from asm_gym.validation import short_repr, typed
 
 
 class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -48,10 +48,10 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         inner: Any = theirs if isinstance(theirs, RobosuiteEnv) else FaultyInterface(env)
         gym.Wrapper.__init__(self, env if inner is theirs else inner)
         if not isinstance(faults, Sequence):
-            raise TypeError(f"faults must be a sequence, got {shown(faults)}")
+            raise TypeError(f"faults must be a sequence, got {short_repr(faults)}")
         for fault in faults:
             if not isinstance(fault, Fault):
-                raise TypeError(f"faults must be asm_gym.faults.Fault objects, got {shown(fault)}")
+                raise TypeError(f"faults must be asm_gym.faults.Fault objects, got {short_repr(fault)}")
             if inner is not theirs and not fault.anywhere:
                 raise ValueError(f"{fault.name} happens in robosuite environments of asm_gym, and this is {theirs}")
             fault.check(inner)

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.validation import check_number, shown
+from asm_gym.validation import check_number, short_repr
 from asm_gym.wrappers.chart import StripChart, arrow, compose, project
 
 ARROW_M = 0.01
@@ -57,7 +57,7 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 'make the environment with gym.make(..., render_mode="rgb_array")'
             )
         if not isinstance(caption, str):
-            raise ValueError(f"caption must be a text, got {shown(caption)}")
+            raise ValueError(f"caption must be a text, got {short_repr(caption)}")
         self.caption = caption
         self._seconds = check_number("seconds", seconds, above=0, high=3600)
         if chart_height is not None:

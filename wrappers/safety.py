@@ -25,7 +25,7 @@ from asm_gym.policies.reflexes import Hold
 from asm_gym.protocols import HoldsItself, SensesWithinSteps
 from asm_gym.spec import control_period
 from asm_gym.stream_source import StreamSource
-from asm_gym.validation import as_float32, check_choice, check_number, shown
+from asm_gym.validation import as_float32, check_choice, check_number, short_repr
 from asm_gym.wrappers.robots import body_memory, felt_by, robots_of
 
 
@@ -157,7 +157,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
         if self._box is None and on_alarm not in ("monitor", "terminate"):
             raise TypeError(
-                f"on_alarm={shown(on_alarm)} needs a Box action space to act in, got {env.action_space}: others can "
+                f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}: others can "
                 'only be watched, on_alarm="monitor", or ended, "terminate"'
             )
         check_choice("info", info, INFO)
@@ -344,9 +344,9 @@ def made_for(on_alarm: Any, env: gym.Env[Any, Any]) -> Policy:
         try:
             made = on_alarm(env)
         except TypeError as error:
-            raise ValueError(f"{refused}{shown(on_alarm)}: {error}") from error
+            raise ValueError(f"{refused}{short_repr(on_alarm)}: {error}") from error
     if not callable(getattr(made, "predict", None)):
-        raise ValueError(f"{refused}{shown(made)}")
+        raise ValueError(f"{refused}{short_repr(made)}")
     if isinstance(made, Hold) and not made.explicit and made.env.unwrapped is not env.unwrapped:
         name = type(made).__name__
         raise ValueError(

@@ -22,7 +22,7 @@ from asm_gym.monitors import Monitor
 from asm_gym.policies.base import Policy, Reflex
 from asm_gym.policies.reflexes import Hold
 from asm_gym.spec import StreamSpec, control_period
-from asm_gym.validation import as_float32, check_choice, shown
+from asm_gym.validation import as_float32, check_choice, short_repr
 from asm_gym.wrappers.robots import askable, felt_by, memory_of, refuse_running_statistics, robots_of_many
 from asm_gym.wrappers.vector_infos import Mask, final, put, replace, said_by
 
@@ -353,7 +353,7 @@ def _shared(policy: Any) -> Policy:
     """
     if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
         raise ValueError(
-            f"on_alarm must be a name or one policy with a predict() that all environments share, got {shown(policy)}"
+            f"on_alarm must be a name or one policy with a predict() that all environments share, got {short_repr(policy)}"
         )
     if isinstance(policy, Reflex) and not (isinstance(policy, Hold) and policy.explicit):
         raise ValueError(f"one {type(policy).__name__} cannot act in several environments: give its name instead")

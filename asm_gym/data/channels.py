@@ -24,7 +24,7 @@ from asm_gym.data.reader_notes import note
 from asm_gym.data.units import bare_name, factor, unit_of
 from asm_gym.readings import noise_of
 from asm_gym.spec import MOTOR, Channel, StreamSpec
-from asm_gym.validation import check_number, shown
+from asm_gym.validation import check_number, short_repr
 
 Column = NDArray[Any]
 
@@ -124,7 +124,7 @@ def _columns(frame: Any) -> dict[str, Column]:
     # A dictionary has keys, an Arrow table column_names, pandas and Polars have columns.
     names = frame if isinstance(frame, Mapping) else getattr(frame, "column_names", getattr(frame, "columns", None))
     if names is None or callable(names):
-        raise TypeError(f"a table must be a dictionary of columns, or a frame of them, got {shown(frame)}")
+        raise TypeError(f"a table must be a dictionary of columns, or a frame of them, got {short_repr(frame)}")
     if len({str(name) for name in names}) < len(list(names)):
         raise ValueError(f"columns must have different names, got {', '.join(map(str, names))}")
     return {str(name): as_array(frame[name]) for name in names}

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import betaincinv
 
 from asm_gym.detection.base import Array
-from asm_gym.validation import check_number, shown
+from asm_gym.validation import check_number, short_repr
 
 EPISODE, HOUR = "episode", "hour"
 """Units of a rate of false alarms."""
@@ -49,7 +49,7 @@ def conformal_threshold(maxima: Array, rate: float) -> float:
     except ValueError:  # rows of several lengths
         found = np.array(None)
     if found.ndim != 1 or found.dtype.kind not in "iuf" or np.isnan(found).any():
-        raise ValueError(f"maxima must be numbers in the shape (n,), got {shown(maxima)}")
+        raise ValueError(f"maxima must be numbers in the shape (n,), got {short_repr(maxima)}")
     n, needed = len(found), conformal_episodes(rate)
     if n < needed:
         raise ValueError(

@@ -28,7 +28,7 @@ from asm_gym.detection.repetition import (
 )
 from asm_gym.detection.tails import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, ceilings
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_flag, check_number, shown, typed
+from asm_gym.validation import check_flag, check_number, short_repr, typed
 
 
 class EvidenceState(NamedTuple):
@@ -72,7 +72,7 @@ class EvidenceDetection:
         try:
             self.spec, self.gains = spec, tuple(check_number("gains", a, above=0.0, high=1.0) for a in gains)
         except ValueError as error:
-            raise ValueError(f"gains must be numbers in (0, 1], got {shown(gains)}") from error
+            raise ValueError(f"gains must be numbers in (0, 1], got {short_repr(gains)}") from error
         if not self.gains:
             raise ValueError("gains must be numbers in (0, 1], got ()")
         self.bound = check_number("bound", bound, above=0.0)
@@ -135,7 +135,7 @@ class EvidenceDetection:
             counted = np.concatenate([counted, np.full((1, senses), REPETITION_OFFSET)])
         if counted.shape != (3, senses) or not ((counted >= 0.0) & np.isfinite(counted)).all():
             raise ValueError(
-                f"the repetition of evidence should be (3, {senses}) numbers of at least 0, found {shown(counted)}"
+                f"the repetition of evidence should be (3, {senses}) numbers of at least 0, found {short_repr(counted)}"
             )
         offset = counted[2]
         self._steps, self._offset, self._most = evidence_steps(counted[:2]), offset, offset + MOST_BEYOND

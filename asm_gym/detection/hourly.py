@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection.base import Array
 from asm_gym.detection.conformal import HOUR, Promise, surely_below
-from asm_gym.validation import check_number, shown
+from asm_gym.validation import check_number, short_repr
 
 MINUTE = 60.0
 """Longest block, and time below the threshold before another alarm counts [s]."""
@@ -54,7 +54,9 @@ class Blocks(NamedTuple):
     def restored(cls, kept: NDArray[np.float64]) -> Blocks:
         """Return what ``array`` was made of. Raises ValueError where that is no maxima and hours."""
         if kept.ndim != 2 or len(kept) not in (2, 3) or not kept.size or not (kept[1] > 0).all():
-            raise ValueError(f"blocks should be maxima and hours in the shape (2, n) or (3, n), found {shown(kept)}")
+            raise ValueError(
+                f"blocks should be maxima and hours in the shape (2, n) or (3, n), found {short_repr(kept)}"
+            )
         return cls(*kept)
 
     @property

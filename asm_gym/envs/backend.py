@@ -17,7 +17,7 @@ from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.extras import require
 from asm_gym.spec import Channel
 from asm_gym.tasks import TaskSpec
-from asm_gym.validation import check_choice, shown
+from asm_gym.validation import check_choice, short_repr
 
 CONTROLLERS = ("OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "JOINT_TORQUE", "IK_POSE")
 """Robosuite's controllers of an arm, less JOINT_VELOCITY, which fails inside robosuite 1.5."""
@@ -81,7 +81,7 @@ def make(
     """
     robosuite = import_robosuite()
     if not isinstance(controller, str | dict):
-        raise ValueError(f"controller must be a name or a configuration, got {shown(controller)}")
+        raise ValueError(f"controller must be a name or a configuration, got {short_repr(controller)}")
     if isinstance(controller, str):
         check_choice("controller", controller, CONTROLLERS)
     unknown = [robot for robot in robots if robot not in IK_ROBOTS]
@@ -102,7 +102,7 @@ def make(
     except Exception as error:
         if isinstance(controller, str):
             raise
-        raise ValueError(f"controller: robosuite cannot use {shown(controller)}: {error!r}") from error
+        raise ValueError(f"controller: robosuite cannot use {short_repr(controller)}: {error!r}") from error
 
 
 def _configuration(controller: str | dict[str, Any], robot: str) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Corruption
 from asm_gym.envs.simulation import Simulation
 from asm_gym.spec import StreamSpec
 from asm_gym.tasks import task as task_spec
-from asm_gym.validation import check_choice, check_flag, check_number, check_numbers, check_text, shown
+from asm_gym.validation import check_choice, check_flag, check_number, check_numbers, check_text, short_repr
 
 _BAD = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
@@ -93,7 +93,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         check_choice("render_mode", render_mode, (None, *RENDER_MODES))
         check_choice("observation", observation, ("flat", "dict"))
         if isinstance(stream, str) or not isinstance(stream, Sequence):
-            raise ValueError(f"stream must be a sequence of names, got {shown(stream)}")
+            raise ValueError(f"stream must be a sequence of names, got {short_repr(stream)}")
         for group in stream:
             check_choice("stream group", check_text("stream group", group), (*GROUPS, *EXTRA_GROUPS))
         if check_number("control_freq", control_freq, low=1, whole=True) and PHYSICS_FREQ % control_freq:
@@ -103,7 +103,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         self._row_substeps = backend.row_substeps(control_freq if stream_freq is None else stream_freq, control_freq)
         self.horizon = self.task.horizon if horizon is None else check_number("horizon", horizon, low=1, whole=True)
         if (check_numbers("render_size", render_size, 2, low=1, high=LARGEST_PICTURE) % 1).any():
-            raise ValueError(f"render_size must be two whole numbers, got {shown(render_size)}")
+            raise ValueError(f"render_size must be two whole numbers, got {short_repr(render_size)}")
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": control_freq}
         self.terminate_on_success = check_flag("terminate_on_success", terminate_on_success)
@@ -228,7 +228,7 @@ class RobosuiteEnv(gym.Env[Any, NDArray[np.float32]]):
         """
         self._ended = True  # until it has worked
         if options is not None and not isinstance(options, dict):
-            raise ValueError(f"options must be a dict, got {shown(options)}")
+            raise ValueError(f"options must be a dict, got {short_repr(options)}")
         super().reset(seed=seed)
         noise = self._qpos_noise
         for name, value in (options or {}).items():

@@ -14,7 +14,7 @@ from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.mujoco_views import JOINT_POSITION, JOINTS, OSC_POSE, Arms, Ints, NominalViews, Views
 from asm_gym.kinematics import Chain
 from asm_gym.tasks import ROBOTS, TaskSpec
-from asm_gym.validation import check_choice, check_text, shown
+from asm_gym.validation import check_choice, check_text, short_repr
 
 PHYSICS_FREQ = 500
 """Robosuite's physics rate [Hz]."""
@@ -30,7 +30,7 @@ def robots_for(task: TaskSpec, robot: str | Sequence[str] | None) -> tuple[str, 
         ValueError: an unknown robot, or the wrong number of them.
     """
     if robot is not None and not isinstance(robot, Sequence):
-        raise ValueError(f"robot must be a name or a sequence of names, got {shown(robot)}")
+        raise ValueError(f"robot must be a name or a sequence of names, got {short_repr(robot)}")
     names = (robot or "Panda",) * task.arms if robot is None or isinstance(robot, str) else tuple(robot)
     for name in names:
         check_choice("robot", check_text("robot", name), ROBOTS)

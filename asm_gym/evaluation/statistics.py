@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from asm_gym.validation import check_number, shown
+from asm_gym.validation import check_number, short_repr
 
 Floats = NDArray[np.floating[Any]]
 
@@ -159,7 +159,7 @@ def _scores(name: str, values: ArrayLike) -> NDArray[np.float64]:
     except ValueError:  # rows of several lengths
         scores = np.array(None)
     if scores.ndim != 1 or scores.dtype.kind not in "biuf":
-        raise ValueError(f"{name} must be numbers in the shape (n,), got {shown(values)}")
+        raise ValueError(f"{name} must be numbers in the shape (n,), got {short_repr(values)}")
     if np.isnan(scores).any():
-        raise ValueError(f"{name} must not be NaN, got {shown(values)}")
+        raise ValueError(f"{name} must not be NaN, got {short_repr(values)}")
     return scores.astype(np.float64)

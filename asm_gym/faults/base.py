@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_choice, check_number, check_numbers, check_text, shown
+from asm_gym.validation import check_choice, check_number, check_numbers, check_text, short_repr
 
 SHAPES = ("constant", "pulse", "ramp", "periodic", "random_walk")
 
@@ -222,7 +222,7 @@ def _check(parameter: Field[Any], value: object) -> None:
                 raise ValueError(f"direction must not be all zero, got {value}")
         case "str":
             if not isinstance(value, str):
-                raise ValueError(f"{parameter.name} must be a name, got {shown(value)}")
+                raise ValueError(f"{parameter.name} must be a name, got {short_repr(value)}")
 
 
 def along(direction: Vector3) -> Floats:

@@ -15,7 +15,7 @@ from asm_gym.monitors import CalibratedMonitor, ExplainsItself, Monitor, NeuralA
 from asm_gym.monitors.adaptation import for_stream
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_number, shown
+from asm_gym.validation import check_number, short_repr
 
 LOG = logging.getLogger("asm_gym.safety")
 
@@ -106,7 +106,7 @@ def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
         RuntimeError: it is not calibrated.
     """
     if not isinstance(monitor, Watches):
-        raise TypeError(f"monitor must have initial_state() and observe(), got {shown(monitor)}")
+        raise TypeError(f"monitor must have initial_state() and observe(), got {short_repr(monitor)}")
     monitor.spec.require(watched, "the monitor")
     return check_number("the monitor's threshold", monitor.threshold)
 

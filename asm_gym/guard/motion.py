@@ -14,7 +14,7 @@ from asm_gym.guard.observer import joined
 from asm_gym.guard.reflexes import Motion, Reflexes
 from asm_gym.guard.robots import Robots
 from asm_gym.policies.base import Policy, Reflex
-from asm_gym.validation import as_float32, shown
+from asm_gym.validation import as_float32, short_repr
 
 USUAL_GAIN = 0.1
 """Weight of the newest step in the external torque that is taken to be usual."""
@@ -109,7 +109,7 @@ class Motions:
                 continue
             said = ""
             if refused[robot]:
-                said = f"policy: the action must be finite, got {shown(actions[robot].tolist())}"
+                said = f"policy: the action must be finite, got {short_repr(actions[robot].tolist())}"
                 self._warn(robot, said, "another is done instead")
                 if self._acts:
                     self._take_over(robot)

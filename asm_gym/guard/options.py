@@ -11,7 +11,7 @@ from asm_gym.detection.adaptive import AdaptiveThreshold
 from asm_gym.guard.reflexes import GRADED, REFLEXES
 from asm_gym.guard.responses import responses_from
 from asm_gym.policies.base import Policy
-from asm_gym.validation import check_choice, check_flag, check_number, shown
+from asm_gym.validation import check_choice, check_flag, check_number, short_repr
 
 ON_ALARM = ("monitor", *REFLEXES, GRADED, "terminate")
 """Names that ``on_alarm`` takes."""
@@ -96,7 +96,9 @@ class GuardOptions:
 
     def __post_init__(self) -> None:
         if isinstance(self.on_alarm, str) and self.on_alarm not in ON_ALARM:
-            raise ValueError(f"unknown on_alarm {shown(self.on_alarm)}; known: {', '.join(ON_ALARM)}, or any policy")
+            raise ValueError(
+                f"unknown on_alarm {short_repr(self.on_alarm)}; known: {', '.join(ON_ALARM)}, or any policy"
+            )
         check_number("release_after", self.release_after, low=1, whole=True)
         check_number("release_below", self.release_below, above=0, high=1)
         for name in ("max_override", "try_after"):
@@ -106,9 +108,11 @@ class GuardOptions:
         responses_from(self.responses)
         limits = self.contact_limits
         if not (limits is None or isinstance(limits, ContactLimits) or limits == "memory"):
-            raise ValueError(f'contact_limits must be ContactLimits, "memory" or None, got {shown(limits)}')
+            raise ValueError(f'contact_limits must be ContactLimits, "memory" or None, got {short_repr(limits)}')
         if self.adaptive_threshold is not None and not isinstance(self.adaptive_threshold, AdaptiveThreshold):
-            raise TypeError(f"adaptive_threshold must be an AdaptiveThreshold, got {shown(self.adaptive_threshold)}")
+            raise TypeError(
+                f"adaptive_threshold must be an AdaptiveThreshold, got {short_repr(self.adaptive_threshold)}"
+            )
         check_number("online_learning_rate", self.online_learning_rate, low=0, high=1)
         check_choice("on_overrun", self.on_overrun, ("warn", "alarm", "ignore"))
         check_number("trust_s", self.trust_s, low=0)
@@ -121,7 +125,7 @@ class GuardOptions:
         """
         chosen: OnAlarm = (GRADED if names_causes else "hold") if self.on_alarm is None else self.on_alarm
         if self.responses is not None and not (isinstance(chosen, str) and chosen == GRADED):
-            raise ValueError(f"responses are those of on_alarm='graded', got on_alarm={shown(chosen)}")
+            raise ValueError(f"responses are those of on_alarm='graded', got on_alarm={short_repr(chosen)}")
         return chosen
 
     def rule(self, graded: bool, dt: float, rows_per_step: int) -> ReleaseRule:

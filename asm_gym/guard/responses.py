@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from asm_gym.monitors.diagnosis import FAMILIES, as_info
-from asm_gym.validation import check_choice, shown
+from asm_gym.validation import check_choice, short_repr
 
 LASTING = {"contact": 1.0, "actuator": 2.5}
 """From when on a cause is a lasting one [s]: a contact that is there for so long; an actuator's fault where its joint
@@ -84,12 +84,12 @@ def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:
             while the arm presses.
     """
     if table is not None and not isinstance(table, Mapping):
-        raise ValueError(f"responses must map causes to responses, got {shown(table)}")
+        raise ValueError(f"responses must map causes to responses, got {short_repr(table)}")
     for cause, response in (table or {}).items():
         check_choice("cause", cause, CAUSES)
         check_choice("response", response, RESPONSES)
         if cause.endswith(PRESSING) and response in GOING_ON:
             raise ValueError(
-                f"{shown(response)} would let an arm go on that presses: {cause} takes hold, comply, retract or stop"
+                f"{short_repr(response)} would let an arm go on that presses: {cause} takes hold, comply, retract or stop"
             )
     return {**DEFAULT, **(table or {})}

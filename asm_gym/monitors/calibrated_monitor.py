@@ -22,7 +22,7 @@ from asm_gym.monitors.calibration import LOG, AlarmRate, Calibrated, require_sig
 from asm_gym.monitors.files import SavedMonitor, write_monitor
 from asm_gym.monitors.stream_model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
 from asm_gym.monitors.training_data import Marks, check_fresh, check_nominal, sketch
-from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
+from asm_gym.validation import check_choice, check_flag, check_number, short_repr, typed
 
 
 class MonitorState(NamedTuple):
@@ -320,11 +320,11 @@ class CalibratedMonitor(Calibrated):
     def _rows(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """Return the rows (B, D) in one piece. Raises where they or the state are not what ``observe`` takes."""
         if not isinstance(state, MonitorState):
-            raise TypeError(f"state must be what initial_state or observe gave, got {shown(state)}")
+            raise TypeError(f"state must be what initial_state or observe gave, got {short_repr(state)}")
         try:
             rows = np.ascontiguousarray(stream, np.float64)
         except (TypeError, ValueError, OverflowError) as error:
-            raise ValueError(f"stream must be rows of numbers, got {shown(stream)}") from error
+            raise ValueError(f"stream must be rows of numbers, got {short_repr(stream)}") from error
         batch = batch_of(state)
         if rows.shape != (batch, self.spec.size):
             self.spec.check_row(rows)

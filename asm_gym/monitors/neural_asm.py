@@ -41,7 +41,7 @@ from asm_gym.monitors.values import PREFIX as VALUES
 from asm_gym.monitors.values import Values
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_choice, check_flag, check_number, shown, typed
+from asm_gym.validation import check_choice, check_flag, check_number, short_repr, typed
 
 
 class NeuralASM(CalibratedMonitor):
@@ -243,7 +243,7 @@ class NeuralASM(CalibratedMonitor):
         self.skill_ = SkillSurprise.found(self.spec, skill, self.seed) if skill else None
         self.values_ = Values.found(self.spec, values, self.seed, self.urdf)
         if self.alarm_on_ != BODY and self.skill_ is None:
-            raise ValueError(f"the checkpoint alarms on {shown(self.alarm_on_)} surprise, and holds no skills")
+            raise ValueError(f"the checkpoint alarms on {short_repr(self.alarm_on_)} surprise, and holds no skills")
         check_choice("alarm_on", self.alarm_on_, ALARMS_ON)
         return self
 

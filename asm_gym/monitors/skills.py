@@ -16,7 +16,7 @@ from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.monitors.skill_surprise import ALARMS_ON, BODY, SkillSurprise
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.monitors.training_data import check_nominal
-from asm_gym.validation import check_choice, check_number, shown
+from asm_gym.validation import check_choice, check_number, short_repr
 
 
 def learn_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
@@ -133,7 +133,7 @@ def skills_of(episode: Episode) -> NDArray[np.str_]:
             raise ValueError("does not say its skill: set info['skill']")
         return np.repeat(name, len(episode))
     if not isinstance(names, list | tuple) or not names or not all(isinstance(name, str) and name for name in names):
-        raise ValueError(f"must name its skills in order, info['skills'], got {shown(names)}")
+        raise ValueError(f"must name its skills in order, info['skills'], got {short_repr(names)}")
     changed = episode.info.get("changed", [])
     rows = changed if isinstance(changed, list | tuple) else [changed]
     begins = [0, *(check_number("info['changed']", row, low=1, whole=True) for row in rows)]
