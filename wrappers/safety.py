@@ -157,8 +157,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
         if self._box is None and on_alarm not in ("monitor", "terminate"):
             raise TypeError(
-                f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}: others can "
-                'only be watched, on_alarm="monitor", or ended, "terminate"'
+                f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}: others "
+                'can only be watched, on_alarm="monitor", or ended, "terminate"'
             )
         check_choice("info", info, INFO)
         self._full = info == "full"

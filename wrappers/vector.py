@@ -353,7 +353,8 @@ def _shared(policy: Any) -> Policy:
     """
     if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
         raise ValueError(
-            f"on_alarm must be a name or one policy with a predict() that all environments share, got {short_repr(policy)}"
+            f"on_alarm must be a name or one policy with a predict() that all environments share, got "
+            f"{short_repr(policy)}"
         )
     if isinstance(policy, Reflex) and not (isinstance(policy, Hold) and policy.explicit):
         raise ValueError(f"one {type(policy).__name__} cannot act in several environments: give its name instead")

@@ -90,6 +90,7 @@ def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:
         check_choice("response", response, RESPONSES)
         if cause.endswith(PRESSING) and response in GOING_ON:
             raise ValueError(
-                f"{short_repr(response)} would let an arm go on that presses: {cause} takes hold, comply, retract or stop"
+                f"{short_repr(response)} would let an arm go on that presses: {cause} takes hold, comply, retract or "
+                "stop"
             )
     return {**DEFAULT, **(table or {})}
