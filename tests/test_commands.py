@@ -105,12 +105,12 @@ def test_the_shell_completes_commands_studies_and_options(capsys, tmp_path):
         return subprocess.run(["/bin/bash", "-c", ask], capture_output=True, text=True, check=True).stdout.split()
 
     assert completed("asm-gym", "do") == ["doctor"]
-    assert completed("asm-gym", "reproduce", "tra") == ["tracking"]
+    assert completed("asm-gym", "reproduce", "loc") == ["local_learning"]
     assert completed("asm-gym", "evaluate", "--mon") == ["--monitors"]
 
 
 @pytest.mark.parametrize(
-    ("typed", "near"), [("docter", "doctor"), ("colect", "collect"), ("reproduce trackin", "tracking")]
+    ("typed", "near"), [("docter", "doctor"), ("colect", "collect"), ("reproduce abstrac", "abstract")]
 )
 def test_a_misspelt_command_is_answered_with_the_nearest_one(typed, near, capsys):
     assert cli.main(typed.split()) == 2
@@ -118,12 +118,12 @@ def test_a_misspelt_command_is_answered_with_the_nearest_one(typed, near, capsys
 
 
 def test_all_studies_check_the_options_of_all_before_the_first_runs(capsys, monkeypatch):
-    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{name}") for name in ("tracking", "failure"))
+    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{name}") for name in ("abstract", "failure"))
     ran: list[str] = []
     for module in (first, last):
         monkeypatch.setattr(module, "run", lambda config, name=module.__name__: ran.append(name))
     monkeypatch.setattr(last, "Config", Options)  # which has no --seeds
-    monkeypatch.setattr(reproduce, "INDEPENDENT", ("tracking", "failure"))
+    monkeypatch.setattr(reproduce, "INDEPENDENT", ("abstract", "failure"))
     assert cli.main(["reproduce", "all", "--seeds", "2"]) == 2
     assert "--seeds" in capsys.readouterr().err
     assert not ran

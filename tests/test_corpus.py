@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from dataclasses import replace
@@ -18,8 +17,6 @@ from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.trial import faulty_trial
 from asm_gym.scripts.corpus import contents
 from asm_gym.scripts.evaluate import main as evaluate
-from asm_gym.scripts.reproduce import main as reproduce
-from asm_gym.scripts.reproduce import parts as parts_study
 from tests.streams import sine_episodes
 
 SOURCES = (Source("Lift", fit=2, calibration=1, nominal=4), Source("Stack", "stack_sac", nominal=2))
@@ -137,14 +134,3 @@ def test_monitors_are_judged_by_a_corpus(pushed, tmp_path):
     assert re.search(r"\| kalman\+evidence \| 1.000 \(1.000–1.000\) \|.* 100 % \(100–100\)", text)
     assert "within chance" in text
     assert not (pushed / "scripted/monitors").exists()
-
-
-def test_parts_of_the_memory_are_judged_by_a_corpus(pushed, tmp_path):
-    asked = ["--corpus", str(pushed), "--ways", "learned traces", "local traces", "linear", "--seeds", "2", "--quick"]
-    assert reproduce(["parts", *asked, "--workers", "1", "--out", str(tmp_path / "out")]) == 0
-    rows = list(csv.DictReader((tmp_path / "out/parts.csv").open()))
-    assert {r["seed"] for r in rows} == {"0", "1"}
-    assert {"all", "association alone", "temporal network alone", "no hidden units"} <= {r["part"] for r in rows}
-    assert all(float(r["auroc"]) > 0.9 for r in rows)  # a push of three metres is plain to every part
-    with pytest.raises(ValueError, match="learned traces"):
-        parts_study.Config(corpus=pushed, ways=("none",))

@@ -7,12 +7,11 @@ import math
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_discrete_are
 
 from asm_gym import NeuralASM
 from asm_gym.memory.inference import Weights, direct_synapses, iterations_within
 from asm_gym.memory.network_learning import initial_weights
-from asm_gym.scripts.reproduce import sequences, speed_accuracy, tracking
+from asm_gym.scripts.reproduce import speed_accuracy
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     ExpressionMemory,
@@ -33,7 +32,6 @@ from asm_gym.scripts.reproduce.handwriting import (
 )
 from asm_gym.scripts.reproduce.local_learning import COMPARED, cosine, exact, local
 from asm_gym.scripts.reproduce.recurrent import Batch, batches, side_by_side
-from asm_gym.scripts.reproduce.tracking import A, C, converged, informed, kalman, recording, squared, tracked
 from asm_gym.scripts.reproduce.two_links import (
     COMMAND,
     CUE,
@@ -178,63 +176,6 @@ def test_the_local_change_is_the_gradient_of_the_energy_and_of_the_error_for_a_f
         assert 0.2 < cosine(*alone) < 0.999  # the way back through time is left out
     assert 0.5 < angles[0] < angles[1]
     assert angles[1] > 0.999
-
-
-@pytest.fixture(scope="module")
-def run():
-    return recording(1500, np.random.default_rng(0))
-
-
-def test_the_kalman_filter_is_as_far_off_as_the_riccati_equation_says(run):
-    prior = solve_discrete_are(A.T, C.T, np.eye(3), np.eye(3))
-    after = prior - prior @ C.T @ np.linalg.inv(C @ prior @ C.T + np.eye(3)) @ C @ prior
-    found, expected = kalman(run)
-    assert squared(found, run.states) == pytest.approx(np.trace(after) / 3, rel=0.1)
-    new = run.observed - expected
-    assert squared(new, 0 * new) == pytest.approx(np.trace(C @ prior @ C.T + np.eye(3)) / 3, rel=0.1)
-    assert tracking.usual_variance() == pytest.approx(np.trace(prior) / 3)
-
-
-def test_inference_comes_nearer_to_the_kalman_filter_step_by_step_and_ends_at_the_closed_form(run):
-    best, end = kalman(run)[0], converged(run)
-    found = {n: tracked(informed(n), run) for n in (1, 2, 4, 10, 1000)}
-    errors = [squared(x, run.states) for x in found.values()]
-    assert all(later < sooner for sooner, later in itertools.pairwise(errors[:4]))
-    assert squared(found[1000], end) < 1e-4
-    assert squared(best, run.states) < squared(end, run.states) < 2 * squared(best, run.states)
-    assert squared(converged(run, tracking.usual_variance()), run.states) < squared(end, run.states)
-
-
-def test_a_network_predicts_the_next_observation_nearly_as_the_kalman_filter_does():
-    rng, config = np.random.default_rng(0), tracking.Config(updates=8000)
-    network, spread = tracking.learned([recording(tracking.LEARNED_STEPS, rng) for _ in range(64)], config, rng)
-    errors = [
-        (squared(tracking.observations(network, spread, r)[200:], r.observed[200:]), squared(kalman(r)[1], r.observed))
-        for r in (recording(tracking.LEARNED_STEPS, rng) for _ in range(8))
-    ]
-    ours, best = np.mean(errors, axis=0)
-    assert best < ours < 1.25 * best
-
-
-def test_a_settling_network_recalls_patterns_that_come_twice_and_one_layer_does_not():
-    config, rng = sequences.Config(updates=1500), np.random.default_rng(0)
-    sequence = sequences.patterns(3, 100, 0.0, rng)[list(sequences.REPEATED["A B C B A"])]
-    found = sequences.by_network(sequence, "settling", config, rng)
-    assert sequences.recalled(found, sequence)[0] == 1.0
-    for other in (sequences.by_one_layer(sequence), sequences.by_correlation(sequence)):
-        assert sequences.recalled(other, sequence)[0] < 1.0  # B is followed by C and by A
-
-
-def test_similar_patterns_confuse_correlation_only():
-    rng = np.random.default_rng(0)
-    made = sequences.patterns(200, 400, 0.5, rng)
-    assert np.mean(made[:100] * made[100:]) == pytest.approx(0.25, abs=0.05)  # b²
-    sequence = sequences.patterns(16, 100, 0.5, rng)
-    assert sequences.recalled(sequences.by_one_layer(sequence), sequence)[0] == 1.0
-    assert sequences.recalled(sequences.by_correlation(sequence), sequence)[0] < 0.5
-    off = sequence.copy()
-    off[3, :10] *= -1
-    assert sequences.recalled(off, sequence) == (14 / 15, pytest.approx(4 * 10 / 1500))
 
 
 @pytest.fixture(scope="module")

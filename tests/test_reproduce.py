@@ -95,7 +95,7 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_study(tmp_path, caps
     assert "file" in capsys.readouterr().err
 
 
-COUNTED = ("failure", "harm", "attack")
+COUNTED = ("failure", "harm")
 """Studies that count episodes; the others print a mean over seeds and draw a figure."""
 
 

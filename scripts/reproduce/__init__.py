@@ -22,17 +22,12 @@ class Study(NamedTuple):
 STUDIES = {
     "memorise_and_recall": Study("one network learns skills, recalls each from a cue"),
     "abstract": Study("one network, six skills, no label: the abstract"),
-    "tracking": Study("the settling network against the Kalman filter"),
-    "sequences": Study("sequences of patterns, some of which come twice"),
     "local_learning": Study("local updates against backpropagation through time"),
     "speed_accuracy": Study("more inference, or slower movements, for more accuracy"),
     "failure": Study("does surprise tell that a policy will fail"),
     "harm": Study("harm avoided against success kept, under any policy"),
-    "attack": Study("what who writes to the senses can hide"),
     "hours": Study("alarms an hour of a shipped memory, as promised?", needs_a_run=True),
     "one_energy": Study("surprise, completion, reaction by one energy", needs_a_run=True),
-    "parts": Study("who does what in the memory, by what rules", needs_a_run=True),
-    "diagnosis": Study("what is wrong, of kinds of faults that were never seen", needs_a_run=True),
     "real_arms": Study("faults in recordings of real arms, once downloaded", needs_a_run=True),
 }
 INDEPENDENT = tuple(name for name, study in STUDIES.items() if not study.needs_a_run)

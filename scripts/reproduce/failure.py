@@ -4,23 +4,19 @@ The shipped agents act as they are, weakened (every weight off by a random share
 disturbed (a fault of the object or of the body). Monitors learn from successful episodes of the agent as it is, without
 labels, and are calibrated on others. Every episode runs to its last step, so that all have the same length.
 
-Two rivals read the commanded actions, after monitors for policies that plan chunks of actions:
-
-    inconsistency   Σ_t ‖a_t - a_{t-1}‖, after STAC: the change from one plan to the next, summed over the episode
-    two_signals     min(r/θ_r, c/θ_c) > 1, after FIPER: random network distillation r, and the entropy c of the last
-                    second's actions as a Gaussian; each with a conformal threshold θ, and an alarm where both exceed it
-
-Sources: Agia et al. 2025 (CoRL, PMLR 270) for STAC; Römer et al. 2025 (NeurIPS) for FIPER.
+A rival reads the commands alone: ``inconsistency`` is Σ_t ‖a_t - a_{t-1}‖, the change from one plan to the next, after
+STAC (Agia et al. 2025, CoRL, PMLR 270).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +27,8 @@ from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import RESAMPLES, Estimate, Share, auroc
 from asm_gym.evaluation.tables import Table, count
 from asm_gym.monitors import MONITORS, make_monitor
+from asm_gym.policies import make_policy
+from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.rollouts.staging import play, staged
@@ -38,12 +36,9 @@ from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record
-from asm_gym.scripts.reproduce.weakened import weakened
 from asm_gym.tasks import env_id
 from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import StreamRecorder
-
-Floats = NDArray[np.float64]
 
 AGENTS = {"Lift": "lift_sac", "Stack": "stack_sac", "Door": "door_sac"}
 KINDS = {
@@ -51,14 +46,13 @@ KINDS = {
     **dict.fromkeys(("Lift", "Stack"), ("teleport", "snatch", "slip", "gripper_opens")),
 }
 """Faults that disturb the agent of a task, in turn."""
-TESTED = ("as it is", "weakened", "disturbed")
+TESTED = {"as_it_is": "as it is", "weakened": "weakened", "disturbed": "disturbed"}
+"""Roles of the episodes to test on, in words."""
 SHARES = (0.25, 0.5, 1.0)
 """Shares of an episode after which failure is predicted."""
-RIVALS = ("inconsistency", "two_signals")
-WINDOW_S = 1.0
-"""Window of the entropy [s]."""
-FAINTEST = 1e-6
-"""Lowest variance of a command."""
+INCONSISTENCY = "inconsistency"
+WEAKEST = 0.3
+"""Largest standard deviation of the share that a weight is off by; that of an episode is drawn below it."""
 
 
 @dataclass(frozen=True)
@@ -70,113 +64,16 @@ class Config(kit.Config):
     tasks: tuple[str, ...] = option(("Lift", "Stack"), quick=("Lift",), least=1, known=AGENTS)
     """Tasks that have an agent; one monitor learns all of them."""
     monitors: tuple[str, ...] = option(
-        ("memory_skill", "neural_asm", "logpzo", "rnd", *RIVALS),
+        ("memory_skill", "neural_asm", "logpzo", "rnd", INCONSISTENCY),
         quick=("memory_skill", "neural_asm"),
         least=1,
-        known=(*MONITORS, *RIVALS),
+        known=(*MONITORS, INCONSISTENCY),
     )
-    """Monitors, and rivals that read commands; memory_skill is skill surprise."""
+    """Monitors, and a rival that reads commands; memory_skill is skill surprise."""
     episodes: int = option(40, quick=6, least=2)
     """Episodes of each task to learn from, to calibrate on, and to test on for each way of acting."""
     false_alarm_rate: float = option(defaults.FALSE_ALARM_RATE, quick=0.5, check=conformal_episodes)
     """Share of the agent's successful episodes that may raise an alarm."""
-
-
-def labels(config: Config, seed: int) -> list[EpisodeLabel]:
-    """Return the episodes of one repetition."""
-    made = []
-    for task in config.tasks:
-        for role in ("fit", "calibration", *TESTED):
-            for n, s in enumerate(role_seeds(seed, task, f"agent/{role}", config.episodes)):
-                happens = (KINDS[task][n % len(KINDS[task])], "strong") if role == "disturbed" else ("", "")
-                onset = draw_onset(s, task_spec(task).horizon) if role == "disturbed" else None
-                made.append(EpisodeLabel(task, role.replace(" ", "_"), *happens, s, onset))
-    return made
-
-
-def record(label: EpisodeLabel, folder: Path) -> Path:
-    """Record the episode of ``label``, to its last step."""
-    name = AGENTS[label.task]
-    acting = RolloutConfig(partial(weakened, name=name) if label.role == "weakened" else name)
-    trial = Trial(env_id(label.task), label.seed, label.kind or NOMINAL, label.severity, label.onset)
-    with staged(trial, acting) as env:
-        recorder = StreamRecorder(env)
-        play(trial, acting, recorder)
-    made = recorder.finish()
-    kept = Episode(made.stream, made.spec, made.success, made.seed, label=label, info={"skill": label.task})
-    return save_episode(folder / label.path, kept)
-
-
-class Watched(NamedTuple):
-    """Verdict of a monitor on one episode."""
-
-    failed: bool
-    how: str  # one of TESTED
-    greatest: tuple[float, ...]  # greatest surprise so far, after each of SHARES
-    alarmed_after: float  # share of the episode; infinite without an alarm
-
-
-class Scored(NamedTuple):
-    """Scores (T,) of episodes, and the threshold of an alarm."""
-
-    values: list[Floats]
-    threshold: float
-
-
-def scored(
-    name: str, seed: int, fit: list[Episode], calibration: list[Episode], tested: list[Episode], rate: float
-) -> Scored:
-    """Return the scores of a monitor or rival, with a conformal threshold for the false-alarm rate."""
-
-    def conformal(score: Callable[[Episode], Floats]) -> Scored:
-        maxima = np.array([score(e).max() for e in calibration])
-        return Scored([score(e) for e in tested], conformal_threshold(maxima, rate))
-
-    if name == "inconsistency":
-        return conformal(inconsistency)
-    if name == "two_signals":
-        both = scored("rnd", seed, fit, calibration, tested, rate), conformal(entropy)
-        ratios = [[v / one.threshold for v in one.values] for one in both]
-        return Scored([np.minimum(r, c) for r, c in zip(*ratios, strict=True)], 1.0)
-    monitor = make_monitor(name, fit[0].spec, seed=seed).fit(fit).calibrate(calibration, rate)
-    return Scored([s.value for s in monitor.score_episodes(tested)], monitor.threshold)
-
-
-def inconsistency(episode: Episode) -> Floats:
-    """Return the summed change of the commands (T,)."""
-    a = episode.stream[:, episode.spec.motor].astype(np.float64)
-    found: Floats = np.cumsum(np.append(0.0, np.linalg.norm(np.diff(a, axis=0), axis=1)))
-    return found
-
-
-def entropy(episode: Episode) -> Floats:
-    """Return exp(entropy/A) of the commands of the last second (T,), as a Gaussian of A dimensions."""
-    a = episode.stream[:, episode.spec.motor].astype(np.float64)
-    rows, least = max(1, round(WINDOW_S / episode.spec.dt)), FAINTEST * np.eye(a.shape[1])
-    windows = (a[max(0, t + 1 - rows) : t + 1] for t in range(len(a)))
-    covariances = np.array([np.cov(part.T, bias=True).reshape(least.shape) + least for part in windows])
-    found: Floats = np.sqrt(2 * np.pi * np.e) * np.exp(0.5 * np.linalg.slogdet(covariances)[1] / a.shape[1])
-    return found
-
-
-def watched(job: tuple[str, int], folder: Path, config: Config) -> list[Watched]:
-    """Return the verdicts of one monitor, fitted and calibrated, on all test episodes of one repetition."""
-    name, seed = job
-    recordings = [load_episode(folder / label.path) for label in labels(config, seed)]
-    roles = {how.replace(" ", "_"): how for how in TESTED}
-    fit, calibration = (
-        [e for e in recordings if e.labelled.role == role and e.success] for role in ("fit", "calibration")
-    )
-    tested = [e for e in recordings if e.labelled.role in roles]
-    values, threshold = scored(name, seed, fit, calibration, tested, config.false_alarm_rate)
-    found = []
-    for episode, value in zip(tested, values, strict=True):
-        so_far = np.maximum.accumulate(value)
-        over = np.flatnonzero(so_far > threshold)
-        greatest = tuple(float(so_far[max(1, round(share * len(so_far))) - 1]) for share in SHARES)
-        alarmed = float(over[0] + 1) / len(so_far) if len(over) else np.inf
-        found.append(Watched(not episode.success, roles[episode.labelled.role], greatest, alarmed))
-    return found
 
 
 def run(config: Config) -> Findings:
@@ -187,20 +84,106 @@ def run(config: Config) -> Findings:
         recording = partial(record, folder=folder)
         make_missing(recording, wanted, lambda label: folder / label.path, config.workers, progress)
     jobs = [(name, seed) for seed in config.repetitions for name in config.monitors]
-    made = kit.each("fitting and judging", partial(watched, folder=folder, config=config), jobs, config)
-    by_monitor: dict[str, list[Watched]] = {}
+    made = kit.each("fitting and judging", partial(judged, folder=folder, config=config), jobs, config)
+    by_monitor: dict[str, list[Verdict]] = {}
     for (name, _), found in zip(jobs, made, strict=True):
         by_monitor.setdefault(name, []).extend(found)
-    records: list[Record] = [
-        {"monitor": name, **w._asdict(), "greatest": list(w.greatest)} for name, own in by_monitor.items() for w in own
-    ]
-    outcomes = {how: Share.of([w.failed for w in made[0] if w.how == how]) for how in TESTED}
+    records: list[Record] = [{"monitor": name, **v._asdict()} for name, own in by_monitor.items() for v in own]
+    outcomes = {how: Share.of([v.failed for v in made[0] if v.how == how]) for how in TESTED.values()}
     return Findings(records, [table(by_monitor, config)], facts={"failed": {h: [*s] for h, s in outcomes.items()}})
 
 
-def separated(own: Sequence[Watched], share: int) -> Estimate:
+# ------------------------------------------------------------------ recordings
+
+
+class Weakened:
+    """An agent of which every weight is off, by another draw in each episode."""
+
+    def __init__(self, env: gym.Env[Any, Any], name: str) -> None:
+        agent = make_policy(name, env)
+        if not isinstance(agent, NetworkPolicy):
+            raise TypeError(f"{name} is no network whose weights could be off")
+        self._agent, self._layers, self.predict = agent, agent.layers, agent.predict
+
+    def set_random_seed(self, seed: int) -> None:
+        """Draw the weights of an episode."""
+        rng = np.random.default_rng([seed, 3])
+        size = WEAKEST * rng.random()
+        self._agent.layers = [
+            ((W * (1.0 + size * rng.standard_normal(W.shape))).astype(np.float32), b) for W, b in self._layers
+        ]
+
+
+def labels(config: Config, seed: int) -> list[EpisodeLabel]:
+    """Return the episodes of one repetition."""
+    made = []
+    for task in config.tasks:
+        for role in ("fit", "calibration", *TESTED):
+            seeds = role_seeds(seed, task, f"agent/{TESTED.get(role, role)}", config.episodes)
+            for n, s in enumerate(seeds):
+                happens = (KINDS[task][n % len(KINDS[task])], "strong") if role == "disturbed" else ("", "")
+                onset = draw_onset(s, task_spec(task).horizon) if role == "disturbed" else None
+                made.append(EpisodeLabel(task, role, *happens, s, onset))
+    return made
+
+
+def record(label: EpisodeLabel, folder: Path) -> Path:
+    """Record the episode of ``label``, to its last step."""
+    name = AGENTS[label.task]
+    acting = RolloutConfig(partial(Weakened, name=name) if label.role == "weakened" else name)
+    trial = Trial(env_id(label.task), label.seed, label.kind or NOMINAL, label.severity, label.onset)
+    with staged(trial, acting) as env:
+        recorder = StreamRecorder(env)
+        play(trial, acting, recorder)
+    made = recorder.finish()
+    kept = Episode(made.stream, made.spec, made.success, made.seed, label=label, info={"skill": label.task})
+    return save_episode(folder / label.path, kept)
+
+
+# ------------------------------------------------------------------ verdicts
+
+
+class Verdict(NamedTuple):
+    """Verdict of a monitor on one episode."""
+
+    failed: bool
+    how: str  # one of TESTED's words
+    greatest: list[float]  # greatest surprise so far, after each of SHARES
+    alarmed_after: float  # share of the episode; infinite without an alarm
+
+
+def inconsistency(episode: Episode) -> NDArray[np.float64]:
+    """Return the summed change of the commands (T,)."""
+    a = episode.stream[:, episode.spec.motor].astype(np.float64)
+    found: NDArray[np.float64] = np.cumsum(np.append(0.0, np.linalg.norm(np.diff(a, axis=0), axis=1)))
+    return found
+
+
+def judged(job: tuple[str, int], folder: Path, config: Config) -> list[Verdict]:
+    """Return the verdicts of one monitor, fitted and calibrated, on all test episodes of one repetition."""
+    (name, seed), rate = job, config.false_alarm_rate
+    recordings = [load_episode(folder / label.path) for label in labels(config, seed)]
+    fit, calibration = ([e for e in recordings if e.labelled.role == r and e.success] for r in ("fit", "calibration"))
+    tested = [e for e in recordings if e.labelled.role in TESTED]
+    if name == INCONSISTENCY:
+        values = [inconsistency(e) for e in tested]
+        threshold = conformal_threshold(np.array([inconsistency(e).max() for e in calibration]), rate)
+    else:
+        monitor = make_monitor(name, fit[0].spec, seed=seed).fit(fit).calibrate(calibration, rate)
+        values, threshold = [s.value for s in monitor.score_episodes(tested)], monitor.threshold
+    found = []
+    for episode, value in zip(tested, values, strict=True):
+        so_far = np.maximum.accumulate(value)
+        over = np.flatnonzero(so_far > threshold)
+        greatest = [float(so_far[max(1, round(share * len(so_far))) - 1]) for share in SHARES]
+        alarmed = float(over[0] + 1) / len(so_far) if len(over) else np.inf
+        found.append(Verdict(not episode.success, TESTED[episode.labelled.role], greatest, alarmed))
+    return found
+
+
+def separated(own: Sequence[Verdict], share: int) -> Estimate:
     """Return the AUROC of failures against successes by the greatest surprise so far, with its bootstrap interval."""
-    failed, score = np.array([w.failed for w in own]), np.array([w.greatest[share] for w in own])
+    failed, score = np.array([v.failed for v in own]), np.array([v.greatest[share] for v in own])
     if failed.all() or not failed.any():
         return Estimate(np.nan, np.nan, np.nan)
     rng, drawn = np.random.default_rng(0), []
@@ -212,16 +195,16 @@ def separated(own: Sequence[Watched], share: int) -> Estimate:
     return Estimate(auroc(score[failed], score[~failed]), float(low), float(high))
 
 
-def table(by_monitor: Mapping[str, Sequence[Watched]], config: Config) -> Table:
+def table(by_monitor: Mapping[str, Sequence[Verdict]], config: Config) -> Table:
     """Return a row for each monitor: how well, and how early, it separates failures from successes."""
 
     def cell(found: Estimate) -> str:
         return "" if np.isnan(found.value) else f"{found.value:.3f} ({found.low:.2f}–{found.high:.2f})"
 
-    def row(name: str, own: Sequence[Watched]) -> tuple[str, ...]:
-        failures, successes = ([w for w in own if w.failed is failed] for failed in (True, False))
-        known = [Share.of([w.alarmed_after <= share for w in failures]) for share in (0.5, 1.0)]
-        false = Share.of([w.alarmed_after <= 1.0 for w in successes if w.how == TESTED[0]])
+    def row(name: str, own: Sequence[Verdict]) -> tuple[str, ...]:
+        failures, successes = ([v for v in own if v.failed is failed] for failed in (True, False))
+        known = [Share.of([v.alarmed_after <= share for v in failures]) for share in (0.5, 1.0)]
+        false = Share.of([v.alarmed_after <= 1.0 for v in successes if v.how == TESTED["as_it_is"]])
         areas = (cell(separated(own, k)) for k in range(len(SHARES)))
         return (name, *areas, *map(count, (*known, false)))
 

@@ -86,6 +86,12 @@ def check_letters(*counts: int, least: int = 1) -> None:
             raise ValueError(f"a repertoire has {least} to {len(NAMES)} skills, got {count}")
 
 
+def wide_enough(hidden: int, channels: int) -> None:
+    """Raise ValueError where a network has fewer hidden units than numbers to predict."""
+    if hidden < channels:
+        raise ValueError(f"hidden must be at least the number of channels, {channels}, got {hidden}")
+
+
 def velocity(letter: Letter, time: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the velocity (T, 3) [cm/s] of the pen at times (T,) [s] since the letter began."""
     total = np.zeros((len(time), 3))

@@ -1,22 +1,10 @@
 """Run a study from its command line, repeat it over seeds, and write what it found.
 
-A study is a module with a frozen ``Config`` and a function ``run(config) -> Findings``:
-
-    @dataclass(frozen=True)
-    class Config(kit.Config):
-        '''What the study asks.'''
-
-        letters: int = option(8, quick=2, least=1)
-        '''Number of letters.'''
-
-    def run(config: Config) -> Findings:
-        records = kit.each("learning letters", partial(one_seed, config=config), config.repetitions, config)
-        return Findings(records, tables(records, config), drawn(records, config))
+A study is a module with a frozen ``Config`` and a function ``run(config) -> Findings``.
 """
 
 from __future__ import annotations
 
-import csv
 import json
 import platform
 import time
@@ -28,14 +16,14 @@ from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from rich.console import Console
 from scipy.stats import t as student
 from threadpoolctl import threadpool_limits
 
-from asm_gym.evaluation.figures import save
-from asm_gym.evaluation.film import write_gif
+from asm_gym.evaluation.figures import look, save
 from asm_gym.evaluation.statistics import Estimate, Spread
 from asm_gym.evaluation.tables import ConsoleTable, Table, markdown
 from asm_gym.rollouts import progress
@@ -82,7 +70,49 @@ class Findings(NamedTuple):
     tables: Sequence[Table]
     figure: Figure | None = None
     facts: Mapping[str, Any] = {}  # further JSON-serialisable results
-    film: Sequence[NDArray[np.uint8]] = ()  # frames (H, W, 3), 20 a second
+
+
+def main(study: ModuleType, argv: Sequence[str] | None = None) -> int:
+    """Run a study from its command line, write and print its results, and return the exit code."""
+    name = study.__name__.rpartition(".")[2]
+
+    def work(config: Any, console: Console) -> None:
+        _ = getattr(config, "tasks", ())  # a run without recordings is refused before anything is written
+        config.out.mkdir(parents=True, exist_ok=True)
+        start = time.perf_counter()
+        with threadpool_limits(1):  # several threads slow products this small down
+            found = study.run(config)
+        written = write(config.out / name, found, config, time.perf_counter() - start)
+        for table in found.tables:
+            console.print(ConsoleTable(table))
+        console.print(f"Wrote {config.out / name}{', '.join(written)}")
+
+    return command.run(f"reproduce {name}", study.Config, work, argv, study.__doc__)
+
+
+def write(path: Path, found: Findings, config: Any, seconds: float) -> list[str]:
+    """Write the figure, records (CSV), tables (Markdown) and conditions (JSON); return the suffixes."""
+    written = [".csv", ".md", ".json"]
+    if found.figure is not None:
+        save(found.figure, path.with_suffix(".png"))
+        found.figure.savefig(path.with_suffix(".svg"), format="svg", metadata={"Date": None})
+        written = [".png", ".svg", *written]
+    pd.DataFrame(found.records).to_csv(path.with_suffix(".csv"), index=False)
+    path.with_suffix(".md").write_text("\n\n".join(map(markdown, found.tables)) + "\n", encoding="utf-8")
+    details = {
+        "arguments": json.loads(json.dumps(asdict(config), default=str)),
+        "seed": config.seed,
+        "versions": versions("scipy", "torch", "matplotlib"),
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "seconds": round(seconds, 1),
+        **found.facts,
+    }
+    path.with_suffix(".json").write_text(json.dumps(details, indent=2) + "\n", encoding="utf-8")
+    return written
+
+
+# ------------------------------------------------------------------ measurement
 
 
 def stage(what: str) -> AbstractContextManager[Progress]:
@@ -101,53 +131,6 @@ def together(found: Sequence[Sequence[Record]]) -> list[Record]:
     return [record for own in found for record in own]
 
 
-def main(study: ModuleType, argv: Sequence[str] | None = None) -> int:
-    """Run a study from its command line, write and print its results, and return the exit code."""
-    name = study.__name__.rpartition(".")[2]
-
-    def work(config: Any, console: Console) -> None:
-        _ = getattr(config, "tasks", ())  # a run without recordings is refused before anything is written
-        config.out.mkdir(parents=True, exist_ok=True)
-        start = time.perf_counter()
-        with threadpool_limits(1):  # several threads slow products this small down
-            found = study.run(config)
-        written = write(name, found, config, time.perf_counter() - start)
-        for table in found.tables:
-            console.print(ConsoleTable(table))
-        console.print(f"Wrote {config.out / name}{', '.join(written)}")
-
-    return command.run(f"reproduce {name}", study.Config, work, argv, study.__doc__)
-
-
-def write(name: str, found: Findings, config: Any, seconds: float) -> list[str]:
-    """Write the figure, the film, records (CSV), tables (Markdown) and conditions (JSON); return the suffixes."""
-    path: Path = config.out / name
-    written = [".csv", ".md", ".json"]
-    if found.figure is not None:
-        save(found.figure, path.with_suffix(".png"))
-        found.figure.savefig(path.with_suffix(".svg"), format="svg", metadata={"Date": None})
-        written = [".png", ".svg", *written]
-    if found.film:
-        write_gif(path.with_suffix(".gif"), found.film, fps=20)
-        written = [".gif", *written]
-    with path.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(key for r in found.records for key in r)))
-        writer.writeheader()
-        writer.writerows(found.records)
-    path.with_suffix(".md").write_text("\n\n".join(map(markdown, found.tables)) + "\n", encoding="utf-8")
-    details = {
-        "arguments": json.loads(json.dumps(asdict(config), default=str)),
-        "seed": config.seed,
-        "versions": versions("scipy", "torch", "matplotlib"),
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-        "seconds": round(seconds, 1),
-        **found.facts,
-    }
-    path.with_suffix(".json").write_text(json.dumps(details, indent=2) + "\n", encoding="utf-8")
-    return written
-
-
 def where(records: Sequence[Record], **values: Any) -> list[Record]:
     """Return the records that have these values."""
     return [r for r in records if all(r.get(name) == value for name, value in values.items())]
@@ -163,18 +146,20 @@ def over_seeds(records: Sequence[Record], value: str, **values: Any) -> Spread:
 def paired(records: Sequence[Record], value: str, one: Record, other: Record, **values: Any) -> Estimate:
     """Return the mean difference of ``one`` minus ``other``, seed by seed, with Student's 95 % interval."""
 
-    def of(chosen: Record) -> dict[int, float]:
+    def by_seed(chosen: Record) -> dict[int, float]:
         own = {r["seed"] for r in where(records, **values | chosen)}
         return {seed: over_seeds(records, value, seed=seed, **values | chosen).mean for seed in own}
 
-    first, second = of(one), of(other)
+    first, second = by_seed(one), by_seed(other)
     difference = np.array([first[seed] - second[seed] for seed in sorted(first.keys() & second.keys())])
+    mean = float(difference.mean()) if len(difference) else float("nan")
     if len(difference) < 2:
-        mean = float(difference.mean()) if len(difference) else float("nan")
         return Estimate(mean, float("-inf"), float("inf"))
-    error = difference.std(ddof=1) / np.sqrt(len(difference))
-    half = float(student.ppf(0.975, len(difference) - 1) * error)
-    return Estimate(float(difference.mean()), float(difference.mean()) - half, float(difference.mean()) + half)
+    half = float(student.ppf(0.975, len(difference) - 1) * difference.std(ddof=1) / np.sqrt(len(difference)))
+    return Estimate(mean, mean - half, mean + half)
+
+
+# ------------------------------------------------------------------ tables and figures
 
 
 def by(name: str, values: Iterable[Any]) -> dict[str, Record]:
@@ -203,3 +188,21 @@ def shown(records: Sequence[Record], value: str, digits: int = 2, **values: Any)
     """Return ``mean ± spread`` over seeds, for a table; empty without records."""
     found = over_seeds(records, value, **values)
     return "" if np.isnan(found.mean) else found.text(digits=digits)
+
+
+def curves(
+    ax: Axes,
+    records: Sequence[Record],
+    value: str,
+    x: tuple[str, Sequence[Any]],
+    lines: Mapping[str, Record],
+    **values: Any,
+) -> None:
+    """Draw a curve for each of ``lines``, over the values of what ``x`` names: means over seeds with a band of a SD."""
+    name, places = x
+    for i, (label, line) in enumerate(lines.items()):
+        found = [over_seeds(records, value, **{**values, **line, name: place}) for place in places]
+        mean, spread = np.array(found).T
+        colour, style, marker = look(i)
+        ax.plot(places, mean, color=colour, linestyle=style, marker=marker, markersize=4, label=label)
+        ax.fill_between(places, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)

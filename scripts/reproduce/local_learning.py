@@ -36,11 +36,9 @@ from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.curves import curves
 from asm_gym.scripts.reproduce.expression import trajectories
-from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire
-from asm_gym.scripts.reproduce.kit import Findings, Record
-from asm_gym.scripts.reproduce.recordings import wide_enough
+from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire, wide_enough
+from asm_gym.scripts.reproduce.kit import Findings, Record, curves
 from asm_gym.scripts.reproduce.recurrent import Batch, batches, side_by_side
 from asm_gym.validation import check_number
 

@@ -23,7 +23,6 @@ from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import SETTLING
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.curves import curves
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     Expresser,
@@ -32,9 +31,8 @@ from asm_gym.scripts.reproduce.expression import (
     mean_demonstrations,
     recalled,
 )
-from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, check_letters, copybook, repertoire
-from asm_gym.scripts.reproduce.kit import Findings, Record
-from asm_gym.scripts.reproduce.recordings import wide_enough
+from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, check_letters, copybook, repertoire, wide_enough
+from asm_gym.scripts.reproduce.kit import Findings, Record, curves
 
 MODELS = {
     "memory": "traces, local",

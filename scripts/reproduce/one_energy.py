@@ -1,10 +1,9 @@
-"""One energy: surprise rises with it, and completion, reaction and learning descend it.
+"""One energy: surprise rises with it, and completion descends it; ``abstract`` shows reaction and learning.
 
 Claim: F, the sum of what is unexpected to the temporal network, to association and to the motor association
-(``asm_gym.memory.free_energy``), finds faults, completes missing senses, and chooses commands. Faults: F against the
-surprise in use, on robosuite skills. Completion: missing senses by descending F, by the correlation memory, and as they
-were last. Reaction: a pen is displaced while it writes, and goes on by the temporal network, by the motor association,
-or by the command that lets F be lowest.
+(``asm_gym.memory.free_energy``), finds faults and completes missing senses, on robosuite skills that ``asm-gym
+evaluate`` recorded. Faults: F against the surprise in use. Completion: missing senses by descending F, by the
+correlation memory, and as they were last.
 """
 
 from __future__ import annotations
@@ -12,16 +11,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from asm_gym.detection import conformal_threshold
+from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.episode import Episode
-from asm_gym.evaluation.figures import figure, look
+from asm_gym.evaluation import defaults
 from asm_gym.evaluation.metrics import detected, false_alarms, time_matched_auroc
+from asm_gym.evaluation.recordings import recorded, tasks_in
 from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import DYNAMICS
@@ -30,9 +31,8 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.acting import learn_to_act
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.handwriting import DT, NOISE, copybook, repertoire
-from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds
-from asm_gym.scripts.reproduce.recordings import RunConfig, in_turn
+from asm_gym.scripts.reproduce.kit import Findings, Record
+from asm_gym.validation import check_number
 
 Floats = NDArray[np.float64]
 Roles = Mapping[str, Sequence[Episode]]
@@ -43,20 +43,37 @@ MEAN_ROWS = 4
 PARTS = ("F", "time", "association", "motor", "in use")
 LOST = {"one encoder": ("encoder[3]",), "all encoders": tuple(f"encoder[{j}]" for j in range(7)), "wrist": ("wrist",)}
 COMPLETED_BY = ("last value", "correlation memory", "lowest F")
-COMMANDED_BY = ("temporal network", "motor association", "lowest F")
-CUE, PUSHED, LETTERS, WRITINGS = 15, 25, 4, 16
-DISPLACEMENT = 1.0
-"""Of the pen [cm]."""
 
 
 @dataclass(frozen=True)
-class Config(RunConfig):
+class Config(kit.Config):
     """F of the memory, by traces and by settling."""
 
+    run: Path = option(Path("runs/evaluate"), metavar="FOLDER")
+    """Folder of an evaluation, whose recordings are learned from and judged."""
+    false_alarm_rate: float = option(defaults.FALSE_ALARM_RATE, check=conformal_episodes)
+    """Share of nominal episodes that may raise an alarm."""
+    window: float = option(defaults.WINDOW_S, check=partial(check_number, "window", above=0))
+    """How soon after its onset a fault must be noticed [s]."""
     completed: int = option(8, quick=1, least=1)
     """Healthy episodes in which senses go missing."""
-    written: int = option(16, quick=2, least=1)
-    """Letters that are written in closed loop."""
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Tasks that the run has recorded; ValueError where there is none."""
+        if not (tasks := tuple(tasks_in(self.run))):
+            raise ValueError(f"{self.run} holds no recordings: run asm-gym evaluate first")
+        return tasks
+
+
+def in_turn(episodes: Sequence[Episode], seed: int) -> list[Episode]:
+    """Return all episodes, one of each task after another, in an order of the seed."""
+    tasks: dict[str, list[Episode]] = {}
+    for episode in episodes:
+        tasks.setdefault(episode.labelled.task, []).append(episode)
+    rng = np.random.default_rng(seed)
+    shuffled = [[own[i] for i in rng.permutation(len(own))] for own in tasks.values()]
+    return [e for turn in zip_longest(*shuffled) for e in turn if e is not None]
 
 
 def by_part(energy: FreeEnergy, episode: Episode) -> dict[str, Floats]:
@@ -129,48 +146,11 @@ def lowest(energy: FreeEnergy, truth: Floats, missing: NDArray[np.bool_], onset:
     return rows
 
 
-def written(energy: FreeEnergy, model: Episode, way: str, push: Floats) -> Floats:
-    """Return the pen (T, 2) after a cue of the ``model``, displaced once by ``push`` (2,) [cm]."""
-    rng = np.random.default_rng(model.seed)
-    rows, c = model.stream.astype(np.float64).copy(), energy.network.at_rest(1)
-    pen = rows[CUE - 1, :2].copy()
-    for t in range(len(rows)):
-        moment = before(rows, t, c, energy)
-        if t >= CUE:
-            command = commanded(energy, moment, way)
-            pen += DT * command + (push if t == PUSHED else 0.0)
-            rows[t] = np.concatenate([pen + NOISE * rng.standard_normal(2), command])
-        c = energy.after(moment, rows[t], turn=t % energy.senses.lag == 0)
-    return rows[:, :2]
-
-
-def commanded(energy: FreeEnergy, moment: Before, way: str) -> Floats:
-    """Return the command (A,) by one of ``COMMANDED_BY``."""
-    if way == COMMANDED_BY[0]:
-        scaler, motor = energy.senses, energy.senses.spec.motor
-        action = energy.network.run_on(moment.c).expected[0, scaler.size :].astype(np.float64)
-        return np.asarray(scaler.mean[motor] + scaler.spread[motor] * action)
-    return energy.reaction(moment) if way == COMMANDED_BY[2] else energy.expected(moment)
-
-
-def reactions(energy: FreeEnergy, models: Sequence[Episode], seed: int) -> list[Record]:
-    """Measure how far letters are from those they go on from, with and without a displacement [cm]."""
-    made, rng = [], np.random.default_rng(seed)
-    for model in models:
-        angle = rng.uniform(0.0, 2.0 * np.pi)
-        for pushed in (False, True):
-            push = DISPLACEMENT * pushed * np.array([np.cos(angle), np.sin(angle)])
-            for way in COMMANDED_BY:
-                error = written(energy, model, way, push)[PUSHED + 10 :] - model.stream[PUSHED + 10 :, :2]
-                made.append({"way": way, "pushed": pushed, "cm": float(np.sqrt(np.mean(np.sum(error**2, axis=1))))})
-    return made
-
-
 def one(job: tuple[str, int], roles: Roles, config: Config) -> list[Record]:
     """Measure everything for one dynamics and one seed."""
     dynamics, seed = job
     asm = NeuralASM(roles["fit"][0].spec, dynamics=dynamics, seed=seed).fit(roles["fit"])
-    learn_to_act(asm, roles["fit"])
+    learn_to_act(asm, roles["fit"])  # F has a term of the motor association
     energy = asm.model.free_energy(roles["spreads"])
     judged = {name: roles[name] for name in ("calibration", "nominal", "faulty")}
     courses = {name: [by_part(energy, e) for e in own] for name, own in judged.items()}
@@ -179,56 +159,26 @@ def one(job: tuple[str, int], roles: Roles, config: Config) -> list[Record]:
             found["in use"] = surprise.value
     records = [r for part in PARTS for r in faults_by(part, courses, roles, config)]
     records += completions(asm, energy, in_turn(roles["nominal"], seed)[: config.completed])
-    rng = np.random.default_rng(seed)
-    letters = repertoire(LETTERS, 2, rng)
-    learned, fresh = (copybook(letters, n, 2, rng) for n in (WRITINGS, -(-config.written // LETTERS)))
-    pen = NeuralASM(learned[0].spec, 64, 64, dynamics=dynamics, seed=seed).fit(learned)
-    learn_to_act(pen, learned, units=64)
-    of_pen = pen.model.free_energy(copybook(letters, 1, 2, rng))
-    records += reactions(of_pen, fresh[: config.written], seed)
     return [{"dynamics": dynamics, "seed": seed, **r} for r in records]
 
 
 def tables(records: Sequence[Record], config: Config) -> list[Table]:
-    """Return faults, completion and reaction."""
+    """Return faults and completion."""
     both, parts = kit.by("dynamics", DYNAMICS), kit.by("part", PARTS)
     rate = f"{100 * config.false_alarm_rate:g} % of nominal episodes may alarm"
     values = {"auroc": "AUROC", "found": f"Found in {config.window:g} s", "alarm": "Nominal episodes in alarm"}
     made = [kit.grid(f"{label} by F and its parts; {rate}", records, v, parts, both) for v, label in values.items()]
     lost: dict[str, Record] = {f"{x} by {way}": {"lost": x, "way": way} for x in LOST for way in COMPLETED_BY}
     made.append(kit.grid("Error of completed senses [rad, N]", records, "rmse", lost, both, 4))
-    ways: dict[str, Record] = {
-        f"{'displaced' if pushed else 'left alone'}, {way}": {"pushed": pushed, "way": way}
-        for pushed in (False, True)
-        for way in COMMANDED_BY
-    }
-    return [*made, kit.grid("Distance of a pen from the letter after a push [cm]", records, "cm", ways, both, 3)]
-
-
-def drawn(records: Sequence[Record]) -> Figure:
-    """Draw the AUROC of each part, and how far off a displaced pen is."""
-    with figure(height=3.4, width=8) as fig:
-        axes = fig.subplots(1, 2)
-        for i, d in enumerate(DYNAMICS):
-            panels = (
-                (PARTS, [over_seeds(records, "auroc", dynamics=d, part=p).mean for p in PARTS]),
-                (COMMANDED_BY, [over_seeds(records, "cm", dynamics=d, pushed=True, way=w).mean for w in COMMANDED_BY]),
-            )
-            for ax, (names, found) in zip(axes, panels, strict=True):
-                ax.barh(np.arange(len(names)) + 0.38 * (i - 0.5), found, 0.36, color=look(i)[0], label=d)
-                ax.set_yticks(range(len(names)), names, fontsize=8)
-        axes[0].set(xlabel="AUROC of faults", xlim=(0.4, 1.0))
-        axes[1].set(xlabel="off the letter after a push [cm]")
-        axes[0].legend(fontsize=8)
-    return fig
+    return made
 
 
 def run(config: Config) -> Findings:
     """Run both dynamics and every seed."""
-    roles = dict(config.roles)
+    roles = dict(recorded(config.run, config.tasks).roles)
     roles["faulty"] = [e for e in roles["faulty"] if len(e) > (e.labelled.onset or 0)]
     healthy = in_turn(roles["calibration"], 0)  # a fifth sets τ, and no threshold
     roles["spreads"], roles["calibration"] = healthy[: len(healthy) // 5], healthy[len(healthy) // 5 :]
     jobs = [(d, seed) for d in DYNAMICS for seed in config.repetitions]
     records = kit.together(kit.each("learning and judging", partial(one, roles=roles, config=config), jobs, config))
-    return Findings(records, tables(records, config), drawn(records))
+    return Findings(records, tables(records, config))

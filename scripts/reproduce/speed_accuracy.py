@@ -21,7 +21,6 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
@@ -29,11 +28,9 @@ from asm_gym.memory.dynamics import DYNAMICS
 from asm_gym.memory.inference import iterations_within
 from asm_gym.scripts.options import fixed, option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.curves import points
 from asm_gym.scripts.reproduce.expression import ExpressionMemory, Rows
-from asm_gym.scripts.reproduce.handwriting import DT, Letter, check_letters, copybook, repertoire, written
-from asm_gym.scripts.reproduce.kit import Findings, Record, over_seeds
-from asm_gym.scripts.reproduce.recordings import wide_enough
+from asm_gym.scripts.reproduce.handwriting import DT, Letter, check_letters, copybook, repertoire, wide_enough, written
+from asm_gym.scripts.reproduce.kit import Findings, Record, curves
 from asm_gym.validation import check_number
 
 CUE = 20
@@ -113,47 +110,28 @@ def by_speed(letters: Sequence[Letter], config: Config, rng: np.random.Generator
     return records
 
 
-def tables(records: Sequence[Record], config: Config) -> list[Table]:
-    """Return errors by inference, and by speed."""
-    made = []
-    for value, label in MEASURES.items():
-        lines: dict[str, Record] = {
-            f"{name}, steps {'as usual' if short == 1 else f'1/{short} as long'}": {"dynamics": name, "shorter": short}
-            for name, short in product(DYNAMICS, SHORTER)
-        }
-        counts = kit.by("iterations", config.iterations)
-        made.append(kit.grid(f"{label} by steps of inference; cue of {CUE}", records, value, lines, counts, 3))
-    for value, label in MEASURES.items():
-        lines = {
-            f"{name}, {budget} short steps a second": {"dynamics": name, "budget": budget}
-            for name, budget in product(DYNAMICS, config.budgets)
-        }
-        made.append(kit.grid(f"{label} by speed", records, value, lines, kit.by("speed", config.speeds), 3))
-    return made
-
-
-def drawn(records: Sequence[Record], config: Config) -> Figure:
-    """Draw both errors over time of inference, and over speed."""
-    with figure(height=3.2, width=10) as fig:
-        axes = fig.subplots(1, 3)
-        for i, (name, short) in enumerate(product(DYNAMICS, SHORTER)):
-            where: Record = {"dynamics": name, "shorter": short}
-            times = [n / short for n in config.iterations]
-            for ax, value in zip(axes, MEASURES, strict=False):
-                found = [over_seeds(records, value, iterations=n, **where) for n in config.iterations]
-                points(ax, times, found, i, f"{name}, steps 1/{short} as long" if short > 1 else name)
-        for ax, label in zip(axes, MEASURES.values(), strict=False):
-            ax.set(xlabel="time of inference [usual steps]", ylabel=label, xscale="log", ylim=0)
-        for i, (name, budget) in enumerate(product(DYNAMICS, config.budgets)):
-            found = [over_seeds(records, "next_cm", dynamics=name, budget=budget, speed=s) for s in config.speeds]
-            points(axes[2], config.speeds, found, i, f"{name}, {budget} a second")
-        axes[2].set(xlabel="speed of writing", ylabel=MEASURES["next_cm"], ylim=0)
-        for ax in axes[1:]:
-            ax.legend(fontsize=7)
-    return fig
+def lines(name: str, values: Sequence[int], words: str) -> dict[str, Record]:
+    """Return the rows of a table, or curves: both dynamics with each value of what ``name`` names."""
+    return {f"{d}, {words.format(v)}": {"dynamics": d, name: v} for d, v in product(DYNAMICS, values)}
 
 
 def run(config: Config) -> Findings:
     """Run every seed."""
     records = kit.together(kit.each("learning letters", partial(one_seed, config=config), config.repetitions, config))
-    return Findings(records, tables(records, config), drawn(records, config))
+    shorter = lines("shorter", SHORTER, "steps 1/{} as long")
+    budgets = lines("budget", config.budgets, "{} short steps a second")
+    counts, speeds = kit.by("iterations", config.iterations), kit.by("speed", config.speeds)
+    tables: list[Table] = []
+    for value, label in MEASURES.items():
+        tables.append(kit.grid(f"{label} by steps of inference; cue of {CUE}", records, value, shorter, counts, 3))
+        tables.append(kit.grid(f"{label} by speed", records, value, budgets, speeds, 3))
+    with figure(height=3.2, width=10) as fig:
+        axes = fig.subplots(1, 3)
+        for ax, (value, label) in zip(axes, MEASURES.items(), strict=False):
+            curves(ax, records, value, ("iterations", config.iterations), shorter)
+            ax.set(xlabel="steps of inference", ylabel=label, xscale="log", ylim=0)
+        curves(axes[2], records, "next_cm", ("speed", config.speeds), budgets)
+        axes[2].set(xlabel="speed of writing", ylabel=MEASURES["next_cm"], ylim=0)
+        for ax in axes[1:]:
+            ax.legend(fontsize=7)
+    return Findings(records, tables, fig)
