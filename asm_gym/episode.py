@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from asm_gym.checkpoint import DAMAGE, read_checkpoint, write_checkpoint
 from asm_gym.data.channels import read_recorded
 from asm_gym.files import regular_file
-from asm_gym.notebook_display import lines_over_time
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32, typed
 
@@ -21,11 +20,6 @@ KIND = "episode"
 
 ARRAYS = {"stream": "f", "actions": "f", "observations": "fiub", "rewards": "f", "faults": "b", "contact_force": "f"}
 """What a file holds, and the kinds of numbers that each may have."""
-
-
-def _most_moving(part: NDArray[np.float32]) -> int:
-    """The column of (T, n) with the largest range."""
-    return int(np.argmax(np.nan_to_num(np.ptp(part, axis=0)))) if len(part) else 0
 
 
 def _empty() -> NDArray[np.float32]:
@@ -116,12 +110,6 @@ class Episode:
         ended = "success" if self.success else "no success"
         rows = f"{len(self)} rows of {self.spec.size}, {seconds:g} s"
         return f"<Episode of {self.spec.source or 'a stream'}: {rows}, {ended}{seed}{faults}>"
-
-    def _repr_html_(self) -> str:
-        """For notebooks: the most moving number of each channel over time; red where a fault was active."""
-        parts = {f"{c.name} [{c.unit}]": self.stream[:, self.spec.slices[c.name]] for c in self.spec.channels}
-        lines = {name: part[:, _most_moving(part)] for name, part in parts.items()}
-        return lines_over_time(repr(self), lines, self.spec.dt, self.faults if len(self.faults) else None)
 
     @property
     def labelled(self) -> EpisodeLabel:

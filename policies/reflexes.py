@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.protocols import HasGrippers, HoldsItself
+
+@runtime_checkable
+class HoldsItself(Protocol):
+    """An environment that can stay where it is, whatever its controller and the wrappers around it."""
+
+    holding: bool
+    """Set, the arms stay in the next control step, and the grippers keep what they were told; the step unsets it."""
+
+    keeps_holding: bool
+    """Set, no step unsets ``holding``: for wrappers in between that make several steps of one."""
 
 
 class Begun(NamedTuple):
@@ -51,7 +60,7 @@ class Hold:
             self._rest = nearest_to_rest(space) if self._robot else resting_action(env)
         if not space.contains(self._rest):
             raise ValueError(f"safe_action {self._rest} is not in {space}")
-        self._grip = np.asarray(inner.gripper_actions if isinstance(inner, HasGrippers) else (), dtype=int)
+        self._grip = np.asarray(getattr(inner, "gripper_actions", ()), dtype=int)
         if self._grip.size and self._grip.max() >= self._rest.size:  # a wrapper inside takes other numbers
             self._grip = self._grip[:0]
 

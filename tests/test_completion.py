@@ -9,7 +9,7 @@ from asm_gym.episode import Episode
 from asm_gym.memory.completion import Completion, sensors_of
 from asm_gym.monitors import NeuralASM, Surprise
 from asm_gym.monitors.diagnosis import CLASSES, Diagnosis, Readout
-from asm_gym.wrappers import CompletedObservation, NeuralASMSafety
+from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.robots import robots_of
 from tests.arms import MEMORY, SENSES, SPEC, STREAMS, Arm, Judge, Repaired, arm, offset
 
@@ -132,37 +132,22 @@ def played(env, steps):
     return out
 
 
-def test_a_policy_under_the_wrapper_sees_what_a_faulty_sense_should_say():
+def test_a_policy_under_the_guard_sees_what_a_faulty_sense_should_say():
     truth = arm(120, 31)
-    for env in (
-        CompletedObservation(Arm(offset), Judge({21})),
-        NeuralASMSafety(Arm(offset), Judge({21}), on_alarm="graded"),
-    ):
-        out = played(env, 60)
-        for t, (observation, _) in enumerate(out):
-            expected = 0.3 if 20 <= t < 22 else 0.0
-            assert abs(observation[0] - truth[t, 0] - expected) < 0.05, t
-            np.testing.assert_array_equal(observation[1:], truth[t, 1:5])
-        info = out[-1][1]
-        said = info.get("completed") or info["asm"]["completed"]
-        assert said == ("observation[0]",)
+    out = played(NeuralASMSafety(Arm(offset), Judge({21}), on_alarm="graded"), 60)
+    for t, (observation, _) in enumerate(out):
+        expected = 0.3 if 20 <= t < 22 else 0.0
+        assert abs(observation[0] - truth[t, 0] - expected) < 0.05, t
+        np.testing.assert_array_equal(observation[1:], truth[t, 1:5])
+    assert out[-1][1]["asm"]["completed"] == ("observation[0]",)
 
 
 def test_what_is_completed_already_completes_nothing_else(monkeypatch):
     monitor = Judge({21, 30})
     named = iter(monitor.diagnosis_.hypotheses)
     monkeypatch.setattr(Diagnosis, "named", lambda *_: next(named))  # another one each time
-    out = played(CompletedObservation(Arm(offset), monitor), 60)
-    assert [info["completed"] for _, info in out[22:]] == [("observation[0]",)] * 39
-
-
-def test_a_named_sensor_is_never_believed_and_an_unknown_one_is_refused():
-    truth = arm(120, 31)
-    env = CompletedObservation(Arm(offset), Judge(()), sensors=["observation[0]"])
-    for t, (observation, _) in enumerate(played(env, 40)):
-        assert abs(observation[0] - truth[t, 0]) < 0.05
-    with pytest.raises(ValueError, match=r"elbow.*observation\[0\]"):
-        CompletedObservation(Arm(), Judge(()), sensors=["elbow"])
+    out = played(NeuralASMSafety(Arm(offset), monitor, on_alarm="graded"), 60)
+    assert [info["asm"]["completed"] for _, info in out[22:]] == [("observation[0]",)] * 39
 
 
 def test_an_observation_that_a_wrapper_has_changed_is_refused():

@@ -14,7 +14,7 @@ from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
-from asm_gym.wrappers.oracle import OracleReflex
+from asm_gym.wrappers.faults import OracleReflex
 from asm_gym.wrappers.robots import robots_of
 from tests.fakes import SPEC, CueMonitor
 

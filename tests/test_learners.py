@@ -8,8 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from asm_gym.wrappers import FlatInfo, NeuralASMSafety, SafetyLog, SixValues
-from asm_gym.wrappers.logging import SafetyCounter, WandbWriter
+from asm_gym.wrappers import NeuralASMSafety
 from tests.fakes import CueMonitor, FakeEnv
 from tests.needs import needs
 
@@ -20,17 +19,10 @@ def watched(cue=(2, 3, 6), length=8, on_alarm="monitor", **how):
     return NeuralASMSafety(FakeEnv(length=length), CueMonitor(cue), on_alarm=on_alarm, **how)
 
 
-class Kept:
-    """A writer that keeps what it is told."""
-
-    def __init__(self):
-        self.said = []
-
-    def add_scalar(self, tag, scalar_value, global_step):
-        self.said.append((tag, scalar_value, global_step))
-
-
 def test_an_episode_is_counted_by_hand():
+    needs("stable_baselines3")
+    from asm_gym.rollouts.training.callback import SafetyCounter
+
     counter, env = SafetyCounter(0.05), watched(on_alarm="hold", release_after=2)
     env.reset()
     for _ in range(8):
@@ -42,48 +34,8 @@ def test_an_episode_is_counted_by_hand():
     assert counter.total.override_s == pytest.approx(4 * 0.05)
     counter.clear()
     assert counter.total.alarms == 0
-    with pytest.raises(KeyError, match="outside of NeuralASMSafety"):
+    with pytest.raises(KeyError, match="wrap the environment in NeuralASMSafety"):
         counter.add({})
-
-
-def test_each_episode_is_logged_when_it_ends():
-    kept = Kept()
-    env = SafetyLog(watched(), kept)
-    for _ in range(2):
-        env.reset()
-        for _ in range(8):
-            env.step(ACT)
-    alarms = [(value, step) for tag, value, step in kept.said if tag == "safety/alarms"]
-    assert alarms == [(2.0, 8), (2.0, 16)]
-    assert ("safety/cost", 3.0, 16) in kept.said
-    assert ("safety/override_s", 0.0, 8) in kept.said
-
-
-def test_tensorboard_keeps_what_is_logged(tmp_path):
-    tensorboard = needs("torch.utils.tensorboard")
-    events = needs("tensorboard.backend.event_processing.event_accumulator")
-    with tensorboard.SummaryWriter(str(tmp_path)) as writer:
-        env = SafetyLog(watched(), writer)
-        env.reset()
-        for _ in range(8):
-            env.step(ACT)
-    read = events.EventAccumulator(str(tmp_path)).Reload()
-    (event,) = read.Scalars("safety/cost")
-    assert (event.step, event.value) == (8, 3.0)
-
-
-@pytest.mark.slow
-def test_weights_and_biases_keeps_what_is_logged_without_a_network(tmp_path, monkeypatch):  # 20 s: it starts a service
-    wandb = needs("wandb")
-    monkeypatch.setenv("WANDB_SILENT", "true")
-    with wandb.init(mode="offline", dir=tmp_path, project="asm-gym") as run:
-        env = SafetyLog(watched(), WandbWriter(run))
-        env.reset()
-        for _ in range(8):
-            env.step(ACT)
-    wandb.teardown()  # its service may write after the run has ended
-    (kept,) = tmp_path.rglob("*.wandb")
-    assert b"safety/alarms" in kept.read_bytes()
 
 
 def test_the_callback_logs_what_learning_met(tmp_path):
@@ -101,33 +53,21 @@ def test_the_callback_logs_what_learning_met(tmp_path):
     assert rows[-1]["safety/surprise"] == 10.0
 
 
-def test_torchrl_reads_the_flat_numbers():
-    envs = needs("torchrl.envs")
+def with_cost():
+    """A watched environment as TorchRL reads it, its cost among the observations."""
+    torch, envs, data = needs("torch"), needs("torchrl.envs"), needs("torchrl.data")
     from torchrl.envs.libs.gym import default_info_dict_reader
 
-    envs.check_env_specs(envs.GymWrapper(watched()))
-    with_cost = envs.GymWrapper(FlatInfo(watched()))
-    with_cost.set_info_dict_reader(default_info_dict_reader(["cost"]))
-    envs.check_env_specs(with_cost)
-    everything = envs.GymWrapper(FlatInfo(watched())).auto_register_info_dict()
-    envs.check_env_specs(everything)
-    rolled = everything.rollout(8)["next"]
-    np.testing.assert_array_equal(rolled["cost"].ravel(), [0, 0, 1, 1, 0, 0, 1, 0])
-    np.testing.assert_array_equal(rolled["asm_alarm"].ravel(), [0, 0, 1, 1, 0, 0, 1, 0])
+    env = envs.GymWrapper(watched())
+    cost = data.Unbounded(shape=(), dtype=torch.float64)
+    return env.set_info_dict_reader(default_info_dict_reader(["cost"], spec={"cost": cost}))
 
 
-def test_flat_info_goes_outside_of_the_guard():
-    with pytest.raises(KeyError, match="put FlatInfo outside of NeuralASMSafety"):
-        FlatInfo(FakeEnv()).reset()
-
-
-def test_six_values_are_those_of_safety_gymnasium():
-    env = SixValues(watched())
-    env.reset()
-    steps = [env.step(ACT) for _ in range(8)]
-    assert [step[2] for step in steps] == [0, 0, 1, 1, 0, 0, 1, 0]
-    assert [len(step) for step in steps] == [6] * 8
-    assert steps[-1][4]
+def test_torchrl_reads_the_cost():
+    envs = needs("torchrl.envs")
+    env = with_cost()
+    envs.check_env_specs(env)
+    np.testing.assert_array_equal(env.rollout(8)["next"]["cost"].ravel(), [0, 0, 1, 1, 0, 0, 1, 0])
 
 
 def test_a_loop_as_cleanrl_writes_it_sees_cost_and_episodes():
@@ -273,13 +213,9 @@ def test_stable_baselines_learns_and_meets_every_cost(kind: str):
 
 
 def test_torchrl_collects_and_meets_every_cost():
-    collectors, envs = needs("torchrl.collectors"), needs("torchrl.envs")
-
-    def make():
-        return envs.GymWrapper(FlatInfo(watched())).auto_register_info_dict()
-
+    collectors = needs("torchrl.collectors")
     kind = getattr(collectors, "Collector", None) or collectors.SyncDataCollector  # the name of before
-    collector = kind(make, None, frames_per_batch=64, total_frames=STEPS)
+    collector = kind(with_cost, None, frames_per_batch=64, total_frames=STEPS)
     assert sum(float(batch["next", "cost"].sum()) for batch in collector) == COST
     collector.shutdown()
 

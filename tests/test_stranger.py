@@ -182,17 +182,12 @@ def test_a_callback_finds_out_the_control_period():
     assert callback.ended[0].override_s == pytest.approx(19 * spec.dt)
 
 
-def test_what_a_notebook_shows_is_a_line_or_a_small_picture():
+def test_what_a_notebook_shows_is_a_line():
     episode = sine_episodes(1)[0]
     assert len(repr(episode)) < 200
     assert "rows of" in repr(episode)
-    html = episode._repr_html_()
-    assert html.count("<svg") == min(8, len(episode.spec.channels))
-    assert f"{len(episode) * episode.spec.dt:.2f} s" in html
     assert len(repr(episode.spec)) < 400
-    surprise = Surprise(np.arange(5.0), np.ones((5, 3)))
-    assert repr(surprise) == "<Surprise of 5: last 4, largest 4>"
-    assert "surprise" in surprise._repr_html_()
+    assert repr(Surprise(np.arange(5.0), np.ones((5, 3)))) == "<Surprise of 5: last 4, largest 4>"
     assert len(repr(Surprise(np.zeros(0), np.zeros((0, 3))))) < 40
 
 

@@ -4,34 +4,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from asm_gym.extras import needed_for
-from asm_gym.wrappers.completed import CompletedObservation
-from asm_gym.wrappers.features import StreamFeatures
-from asm_gym.wrappers.logging import FlatInfo, SafetyLog, SixValues, WandbWriter
 from asm_gym.wrappers.recording import StreamRecorder
 from asm_gym.wrappers.safety import NeuralASMSafety
 from asm_gym.wrappers.vector import VectorNeuralASMSafety
 
 if TYPE_CHECKING:
     from asm_gym.wrappers.faults import FaultInjection
-    from asm_gym.wrappers.live_view import RerunView
     from asm_gym.wrappers.overlay import SurpriseOverlay
 
 __all__ = [
-    "CompletedObservation",
     "FaultInjection",
-    "FlatInfo",
     "NeuralASMSafety",
-    "RerunView",
-    "SafetyLog",
-    "SixValues",
-    "StreamFeatures",
     "StreamRecorder",
     "SurpriseOverlay",
     "VectorNeuralASMSafety",
-    "WandbWriter",
 ]
 
-_NEED_MORE = {"FaultInjection": "faults", "RerunView": "live_view", "SurpriseOverlay": "overlay"}
+_NEED_MORE = {"FaultInjection": "faults", "SurpriseOverlay": "overlay"}
 """Those that need more than watching a stream does, and are imported when they are asked for."""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, SupportsFloat
+from typing import Any, Literal, Protocol, SupportsFloat, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -21,12 +21,23 @@ from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import INFO, RowReport, report
 from asm_gym.monitors import Monitor
 from asm_gym.policies.base import Policy
-from asm_gym.policies.reflexes import Hold
-from asm_gym.protocols import HoldsItself, SensesWithinSteps
-from asm_gym.spec import control_period
+from asm_gym.policies.reflexes import Hold, HoldsItself
+from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import StreamSource
 from asm_gym.validation import as_float32, check_choice, check_number, short_repr
 from asm_gym.wrappers.robots import body_memory, felt_by, robots_of
+
+
+@runtime_checkable
+class SensesWithinSteps(Protocol):
+    """An environment whose stream can run faster than control, and whose action can be replaced within a step."""
+
+    row_hooks: list[Any]
+    stream_freq: int
+
+    def stream_spec_at(self, rate: int) -> StreamSpec: ...
+
+    def command(self, action: NDArray[np.float32]) -> None: ...
 
 
 class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

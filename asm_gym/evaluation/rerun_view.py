@@ -1,11 +1,9 @@
-"""Write a recording for Rerun's viewer: senses and predictions, surprise, threshold, cause, and camera.
+"""Write a recording for Rerun's viewer: senses and predictions, surprise, threshold and cause.
 
     senses/<channel>/sensed, expected, low, high     each number; the band is two standard deviations wide on each side
     surprise, threshold                              what an alarm is raised by
     shares/<channel>                                 what each channel adds to surprise
     log                                              when an alarm began, and its cause
-    camera                                           where there is one
-    robot                                            its links as lines [m], where the simulator is at hand
 
 Open it by ``rerun FILE.rrd``. Predictions are those of the memory's completion, each sense from all others.
 """
@@ -59,7 +57,6 @@ class LiveView:
         self.path, self.spec = Path(path), spec
         self._drawn = [c for c in spec.channels if channels is None or c.name in channels]
         self._completion = model.completion_ if isinstance(model, Completes) else None
-        self._scenes: dict[str, Any] = {}  # view of the robot and the camera, once there is one
         self.begin()
         self.path.parent.mkdir(parents=True, exist_ok=True)
         os.environ.setdefault("RERUN_FLUSH_TICK_SECS", "1")  # read by the next line: by default 0.008, a chunk a row
@@ -80,7 +77,6 @@ class LiveView:
                 views.TimeSeriesView(name="surprise", origin="/", contents=["/surprise", "/threshold"]),
                 views.TimeSeriesView(name="shares", origin="/shares", plot_legend=bare),
                 views.TextLogView(name="log", origin="/log"),
-                *self._scenes.values(),
                 *senses,
             )
         )
@@ -104,8 +100,6 @@ class LiveView:
         threshold: float,
         shares: NDArray[np.floating[Any]],
         cause: Mapping[str, Any] | None = None,
-        picture: NDArray[np.uint8] | None = None,
-        links: NDArray[np.float64] | None = None,
     ) -> None:
         """Write one row and its surprise.
 
@@ -116,8 +110,6 @@ class LiveView:
             threshold: that an alarm is over.
             shares: (D,) what each number adds to surprise.
             cause: of an alarm, as in ``info["asm"]["cause"]``.
-            picture: (H, W, 3).
-            links: (n, 2, 3) both ends of each link of the robot [m].
         """
         rr, log = self._rr, self._stream.log
         self._stream.set_time("time", duration=seconds)
@@ -135,18 +127,6 @@ class LiveView:
             what = f"alarm: {self.spec.labels[int(np.argmax(shares))]}, {surprise / threshold:.2f} thresholds"
             log("log", rr.TextLog(what + _in_words(cause or {}), level="WARN"))
         self._alarm = alarm
-        if picture is not None:
-            self._show("camera", "Spatial2DView", rr.Image(picture))
-        if links is not None:
-            self._show("robot", "Spatial3DView", rr.LineStrips3D(links))
-
-    def _show(self, name: str, view: str, scene: Any) -> None:
-        """Log a scene, and give it a view when it is first seen."""
-        if name not in self._scenes:
-            views = require("rerun.blueprint", what="a live view")
-            self._scenes[name] = getattr(views, view)(name=name, origin=f"/{name}")
-            self._stream.send_blueprint(self._blueprint())
-        self._stream.log(name, scene)
 
     def _predicted(self, row: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Prediction and band of every number (D,); actions are their own prediction."""

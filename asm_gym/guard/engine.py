@@ -23,11 +23,11 @@ from asm_gym.guard.diagnosis import Alarm, Diagnostician
 from asm_gym.guard.limits import EpisodeLimits
 from asm_gym.guard.motion import Command, Motions
 from asm_gym.guard.observer import Observation, Observer, joined
-from asm_gym.guard.options import GuardOptions
+from asm_gym.guard.options import TRUST_S, GuardOptions
 from asm_gym.guard.reflexes import GRADED, REFLEXES, Reflexes
 from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, NOTHING, SURPRISE, Outcome, RowReport
 from asm_gym.guard.responses import NO_RESPONSE, Response, responses_from
-from asm_gym.guard.robots import NO_COLUMNS, Robots
+from asm_gym.guard.robots import Robots
 from asm_gym.guard.rows import Believed, Rows
 from asm_gym.guard.severity import FAST, Felt, Severity, SeverityEstimator, Weighed
 from asm_gym.monitors import Monitor
@@ -62,7 +62,6 @@ class Engine:
         options: what the guard is told.
         policies: the user's own, one for each robot, where ``options`` name no reflex.
         rows_per_step: rows of the stream in a control step.
-        never: columns of sensors that are not believed from the first row on.
 
     Raises:
         ValueError: a reflex that these robots cannot do, or contact limits of another arm; ``"recall"`` with a monitor
@@ -76,7 +75,6 @@ class Engine:
         options: GuardOptions,
         policies: Sequence[Policy] = (),
         rows_per_step: int = 1,
-        never: NDArray[np.intp] = NO_COLUMNS,
     ) -> None:
         n, spec, diagnosis = robots.count, monitor.spec, diagnosis_of(monitor)
         chosen = options.reaction(diagnosis is not None)
@@ -99,8 +97,8 @@ class Engine:
         self._severity = SeverityEstimator(n, spec, robots.felt_channels, options.leans_s, self._arbiter)
         table = responses_from(options.responses)
         self._diagnostician = Diagnostician(robots, spec, diagnosis, table, graded)
-        completion = diagnosis.completion if diagnosis is not None and (graded or options.completes) else None
-        self._rows = Rows(robots, spec, completion, options.trust_s, self._diagnostician.rows, never)
+        completion = diagnosis.completion if diagnosis is not None and graded else None
+        self._rows = Rows(robots, spec, completion, TRUST_S, self._diagnostician.rows)
         limited = name != "monitor" and robots.rest.size > 0
         self._limits = EpisodeLimits(robots, spec, limits, limited, familiar_to(monitor, limits))
         adaptive = options.adaptive_threshold
@@ -239,20 +237,6 @@ class Engine:
             return NOTHING
         found = {i: (self._rows.last(i, 1)[0], repair.missing) for i, repair in self._rows.repairs.items()}
         return {i: (row, missing) for i, (row, missing) in found.items() if missing.any()}
-
-    @property
-    def trusted(self) -> Mask:
-        """(n,) whether a policy can rely on what was completed."""
-        return np.array([i not in self._rows.repairs or self._rows.repairs[i].trusted for i in range(self._count)])
-
-    def read(self, rows: NDArray[np.float32]) -> None:
-        """Take in rows (n, D) that nothing judges, such as the first of an episode."""
-        self._rows.next(rows, self._everyone)
-
-    @property
-    def completed(self) -> Mapping[int, tuple[str, ...]]:
-        """The sensors that are not believed now, by robot."""
-        return {i: repair.names for i, repair in self._rows.repairs.items()}
 
     def amend(self, rows: NDArray[np.float32]) -> None:
         """Tell the monitor that the last rows (n, D) were these: something else was commanded than it seemed."""

@@ -71,8 +71,6 @@ class GuardOptions:
     Args:
         on_alarm, release_after, release_below, max_override, try_after, truncate, responses, contact_limits,
             adaptive_threshold, online_learning_rate, on_overrun: as there.
-        completes: sensors at fault are completed whatever ``on_alarm`` is; always so under ``"graded"``.
-        trust_s: how long a sense that no other sense tells of is completed [s].
         leans_s: how long an arm may press with more than healthy motion does below its limits [s].
 
     Raises:
@@ -90,8 +88,6 @@ class GuardOptions:
     adaptive_threshold: AdaptiveThreshold | None = None
     online_learning_rate: float = 0.0
     on_overrun: str = "ignore"
-    completes: bool = False
-    trust_s: float = TRUST_S
     leans_s: float = LEANS_S
 
     def __post_init__(self) -> None:
@@ -115,7 +111,6 @@ class GuardOptions:
             )
         check_number("online_learning_rate", self.online_learning_rate, low=0, high=1)
         check_choice("on_overrun", self.on_overrun, ("warn", "alarm", "ignore"))
-        check_number("trust_s", self.trust_s, low=0)
 
     def reaction(self, names_causes: bool) -> OnAlarm:
         """Return ``on_alarm``, or what None means for a monitor that names causes or does not.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import compiled
 from asm_gym.guard.hand import NEEDS, Contradiction, HandAgainstJoints
 from asm_gym.guard.repair import Repair
-from asm_gym.guard.robots import NO_COLUMNS, Robots
+from asm_gym.guard.robots import Robots
 from asm_gym.memory.completion import Completion
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec
@@ -49,7 +49,6 @@ class Rows:
         completion: of the memory that watches; None where nothing completes senses.
         trust_s: how long a sense that no other sense tells of is completed [s].
         kept: how many rows are kept of each.
-        never: columns of sensors that are not believed from the first row on.
     """
 
     def __init__(
@@ -59,9 +58,8 @@ class Rows:
         completion: Completion | None,
         trust_s: float,
         kept: int,
-        never: NDArray[np.intp] = NO_COLUMNS,
     ) -> None:
-        self._spec, self._trust_s, self._kept, self._never = spec, trust_s, kept, never
+        self._spec, self._trust_s, self._kept = spec, trust_s, kept
         self._completion = None if robots.read is None else completion
         if completion is not None and robots.read is None:
             # Completing what the monitor sees would hide a fault that the policy goes on to see.
@@ -97,7 +95,7 @@ class Rows:
                 lost[i] = tuple(self._spec.labels[k] for k in np.flatnonzero(~np.isfinite(rows[i])))
         contradictory = [hand.compare(rows) for hand in self._hands]
         unusual = {i for i in (*self._repairs, *lost, *(i for found in contradictory for i in found)) if active[i]}
-        if not unusual and not self._never.size:
+        if not unusual:
             self._end += 1
             return Believed(rows, lost, {}, {})
         believed, contradictions, failures = rows.copy(), {}, {}
@@ -115,9 +113,6 @@ class Rows:
             if repair is not None and not repair.trusted:
                 failures[i] = f"completion: too much is missing, or for too long: {', '.join(repair.names)}"
         self._end += 1
-        for i in np.flatnonzero(active) if self._never.size else ():
-            if self.suspect(int(i), self._never):
-                believed[i] = self._history[i, self._end - 1]
         return Believed(believed, lost, contradictions, failures)
 
     def last(self, robot: int, count: int | None = None) -> NDArray[np.float32]:

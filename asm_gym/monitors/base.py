@@ -14,7 +14,6 @@ from asm_gym.detection.base import Arrays
 from asm_gym.detection.events import EVENTS, KNOCK, STOP, event_of
 from asm_gym.episode import Episode
 from asm_gym.monitors.diagnosis import Diagnosis
-from asm_gym.notebook_display import lines_over_time
 from asm_gym.spec import StreamSpec
 
 Progress = Callable[[int, int], object]
@@ -50,13 +49,6 @@ class Surprise(NamedTuple):
         if not len(self.value):
             return "<Surprise of no row>"
         return f"<Surprise of {len(self.value)}: last {self.value[-1]:.4g}, largest {self.value.max():.4g}>"
-
-    def _repr_html_(self) -> str:
-        """Return a plot for notebooks: surprise over time, and the numbers with the largest share."""
-        shares = np.nan_to_num(np.atleast_2d(self.attribution))
-        most = np.argsort(-shares.sum(axis=0))[:4]
-        lines = {"surprise": self.value} | {f"share of number {k}": shares[:, k] for k in most}
-        return lines_over_time(repr(self), lines)
 
     @property
     def parts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -28,8 +28,8 @@ from asm_gym.policies.scripted.base import Style
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import EXECUTIONS, PASSING, PolicySource, RolloutConfig, Settings, Trial
 from asm_gym.spec import control_period
-from asm_gym.wrappers import FaultInjection, StreamRecorder
-from asm_gym.wrappers.oracle import OracleReflex
+from asm_gym.wrappers import StreamRecorder
+from asm_gym.wrappers.faults import FaultInjection, OracleReflex
 
 _CACHE: dict[str, tuple[Any, Any]] = {}
 """What this process made last, by name: what it was made of, and the result."""

@@ -32,7 +32,7 @@ from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Record
 from asm_gym.tasks import env_id
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.oracle import OracleReflex
+from asm_gym.wrappers.faults import OracleReflex
 
 IDEAL = "ideal reflex"
 GUARDS: dict[str, dict[str, Any] | None] = {

@@ -1,14 +1,72 @@
-"""A callback of stable-baselines3 that logs the safety wrapper's numbers to its logger."""
+"""A callback of stable-baselines3 that logs what the guard did in each episode."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
 from stable_baselines3.common.callbacks import BaseCallback
 
-from asm_gym.wrappers.logging import EpisodeSafety, SafetyCounter
+from asm_gym.detection.events import FAULT, KNOCK, NO_EVENT, STOP
+
+
+class EpisodeSafety(NamedTuple):
+    """What the guard reported in one episode.
+
+    Attributes:
+        surprise: the greatest, in thresholds.
+        alarms: how often one began.
+        cost: steps in alarm.
+        override_s: for how long something else than the policy acted [s].
+        knocks, stops, faults: how often one of these began; see ``info["asm"]["event"]``.
+    """
+
+    surprise: float = 0.0
+    alarms: int = 0
+    cost: float = 0.0
+    override_s: float = 0.0
+    knocks: int = 0
+    stops: int = 0
+    faults: int = 0
+
+
+class SafetyCounter:
+    """Adds up the guard's reports of one episode.
+
+    Args:
+        dt: control period [s].
+    """
+
+    def __init__(self, dt: float) -> None:
+        self.dt = dt
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin a new episode."""
+        self.total, self._alarm, self._event = EpisodeSafety(), False, NO_EVENT
+
+    def add(self, info: Mapping[str, Any]) -> None:
+        """Add one step. Raises KeyError where ``info`` is not from a guarded environment."""
+        if "asm" not in info:
+            raise KeyError('info has no "asm": wrap the environment in NeuralASMSafety')
+        alarm, total, event = bool(info["asm_alarm"]), self.total, str(info["asm"]["event"])
+        begun = event if event != self._event else NO_EVENT
+        self.total = EpisodeSafety(
+            max(total.surprise, float(info["asm_surprise"]) / float(info["asm"]["threshold"])),
+            total.alarms + (alarm and not self._alarm),
+            total.cost + float(info["cost"]),
+            total.override_s + self.dt * bool(info["asm_intervened"]),
+            total.knocks + (begun == KNOCK),
+            total.stops + (begun == STOP),
+            total.faults + (begun == FAULT),
+        )
+        self._alarm, self._event = alarm, event
 
 
 class SafetyCallback(BaseCallback):
     """Log the mean of each number of the episodes that have ended: ``safety/surprise``, ``/alarms``, ``/cost``, …
+
+    They go to stable-baselines3's logger, and from there to TensorBoard, CSV, or Weights and Biases.
 
     Args:
         dt: control period of the environments [s]; by default the first of them tells.
