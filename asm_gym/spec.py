@@ -200,32 +200,6 @@ class StreamSpec:
         if lines:
             raise ValueError(f"{whose} does not fit this stream:\n  " + "\n  ".join(lines))
 
-    def never_met(self, known: StreamSpec) -> list[str]:
-        """What of this stream a memory of one that is ``known`` cannot do with, a line each; commands do not matter."""
-        senses = {c.name for c in self.channels if c.group != MOTOR} | {"dt"}
-        lines = (line.partition(": ") for line in known.difference(self))
-        return ["".join(line) for line in lines if line[0] in senses and line[2] != "missing"]
-
-    def columns_in(self, known: StreamSpec) -> NDArray[np.intp]:
-        """(D,) where each number of this stream stands in one that is ``known``; -1 for commands that are not.
-
-        Raises:
-            ValueError: a sense that is not known, by name, size, unit and group; another rate.
-        """
-        lines = self.never_met(known)
-        if lines:
-            raise ValueError(
-                "the memory never met what this stream holds:\n  "
-                + "\n  ".join(lines)
-                + "\nLeave what it never met out of the "
-                f"stream, or fit a memory of your own. It knows {', '.join(c.name for c in known.channels)}"
-            )
-        theirs, columns = {c.name: c for c in known.channels}, np.full(self.size, -1, np.intp)
-        for c in self.channels:
-            if c.name in theirs and _alike(c, theirs[c.name]):
-                columns[self.slices[c.name]] = np.arange(known.size)[known.slices[c.name]]
-        return columns
-
     def to_json(self) -> str:
         return json.dumps(asdict(self))
 
@@ -285,10 +259,6 @@ def flat_rows(space: spaces.Space[Any], values: Any, rows: int) -> NDArray[np.fl
     if isinstance(space, spaces.Box):
         return np.asarray(values, np.float32).reshape(rows, -1)
     return np.array([spaces.flatten(space, value) for value in values], np.float32).reshape(rows, -1)
-
-
-def _alike(one: Channel, other: Channel) -> bool:
-    return (one.size, one.unit, one.group) == (other.size, other.unit, other.group)
 
 
 def control_period(env: gym.Env[Any, Any]) -> float:

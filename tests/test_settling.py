@@ -23,9 +23,7 @@ from asm_gym.memory.settling_learning import (
 from asm_gym.memory.temporal import unassociated
 from asm_gym.monitors import MemoryConfig, NeuralASM, load_monitor
 from asm_gym.monitors.acting import expected_action, recall
-from asm_gym.monitors.adaptation import for_stream
 from asm_gym.monitors.skills import name_skills, named_skills
-from asm_gym.spec import Channel, StreamSpec
 from tests.problems import some_rows
 from tests.streams import frozen, sine_episodes, sine_spec
 
@@ -237,30 +235,6 @@ def test_more_inference_a_row_makes_it_expect_the_next_better(asm):
         errors[count] = np.mean(wrong)
     assert errors[0] > 1.5 * errors[1] > 1.5 * errors[5]
     assert errors[50] < 1.1 * errors[5]
-
-
-def test_a_memory_of_fewer_senses_settles_where_it_would_had_it_never_seen_them():
-    joint, wrist = Channel("joint", 3, "rad", group="joint"), Channel("wrist", 2, "N", group="wrench")
-    other, command = Channel("command_z", 1, group="action"), Channel("command", 2, group="action")
-    spec, rng = StreamSpec((joint, wrist, other, command), dt=0.05), np.random.default_rng(0)
-    mixing, episodes = rng.normal(size=(2, 5)), []
-    for _ in range(40):
-        commands = np.hstack([np.zeros((40, 1)), rng.normal(size=(40, 2))])
-        senses = np.cumsum(commands[:, 1:], axis=0) @ mixing + 0.05 * rng.normal(size=(40, 5))
-        episodes.append(Episode.from_stream(np.hstack([senses, commands]).astype(np.float32), spec))
-    whole = NeuralASM(spec, 8, 24, epochs=5, dynamics="settling", config=MemoryConfig(iterations=1000)).fit(episodes)
-    fewer = for_stream(whole, StreamSpec((command, joint), dt=0.05))
-    assert fewer.dynamics == "settling"
-    left = episodes[0].stream[:, [6, 7, 0, 1, 2]]
-    full, part = whole.senses_.read_episode(episodes[0].stream), fewer.senses_.read_episode(left)
-    seen = np.array([[c not in (3, 4) for c in (*spec.sensory, *whole.senses_.slow)]], np.float32)
-    assert 0 < seen.sum() < seen.size
-    z, small = whole.model.network.at_rest(1), fewer.model.network.at_rest(1)
-    for x, u, y, v in zip(full.senses, full.commands, part.senses, part.commands, strict=True):
-        z = whole.model.network.follow(z, u[None], x[None], seen).traces
-        small = fewer.model.network.follow(small, v[None], y[None], np.ones((1, len(y)), np.float32)).traces
-        np.testing.assert_allclose(small, z, atol=2e-4)
-    assert np.isfinite(fewer.score(Episode.from_stream(left, fewer.spec)).value).all()
 
 
 def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):

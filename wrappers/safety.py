@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.guard.arbiter import ENDED
-from asm_gym.guard.checks import LOG, Fitted, check_monitor, diagnosis_of, fitted_to
+from asm_gym.guard.checks import LOG, Fitted, check_answer, check_monitor, diagnosis_of
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.lazy_info import LazyInfo
 from asm_gym.guard.motion import Command
@@ -195,12 +195,13 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     @monitor.setter
     def monitor(self, monitor: Monitor) -> None:
-        check_monitor(fitted_to(monitor, self._spec), self._spec)
+        check_answer(monitor)
+        check_monitor(monitor, self._spec)
         self._next = monitor
 
     def _watch_with(self, monitor: Monitor) -> None:
         """Take up a monitor, and all that depends on it."""
-        monitor = fitted_to(monitor, self._spec)
+        check_answer(monitor)
         check_monitor(monitor, self._spec)
         chosen = self._options.reaction(diagnosis_of(monitor) is not None)
         policies = () if isinstance(chosen, str) else (made_for(chosen, self.env),)

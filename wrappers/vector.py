@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection import AdaptiveThreshold
-from asm_gym.guard.checks import LOG, Fitted, check_monitor, diagnosis_of, fitted_to
+from asm_gym.guard.checks import LOG, Fitted, check_answer, check_monitor, diagnosis_of
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import INFO, RowReport, side_by_side
@@ -136,7 +136,7 @@ class VectorNeuralASMSafety(VectorWrapper):
 
     def _watch_with(self, monitor: Monitor) -> None:
         """Take up a monitor, and all that depends on it."""
-        monitor = fitted_to(monitor, self._spec)
+        check_answer(monitor)
         check_monitor(monitor, self._spec)
         chosen = self._options.reaction(diagnosis_of(monitor) is not None)
         self._robots, self._places = robots_of_many(self.env, monitor.spec)
@@ -152,7 +152,8 @@ class VectorNeuralASMSafety(VectorWrapper):
 
     @monitor.setter
     def monitor(self, monitor: Monitor) -> None:
-        check_monitor(fitted_to(monitor, self._spec), self._spec)
+        check_answer(monitor)
+        check_monitor(monitor, self._spec)
         self._next = monitor
 
     @property

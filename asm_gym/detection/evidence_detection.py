@@ -91,17 +91,6 @@ class EvidenceDetection:
         counted = count_repetitions([e.stream[:, senses] for e in nominal.episodes], self.spec.noise[senses] > 0)
         return self.restore({name: getattr(detector, name) for name in self.arrays[:-1]} | {"repetition": counted})
 
-    def fewer(
-        self, spec: StreamSpec, left: NDArray[np.intp], widened: NDArray[np.float64], narrower: NDArray[np.float64]
-    ) -> EvidenceDetection:
-        """Return the detection on the errors ``left`` (X',), with covariance (E + widened) narrower narrowerᵀ."""
-        old = self.learned_
-        E = np.linalg.inv(old["whitening"] @ old["whitening"])[np.ix_(left, left)]  # ZCA: M = E^(-1/2)
-        values, vectors = np.linalg.eigh((E + widened) * np.outer(narrower, narrower))
-        kept = {name: old[name][:, left] for name in ("ceiling", "tail", "repetition")}
-        usual = {name: old[name] for name in ("context_quantile", "context_range")}
-        return self._like(spec).restore({"whitening": (vectors / np.sqrt(values)) @ vectors.T, **usual, **kept})
-
     def with_ceilings(self, maxima: Array, anew: bool) -> EvidenceDetection:
         """Return a copy with q from the largest v in each of N healthy episodes (N, G, X), and κ by a smaller ξ_0.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import warnings
 from copy import deepcopy
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
@@ -12,7 +11,6 @@ import numpy as np
 from asm_gym.contact_limits import ContactLimits
 from asm_gym.familiar_speed import FamiliarSpeed
 from asm_gym.monitors import CalibratedMonitor, ExplainsItself, Monitor, NeuralASM, pretrained_for
-from asm_gym.monitors.adaptation import for_stream
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, short_repr
@@ -77,27 +75,6 @@ def _parts(monitor: Monitor) -> tuple[Any, ...]:
     return monitor, getattr(monitor, "diagnosis_", None), None
 
 
-def fitted_to(monitor: Monitor, watched: StreamSpec) -> Monitor:
-    """Return the monitor itself where it reads such a stream, or what it makes of itself with fewer senses.
-
-    Raises:
-        ValueError: the stream has senses that it never met, by name.
-        TypeError: it answers something else than a state and a surprise.
-    """
-    if isinstance(monitor, Watches) and not isinstance(monitor, CalibratedMonitor):
-        _check_answer(monitor)
-    if not isinstance(monitor, NeuralASM) or not monitor.spec.difference(watched):
-        return monitor
-    fewer = for_stream(monitor, watched)
-    lacks = "; ".join(monitor.spec.difference(watched))
-    warnings.warn(
-        f"the monitor does without what this stream lacks ({lacks}); its threshold was set with all its senses: "
-        "for_stream(memory, spec).calibrate(episodes) sets it anew",
-        stacklevel=4,
-    )
-    return fewer
-
-
 def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
     """Return the monitor's threshold, once it can watch such a stream.
 
@@ -111,8 +88,10 @@ def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
     return check_number("the monitor's threshold", monitor.threshold)
 
 
-def _check_answer(monitor: Monitor) -> None:
-    """Raise TypeError where a monitor answers a row with something else than it should, which would alarm for ever."""
+def check_answer(monitor: Monitor) -> None:
+    """Raise TypeError where a user's monitor answers a row with anything but a state and a surprise."""
+    if not isinstance(monitor, Watches) or isinstance(monitor, CalibratedMonitor):
+        return
     try:
         tried = deepcopy(monitor)  # one that keeps count of its rows must not count this one
         answer: Any = tried.observe(tried.initial_state(1), np.zeros((1, monitor.spec.size), np.float32))

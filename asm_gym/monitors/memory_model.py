@@ -22,7 +22,6 @@ from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
 from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs
-from asm_gym.memory.marginalise import MOST_INPUTS, moments
 from asm_gym.memory.motor import Motor
 from asm_gym.memory.state import MemoryState, at_start
 from asm_gym.memory.temporal import TemporalNetwork
@@ -99,8 +98,6 @@ class MemoryModel(StreamModel):
         how = FEEDBACK[self.feedback](), self.dynamics
         trained = train(trajectories, *layout, self.schedule, rng, progress, *how)
         learned = {**senses.arrays, "energy": trained.energy}
-        if senses.inputs <= MOST_INPUTS:
-            learned["moments"] = moments(np.concatenate([t.inputs for t in trajectories]))
         network, completion = trained.network, Completion.fit(senses, streams)
         filled = completion.named() if completion is not None else {}
         return self.restore({**learned, **network.weights._asdict(), **network.association._asdict(), **filled})
@@ -115,7 +112,7 @@ class MemoryModel(StreamModel):
         changes = np.ascontiguousarray(inputs[:, senses.changes])
         layout = senses.groups, senses.changes, self._units_each(senses)
         now = specialise(self.network.association, inputs, changes, *layout)
-        kept = {"mean", "spread", "change", "energy", "moments", *self.network.weights._fields}
+        kept = {"mean", "spread", "change", "energy", *self.network.weights._fields}
         return self.restore({**{n: a for n, a in self.learned_.items() if n in kept}, **now._asdict()})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:

@@ -41,7 +41,7 @@ def pretrained_file(name: str) -> Path:
 
 @typed
 def pretrained_for(spec: StreamSpec, controller: str) -> str:
-    """Return the name of the shipped memory of this body; a stream may lack channels that it knows.
+    """Return the name of the shipped memory of this body.
 
     Args:
         spec: of the stream to be watched; its source says whose body it is.
@@ -55,7 +55,7 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
         header = read_header(path)
         known, about = StreamSpec.from_json(header["spec"]), header["about"]
         misfits = [f"{what}: {mine} against {theirs}" for what, mine, theirs in _named(known, about, spec, controller)]
-        misfits += spec.never_met(known)
+        misfits += known.difference(spec)
         if not misfits:
             return name
         lines.append(f"  {name}: {'; '.join(misfits)}")
