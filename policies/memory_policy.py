@@ -15,7 +15,6 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.acting import expected_action
 from asm_gym.monitors.base import State
 from asm_gym.policies.grip import CommandReadout, Grip
 from asm_gym.spec import StreamSpec, control_period
@@ -124,7 +123,7 @@ class NeuralASMPolicy:
             state = ActingState(self.memory.initial_state(), np.zeros(self._size, np.float32))
         row = self._read(observation, state.action)
         memory, _ = self.memory.observe(state.memory, row[None])
-        action, grip = self._readout(expected_action(self.memory, memory)[0], state.grip)
+        action, grip = self._readout(self.memory.expected_action(memory)[0], state.grip)
         return action, ActingState(memory, action, grip)
 
 

@@ -28,7 +28,7 @@ from asm_gym.evaluation.scoring import benchmark
 from asm_gym.evaluation.tables import ConsoleTable
 from asm_gym.faults import anywhere
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of
-from asm_gym.monitors import MONITORS, PARTS, make_monitor
+from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 from asm_gym.rollouts.plan import evaluation_trials
@@ -71,7 +71,7 @@ class Args:
     steps: int | None = option(None, check=partial(check_number, "steps", low=2, whole=True))
     """Length of an episode, in an environment by its id; by default its own."""
     monitors: tuple[str, ...] = option(
-        tuple(name for name in MONITORS if name not in PARTS), quick=_QUICK, least=1, check=check_monitor_name
+        tuple(name for name in MONITORS if name != "memory_skill"), quick=_QUICK, least=1, check=check_monitor_name
     )
     """Names of monitors; any model goes under any detection, as in external_torque_limit+evidence."""
     faults: tuple[str, ...] = option((), listed=KINDS, metavar="KIND")

@@ -1,6 +1,5 @@
 """Every monitor keeps one contract, and each baseline does what its source says."""
 
-import copy
 from functools import cache
 
 import numpy as np
@@ -144,7 +143,6 @@ def test_unknown_names_and_hyperparameters_list_the_known():
     [
         ("window_pca", {"rows": 3, "kept": 0.9}),
         ("kalman", {"ridge": 0.5}),
-        ("memory_temporal", {"dynamics": "settling"}),
         ("gru", {"hidden_size": 8}),
         ("lstm_vae", {"hidden_size": 8, "latent_size": 3}),
     ],
@@ -166,26 +164,6 @@ def test_what_a_baseline_was_set_to_is_in_its_file_and_a_file_from_before_has_it
     np.testing.assert_array_equal(older.score(one).value, own.score(one).value)
 
 
-def test_the_parts_of_the_memory_expect_what_it_does():
-    whole, association, temporal = map(fitted, ("neural_asm", "memory_association", "memory_temporal"))
-    rows = episodes(1, seed=6)[0].stream.astype(np.float64)
-    both = [association.model.memory, temporal.model.memory]
-    assert all(np.array_equal(m.network.weights.W_C, both[0].network.weights.W_C) for m in both)  # learned alike
-    assert len(temporal.detection.detector_.context_quantile) == 2 * both[0].hidden_size + 1  # its state
-    assert len(association.detection.detector_.context_quantile) == 1  # no context: only a bias
-    # What the temporal network expects is better than nothing expected at all, on episodes that it has not seen.
-    state, left, all_of_it = temporal.model.start(1), [], []
-    spread = temporal.model.learned_["temporal_spread"]
-    for row in rows:
-        reading = temporal.model.memory.senses_.read(row[None], row[None], row[None])
-        state, output = temporal.model.predict(state, row[None])
-        left.append(output.errors * spread)
-        all_of_it.append(reading.senses)
-    X = len(SPEC.sensory)
-    assert np.square(left)[20:, 0, :X].mean() < 0.5 * np.square(all_of_it)[20:, 0, :X].mean()
-    assert whole.model.kind == "neural_asm"
-
-
 def test_training_slows_down_at_plateaus_ends_where_nothing_is_gained_and_keeps_the_best():
     torch = needs("torch")
     from asm_gym.monitors.baselines.torch_model import PATIENCE, converge
@@ -202,27 +180,3 @@ def test_training_slows_down_at_plateaus_ends_where_nothing_is_gained_and_keeps_
     assert float(module.weight) == 2.0
     assert len(rates) == 2 + 3 * (PATIENCE + 1)
     np.testing.assert_allclose(sorted(set(rates)), [9e-5, 3e-4, 1e-3])
-
-
-TORCH = ["gru", "lstm_vae", "logpzo", "rnd", "rapt"]
-
-
-@pytest.mark.parametrize("name", TORCH)
-def test_all_that_a_network_computes_with_is_on_its_device(name):
-    pytest.importorskip("torch")
-    model = copy.copy(fitted(name).model)
-    model.module_ = copy.deepcopy(model.module_)
-    assert model.to("meta") is model  # which has no numbers, and refuses tensors of any other device
-    with pytest.raises(NotImplementedError, match="Cannot copy out of meta tensor"):
-        model.predict(model.start(2), np.zeros((2, SPEC.size)))
-
-
-def test_a_device_that_there_is_not_is_refused_in_one_line(tmp_path):
-    pytest.importorskip("torch")
-    with pytest.raises(ValueError, match=r"^device 'warp' cannot be used: [^\n]+$"):
-        make_monitor("gru", SPEC, device="warp")
-    with pytest.raises(ValueError, match="kalman runs on a CPU alone, got device 'cuda'"):
-        make_monitor("kalman", SPEC, device="cuda")
-    fitted("gru").save(tmp_path / "gru.asm")
-    with pytest.raises(ValueError, match="device 'warp' cannot be used"):
-        load_monitor(tmp_path / "gru.asm", device="warp")

@@ -22,7 +22,6 @@ from asm_gym.monitors import (
     monitor_class,
     register_monitor,
 )
-from asm_gym.monitors.adaptation import adapt
 from tests.models import Persistence
 from tests.streams import frozen, sine_episodes, sine_spec
 
@@ -154,7 +153,7 @@ def test_a_copy_does_not_learn_on_the_job_of_its_original():
     for row in episode.stream:
         last = state
         state, surprise = copy.observe(last, row[None])
-        adapt(copy, last, row[None], surprise, rate=0.5)
+        copy.adapt(last, row[None], surprise, rate=0.5)
     np.testing.assert_array_equal(asm.score(episode).value, before)
     assert np.abs(copy.score(episode).value[1:] / before[1:] - 1).max() > 0.01
 

@@ -9,7 +9,6 @@ import pytest
 
 from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.adaptation import adapt
 from tests.memories import SMALL, learned_bytes, sine_memory
 from tests.streams import sine_episodes, sine_spec
 
@@ -33,7 +32,7 @@ def live(memory: NeuralASM, episode: Episode, learn: bool) -> tuple[np.ndarray, 
         state, surprise = memory.observe(before, row[None])
         values.append(surprise.value[0])
         if learn:
-            learned += int(adapt(memory, before, row[None], surprise)[0])
+            learned += int(memory.adapt(before, row[None], surprise)[0])
     return np.array(values), learned
 
 
@@ -59,11 +58,11 @@ def test_what_is_surprising_is_never_learned(asm, tmp_path):
         row = np.full((1, asm.spec.size), 50.0 * (-1) ** t)
         before = state
         state, surprise = adapting.observe(before, row)
-        assert not adapt(adapting, before, row, surprise).any()
+        assert not adapting.adapt(before, row, surprise).any()
     assert learned_bytes(adapting) == kept
     row[0, 0] = np.nan
     _, surprise = adapting.observe(state, row)
-    assert not adapt(adapting, state, row, surprise).any()
+    assert not adapting.adapt(state, row, surprise).any()
 
 
 def test_learning_on_the_job_refuses_what_makes_no_sense(asm):
@@ -71,11 +70,9 @@ def test_learning_on_the_job_refuses_what_makes_no_sense(asm):
     row = sine_episodes(1)[0].stream[:1]
     _, surprise = asm.observe(state, row)
     with pytest.raises(ValueError, match=r"rate must be a number in \(0, 1\], got 0"):
-        adapt(asm, state, row, surprise, rate=0.0)
-    with pytest.raises(ValueError, match=r"below must be a number in \(0, 1\], got 2"):
-        adapt(asm, state, row, surprise, below=2.0)
+        asm.adapt(state, row, surprise, rate=0.0)
     fresh = NeuralASM(sine_spec(), **SMALL | {"epochs": 1}).fit(sine_episodes(4))
     state = fresh.initial_state()
     _, surprise = fresh.observe(state, row)
     with pytest.raises(RuntimeError, match="no threshold"):
-        adapt(fresh, state, row, surprise)
+        fresh.adapt(state, row, surprise)

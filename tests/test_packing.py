@@ -5,7 +5,6 @@ import pytest
 
 from asm_gym import NeuralASM
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
-from asm_gym.monitors import adaptation
 from asm_gym.monitors.packing import packed, rounded, unpacked
 from tests.streams import sine_episodes, sine_spec
 
@@ -92,7 +91,7 @@ def test_a_file_of_an_older_format_is_refused_in_one_line_that_says_how_to_make_
 
 def test_a_rounded_memory_is_the_same_when_it_is_read_and_smaller(tmp_path):
     memory = NeuralASM(sine_spec(), hidden_size=64, association_size=64, epochs=1).fit(sine_episodes(40))
-    small = adaptation.rounded(memory)
+    small = memory.rounded()
     assert small.threshold_ is None
     small.calibrate(sine_episodes(40, seed=1), 0.05)
     memory.calibrate(sine_episodes(40, seed=1), 0.05)

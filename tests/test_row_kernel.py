@@ -13,7 +13,6 @@ from asm_gym.detection.whitening import bounded
 from asm_gym.memory.readout import KEPT, SMALLEST, certainty
 from asm_gym.memory.state import UNSURE, MemoryState
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.adaptation import adapt
 from asm_gym.monitors.calibrated_monitor import MonitorState
 from asm_gym.monitors.row_kernel import _ONE_THREAD
 from asm_gym.monitors.skills import name_skills
@@ -156,7 +155,7 @@ def test_what_was_learned_since_counts():
     asm.fit(episodes[4:])
     both(asm, rows[:, :1], asm.initial_state(1))
     other = asm.with_threshold(1.0)
-    adapt(other, state, rows[10, :1], before._replace(value=np.zeros(1)), rate=1.0)
+    other.adapt(state, rows[10, :1], before._replace(value=np.zeros(1)), rate=1.0)
     both(other, rows[:, :1], other.initial_state(1))
 
 

@@ -22,7 +22,7 @@ from asm_gym.memory.settling_learning import (
 )
 from asm_gym.memory.temporal import unassociated
 from asm_gym.monitors import MemoryConfig, NeuralASM, load_monitor
-from asm_gym.monitors.acting import expected_action, recall
+from asm_gym.monitors.acting import recall
 from asm_gym.monitors.skills import name_skills, named_skills
 from tests.problems import some_rows
 from tests.streams import frozen, sine_episodes, sine_spec
@@ -219,7 +219,7 @@ def test_a_memory_that_settles_is_used_by_the_same_names(asm, tmp_path):
     state = asm.initial_state()
     for row in episode.stream:
         state, _ = asm.observe(state, row[None])
-    assert expected_action(asm, state).shape == (1, 2)
+    assert asm.expected_action(state).shape == (1, 2)
 
 
 def test_more_inference_a_row_makes_it_expect_the_next_better(asm):

@@ -30,9 +30,7 @@ from asm_gym.guard.responses import NO_RESPONSE, Response, responses_from
 from asm_gym.guard.robots import Robots
 from asm_gym.guard.rows import Believed, Rows
 from asm_gym.guard.severity import FAST, Felt, Severity, SeverityEstimator, Weighed
-from asm_gym.monitors import Monitor
-from asm_gym.monitors.acting import actor_of
-from asm_gym.monitors.adaptation import learner_of
+from asm_gym.monitors import ExpectsActions, LearnsOnTheJob, Monitor
 from asm_gym.policies.base import Policy
 
 FAULTY, KNOCKED = EVENTS.index(FAULT), EVENTS.index(KNOCK)
@@ -81,9 +79,9 @@ class Engine:
         name = chosen if isinstance(chosen, str) else ""
         graded, acts = name == GRADED, bool(policies) or name in (*REFLEXES, GRADED)
         recalls = name == "recall"
-        if recalls and not (actor_of(monitor) and spec.motor.size):
+        if recalls and not (isinstance(monitor, ExpectsActions) and spec.motor.size):
             raise ValueError(f"recall needs a memory that expects actions, and {type(monitor).__name__} does not")
-        if options.online_learning_rate > 0 and learner_of(monitor) is None:
+        if options.online_learning_rate > 0 and not isinstance(monitor, LearnsOnTheJob):
             raise ValueError(f"{type(monitor).__name__} cannot learn on the job: online_learning_rate must be 0")
         limits = limits_of(options.contact_limits, monitor)
         self.fitted = Fitted.of(monitor, spec)

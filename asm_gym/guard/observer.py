@@ -9,9 +9,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.monitors import ForgetsEvidence, Monitor, NeuralASM, Surprise
-from asm_gym.monitors.acting import actor_of
-from asm_gym.monitors.adaptation import learner_of
+from asm_gym.monitors import ExpectsActions, ForgetsEvidence, LearnsOnTheJob, Monitor, NeuralASM, Surprise
 
 Mask = NDArray[np.bool_]
 
@@ -53,8 +51,8 @@ class Observer:
         self._copies = not isinstance(monitor, NeuralASM)  # another's arrays may be buffers that it uses again
         # Asked once: isinstance on a protocol takes longer than most of what follows.
         self._forgets = monitor if isinstance(monitor, ForgetsEvidence) else None
-        self._learns = learner_of(monitor)
-        self._recalls = actor_of(monitor) if recalls else None
+        self._learns = monitor if isinstance(monitor, LearnsOnTheJob) else None
+        self._recalls = monitor if recalls and isinstance(monitor, ExpectsActions) else None
         self.begin(np.ones(count, bool))
 
     def begin(self, which: Mask) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.episode import Episode
-from asm_gym.memory.motor import learn_motor, lessons, situation
+from asm_gym.memory.motor import learn_motor, lessons
 from asm_gym.memory.recall import continued
-from asm_gym.monitors.base import ExpectsActions
-from asm_gym.monitors.calibrated_monitor import MonitorState
 from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.monitors.training_data import check_nominal
 
@@ -36,41 +33,6 @@ def learn_to_act(memory: NeuralASM, episodes: Sequence[Episode], units: int = 51
         motor = learn_motor(*lessons(model.senses_, episodes), units, np.random.default_rng(memory.seed))
     model.restore({**model.learned_, **motor.named(model.senses_)}, model.skills_)
     return memory
-
-
-def expected_action(memory: NeuralASM, state: MonitorState) -> NDArray[np.float32]:
-    """Return the motor prediction (B, A): the likely next command, in the units of the action.
-
-    That of the motor association, after ``learn_to_act``; else that of the temporal network.
-
-    Args:
-        memory: fitted.
-        state: as ``observe`` returned it.
-    """
-    model, now = memory.model, state.model
-    if model.motor_ is not None:
-        return model.motor_.command(situation(model.senses_, now.history.before[:, -1]))
-    motor, senses = memory.spec.motor, model.senses_
-    action = model.network.run_on(now.traces).expected[:, senses.size :]
-    return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class Actor:
-    """The motor prediction of one memory."""
-
-    memory: NeuralASM
-
-    def expected_action(self, state: MonitorState) -> NDArray[np.float32]:
-        """Return the likely next command (B, A)."""
-        return expected_action(self.memory, state)
-
-
-def actor_of(monitor: object) -> ExpectsActions | None:
-    """Return what predicts the next command for a monitor; None where it cannot."""
-    if isinstance(monitor, NeuralASM):
-        return Actor(monitor)
-    return monitor if isinstance(monitor, ExpectsActions) else None
 
 
 def recall(memory: NeuralASM, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:

@@ -181,7 +181,7 @@ class ForgetsEvidence(Protocol):
 
 @runtime_checkable
 class ExpectsActions(Protocol):
-    """A monitor that predicts the next command; of a memory ``acting.actor_of`` makes one."""
+    """A monitor that predicts the next command."""
 
     def expected_action(self, state: State) -> NDArray[np.float32]:
         """Return the command (B, A) in the units of the action, after the state that ``observe`` returned."""
@@ -190,7 +190,7 @@ class ExpectsActions(Protocol):
 
 @runtime_checkable
 class LearnsOnTheJob(Protocol):
-    """A monitor that learns from rows that did not surprise it; of a memory ``adaptation.learner_of`` makes one."""
+    """A monitor that learns from rows that did not surprise it."""
 
     def adapt(
         self, before: State, stream: NDArray[np.floating[Any]], surprise: Surprise, rate: float = ...

@@ -15,7 +15,7 @@ from asm_gym.episode import Episode
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.monitors.stream_model import model_outputs
-from asm_gym.monitors.training_data import check_fresh, check_nominal, overlaps, sketch
+from asm_gym.monitors.training_data import check_fresh, check_nominal, sketch
 from asm_gym.validation import typed
 
 AT_ONCE = 400
@@ -45,7 +45,7 @@ def learn_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> C
         raise ValueError(f"ceilings take {FEWEST_EPISODES} healthy episodes or more, got {len(episodes)}")
     check_fresh(episodes, monitor.learned_from_)
     with threadpool_limits(1):
-        maxima = worst_of(monitor, monitor.detection, episodes)
+        maxima = _worst_of(monitor, monitor.detection, episodes)
     learned = monitor.detection.with_ceilings(maxima, anew=monitor.ceilings_from_ is None)
     monitor.detection = learned
     monitor.detections = {**monitor.detections, learned.name: learned}
@@ -57,13 +57,7 @@ def learn_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> C
     return monitor
 
 
-@typed
-def learned_from(monitor: CalibratedMonitor, episode: Episode) -> bool:
-    """Return whether a stretch of it was learned from, by ``fit`` or ``learn_ceilings``: no promise is made of it."""
-    return overlaps(episode, monitor.learned_from_, monitor.ceilings_from_)
-
-
-def worst_of(
+def _worst_of(
     monitor: CalibratedMonitor, detection: EvidenceDetection, episodes: Sequence[Episode]
 ) -> NDArray[np.float64]:
     """Return the largest v (N, G, X) in each of N episodes.

@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
-from asm_gym.memory.adaptation import specialise
-from asm_gym.memory.association import Association, association_shapes
+from asm_gym.memory.adaptation import followed, specialise
+from asm_gym.memory.association import Association, association_shapes, existing
 from asm_gym.memory.association_learning import FEEDBACK, LEARNED
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
 from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs
-from asm_gym.memory.motor import Motor
+from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.state import MemoryState, at_start
 from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.base import Progress
@@ -147,6 +147,28 @@ class MemoryModel(StreamModel):
         new = uninitialised(state)
         error, _ = expect_rows(np.ascontiguousarray(rows, np.float64), state, new, self.compiled_)  # type: ignore[arg-type]
         return new, ModelOutput(error, new.expected)
+
+    def expected_action(self, state: MemoryState) -> NDArray[np.float32]:
+        """Return the likely next command (B, A), by the motor association or else by the temporal network."""
+        if self.motor_ is not None:
+            return self.motor_.command(situation(self.senses_, state.history.before[:, -1]))
+        motor, senses = self.spec.motor, self.senses_
+        action = self.network.run_on(state.traces).expected[:, senses.size :]
+        return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
+
+    def adapt(
+        self, before: MemoryState, rows: NDArray[np.float64], normal: NDArray[np.bool_], rate: float
+    ) -> NDArray[np.bool_]:
+        """Let association follow the rows (B, D) that are ``normal`` (B,); return which it learned from (B,)."""
+        history = before.history
+        reading = self.senses_.read(rows, history.before[:, 0], history.earlier[:, 0])
+        learned: NDArray[np.bool_] = normal & (history.steps >= 2 * self.lag) & (reading.whole[:, 0] > 0)
+        if learned.any():
+            association = self.network.association
+            now = followed(association, existing(association), reading.inputs[learned], reading.changes[learned], rate)
+            self.learned_ = {**self.learned_, "U": now.U, "D": now.D}
+            self.network_ = self.network.with_association(now)
+        return learned
 
     def free_energy(self, healthy: Sequence[Episode]) -> FreeEnergy:
         """Return F of all that it predicts, in the spreads that fresh ``healthy`` episodes leave."""

@@ -2,8 +2,7 @@
 
 row → memory: errors, context → whiten → accumulate → value, attribution
 
-What else a memory can do takes it as an argument: ``skills``, ``acting``, ``adaptation``, ``channels``, ``ceilings``,
-``hub``.
+What else a memory can do takes it as an argument: ``skills``, ``acting``, ``ceilings``, ``hub``.
 """
 
 from __future__ import annotations
@@ -32,6 +31,7 @@ from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.files import restored, split_off
 from asm_gym.monitors.memory_config import MemoryConfig
 from asm_gym.monitors.memory_model import MemoryModel
+from asm_gym.monitors.packing import rounded
 from asm_gym.monitors.row_kernel import RowKernel
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.skill_surprise import ALARMS_ON, BODY, SkillSurprise
@@ -42,6 +42,9 @@ from asm_gym.monitors.values import Values
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_flag, check_number, short_repr, typed
+
+ADAPTED_BELOW = 0.5
+"""Share of the threshold below which ``adapt`` learns from a row."""
 
 
 class NeuralASM(CalibratedMonitor):
@@ -235,6 +238,49 @@ class NeuralASM(CalibratedMonitor):
     def reset_evidence(self, state: MonitorState) -> MonitorState:
         state = super().reset_evidence(state)._replace(values=self.values_.reset(state.values))
         return state if self.skill_ is None else state._replace(skill=self.skill_.monitor.reset_evidence(state.skill))
+
+    def expected_action(self, state: MonitorState) -> NDArray[np.float32]:
+        """Return the likely next command (B, A), in the units of the action, after the state that ``observe`` returned.
+
+        It is that of the motor association after ``acting.learn_to_act``, else that of the temporal network.
+        """
+        return self.model.expected_action(state.model)
+
+    @typed
+    def adapt(
+        self, before: MonitorState, stream: NDArray[np.floating[Any]], surprise: Surprise, rate: float = 0.1
+    ) -> NDArray[np.bool_]:
+        """Learn from rows that were just observed, where they were not surprising: for a body that slowly wears.
+
+        It changes this memory for everybody who watches with it. The promise of ``calibrate`` holds for the weights
+        it was made with, so calibrate anew now and then.
+
+        Args:
+            before: the state that ``observe`` was given.
+            stream: (B, D) the rows that ``observe`` was given.
+            surprise: what ``observe`` returned for them; only rows below half of the threshold are learned from.
+            rate: share of an error that one step takes away, in (0, 1].
+
+        Returns:
+            (B,) which rows were learned from.
+
+        Raises:
+            RuntimeError: there is no threshold yet.
+        """
+        rate = check_number("rate", rate, above=0.0, high=1.0)
+        normal = surprise.value < ADAPTED_BELOW * self.threshold
+        return self.model.adapt(before.model, self._rows(before, stream), normal, rate)
+
+    def rounded(self) -> Self:
+        """Return the same memory with weights of 8 bits, which takes a quarter of the space when it is saved.
+
+        It has no threshold: ``calibrate`` sets that of the rounded weights.
+        """
+        self._require_fitted()
+        other = self._copy()
+        other.model.restore(rounded(self.model.learned_), self.skills_)
+        other._uncalibrate()
+        return other
 
     def restore(self, saved: Checkpoint) -> Self:
         own, skill = split_off(saved, SKILL)

@@ -26,7 +26,6 @@ DETECTIONS: dict[str, Any] = {
     "mahalanobis": "asm_gym.detection.scores:Mahalanobis",
     "moving_mean": "asm_gym.detection.scores:MovingMean",
     "largest": "asm_gym.detection.scores:Largest",
-    "per_dimension": "asm_gym.detection.scores:PerDimension",
     "latent_threshold": "asm_gym.monitors.baselines.lstm_vae:LatentThreshold",
 }
 """The class of each detection, or ``module:class``."""
@@ -104,7 +103,6 @@ _BASELINES = {
     "rnd": _row("fail_detect:RND", "moving_mean"),
     "lstm_vae": _row("lstm_vae:LSTMVAE", "latent_threshold"),
     "gru": _row("gru:GRU", "mahalanobis"),
-    "rapt": _row("rapt:RAPT", "per_dimension"),
     "kalman": _row("kalman:Kalman", "mahalanobis"),
     "association_linear": _row("association_linear:LinearAssociation", "mahalanobis"),
     "association_values": MonitorKind(
@@ -112,13 +110,6 @@ _BASELINES = {
     ),
     "window_pca": _row("window_pca:WindowPCA", "squares"),
 }
-
-PARTS = {
-    "memory_temporal": MonitorKind("asm_gym.monitors.baselines.memory_parts:TemporalPart"),
-    "memory_association": MonitorKind("asm_gym.monitors.baselines.memory_parts:AssociationPart"),
-    "memory_skill": MonitorKind("asm_gym.monitors.skill_surprise:SkillModel"),
-}
-"""Of the Neural ASM, each alone: for an ablation."""
 
 MONITORS: Registry[MonitorKind] = Registry(
     "monitor",
@@ -131,7 +122,7 @@ MONITORS: Registry[MonitorKind] = Registry(
         "external_torque_limit": _row("limits:ExternalTorqueLimit", "largest"),
         "force_limit": _row("limits:ForceLimit", "squares"),
         "channel_limit": _row("limits:ChannelLimit", "largest"),
-        **PARTS,
+        "memory_skill": MonitorKind("asm_gym.monitors.skill_surprise:SkillModel"),
     },
 )
 """Every monitor by name. A baseline's plain name scores as its authors did; with ``+evidence``, its errors are judged
@@ -222,7 +213,6 @@ def make_monitor(
     name: str,
     spec: StreamSpec,
     detection: str | Detection | None = None,
-    device: str = "cpu",
     **hyperparameters: Any,
 ) -> CalibratedMonitor:
     """Return a monitor by name, not yet fitted.
@@ -231,12 +221,10 @@ def make_monitor(
         name: for example ``neural_asm``, or ``gru+evidence``, which is ``gru`` with the detection ``evidence``.
         spec: the stream to watch.
         detection: judges the model's errors, by name or your own; where None, that of the name.
-        device: where it learns and predicts, as in ``cuda``, if its model is a PyTorch network.
         **hyperparameters: of that monitor.
 
     Raises:
-        ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists;
-            or the device cannot be used, or not by this monitor.
+        ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists.
 
     Example:
         >>> import numpy as np
@@ -251,13 +239,13 @@ def make_monitor(
     kind = monitor_class(name if not isinstance(detection, str) else f"{model_of(name)}+{detection}")
     for parameter in hyperparameters:
         check_choice(f"hyperparameter of {name}", parameter, kind.hyperparameters)
-    made = _placed(kind(spec, **hyperparameters), device)
+    made = kind(spec, **hyperparameters)
     return made if detection is None or isinstance(detection, str) else made.with_detection(detection)
 
 
 @typed
-def load_monitor(path: str | Path, device: str = "cpu") -> CalibratedMonitor:
-    """Read what any monitor has saved, with the detection that it had, to predict on a device as in ``make_monitor``.
+def load_monitor(path: str | Path) -> CalibratedMonitor:
+    """Read what any monitor has saved, with the detection that it had.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -265,13 +253,4 @@ def load_monitor(path: str | Path, device: str = "cpu") -> CalibratedMonitor:
     """
     kind = monitor_class(kind_of(path))
     saved = read_checkpoint(path, kind.model_class.kind)
-    return _placed(restored(path, saved, kind.under(saved.header.get("detection", kind.detection))), device)
-
-
-def _placed(monitor: CalibratedMonitor, device: str) -> CalibratedMonitor:
-    """Return it with its model on the device."""
-    if device != "cpu":
-        if not hasattr(monitor.model, "to"):
-            raise ValueError(f"{monitor.model.kind} runs on a CPU alone, got device {device!r}")
-        monitor.model.to(device)
-    return monitor
+    return restored(path, saved, kind.under(saved.header.get("detection", kind.detection)))

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from asm_gym.episode import Episode
 from asm_gym.memory.free_energy import Before, FreeEnergy
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.acting import expected_action
 from asm_gym.monitors.calibrated_monitor import MonitorState
 from asm_gym.scripts.reproduce.expression import Backpropagated
 from asm_gym.scripts.reproduce.handwriting import DT as PEN_DT
@@ -127,7 +126,7 @@ class MemoryDriver:
         self.attribution = np.zeros((batch, SPEC.size))
 
     def command(self) -> Floats:
-        return expected_action(self.asm, self.state).astype(np.float64)
+        return self.asm.expected_action(self.state).astype(np.float64)
 
     def read(self, rows: Floats) -> Floats:
         self.state, surprise = self.asm.observe(self.state, rows)

@@ -13,7 +13,6 @@ from asm_gym.data.crashes import CRASH, peak_force, peak_torques
 from asm_gym.detection.tails import FEWEST_EPISODES
 from asm_gym.episode import Episode, spans
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.adaptation import rounded
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.ceilings import learn_ceilings
 from asm_gym.spec import StreamSpec
@@ -164,7 +163,7 @@ def learn_body(lessons: Lessons, spec: StreamSpec, seed: int, progress: Progress
         progress: is called as (done, total).
     """
     memory = NeuralASM(spec, hidden_size=HIDDEN, epochs=PASSES, habituates=False, excuses=True, seed=seed)
-    return rounded(memory.fit(lessons.fit, progress))
+    return memory.fit(lessons.fit, progress).rounded()
 
 
 def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode], per_hour: float) -> NeuralASM:
