@@ -19,7 +19,7 @@ from rich.console import Console
 from asm_gym.body_model import read_urdf
 from asm_gym.data.commands import feedback
 from asm_gym.data.gaps import filled
-from asm_gym.data.live import record
+from asm_gym.data.live import lines_from, live_source, record
 from asm_gym.data.logs import LogLayout, read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.selection import (
@@ -33,7 +33,6 @@ from asm_gym.data.selection import (
     with_shared_noise,
     without_marked_rows,
 )
-from asm_gym.data.sources import is_live, lines_from
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.episode import Episode
@@ -84,8 +83,6 @@ class Args:
     """Columns that mark what is wrong, beside those called so; marked rows are not learned from."""
     columns: tuple[str, ...] = option((), metavar="NAME")
     """Names of the columns of files without a header."""
-    join: bool = False
-    """The files of a folder are parts of one recording: join them by their clocks."""
     bridge: float = option(0.0, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
     """Gaps up to this long are interpolated, such as 0.05; a log is cut at others."""
     urdf: Path | None = option(None, metavar="FILE")
@@ -139,7 +136,7 @@ def record_live(args: Args, console: Console) -> Args:
 
 def read_normal(args: Args, progress: Any) -> tuple[NormalEpisodes, list[str]]:
     """Return the normal episodes, and the notes of the reader. Raises ValueError where there are none."""
-    layout = LogLayout(None, args.rate, args.action, args.channels, args.label, args.columns, args.join, by_name=True)
+    layout = LogLayout(None, args.rate, args.action, args.channels, args.label, args.columns, by_name=True)
     with noted() as notes:
         logs = read_logs(args.data, layout)
         found = normal_episodes(logs if args.split is None else without_marked_rows(logs), progress=progress)
@@ -230,7 +227,7 @@ def hours_of(episodes: list[Episode]) -> float:
 
 def fit(args: Args, console: Console) -> None:
     """Read, learn, calibrate, save, and print a summary."""
-    if is_live(str(args.data)):
+    if live_source(str(args.data)) is not None:
         args = record_live(args, console)
     start = time.perf_counter()
     with stage("reading", console, {}) as progress:

@@ -21,9 +21,9 @@ from typing import Any
 
 from rich.console import Console
 
+from asm_gym.data.live import lines_from, live_source
 from asm_gym.data.logs import Log, LogLayout, read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.data.sources import lines_from, live_source
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, traces_of
 from asm_gym.evaluation.rerun_view import LiveView
 from asm_gym.evaluation.scored_episode import ScoredEpisode
@@ -57,8 +57,6 @@ class Args:
     """Rows of logs a second; by default their column called time says it, or else the memory."""
     columns: tuple[str, ...] = option((), metavar="NAME")
     """Names of the columns of files without a header."""
-    join: bool = False
-    """The files of a folder are parts of one recording: join them by their clocks."""
     bridge: float = option(0.0, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
     """For how long a number may be missing without an alarm, such as 0.05; such rows are not judged."""
     silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
@@ -86,7 +84,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     alarms: list[Alarm] = []
     worst: list[ScoredEpisode] = []
     episodes, excused = 0, Counter[str]()
-    layout = LogLayout(monitor.spec, args.rate, columns=args.columns, join=args.join)
+    layout = LogLayout(monitor.spec, args.rate, columns=args.columns)
     with stage("watching", console, {}) as progress, noted() as notes:
         for group in in_groups(read_logs(args.source, layout), AT_ONCE):
             traces = traces_of(group, monitor, args.bridge)

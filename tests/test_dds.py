@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from asm_gym.data.live import SourceDied
-from asm_gym.data.sources import lines_from
+from asm_gym.data.live import SourceDied, lines_from
 from tests.dds_types import Header, JointState, Text, Time
 from tests.needs import needs
 

@@ -114,25 +114,27 @@ def columns() -> dict[str, np.ndarray]:
 
 def test_an_inspection_says_what_is_known_of_a_log():
     found = inspected("x", columns())
-    channels = {c.name: c for c in found.channels}
+    facts = {row["channel"]: row for row in found.facts}
     assert found.clock.rate == pytest.approx(100, rel=1e-3)
     assert found.clock.jitter == pytest.approx(0.1 * np.sqrt(2), rel=0.05)
     ((start, stop),) = found.clock.gaps
-    assert stop - start == pytest.approx(2.01, abs=0.01)
-    assert {c.name: c.role for c in found.channels} == {
+    assert stop - start == pytest.approx(2.01, abs=0.02)
+    assert {c.name: c.role for c in found.columns} == {
         **{"Time": "clock", "Num": "counter", "q_1": "sense", "current_1": "sense", "fan": "sense"},
         **{"target_1": "command", "anomaly": "label"},
     }
-    assert channels["q_1"].unit == "rad"
-    assert channels["q_1"].resolution == pytest.approx(0.002, rel=1e-3)
-    assert channels["current_1"].noise == pytest.approx(0.05, rel=0.1)
-    assert channels["current_1"].resolution == 0.0
-    assert channels["current_1"].missing == 10
-    assert channels["fan"].constant
-    assert "never moves" in channels["fan"].treatment()
-    assert "healthy" in channels["q_1"].treatment()
-    assert any("1 gaps in the clock, the longest 2.01 s" in line for line in found.remarks())
+    assert (facts["q_1"]["unit"], facts["q_1"]["resolution"]) == ("rad", pytest.approx(0.002, rel=1e-3))
+    assert facts["current_1"]["noise"] == pytest.approx(0.05, rel=0.1)
+    assert (facts["current_1"]["resolution"], facts["current_1"]["missing"]) == (0.0, 10)
+    assert "never moves" in facts["fan"]["what is done"]
+    assert "healthy" in facts["q_1"]["what is done"]
+    assert any("1 gaps in the clock, the longest 2.0" in line for line in found.remarks())
     assert "no clock: say --rate, rows a second" in inspected("x", {"q": np.arange(9.0)}).remarks()
+
+
+def test_an_inspection_counts_the_rows_that_fit_loses():
+    t = np.delete(np.arange(100), [40, 41, 60]) / 50
+    assert np.diff(inspected("x", {"time": t, "q": t}).clock.gaps, axis=1).ravel() == pytest.approx([0.06, 0.04])
 
 
 def test_the_command_prints_a_table_and_draws_a_picture(tmp_path, capsys, monkeypatch):

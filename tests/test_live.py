@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from asm_gym.data.gaps import Bridge, blamed, bridged, filled, reason
-from asm_gym.data.live import RowReader, SourceDied
-from asm_gym.data.pace import NEWEST, ClockWentBack, Pace
-from asm_gym.data.sources import is_live, lines_from
+from asm_gym.data.live import SourceDied, lines_from, live_source
+from asm_gym.data.rows import NEWEST, ClockWentBack, Pace, RowReader
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02)
@@ -149,7 +148,7 @@ def test_datagrams_are_rows_until_an_empty_one():
 def test_a_source_that_makes_no_sense_is_refused(source, message):
     with pytest.raises(ValueError, match=message):
         list(lines_from(source, io.StringIO(), 1.0))
-    assert is_live(source) == source.startswith("udp")
+    assert (live_source(source) is not None) == source.startswith("udp")
 
 
 def paced(stamps: np.ndarray, dt: float = 0.02) -> tuple[list[int | None], Pace]:

@@ -13,7 +13,7 @@ import pytest
 
 from asm_gym.data.live import SourceDied
 from asm_gym.data.logs import Log
-from asm_gym.data.pace import ClockWentBack
+from asm_gym.data.rows import ClockWentBack
 from asm_gym.detection.events import EVENTS, KNOCK
 from asm_gym.episode import Episode
 from asm_gym.evaluation.alarms import alarms_of, excused_in, traces_of

@@ -17,11 +17,10 @@ import pytest
 from asm_gym.data.arrays import read_parquet
 from asm_gym.data.channels import read_recorded
 from asm_gym.data.clock import clock_among, evenly, period
-from asm_gym.data.logs import LogLayout, read_logs
+from asm_gym.data.logs import FILES, LogLayout, read_logs
 from asm_gym.data.names import is_clock, is_command
 from asm_gym.data.reader_notes import LogWarning
 from asm_gym.data.selection import normal_episodes
-from asm_gym.data.sources import FILES
 from asm_gym.data.text import read_text
 from asm_gym.episode import Episode, EpisodeLabel, save_episode
 from asm_gym.readings import noise_of, resolution
@@ -234,31 +233,30 @@ def test_the_period_is_the_mean_step_and_gaps_and_lost_rows_are_none_of_it():
 
 def test_rows_that_come_on_time_are_left_as_they_are():
     t = np.arange(50) * 0.02 + np.random.default_rng(0).uniform(-0.003, 0.003, 50)
-    columns = {"x": np.arange(50.0)}
-    assert evenly(columns, t, 0.02)["x"] is columns["x"]
+    rows = np.arange(50.0)[:, None]
+    assert evenly(rows, t, 0.02) is rows
 
 
 def test_rows_that_were_lost_are_marked_and_the_others_keep_their_place_and_values():
     kept = np.delete(np.arange(50), [10, 11, 30])
-    out = evenly({"x": kept.astype(float), "pose": np.stack([kept, -kept], axis=1)}, kept * 0.02, 0.02)
-    assert len(out["x"]) == 50
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(out["x"])), [10, 11, 30])
-    np.testing.assert_array_equal(out["x"][kept], kept)
-    np.testing.assert_array_equal(out["pose"][kept, 1], -kept)
+    out = evenly(np.stack([kept, -kept], axis=1).astype(float), kept * 0.02, 0.02)
+    assert len(out) == 50
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(out[:, 0])), [10, 11, 30])
+    np.testing.assert_array_equal(out[kept], np.stack([kept, -kept], axis=1))
 
 
 def test_a_clock_that_runs_a_little_fast_moves_no_row():
     t = np.arange(5000) * 0.0201
-    assert len(evenly({"x": t}, t, 0.02)["x"]) == 5000
+    assert len(evenly(t[:, None], t, 0.02)) == 5000
 
 
 def test_rows_at_odd_times_are_interpolated_and_gaps_are_not():
     rng = np.random.default_rng(1)
     t = np.sort(np.concatenate([[0.0], rng.uniform(0, 1, 120), rng.uniform(2, 3, 120), [3.0]]))
-    out = evenly({"x": 3.0 * t}, t, float(np.median(np.diff(t))))
-    due = np.arange(len(out["x"])) * np.median(np.diff(t))
-    known = np.isfinite(out["x"])
-    np.testing.assert_allclose(out["x"][known], 3.0 * due[known], atol=1e-9)
+    out = evenly(3.0 * t[:, None], t, float(np.median(np.diff(t))))[:, 0]
+    due = np.arange(len(out)) * np.median(np.diff(t))
+    known = np.isfinite(out)
+    np.testing.assert_allclose(out[known], 3.0 * due[known], atol=1e-9)
     assert not known[(due > 1.1) & (due < 1.9)].any()
     assert known[(due < 0.9)].mean() > 0.8
 
@@ -375,9 +373,8 @@ def test_text_is_read_in_the_encodings_of_loggers(encoding, tmp_path):
         ("a,b\n1,2\n3\n", [], "line 3 has 1 cells, its header 2"),
         ("0,1\n1,2\n", [], "its first line is of 2 numbers and no header: name its columns with --columns"),
         ("0,1\n1,2\n", ["t"], "1 columns are named, and its first line has 2 cells"),
-        ("a,b\n1," + "9" * 1_000_000 + "\n", [], "line 2 has a cell of more than 65536 characters"),
-        (",".join(f"x{k}" for k in range(100_000)) + "\n", [], "it has 100000 columns, and at most 8192"),
-        ("a,b\n" + "1" * 5_000_000, [], "a line of 4194304 characters or more is no row"),
+        ("a,b\n1," + "9" * 1_000_000 + "\n", [], "line 2 has 1000002 characters: at most 8192 columns"),
+        (",".join(f"x{k}" for k in range(10_000)) + "\n", [], "it has 10000 columns, and at most 8192"),
     ],
 )
 def test_text_that_is_no_table_is_refused_soon_and_in_one_line(text, columns, message, tmp_path):
@@ -471,34 +468,6 @@ def test_every_format_of_a_table_gives_the_same_rows(tmp_path):
     np.testing.assert_array_equal(read(tmp_path / "bare.npy", rate=RATE).stream, wanted.stream)
 
 
-def test_three_files_of_one_recording_are_joined_by_their_clocks(tmp_path):
-    t = np.arange(100) * 0.01
-    for name, start in (("position", 0), ("velocity", 0), ("effort", 5)):
-        values = np.sin(t[start:]) + len(name)
-        lines = [f"{a},{b}" for a, b in zip(t[start:], values, strict=True)]
-        written(tmp_path / f"arm_{name}.csv", "\n".join([f"t,- joint_{name}", *lines]) + "\n")
-    episode = read(tmp_path, join=True)
-    assert episode.spec.labels == ("joint_effort", "joint_position", "joint_velocity")
-    assert len(episode) == 95
-    np.testing.assert_allclose(episode.stream, np.add(np.sin(t[5:, None]), [6, 8, 8]), atol=1e-6)
-    with pytest.raises(ValueError, match="channels that are not there: joint_effort; --join reads files as parts"):
-        list(read_logs(tmp_path))
-
-
-def test_files_without_a_clock_are_joined_row_by_row(tmp_path):
-    for name in ("current", "position"):
-        written(tmp_path / f"{name}.csv", "J_1,J_2\n1,2\n3,4\n")
-    assert read(tmp_path, join=True, rate=10.0).spec.labels == (
-        *("current.J[1]", "current.J[2]"),
-        *("position.J[1]", "position.J[2]"),
-    )
-    written(tmp_path / "position.csv", "J_1,J_2\n1,2\n")
-    with pytest.raises(ValueError, match="without a clock must be of one length, got current: 2, position: 1"):
-        read(tmp_path, join=True, rate=10.0)
-    with pytest.raises(ValueError, match="--join takes a folder of the files of one recording, got 0 in"):
-        read(tmp_path / "position.csv", join=True)
-
-
 # ------------------------------------------------------------------ damage
 
 
@@ -557,8 +526,8 @@ def test_a_damaged_header_of_an_array_is_one_line(tmp_path):
     ("place", "layout", "rate", "shape", "faults"),
     [
         ("ur3_cobotops/dataset_02052023.csv", {}, 0.9949, (26188, 20), 518),
-        ("tiago_figaroh", {"join": True}, 99.999, (8022, 24), 0),
-        ("staubli_tx40_figaroh", {"join": True, "rate": 5000.0}, 5000.0, (45000, 12), 0),
+        ("tiago_figaroh/tiago_effort.csv", {}, 99.999, (8022, 8), 0),
+        ("staubli_tx40_figaroh/pos_read_data.csv", {"rate": 5000.0}, 5000.0, (45000, 6), 0),
         ("unisa_acg/panda_exciting_trajectory.db3", {}, 29.9999, (727, 21), 0),
         ("unisa_acg/ur10_exciting_trajectory.db3", {}, 125.0, (3441, 18), 0),
     ],

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from asm_gym import Channel, NeuralASMSafety, StreamRecorder, StreamSpec, collect, make_monitor, register_task
-from asm_gym.data.live import RowReader
+from asm_gym.data.rows import RowReader
 from asm_gym.detection import ModelOutput
 from asm_gym.monitors import CalibratedMonitor, Surprise, load_monitor
 from asm_gym.monitors.registry import MONITORS, register_monitor

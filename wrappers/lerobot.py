@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.gaps import blamed, reason
-from asm_gym.data.pace import SLOWER, Pace
+from asm_gym.data.rows import SLOWER, Pace
 from asm_gym.monitors import Monitor, load_monitor
 from asm_gym.validation import check_choice, check_number
 

@@ -1,23 +1,33 @@
-"""Read the columns of Parquet files and NumPy arrays, which are looked at before they are read."""
+"""Read Parquet files, NumPy arrays and HDF5; files that declare more than they hold are refused unread."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from asm_gym.data.integrity import check_declared
+from asm_gym.data.text import Columns
 from asm_gym.extras import require
 from asm_gym.files import regular_file
 
-Columns = dict[str, NDArray[Any]]
+MOST_EXPANDED = 100
+"""How many times larger than its file the content may be: pictures of one colour shrink by that."""
+
+SMALL = 16 * 2**20
+"""[bytes] that no file is too small for."""
+
+
+def check_declared(path: Path, declared: int, size: int) -> None:
+    """Raise ValueError where a file of ``size`` says that it holds ``declared`` [bytes], and that cannot be."""
+    if declared > max(SMALL, MOST_EXPANDED * size):
+        raise ValueError(f"{path} declares {declared} bytes, and has {size}")
 
 
 def read_parquet(path: Path) -> Columns:
-    """Return the columns of a Parquet file, those of lists as arrays of two dimensions.
+    """Return the columns of a Parquet file.
 
     Raises:
         ValueError: it is damaged, empty, or declares far more than it holds.
@@ -33,17 +43,7 @@ def read_parquet(path: Path) -> Columns:
             table = file.read()
     except OSError as error:
         raise ValueError(f"{path} is damaged: {error}") from error
-    return {name: as_array(table[name]) for name in table.column_names}
-
-
-def as_array(column: Any) -> NDArray[Any]:
-    """Return (T,) or, of lists of one length, (T, k)."""
-    array = np.asarray(column)
-    if array.dtype == object and len(array) and isinstance(array[0], list | tuple | np.ndarray):
-        lengths = {len(row) for row in array if row is not None}
-        if len(lengths) == 1 and all(row is not None for row in array):
-            return np.array(array.tolist())
-    return array
+    return {name: np.asarray(table[name]) for name in table.column_names}
 
 
 def read_array(path: Path, columns: Sequence[str] = ()) -> Columns:
@@ -70,3 +70,35 @@ def read_array(path: Path, columns: Sequence[str] = ()) -> Columns:
     if rows.shape[1] != len(columns):
         raise ValueError(f"{len(columns)} columns are named, and {path} has {rows.shape[1]}")
     return {name: np.array(rows[:, k]) for k, name in enumerate(columns)}
+
+
+@contextmanager
+def opened_hdf5(path: Path) -> Iterator[Any]:
+    """Open an HDF5 file for reading.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is no regular file, declares what was never written, or reads from other files.
+        OSError: it is no HDF5.
+    """
+    h5py = require("h5py", what="an HDF5 file")
+    size = regular_file(path)
+    with h5py.File(path, "r") as file:
+        check_declared(path, sum(_declared(h5py, file)), size)
+        yield file
+
+
+def _declared(h5py: Any, group: Any) -> Iterator[int]:
+    """[bytes] of each array at or below a group."""
+    for name in group:
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise ValueError(f"{group.name}/{name} points elsewhere, which is not followed")
+        node = group[name]
+        if isinstance(node, h5py.Group):
+            yield from _declared(h5py, node)
+        elif isinstance(node, h5py.Dataset):
+            if node.external or node.is_virtual:
+                raise ValueError(f"{node.name} is kept in another file, which is not read")
+            if node.nbytes and not node.id.get_storage_size():
+                raise ValueError(f"{node.name} declares {node.nbytes} bytes that were never written")
+            yield int(node.nbytes)

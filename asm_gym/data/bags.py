@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.integrity import check_declared
+from asm_gym.data.arrays import check_declared
 from asm_gym.extras import require
 from asm_gym.files import regular_file
 

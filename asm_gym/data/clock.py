@@ -9,8 +9,8 @@ elsewhere            values between two stamps are interpolated; where these are
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from datetime import datetime
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from asm_gym.data.names import CLOCK, SECONDS, is_clock
 from asm_gym.data.reader_notes import note
 
-Column = NDArray[Any]
+Floats = NDArray[np.float64]
 
 EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
 """From which number on, and in which unit, a clock without a unit counts from 1970: 1e8 s is March 1973."""
@@ -57,7 +57,7 @@ class Clock(NamedTuple):
     column: str
     unit: float | None = None
 
-    def seconds(self, values: Column) -> NDArray[np.float64]:
+    def seconds(self, values: NDArray[Any]) -> Floats:
         """Return (T,) seconds, from the first row where the clock counts from 1970, which would cost digits.
 
         Raises:
@@ -72,13 +72,12 @@ class Clock(NamedTuple):
             raise ValueError(f"the clock {self.column!r} must hold a number a row, got the shape {values.shape}")
         known = values[np.isfinite(values)]
         unit = self.unit_of(float(known[0])) if len(known) else 1.0
-        if self.unit is None and unit == 1.0 and len(known) > 2:
-            step = float(np.median(np.diff(known)))
-            if step >= SLOWEST_WITHOUT_UNIT:
-                raise ValueError(
-                    f"{self.column!r} goes on by {step:g} from row to row, and says no unit: "
-                    f"call it '{self.column} [ms]' or '{self.column} [s]'"
-                )
+        step = float(np.median(np.diff(known))) if len(known) > 2 else 0.0
+        if self.unit is None and unit == 1.0 and step >= SLOWEST_WITHOUT_UNIT:
+            raise ValueError(
+                f"{self.column!r} goes on by {step:g} from row to row, and says no unit: "
+                f"call it '{self.column} [ms]' or '{self.column} [s]'"
+            )
         if not len(known) or float(known[0]) < EPOCHS[-1][0]:
             return values.astype(np.float64) * unit
         since = values.astype(np.int64) - int(known[0]) if values.dtype.kind in "biu" else values - known[0]
@@ -96,13 +95,28 @@ class Clock(NamedTuple):
             number = float(cell or "nan")
         except ValueError:
             try:
-                found = datetime.fromisoformat(cell.strip())
+                moment = datetime.fromisoformat(cell.strip())
             except ValueError:
                 raise ValueError(f"the clock {self.column!r} must hold a time, got {cell[:40]!r}") from None
-            ahead = found.utcoffset()  # without a zone all rows are of the same one
-            since = (found.replace(tzinfo=None) - datetime(1970, 1, 1)).total_seconds()
-            return since - (ahead.total_seconds() if ahead else 0.0)
+            moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)  # all rows are of the same zone
+            return (moment - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds()
         return number * self.unit_of(number)
+
+
+class Timing(NamedTuple):
+    """When the rows of a log were sensed.
+
+    Attributes:
+        clock: column that tells it.
+        times: (N,) of the rows that are kept [s].
+        kept: (N,) which rows of the log these are: one of several with the same time.
+        dt: from row to row in the mean [s]; None of a single row.
+    """
+
+    clock: Clock
+    times: Floats
+    kept: NDArray[np.intp]
+    dt: float | None
 
 
 def clock_among(names: Iterable[str]) -> Clock | None:
@@ -115,16 +129,22 @@ def clock_among(names: Iterable[str]) -> Clock | None:
     return None
 
 
-def distinct(times: Column) -> NDArray[np.intp]:
-    """Return the rows (N,) that are kept: of several with the same stamp the first, where few are; all others."""
+def timing_of(table: Mapping[str, NDArray[Any]]) -> Timing | None:
+    """Return when the rows of a table were sensed; None without a clock. Raises ValueError where it cannot be read."""
+    clock = clock_among(table)
+    if clock is None:
+        return None
+    times = clock.seconds(table[clock.column])
     again = np.concatenate([[False], np.diff(times) == 0.0])
-    if not again.any() or again.mean() > MOST_DOUBLED:
-        return np.arange(len(times))
-    note(f"{int(again.sum())} rows have the same time as the one before, and are left out")
-    return np.flatnonzero(~again)
+    if again.any() and again.mean() <= MOST_DOUBLED:
+        note(f"{int(again.sum())} rows have the same time as the one before, and are left out")
+        kept = np.flatnonzero(~again)
+    else:
+        kept = np.arange(len(times))
+    return Timing(clock, times[kept], kept, period(times[kept]))
 
 
-def period(times: Column) -> float | None:
+def period(times: Floats) -> float | None:
     """Return the seconds from row to row in the mean, lost rows counted; None of fewer than two rows.
 
     Where nearly all steps are whole multiples of the median, rows were lost between those that are more than one;
@@ -133,13 +153,12 @@ def period(times: Column) -> float | None:
     Raises:
         ValueError: time does not increase.
     """
-    if len(times) < 2 or times.ndim != 1:
+    if len(times) < 2:
         return None
-    stamps = times.astype(np.float64)
-    if not np.isfinite(stamps).all():
-        row = int(np.argmin(np.isfinite(stamps)))
-        raise ValueError(f"time must be a number in every row, got {stamps[row]} in row {row}")
-    steps = np.diff(stamps)
+    if not np.isfinite(times).all():
+        row = int(np.argmin(np.isfinite(times)))
+        raise ValueError(f"time must be a number in every row, got {times[row]} in row {row}")
+    steps = np.diff(times)
     if not np.all(steps > 0):
         row = int(np.argmin(steps > 0)) + 1
         raise ValueError(
@@ -155,43 +174,30 @@ def period(times: Column) -> float | None:
     return float(f"{mean:.6g}")  # stamps jitter, and rates that differ by rounding would be two rates
 
 
-def evenly(columns: dict[str, Column], times: Column, dt: float) -> dict[str, Column]:
-    """Return the columns (T,) or (T, k) as rows that are ``dt`` [s] apart; unchanged where they are.
+def evenly(rows: Floats, times: Floats, dt: float) -> Floats:
+    """Return rows (T, D) as rows that are ``dt`` [s] apart, NaN where one was lost; unchanged where they are.
 
     Raises:
         ValueError: more rows are missing than can have been lost.
     """
-    stamps = times.astype(np.float64)
-    steps = np.diff(stamps) / dt
+    steps = np.diff(times) / dt
     whole = np.rint(steps)
-    rows = int(np.sum(steps)) + 1
-    if rows > MOST_LOST * len(stamps) + 600 / dt:
+    size = int(np.sum(steps)) + 1
+    if size > MOST_LOST * len(times) + 600 / dt:
         gap = int(np.argmax(steps))
-        raise ValueError(f"time jumps by {steps[gap] * dt:g} s after {stamps[gap]:g} s: cut the log there")
+        raise ValueError(f"time jumps by {steps[gap] * dt:g} s after {times[gap]:g} s: cut the log there")
     steady = abs(float(steps.sum() / max(whole.sum(), 1)) - 1) <= DRIFT
     if steady and np.all(whole >= 1) and np.all(np.abs(steps - whole) <= JITTER):
         places = np.concatenate([[0], np.cumsum(whole)]).astype(np.intp)
         if len(places) == places[-1] + 1:
-            return columns
-        return {name: _placed(column, places) for name, column in columns.items()}
-    due = stamps[0] + dt * np.arange(rows)
+            return rows
+        placed = np.full((places[-1] + 1, rows.shape[1]), np.nan)
+        placed[places] = rows
+        return placed
+    due = times[0] + dt * np.arange(size)
     far = FAR * max(dt, float(np.quantile(steps, 0.9)) * dt)
-    return {name: interpolated(column, stamps, due, far) for name, column in columns.items()}
-
-
-def _placed(column: Column, places: NDArray[np.intp]) -> Column:
-    out = np.full((places[-1] + 1, *column.shape[1:]), np.nan)
-    out[places] = column
-    return out
-
-
-def interpolated(column: Column, stamps: NDArray[np.float64], due: NDArray[np.float64], far: float) -> Column:
-    """Return a column at the times ``due``: NaN between stamps that are ``far`` apart [s]; of words the last one."""
-    after = np.clip(np.searchsorted(stamps, due), 1, len(stamps) - 1)
-    if column.dtype.kind not in "biuf":
-        words: Column = column[np.where(stamps[after] > due, after - 1, after)]
-        return words
-    flat = column.reshape(len(column), -1).astype(np.float64)
-    out = np.column_stack([np.interp(due, stamps, flat[:, k]) for k in range(flat.shape[1])])
-    out[(stamps[after] - stamps[after - 1] > far) & (stamps[after] != due) & (stamps[after - 1] != due)] = np.nan
-    return out.reshape(len(due), *column.shape[1:])
+    after = np.clip(np.searchsorted(times, due), 1, len(times) - 1)
+    unknown = (times[after] - times[after - 1] > far) & (times[after] != due) & (times[after - 1] != due)
+    interpolated = np.column_stack([np.interp(due, times, column) for column in rows.T])
+    interpolated[unknown] = np.nan
+    return interpolated

@@ -7,6 +7,7 @@ https://minari.farama.org.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import shutil
@@ -20,7 +21,7 @@ import numpy as np
 from gymnasium.spaces.utils import flatten_space
 from numpy.typing import NDArray
 
-from asm_gym.data.integrity import digest, opened_hdf5
+from asm_gym.data.arrays import opened_hdf5
 from asm_gym.episode import Episode, check_recorded
 from asm_gym.extras import require
 from asm_gym.files import named, require_space, written_whole
@@ -95,7 +96,7 @@ def write_dataset(
         about = {"dataset_id": dataset_id, "minari_version": _minari("minari.__version__")}
         size = {"dataset_size": storage.get_size(), "stream_spec": spec.to_json()}
         storage.update_metadata({**counted, **size, **details, **about})
-        sums = "".join(f"{digest(data / name)}  {name}\n" for name in (ARRAYS, METADATA))
+        sums = "".join(f"{_digest(data / name)}  {name}\n" for name in (ARRAYS, METADATA))
         (data / CHECKSUMS).write_text(sums, encoding="ascii")
     if folder.exists():
         folder.rename(replaced)
@@ -200,12 +201,18 @@ def find_dataset(path: Path) -> Path:
     return below[0]
 
 
+def _digest(path: Path) -> str:
+    """The SHA-256 of a file in hexadecimal digits."""
+    with path.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
 def _check_whole(folder: Path) -> None:
     """Raises ValueError unless the files are those that were written, and hold what they declare."""
     if (folder / CHECKSUMS).is_file():  # others write none
         for line in (folder / CHECKSUMS).read_text(encoding="ascii").splitlines():
             written, _, name = line.partition("  ")
-            if name not in (ARRAYS, METADATA) or digest(folder / name) != written:
+            if name not in (ARRAYS, METADATA) or _digest(folder / name) != written:
                 raise ValueError(
                     f"{name} is not as it was written (where it was changed on purpose, remove {CHECKSUMS})"
                 )

@@ -16,7 +16,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from asm_gym.data.arrays import Columns, read_parquet
+from asm_gym.data.arrays import read_parquet
+from asm_gym.data.channels import as_array
+from asm_gym.data.text import Columns
 
 INFO = Path("meta") / "info.json"
 
@@ -56,7 +58,8 @@ def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
         for episode in dict.fromkeys(index.tolist()):
             rows = index == episode
             success = bool(columns["next.success"][rows].any()) if "next.success" in columns else True
-            yield {k: v for name in read for k, v in _split(name, columns[name][rows], read[name])}, rate, success
+            found = {name: as_array(columns[name][rows]) for name in read}
+            yield {k: v for name in read for k, v in _split(name, found[name], read[name])}, rate, success
 
 
 def _names(feature: dict[str, Any]) -> list[str]:

@@ -1,7 +1,8 @@
-"""Tell what a column is, by its name: a clock, a label, a counter, a command, a sense; a position or a speed."""
+"""Read the name of a column: its unit, and its role as a clock, a label, a counter, a command or a sense."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
@@ -11,7 +12,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.units import bare_name
+UNITS: dict[str, tuple[str, float]] = {
+    **dict.fromkeys(("rad", "radian", "radians"), ("rad", 1.0)),
+    **dict.fromkeys(("deg", "°", "degree", "degrees"), ("rad", math.pi / 180)),
+    "rad/s": ("rad/s", 1.0),
+    **dict.fromkeys(("deg/s", "°/s"), ("rad/s", math.pi / 180)),
+    "rpm": ("rad/s", math.pi / 30),
+    **dict.fromkeys(("A", "amp", "ampere", "amperes"), ("A", 1.0)),
+    "mA": ("A", 1e-3),
+    **dict.fromkeys(("m", "meter", "metre"), ("m", 1.0)),
+    "mm": ("m", 1e-3),
+    "m/s": ("m/s", 1.0),
+    "mm/s": ("m/s", 1e-3),
+    **dict.fromkeys(("Nm", "N m", "N*m", "N.m", "N·m"), ("N m", 1.0)),
+    "mNm": ("N m", 1e-3),
+    "N": ("N", 1.0),
+    "kN": ("N", 1e3),
+    "V": ("V", 1.0),
+    "mV": ("V", 1e-3),
+    **dict.fromkeys(("C", "°C", "degC", "celsius"), ("°C", 1.0)),
+}
+"""The base unit of each, and how many of that it is."""
 
 SECONDS = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
@@ -31,17 +52,56 @@ CLOCK = re.compile(
     rf"[%_#\s]*(?:(?:.*[./])?(?:header[._])?(?:{_OF}[ _]?)?{_WHAT}|t)(?:[ _.]*[\[(]?\s*(?P<unit>{_UNIT})\s*[\])]?)?",
     re.I,
 )
-LABEL = re.compile(
-    r"(.*[^a-z])?(labels?|anomal(y|ies|ous)|faults?|faulty|failures?|protective_?stop|grip_?lost)([^a-z].*)?", re.I
-)
-COMMAND = re.compile(
-    r"(.*[^a-z])?(target|desired|cmd|commands?|commanded|set_?points?|goal|ref|reference|action)([^a-z].*)?"
-)
-SPEED = re.compile(r"(.*[^a-z])?(vel|velocity|velocities|speeds?|qd|dq|qvel|joint_vel)([^a-z].*)?")
-POSITION = re.compile(r"(.*[^a-z])?(pos|position|positions|angles?|q|qpos|joint_pos)([^a-z].*)?")
+
+
+def _word(words: str) -> re.Pattern[str]:
+    """A name in which one of these words stands by itself."""
+    return re.compile(rf"(.*[^a-z])?({words})([^a-z].*)?", re.I)
+
+
+LABEL = _word("labels?|anomal(y|ies|ous)|faults?|faulty|failures?|protective_?stop|grip_?lost")
+COMMAND = _word("target|desired|cmd|commands?|commanded|set_?points?|goal|ref|reference|action")
+SPEED = _word("vel|velocity|velocities|speeds?|qd|dq|qvel|joint_vel")
+POSITION = _word("pos|position|positions|angles?|q|qpos|joint_pos")
 
 ELEMENT = re.compile(r"(?P<stem>.*[^\W\d_])(?:\[(?P<named>\w+)\]|[_.]?(?P<number>\d+))")
 """One of several numbers of a channel: ``joint[0]``, ``joint_0``, ``position[elbow]``."""
+
+_WITH_UNIT = re.compile(r"(?P<name>.*\S)\s+[\[(](?P<unit>[^\[\]()]+)[\])]")
+
+
+def split_unit(column: str) -> tuple[str, str]:
+    """Return a column's name and unit: ``joint_0`` and ``rad`` of ``joint_0 [rad]``; the unit may be empty."""
+    found = _WITH_UNIT.fullmatch(column)
+    return (found["name"], found["unit"]) if found else (column, "")
+
+
+def ratio(unit: str, other: str) -> float | None:
+    """Return how many of ``other`` are in one ``unit``; None where the two do not measure the same."""
+    if unit == other:
+        return 1.0
+    if unit not in UNITS or other not in UNITS or UNITS[unit][0] != UNITS[other][0]:
+        return None
+    return UNITS[unit][1] / UNITS[other][1]
+
+
+def factor(name: str, own: str, unit: str) -> float:
+    """Return how many of ``unit`` are in one of a column's own unit; 1 where either is unknown.
+
+    Raises:
+        ValueError: the two do not measure the same.
+    """
+    found = 1.0 if not own or unit == "1" else ratio(own, unit)
+    if found is None:
+        raise ValueError(f"{name} is in {own}, and the memory reads {unit}")
+    return found
+
+
+@cache
+def label_of(name: str) -> str:
+    """Return what a stream calls the number of a column: ``joint[0]`` of ``joint_0``."""
+    found = ELEMENT.fullmatch(name)
+    return f"{found['stem']}[{found['named'] or found['number']}]" if found else name
 
 
 def is_clock(name: str) -> bool:
@@ -56,38 +116,32 @@ def is_label(name: str, patterns: Sequence[str] = ()) -> bool:
 
 def is_command(name: str) -> bool:
     """Tell whether a column was commanded and not sensed."""
-    return COMMAND.fullmatch(name.lower()) is not None
+    return COMMAND.fullmatch(name) is not None
 
 
-def is_counter(name: str, column: NDArray[Any]) -> bool:
-    """Tell whether a column counts rows: each is one more than the one before, but for rows that were lost."""
-    if name.lower() not in COUNTERS or column.ndim != 1 or len(column) < 2 or column.dtype.kind not in "biuf":
+def is_counter(name: str, values: NDArray[Any]) -> bool:
+    """Tell whether a column (T,) counts rows: each is one more than the one before, but for rows that were lost."""
+    if name.lower() not in COUNTERS or len(values) < 2 or values.dtype.kind not in "biuf":
         return False
-    steps = np.diff(column.astype(np.float64))
+    steps = np.diff(values.astype(np.float64))
     return bool((steps >= 1).all() and (steps == np.rint(steps)).all() and np.median(steps) == 1)
 
 
 def role_of(column: str, values: NDArray[Any], labels: Sequence[str] = ()) -> str:
-    """Return the role of a column: clock, label, words, counter, command or sense.
+    """Return the role of a column (T,): clock, label, words, counter, command or sense.
 
     Args:
         column: its name.
-        values: (T,) or (T, k).
+        values: what it holds.
         labels: patterns of the columns that say what is wrong, beside those that are called so.
     """
-    name = bare_name(column)
-    roles = {
-        "clock": is_clock(column),
-        "label": values.ndim == 1 and is_label(name, labels),
-        "words": values.dtype.kind not in "biuf",
-        "counter": is_counter(name, values),
-        "command": is_command(name),
-    }
-    return next((role for role, holds in roles.items() if holds), "sense")
-
-
-@cache
-def label_of(column: str) -> str:
-    """Return what a stream calls the number of a column: ``joint[0]`` of ``joint_0``."""
-    found = ELEMENT.fullmatch(column)
-    return f"{found['stem']}[{found['named'] or found['number']}]" if found else column
+    name, _ = split_unit(column)
+    if is_clock(column):
+        return "clock"
+    if is_label(name, labels):
+        return "label"
+    if values.dtype.kind not in "biuf":
+        return "words"
+    if is_counter(name, values):
+        return "counter"
+    return "command" if is_command(name) else "sense"

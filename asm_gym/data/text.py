@@ -9,32 +9,27 @@ last line   cut off in the middle: left out, with a note
 from __future__ import annotations
 
 import csv
+import io
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import chain
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import is_clock
+from asm_gym.data.names import is_clock, split_unit
 from asm_gym.data.reader_notes import note
-from asm_gym.data.units import bare_name, unit_of
 from asm_gym.files import regular_file
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Columns = dict[str, NDArray[Any]]
-
 KeepWords = Callable[[str], bool]
 """Whether the words of a column of this name are kept."""
-
-LONGEST_LINE, LONGEST_CELL = 2**22, 2**16
-"""Characters of a line and of a cell; a row of a robot has some thousand."""
 
 LONGEST_WORD = 64
 """Characters that are kept of a word, of a label or a time."""
@@ -42,10 +37,12 @@ LONGEST_WORD = 64
 MOST_COLUMNS = 8192
 """Every number is weighed against every other later on: see ``whitening``."""
 
+LONGEST_LINE = LONGEST_WORD * MOST_COLUMNS
+"""Characters of a line."""
+
 SEPARATORS = ";\t,|"
 
 FLAGS = {"true": 1.0, "false": 0.0}
-_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)(e[+-]?\d+)?|nan|[+-]?inf(inity)?", re.I)
 
 
 class Dialect(NamedTuple):
@@ -71,16 +68,12 @@ class Dialect(NamedTuple):
         """Return the cells of a line. Raises ValueError where it cannot be cut."""
         if self.separator == " ":
             return line.split()
+        if '"' not in line:
+            return line.rstrip("\r\n").split(self.separator)
         try:
             return next(csv.reader([line], delimiter=self.separator), [])
         except csv.Error as error:
             raise ValueError(f"it is no table of text: {error}") from error
-
-    def width(self, line: str) -> int:
-        """Return how many cells a line has."""
-        if '"' in line:
-            return len(self.cells(line))
-        return len(line.split()) if self.separator == " " else line.count(self.separator) + 1
 
     def number(self, cell: str) -> float:
         """Return a cell's number, NaN of an empty one. Raises ValueError where it is none."""
@@ -101,16 +94,6 @@ class Dialect(NamedTuple):
         return True
 
 
-class Text(NamedTuple):
-    """What one pass over a file of text found: its dialect and names, and where its rows are."""
-
-    dialect: Dialect
-    names: list[str]
-    skipped: int  # lines before the first row
-    rows: int
-    width: int  # cells of the widest line
-
-
 def read_text(path: Path, columns: Sequence[str] = (), keeps: KeepWords = is_clock) -> Columns:
     """Return the columns of numbers of a table of text; an empty cell is NaN, true and false are 1 and 0.
 
@@ -125,85 +108,70 @@ def read_text(path: Path, columns: Sequence[str] = (), keeps: KeepWords = is_clo
     """
     import pandas as pd
 
-    regular_file(path)
-    with path.open("rb") as file:
-        encoding = "utf-16" if file.read(2) in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-    try:
-        found = _surveyed(path, encoding, columns)
-    except UnicodeDecodeError:
-        encoding = "cp1252"
-        found = _surveyed(path, encoding, columns)
-        note(f"{path} is not in UTF-8, and is read as Windows-1252")
+    numbered, complete = _lines(path)
+    if not numbered:
+        raise ValueError("it needs a header and at least one row, got 0 lines")
+    first, rows = numbered[0][1], numbered[1:]
+    dialect = Dialect.of(first)
+    names, has_header = _header(dialect, first, columns)
+    rows = rows if has_header else numbered
+    if not complete and len(rows) > 1 and _cut_off(dialect, rows[-2][1], rows[-1][1], len(names)):
+        note(f"{path}: its last line was cut off, and is left out")
+        rows = rows[:-1]
+    if not rows:
+        raise ValueError(f"it needs a header and at least one row, got {len(numbered)} lines")
+    widest = len(names)
+    for n, line in rows:
+        cells = dialect.cells(line)
+        widest = max(widest, len(cells))
+        if len(cells) < len(names) or any(cell.strip() for cell in cells[len(names) :]):
+            raise ValueError(f"line {n} has {len(cells)} cells, its header {len(names)}")
     try:
         frame = pd.read_csv(
-            path,
-            sep=r"\s+" if found.dialect.separator == " " else found.dialect.separator,
+            io.StringIO("\n".join(line for _, line in rows)),
+            sep=r"\s+" if dialect.separator == " " else dialect.separator,
             header=None,
-            names=list(range(found.width)),
-            skiprows=found.skipped,
-            nrows=found.rows,
-            encoding=encoding,
+            names=list(range(widest)),
             float_precision="round_trip",
             low_memory=False,
         )
     except ValueError as error:
         raise ValueError(f"it is no table of text: {' '.join(str(error).split())}") from error
-    named = {name: frame[k] for k, name in enumerate(found.names)}
-    return _numbers(named, keeps, found.dialect.comma, found.skipped)
+    return _numbers({name: frame[k] for k, name in enumerate(names)}, keeps, dialect.comma, rows[0][0])
 
 
-def _surveyed(path: Path, encoding: str, columns: Sequence[str]) -> Text:
-    """Looks at every line once. Raises ValueError where one is no row."""
-    with path.open(encoding=encoding) as file:
-        lines = _lines(file)
-        first = next(lines, (0, ""))
-        if "\x00" in first[1]:
-            raise ValueError("it is no text")
-        dialect = Dialect.of(first[1])
-        names, has_header = _header(dialect.cells(first[1]), columns)
-        if len(names) > MOST_COLUMNS:
-            raise ValueError(f"it has {len(names)} columns, and at most {MOST_COLUMNS} can be watched")
-        rows, widest, before = 0, len(names), ("", "")  # the last two lines
-        for n, line in lines if has_header else chain([first], lines):
-            width = dialect.width(line)
-            if width > len(names):
-                widest, width = max(widest, width), dialect.width(line.rstrip().rstrip(dialect.separator))
-            if width > len(names) or (width < len(names) and line.endswith("\n")):
-                raise ValueError(f"line {n} has {width} cells, its header {len(names)}")
-            rows, before = rows + 1, (before[1], line)
-    if rows and not before[1].endswith("\n") and _cut_off(dialect, before, len(names)):
-        note(f"{path}: its last line was cut off, and is left out")
-        rows -= 1
-    if not rows:
-        raise ValueError(f"it needs a header and at least one row, got {int(bool(first[1]))} lines")
-    return Text(dialect, names, first[0] if has_header else 0, rows, widest)
+def _lines(path: Path) -> tuple[list[tuple[int, str]], bool]:
+    """The lines that are not empty, numbered from 1, and whether the last one has an end."""
+    regular_file(path)
+    raw = path.read_bytes()
+    wide = raw[:2] in (b"\xff\xfe", b"\xfe\xff")
+    if b"\x00" in raw[:LONGEST_LINE] and not wide:
+        raise ValueError("it is no text")
+    try:
+        text = raw.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = raw.decode("cp1252", errors="replace")
+        note(f"{path} is not in UTF-8, and is read as Windows-1252")
+    lines = re.split(r"\r\n?|\n", text)
+    numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip(" ")]
+    n, longest = max(numbered, key=lambda each: len(each[1]), default=(0, ""))
+    if len(longest) > LONGEST_LINE:
+        raise ValueError(f"line {n} has {len(longest)} characters: at most {MOST_COLUMNS} columns can be watched")
+    return numbered, text.endswith(("\n", "\r"))
 
 
-def _lines(file: TextIO) -> Iterator[tuple[int, str]]:
-    """The lines that are not empty, numbered from 1."""
-    n = 0
-    while line := file.readline(LONGEST_LINE):
-        n += 1
-        if len(line) == LONGEST_LINE:
-            raise ValueError(f"a line of {LONGEST_LINE} characters or more is no row")
-        if len(line) > LONGEST_CELL and re.search(f"[^{SEPARATORS}\\s]{{{LONGEST_CELL}}}", line):
-            raise ValueError(f"it is no table of text: line {n} has a cell of more than {LONGEST_CELL} characters")
-        if line.strip(" \r\n"):
-            yield n, line
-
-
-def _cut_off(dialect: Dialect, last_two: tuple[str, str], size: int) -> bool:
+def _cut_off(dialect: Dialect, before: str, last: str, size: int) -> bool:
     """Whether the last line lacks cells, or has a word where the one before it has a number."""
-    before, last = map(dialect.cells, last_two)
-    words = (dialect.is_number(was) and not dialect.is_number(now) for was, now in zip(before, last, strict=False))
-    return len(last) < size or any(words)
+    cells = list(zip(dialect.cells(before), dialect.cells(last), strict=False))
+    return len(cells) < size or any(dialect.is_number(was) and not dialect.is_number(now) for was, now in cells)
 
 
-def _header(cells: list[str], columns: Sequence[str]) -> tuple[list[str], bool]:
+def _header(dialect: Dialect, line: str, columns: Sequence[str]) -> tuple[list[str], bool]:
     """Names of the columns, and whether the first line holds them."""
-    if len(cells) > 1 and cells[0] in ("#", "%"):  # in front of a header whose names stand apart by blanks
+    cells = dialect.cells(line)
+    if len(cells) > 1 and cells[0] in ("#", "%"):  # in front of a header whose names are separated by blanks
         cells = cells[1:]
-    numbers = [bool(_NUMBER.fullmatch(cell.strip())) for cell in cells if cell.strip()]
+    numbers = [dialect.is_number(cell) for cell in cells if cell.strip()]
     if columns:
         if len(columns) != len(cells):
             raise ValueError(f"{len(columns)} columns are named, and its first line has {len(cells)} cells")
@@ -214,19 +182,25 @@ def _header(cells: list[str], columns: Sequence[str]) -> tuple[list[str], bool]:
 
 
 def header_of(cells: Sequence[str], where: str) -> list[str]:
-    """Return the names of columns. Raises ValueError where there are none, or one stands twice."""
+    """Return the names of columns. Raises ValueError where there are none or too many, or one stands twice."""
     names = [cell.strip().lstrip("#%-").strip() if cell.strip() not in ("%", "#") else "" for cell in cells]
     while names and not names[-1]:  # ;;; at the end of every line
         names.pop()
     if not names:
         raise ValueError(f"{where} needs a header and at least one row, got 0 lines")
+    _check_width(len(names))
     doubled = sorted(name for name, count in Counter(names).items() if count > 1)
     if doubled:
         raise ValueError(f"{where} has columns of the same name: {', '.join(map(repr, doubled[:8]))}")
     return names
 
 
-def _numbers(series: Mapping[str, pd.Series[Any]], keeps: KeepWords, comma: bool, skipped: int) -> Columns:
+def _check_width(size: int) -> None:
+    if size > MOST_COLUMNS:
+        raise ValueError(f"it has {size} columns, and at most {MOST_COLUMNS} can be watched")
+
+
+def _numbers(series: Mapping[str, pd.Series[Any]], keeps: KeepWords, comma: bool, first: int) -> Columns:
     """Columns of numbers, and the words of those that are kept. Raises ValueError where a column mixes the two."""
     import pandas as pd
 
@@ -245,7 +219,7 @@ def _numbers(series: Mapping[str, pd.Series[Any]], keeps: KeepWords, comma: bool
             made[name] = text.fillna("").str[:LONGEST_WORD].to_numpy(dtype=object)
         elif words.any() and not (words | empty).all():
             row = int(np.argmax(words))
-            raise ValueError(f"{name}, line {row + skipped + 1} must be a number, got {str(text.iloc[row])[:40]!r}")
+            raise ValueError(f"{name}, line {row + first} must be a number, got {str(text.iloc[row])[:40]!r}")
         elif not words.any():
             made[name] = values.to_numpy(np.float64, na_value=np.nan)
     return made
@@ -259,23 +233,21 @@ def read_json_lines(path: Path, columns: Sequence[str] = (), keeps: KeepWords = 
     """
     import pandas as pd
 
-    regular_file(path)
     rows: list[dict[str, Any]] = []
-    with path.open(encoding="utf-8-sig") as file:
-        for n, line in _lines(file):
-            try:
-                rows.append(flat_row(json.loads(line), columns))
-            except (ValueError, RecursionError) as error:
-                if rows and isinstance(error, json.JSONDecodeError) and not line.endswith("\n"):
-                    note(f"{path}: its last line was cut off, and is left out")
-                    continue
-                raise ValueError(f"line {n} is no row: {error}") from error
-            if len(rows[-1]) > MOST_COLUMNS:
-                raise ValueError(f"it has {len(rows[-1])} columns, and at most {MOST_COLUMNS} can be watched")
+    numbered, complete = _lines(path)
+    for n, line in numbered:
+        try:
+            rows.append(flat_row(json.loads(line), columns))
+            _check_width(len(rows[-1]))
+        except (ValueError, RecursionError) as error:
+            if rows and isinstance(error, json.JSONDecodeError) and n == numbered[-1][0] and not complete:
+                note(f"{path}: its last line was cut off, and is left out")
+                continue
+            raise ValueError(f"line {n} is no row: {error}") from error
     if not rows:
         raise ValueError("it needs at least one row, got none")
     frame = pd.DataFrame(rows)
-    return _numbers({name: frame[name] for name in frame.columns}, keeps, comma=False, skipped=0)
+    return _numbers({name: frame[name] for name in frame.columns}, keeps, comma=False, first=numbered[0][0])
 
 
 def flat_row(row: Any, columns: Sequence[str] = ()) -> dict[str, Any]:
@@ -295,7 +267,7 @@ def flat_row(row: Any, columns: Sequence[str] = ()) -> dict[str, Any]:
         if isinstance(value, dict):
             found |= {f"{name}.{part}": v for part, v in flat_row(value).items()}
         elif isinstance(value, list):
-            bare, unit = bare_name(name), unit_of(name)
+            bare, unit = split_unit(name)
             names = (f"{bare}[{k}] [{unit}]" if unit else f"{bare}[{k}]" for k in range(len(value)))
             found |= {n: v for n, v in zip(names, value, strict=True) if isinstance(v, int | float) or v is None}
         else:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
-from asm_gym.data.live import Row, RowReader, SourceDied
-from asm_gym.data.pace import ClockWentBack
+from asm_gym.data.live import SourceDied
+from asm_gym.data.rows import ClockWentBack, Row, RowReader
 from asm_gym.detection.events import KNOCK, NO_EVENT, STOP
 from asm_gym.spec import StreamSpec
 
@@ -39,7 +39,7 @@ def follow(
     """Say every alarm as it is raised, and why; return how many there were.
 
     Args:
-        lines: rows, as ``asm_gym.data.sources.lines_from`` yields them.
+        lines: rows, as ``asm_gym.data.live.lines_from`` yields them.
         monitor: calibrated.
         say: takes a line for the user.
         seconds: that something may be missing without an alarm.

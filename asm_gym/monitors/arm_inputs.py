@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.body_model import BodyModel
-from asm_gym.data.names import POSITION, SPEED
-from asm_gym.data.units import ratio
+from asm_gym.data.names import POSITION, SPEED, ratio
 from asm_gym.spec import StreamSpec
 
 Floats = NDArray[np.float64]

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from asm_gym.body_model import read_urdf
 from asm_gym.data.bags import read_bag
-from asm_gym.data.logs import joined
 from asm_gym.data.text import read_text
 from asm_gym.episode import Episode
 
@@ -74,12 +73,13 @@ def _bag(path: Path) -> Columns:
 
 
 def _three_files(path: Path) -> Columns:
-    """Read one file each of positions, velocities and efforts, joined by their clocks."""
-    whole = joined({file.stem: read_text(file) for file in sorted(path.glob("*.csv"))})
+    """Read one file each of positions, velocities and efforts, interpolated at the times of the first one."""
+    tables = [read_text(file) for file in sorted(path.glob("*.csv"))]
+    times = [table.pop("t") for table in tables]
+    due = times[0][(times[0] >= max(t[0] for t in times)) & (times[0] <= min(t[-1] for t in times))]
+    whole = {name: np.interp(due, t, v) for t, table in zip(times, tables, strict=True) for name, v in table.items()}
     kinds = ("position", "velocity", "effort")
-    return {"time": whole["time"]} | {
-        kind: np.column_stack([v for n, v in whole.items() if n.endswith(kind)]) for kind in kinds
-    }
+    return {"time": due} | {kind: np.column_stack([v for n, v in whole.items() if n.endswith(kind)]) for kind in kinds}
 
 
 UNISA = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from asm_gym.data.inspection import ChannelFound, Inspection, in_time
+from asm_gym.data.channels import Column
+from asm_gym.data.inspection import Inspection, is_constant
 from asm_gym.evaluation.figures.style import BLUE, GREEN, GREY, ORANGE, VERMILLION, figure
 
 ACROSS, MOST_PANELS, MOST_POINTS = 4, 60, 4000
@@ -22,54 +21,51 @@ COLOURS = {"sense": BLUE, "command": GREEN, "label": VERMILLION}
 
 def log_figure(found: Inspection) -> Figure:
     """Draw a panel per channel, with its gaps shaded; the first one shows the steps of the clock."""
-    columns = zip(found.channels, found.columns.values(), strict=False)
-    drawn = [(channel, values) for channel, values in columns if channel.role in COLOURS and channel.rows]
+    drawn = [c for c in found.columns if c.role in COLOURS and c.values.dtype.kind in "biuf"]
     more = f"; {len(drawn) - MOST_PANELS} more channels are in the table" if len(drawn) > MOST_PANELS else ""
     drawn = drawn[:MOST_PANELS]
     down = math.ceil((len(drawn) + 1) / ACROSS)
-    clock = found.clock
     with figure(height=0.7 + 1.25 * down, width=11.0) as fig:
         panels = fig.subplots(down, ACROSS, squeeze=False).ravel()
         _clock_panel(panels[0], found)
-        for ax, (channel, values) in zip(panels[1:], drawn, strict=False):
-            _channel_panel(ax, found, channel, values)
+        for ax, column in zip(panels[1:], drawn, strict=False):
+            _column_panel(ax, found, column)
         for ax in panels:
             ax.title.set_fontsize(7)
             ax.tick_params(labelsize=6)
         for ax in panels[len(drawn) + 1 :]:
             ax.set_visible(False)
-        rate = f"{clock.rate:.5g} Hz" if clock.rate else "no rate"
-        about = f"{clock.rows} rows, {in_time(clock.seconds)}, {rate}, {len(clock.gaps)} gaps{more}"
-        fig.suptitle(f"{found.name}: {about}", fontsize=10)
-        fig.supxlabel("time [s]" if clock.rate else "row", fontsize=9)
+        fig.suptitle(f"{found.caption()}{more}", fontsize=10)
+        fig.supxlabel("time [s]" if found.clock.rate else "row", fontsize=9)
     return fig
 
 
 def _clock_panel(ax: Axes, found: Inspection) -> None:
     ax.set_title("steps of the clock [ms]")
-    if not found.clock.column or not found.clock.rate:
+    if len(found.clock.times) < 2 or not found.clock.rate:
         ax.text(0.5, 0.5, found.clock.trouble or "no clock", ha="center", va="center", fontsize=7, wrap=True)
         ax.set_axis_off()
         return
     usual = 1e3 / found.clock.rate
-    ax.hist(np.clip(1e3 * np.diff(found.times), 0, 4 * usual), bins=60, color=BLUE, log=True)
+    ax.hist(np.clip(1e3 * np.diff(found.clock.times), 0, 4 * usual), bins=60, color=BLUE, log=True)
     ax.axvline(usual, color=VERMILLION, linewidth=1)
     low, high = ax.get_xlim()
     ax.set_xlim(min(low, 0.95 * usual), max(high, 1.05 * usual))  # rounding is no jitter
 
 
-def _channel_panel(ax: Axes, found: Inspection, channel: ChannelFound, values: NDArray[Any]) -> None:
+def _column_panel(ax: Axes, found: Inspection, column: Column) -> None:
+    values, clock = column.values, found.clock
     every = max(1, len(values) // MOST_POINTS)
-    times, shown = found.times[::every].astype(np.float64), values[::every].astype(np.float64)
-    after_gap = np.searchsorted(times, found.clock.gaps[:, 1])  # no line is drawn across a gap
-    colour = GREY if channel.constant else COLOURS[channel.role]
+    times, shown = clock.times[::every], values[::every].astype(np.float64)
+    after_gap = np.searchsorted(times, clock.gaps[:, 1])  # no line is drawn across a gap
+    colour = GREY if is_constant(column) else COLOURS[column.role]
     ax.plot(np.insert(times, after_gap, np.nan), np.insert(shown, after_gap, np.nan), color=colour, linewidth=0.7)
-    for start, stop in found.clock.gaps[:200]:
+    for start, stop in clock.gaps[:200]:
         ax.axvspan(start, stop, color=ORANGE, alpha=0.35, linewidth=0)
     lost = ~np.isfinite(values)
     if lost.any():
-        ax.plot(found.times[lost], np.full(lost.sum(), channel.low), "|", color=ORANGE, markersize=4)
-    name = channel.name if len(channel.name) < 30 else "…" + channel.name[-29:]
-    unit = f" [{channel.unit}]" if channel.unit else ""
-    ax.set_title(f"{name}{unit}, {channel.role}{', never moves' * channel.constant}")
+        ax.plot(clock.times[lost], np.full(lost.sum(), np.nanmin(shown, initial=0.0)), "|", color=ORANGE, markersize=4)
+    name = column.name if len(column.name) < 30 else "…" + column.name[-29:]
+    unit = f" [{column.unit}]" if column.unit else ""
+    ax.set_title(f"{name}{unit}, {column.role}{', never moves' * is_constant(column)}")
     ax.margins(x=0)

@@ -1,0 +1,199 @@
+"""Read lines of a live source as rows of a stream, at the rate of the memory.
+
+A JSON line is a list of numbers, or an object by channel or by number; CSV begins with a header. Where there is a time,
+
+own      median step of the newest 32 rows [s]
+right    dt/1.5 <= own <= 1.5 dt    every row is read; (step / dt) - 1 rows were lost before it
+faster   own < dt/1.5               rows are read dt apart, and those between passed over
+slower   own > 1.5 dt               nothing is judged: a memory of short steps cannot judge longer ones
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from statistics import median
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.channels import RESAMPLED
+from asm_gym.data.clock import Clock, clock_among
+from asm_gym.data.names import factor, label_of, split_unit
+from asm_gym.data.text import Dialect, flat_row, header_of
+from asm_gym.spec import StreamSpec
+
+NEWEST = 32
+"""Rows that tell the rate, and after which it is told again."""
+
+EARLY = 0.5
+"""Of their own step, how much sooner than due a row may come that is read."""
+
+RIGHT, FASTER, SLOWER = "right", "faster", "slower"
+
+
+class ClockWentBack(ValueError):  # noqa: N818 (what happened, and no fault of ours)
+    """A row is older than the one before it."""
+
+
+class Pace:
+    """Follow the clock of a source; ``change`` is a message where its rate changed.
+
+    Args:
+        dt: from row to row of the memory [s].
+    """
+
+    def __init__(self, dt: float) -> None:
+        self.dt, self.kind, self.change = dt, RIGHT, ""
+        self._steps: deque[float] = deque(maxlen=NEWEST)
+        self._rows = 0
+        self._before: float | None = None
+        self._read = 0.0  # time of the last row that was read
+
+    def lost(self, stamp: float) -> int | None:
+        """Return how many rows were lost before the one of this time [s]; None where it is not to be read.
+
+        Raises:
+            ClockWentBack: its time is not later than that of the row before.
+        """
+        before, self._before, self.change = self._before, stamp, ""
+        if before is None:
+            self._read = stamp
+            return 0
+        if not stamp > before:
+            raise ClockWentBack(f"time must increase, got {stamp:g} s after {before:g} s")
+        self._steps.append(stamp - before)
+        self._rows += 1
+        if self._rows % NEWEST == 0:
+            self._judge(median(self._steps))
+        if self.kind == SLOWER:
+            self._read = stamp
+            return None
+        if self.kind == FASTER and stamp - self._read < self.dt - EARLY * min(self.dt, median(self._steps)):
+            return None
+        step, self._read = stamp - self._read, stamp
+        return max(0, round(step / self.dt) - 1)
+
+    def _judge(self, own: float) -> None:
+        kind = FASTER if own < self.dt / RESAMPLED else SLOWER if own > self.dt * RESAMPLED else RIGHT
+        if kind != self.kind:
+            consequence = {
+                RIGHT: " again",
+                FASTER: f", and are read at {1 / self.dt:.4g}, by their clock",
+                SLOWER: f", and the memory reads {1 / self.dt:.4g}: they are not judged, an alarm",
+            }
+            self.change = f"rows come at {1 / own:.4g} a second{consequence[kind]}"
+        self.kind = kind
+
+
+class Row(NamedTuple):
+    """A row.
+
+    Attributes:
+        numbers: (D,) NaN where one was lost.
+        lost: rows that should have come before it.
+        read: whether it stands where the memory reads one.
+        change: a message about the rate, where that changed.
+    """
+
+    numbers: NDArray[np.float64]
+    lost: int = 0
+    read: bool = True
+    change: str = ""
+
+
+class RowReader:
+    """Read lines as rows of a stream.
+
+    Args:
+        spec: of the memory that is to read them.
+
+    Example:
+        >>> from asm_gym import Channel, StreamSpec
+        >>> reader = RowReader(StreamSpec((Channel("q", 2, "rad"),), dt=0.01))
+        >>> [row.numbers.tolist() for row, _ in reader.rows(["[1, 2]", "[3, 4]"])]
+        [[1.0, 2.0], [3.0, 4.0]]
+    """
+
+    def __init__(self, spec: StreamSpec) -> None:
+        self.spec, self.line = spec, 0
+        self._dialect = Dialect(",", comma=False)
+        self._header: list[str] | None = None  # of CSV
+        self._columns: list[tuple[str, float]] | None = None  # of each number of the stream, and its factor
+        self._clock: Clock | None = None
+        self._pace = Pace(spec.dt)
+
+    def rows(self, lines: Iterable[str]) -> Iterator[tuple[Row, float]]:
+        """Yield each row, and when its line came, by ``time.perf_counter``.
+
+        Raises:
+            ValueError: a line is no row; the message says which.
+        """
+        for line in filter(str.strip, lines):
+            arrived = time.perf_counter()
+            self.line += 1
+            if self.line == 1 and line.lstrip()[0] not in "[{":
+                self._read_header(line)
+                continue
+            try:
+                numbers, stamp = self._numbers(line)
+                lost = 0 if stamp is None else self._pace.lost(stamp)
+            except (ValueError, TypeError) as error:
+                kind = ClockWentBack if isinstance(error, ClockWentBack) else ValueError
+                raise kind(f"line {self.line} is no row of numbers: {error}") from error
+            if numbers.shape != (self.spec.size,):
+                raise ValueError(f"line {self.line} must hold {self.spec.size} numbers, got the shape {numbers.shape}")
+            yield Row(numbers, lost or 0, lost is not None, "" if stamp is None else self._pace.change), arrived
+
+    def _read_header(self, line: str) -> None:
+        self._dialect = Dialect.of(line)
+        try:
+            self._header = header_of(self._dialect.cells(line), "the header")
+            self._match(self._header)
+        except ValueError as error:
+            raise ValueError(f"line 1 is no row of numbers, and no header: {error}") from error
+
+    def _match(self, names: Iterable[str]) -> None:
+        """Find the column of each label, and the clock. Raises ValueError where a column is missing."""
+        bare = {name: split_unit(name)[0] for name in names}
+        places = {label_of(b): name for name, b in bare.items()} | {b: name for name, b in bare.items()}
+        labels = {label: label for label in self.spec.labels}
+        for channel in self.spec.channels:  # a list by its channel's name
+            labels |= {label: f"{channel.name}[{k}]" for k, label in enumerate(channel.labels) if label not in places}
+        missing = [label for label, name in labels.items() if name not in places]
+        if missing:
+            raise ValueError(f"it lacks {', '.join(missing)}")
+        headers = [places[name] for name in labels.values()]
+        self._columns = [(h, factor(*split_unit(h), unit)) for h, unit in zip(headers, self.spec.units, strict=True)]
+        self._clock = clock_among(bare)
+
+    def _numbers(self, line: str) -> tuple[NDArray[np.float64], float | None]:
+        """The numbers of a row (D,), and its time [s] where it has one."""
+        if self._header is not None:
+            cells = self._dialect.cells(line)
+            size = len(self._header)
+            if len(cells) < size or any(cell.strip() for cell in cells[size:]):
+                raise ValueError(f"it has {len(cells)} cells, the header {size}")
+            return self._by_name(dict(zip(self._header, cells, strict=False)), self._dialect.number)
+        row: Any = json.loads(line)
+        if isinstance(row, list):
+            return np.asarray(row, np.float64), None
+        flat = flat_row(row)
+        for channel in self.spec.channels:
+            if isinstance(part := row.get(channel.name), list) and len(part) != channel.size:
+                raise ValueError(f"{channel.name} must hold {channel.size} numbers, got {len(part)}")
+        if self._columns is None:
+            self._match(flat)
+        return self._by_name(flat, lambda value: float("nan" if value is None else value))
+
+    def _by_name(
+        self, row: Mapping[str, Any], number: Callable[[Any], float]
+    ) -> tuple[NDArray[np.float64], float | None]:
+        """The numbers and the time of a row by name; a number that the row lacks is NaN."""
+        assert self._columns is not None
+        numbers = [number(row.get(name)) * scale if name in row else np.nan for name, scale in self._columns]
+        stamp = row.get(self._clock.column) if self._clock else None
+        return np.array(numbers), None if stamp is None or self._clock is None else self._clock.moment(str(stamp))
