@@ -38,7 +38,7 @@ from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.staging import environment
 from asm_gym.rollouts.trial import RolloutConfig, nominal_trials
 from asm_gym.scripts.command import run
-from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.scripts.options import check_options, option
 from asm_gym.tasks import ROBOTS, TASKS
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_choice
@@ -81,9 +81,9 @@ class Args:
     """Folder of the run."""
     quick: bool = False
     """To see that everything runs, not to judge the figures."""
-    tasks: tuple[str, ...] | None = fixed(None)
+    tasks: tuple[str, ...] | None = option(None)
     """Tasks to babble in; by default seven with the Panda, and those of them that other arms' experts do."""
-    false_alarms_per_hour: float = fixed(5.0, quick=120.0, check=check_per_hour)
+    false_alarms_per_hour: float = option(5.0, quick=120.0, check=check_per_hour)
     """False alarms per hour of healthy episodes."""
 
     def __post_init__(self) -> None:
@@ -226,7 +226,7 @@ def babble(args: Args, console: Console) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Babble, and return the exit code."""
-    return run("babble", Args, babble, argv, __doc__)
+    return run("babble", Args, babble, argv)
 
 
 if __name__ == "__main__":

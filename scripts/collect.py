@@ -30,7 +30,7 @@ from asm_gym.tasks import ROBOTS, TASKS, env_id
 class Args:
     """Episodes of a policy, as a Minari dataset."""
 
-    task: str = option("Lift", positional=True, check=env_id, listed=TASKS, metavar="TASK")
+    task: str = option("Lift", positional=True, check=env_id, known=TASKS, metavar="TASK")
     """Name of a task, or any Gymnasium id with numeric spaces, such as Pusher-v5."""
     policy: str = "scripted"
     """Policy: scripted, hold, sway, a shipped agent, or the path of one."""
@@ -97,7 +97,7 @@ def collect(args: Args, console: Console) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Record, and return the exit code."""
-    return run("collect", Args, collect, argv, __doc__)
+    return run("collect", Args, collect, argv)
 
 
 if __name__ == "__main__":

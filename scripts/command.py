@@ -12,20 +12,23 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import gymnasium as gym
 
-from asm_gym.scripts.options import Args, read
+from asm_gym.scripts.options import parser
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+Args = TypeVar("Args")
 DONE, BAD_NEWS, REFUSED = 0, 1, 2
 
 USAGE_ERRORS = (ValueError, TypeError, OSError, ImportError, gym.error.Error)
@@ -37,34 +40,35 @@ class Terminated(KeyboardInterrupt):
 
 
 def run(
-    name: str,
-    kind: type[Args],
-    work: Callable[[Args, Console], int | None],
-    argv: Sequence[str] | None = None,
-    about: str | None = None,
+    name: str, kind: type[Args], work: Callable[[Args, Console], int | None], argv: Sequence[str] | None = None
 ) -> int:
     """Run one command and return its exit code.
 
     Args:
         name: command, as typed after ``asm-gym``.
-        kind: dataclass of its options.
+        kind: dataclass of its options; the docstring of its module is the help text above them.
         work: function of the options and a console; returns the exit code, None is 0.
         argv: options as typed; those of this process by default.
-        about: help text above the options; the docstring of ``kind`` by default.
     """
     from rich.console import Console
 
-    return exit_code(name, lambda: work(parse(name, kind, argv, about), Console()))
+    return exit_code(name, lambda: work(parse(name, kind, argv), Console()))
 
 
-def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None, about: str | None = None) -> Args:
-    """Return the options of a command.
+def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None) -> Args:
+    """Return the options of a command; those not typed have their defaults, or with ``--quick`` their quick values.
 
     Raises:
         SystemExit: help was asked for, or options are unknown or unreadable; tyro printed why.
         ValueError: the dataclass refuses a value.
     """
-    return read(kind, sys.argv[1:] if argv is None else argv, f"asm-gym {name}".strip(), about or "")
+    import tyro
+
+    args = list(sys.argv[1:] if argv is None else argv)
+    text = inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "").replace("`", "")
+    flags = (tyro.conf.FlagCreatePairsOff,)
+    typed = tyro.cli(parser(kind, "--quick" in args), args=args, prog=f"asm-gym {name}", description=text, config=flags)
+    return kind(**vars(typed))
 
 
 def exit_code(name: str, work: Callable[[], int | None]) -> int:
@@ -103,11 +107,10 @@ def _terminable() -> Iterator[None]:
     def end(number: int, frame: object) -> None:
         raise Terminated
 
-    try:
-        before = signal.signal(signal.SIGTERM, end)
-    except ValueError:  # only the main thread receives signals
+    if threading.current_thread() is not threading.main_thread():  # which alone receives signals
         yield
         return
+    before = signal.signal(signal.SIGTERM, end)
     try:
         yield
     finally:

@@ -69,7 +69,7 @@ def make(args: Args, console: Console) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Record, and return the exit code."""
-    return run("corpus", Args, make, argv, __doc__)
+    return run("corpus", Args, make, argv)
 
 
 if __name__ == "__main__":

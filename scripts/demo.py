@@ -40,7 +40,7 @@ from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.staging import play, staged
 from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.scripts.command import run
-from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.scripts.options import check_options, option
 from asm_gym.tasks import TASKS, env_id
 from asm_gym.wrappers import NeuralASMSafety
 
@@ -52,7 +52,7 @@ PUSHED_AT = 40
 class Args:
     """Collect, fit, calibrate, break things, and see who notices."""
 
-    task: str = option("Lift", positional=True, check=env_id, listed=TASKS, metavar="TASK")
+    task: str = option("Lift", positional=True, check=env_id, known=TASKS, metavar="TASK")
     """Name of a task."""
     on_alarm: Literal["graded", "hold", "terminate"] = option("graded", known=("graded", "hold", "terminate"))
     """Response of the wrapper to an alarm; graded depends on the cause."""
@@ -66,15 +66,15 @@ class Args:
     """Folder to write to."""
     quick: bool = False
     """A third of the episodes: to see that everything runs, not to judge the figures."""
-    fit_episodes: int = fixed(60, quick=20, least=1)
+    fit_episodes: int = option(60, quick=20, least=1)
     """Nominal episodes to learn from."""
-    calibration_episodes: int = fixed(60, quick=20, least=conformal_episodes(FALSE_ALARM_RATE))
+    calibration_episodes: int = option(60, quick=20, least=conformal_episodes(FALSE_ALARM_RATE))
     """Other nominal episodes that set the threshold."""
-    nominal_episodes: int = fixed(40, quick=13, least=1)
+    nominal_episodes: int = option(40, quick=13, least=1)
     """Nominal episodes to test on."""
-    faulty_episodes: int = fixed(20, quick=6, least=1)
+    faulty_episodes: int = option(20, quick=6, least=1)
     """Episodes to test on for each fault."""
-    epochs: int = fixed(40, quick=13, least=1)
+    epochs: int = option(40, quick=13, least=1)
     """Passes over the episodes in learning."""
 
     def __post_init__(self) -> None:
@@ -223,7 +223,7 @@ def demonstrate(args: Args, console: Console) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the demo and return the exit code."""
-    return run("demo", Args, demonstrate, argv, __doc__)
+    return run("demo", Args, demonstrate, argv)
 
 
 if __name__ == "__main__":

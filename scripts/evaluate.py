@@ -37,7 +37,7 @@ from asm_gym.rollouts.run_folder import claimed, make_missing
 from asm_gym.rollouts.staging import record
 from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial
 from asm_gym.scripts.command import one_line, run
-from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.scripts.options import check_options, option
 from asm_gym.stream_source import StreamSource
 from asm_gym.tasks import ROBOTS, env_id, is_task
 from asm_gym.validation import check_choice, check_number
@@ -74,7 +74,7 @@ class Args:
         tuple(name for name in MONITORS if name != "memory_skill"), quick=_QUICK, least=1, check=check_monitor_name
     )
     """Names of monitors; any model goes under any detection, as in external_torque_limit+evidence."""
-    faults: tuple[str, ...] = option((), listed=KINDS, metavar="KIND")
+    faults: tuple[str, ...] = option((), known=KINDS, metavar="KIND")
     """Kinds of fault, by default all; development or test for the halves of robosuite's."""
     severities: tuple[str, ...] = option(SEVERITIES, quick=("strong",), least=1, known=SEVERITIES)
     """How bad each is."""
@@ -102,7 +102,7 @@ class Args:
     """To see that everything runs, not to judge the figures."""
     corpus: Path | None = option(None, metavar="FOLDER")
     """Judge the recordings of asm-gym corpus, all of its skills, faults and splits; nothing is recorded."""
-    window: float = fixed(WINDOW_S, check=partial(check_number, "window", above=0))
+    window: float = option(WINDOW_S, check=partial(check_number, "window", above=0))
     """A fault must be noticed this soon after its onset [s]."""
 
     def __post_init__(self) -> None:
@@ -216,7 +216,7 @@ def evaluate_and_report(args: Args, console: Console) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Evaluate, and return the exit code."""
-    return run("evaluate", Args, evaluate_and_report, argv, __doc__)
+    return run("evaluate", Args, evaluate_and_report, argv)
 
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
-from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.scripts.options import check_options, option
 from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import check_number
 
@@ -67,7 +67,7 @@ class Args:
     objects: it is recorded beside FILE."""
     out: Path = option(Path("runs/fit/memory.asm"), metavar="FILE")
     """File to write the memory to."""
-    monitor: str = option("neural_asm", check=check_monitor_name, listed=MONITORS)
+    monitor: str = option("neural_asm", check=check_monitor_name, known=MONITORS)
     """Name of the monitor."""
     false_alarm_rate: float = option(FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of normal episodes that may raise an alarm."""
@@ -95,13 +95,13 @@ class Args:
     """Seed of the memory, and of which episodes it learns from."""
     quick: bool = False
     """Learn little, from few episodes: to see that everything runs."""
-    calibration_share: float = fixed(0.5, check=partial(check_number, "calibration_share", above=0, below=1))
+    calibration_share: float = option(0.5, check=partial(check_number, "calibration_share", above=0, below=1))
     """Share of the episodes that set the threshold, and are not learned from."""
-    most: int | None = fixed(None, quick=20)
+    most: int | None = option(None, quick=20)
     """Episodes to learn from at most."""
-    in_time: bool = fixed(False)
+    in_time: bool = option(False)
     """Learn from the heads of logs, and calibrate on their tails."""
-    epochs: int | None = fixed(None, quick=5)
+    epochs: int | None = option(None, quick=5)
     """Passes over the episodes, of a monitor that learns in passes."""
 
     def __post_init__(self) -> None:
@@ -258,7 +258,7 @@ def fit(args: Args, console: Console) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Fit, and return the exit code."""
-    return run("fit", Args, fit, argv, __doc__)
+    return run("fit", Args, fit, argv)
 
 
 if __name__ == "__main__":

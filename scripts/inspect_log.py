@@ -20,7 +20,7 @@ from asm_gym.data.logs import LogLayout, read_tables
 from asm_gym.data.reader_notes import noted
 from asm_gym.evaluation import figures
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
-from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.scripts.options import check_options, option
 from asm_gym.validation import check_number
 
 FORMATS = {"from": "{:.4g}", "to": "{:.4g}", "noise": "{:.2g}", "resolution": "{:.2g}", "repeats": "{:.0%}"}
@@ -39,7 +39,7 @@ class Args:
     """Rows a second, where the log has no clock."""
     columns: tuple[str, ...] = option((), metavar="NAME")
     """Names of the columns of files without a header."""
-    logs: int = fixed(3, least=1)
+    logs: int = option(3, least=1)
     """How many logs of a folder are shown."""
 
     def __post_init__(self) -> None:
@@ -89,7 +89,7 @@ def differences(first: Inspection, other: Inspection) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Inspect, and return the exit code."""
-    return run("inspect", Args, inspect, argv, __doc__)
+    return run("inspect", Args, inspect, argv)
 
 
 if __name__ == "__main__":

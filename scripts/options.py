@@ -1,26 +1,14 @@
-"""Options of a command: the fields of a frozen dataclass, read by tyro; the string under a field is its help.
-
-@dataclass(frozen=True)
-class Args:
-    '''What the command does.'''
-
-    episodes: int = option(100, quick=4, least=1)
-    '''Number of episodes.'''
-"""
+"""Options of a command: the fields of a frozen dataclass, read by tyro; the string under a field is its help."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, field, fields, make_dataclass
-from typing import Annotated, Any, TypeVar, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 from asm_gym.validation import check_choice
 
 T = TypeVar("T")
-Args = TypeVar("Args")
-Names = Iterable[str] | Callable[[], Iterable[str]]
-
 _SAME: Any = object()
 _ANNOTATED: Any = Annotated
 
@@ -30,8 +18,7 @@ def option(
     *,
     quick: T = _SAME,
     least: float | None = None,
-    known: Names = (),
-    listed: Names = (),
+    known: Iterable[str] | Callable[[], Iterable[str]] = (),
     check: Callable[[Any], object] | None = None,
     metavar: str = "",
     positional: bool = False,
@@ -42,22 +29,13 @@ def option(
         default: value; without one the option is required.
         quick: default with ``--quick``.
         least: lowest number, or the least length of a tuple.
-        known: names that are accepted.
-        listed: names that the help lists; others are accepted too.
+        known: names that the help lists; no others are accepted, unless ``check`` decides.
         check: function that raises for a value, or for an element of a tuple, that is not accepted.
         metavar: placeholder of the value in the help.
         positional: whether the option is given without its name.
     """
-    about = {"quick": quick, "least": least, "known": known, "listed": listed, "check": check}
+    about = {"quick": quick, "least": least, "known": known, "check": check}
     made: T = field(default=default, metadata={**about, "metavar": metavar, "positional": positional})
-    return made
-
-
-def fixed(
-    default: T, *, quick: T = _SAME, least: float | None = None, check: Callable[[Any], object] | None = None
-) -> T:
-    """Return a dataclass field that is set in Python only; ``--quick`` changes it too."""
-    made: T = field(default=default, metadata={"quick": quick, "least": least, "check": check, "fixed": True})
     return made
 
 
@@ -73,61 +51,34 @@ def check_options(options: Any) -> None:
             if not number >= least:
                 raise ValueError(f"{name} must be at least {least:g}, got {number}")
         for one in value if isinstance(value, tuple) else (value,):
-            if known := _names(about.get("known")):
-                check_choice(singular(each.name), one, known)
             if check := about.get("check"):
                 check(one)
+            elif known := _names(about):
+                check_choice(each.name.removesuffix("s").replace("_", " "), one, known)
 
 
-def singular(name: str) -> str:
-    """Return the name of one value of an option."""
-    return name.removesuffix("s").replace("_", " ") if not name.endswith("ss") else name
-
-
-def read(kind: type[Args], argv: Sequence[str], prog: str, description: str = "") -> Args:
-    """Return the options typed; the others have their defaults, or with ``--quick`` their quick values.
-
-    Raises:
-        SystemExit: help was asked for, or options are unknown or unreadable; tyro printed why.
-        ValueError: the dataclass refuses a value.
-    """
-    import tyro
-
-    text = inspect.cleandoc(description or kind.__doc__ or "").replace("`", "")
-    on_off = (tyro.conf.FlagCreatePairsOff,)
-    typed = tyro.cli(parser(kind, "--quick" in argv), args=list(argv), prog=prog, description=text, config=on_off)
-    return kind(**vars(typed))
-
-
-def parser(kind: type[Any], hurried: bool = False) -> Any:
+def parser(kind: type[Any], quick: bool = False) -> Any:
     """Return a subclass of ``kind`` that tyro reads: annotated, and not checked while it is read."""
     import tyro
 
     hints: dict[str, Any] = get_type_hints(kind, include_extras=True)
-    marks: Any = tyro.conf
     made: list[Any] = []
     for each in fields(kind):
         about, hint = each.metadata, hints[each.name]
-        quick = about.get("quick", _SAME)
-        if about.get("fixed"):
-            hint = marks.Suppress[marks.Fixed[hint]]
-        else:
-            many = " ..." if get_origin(hint) is tuple and about.get("metavar") else ""
-            metavar = about.get("metavar", "") + many or None
-            names = _names(about.get("known") or about.get("listed"))
-            hint = _ANNOTATED[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint(names, quick))]
-            hint = marks.Positional[hint] if about.get("positional") else hint
-        default = quick if hurried and quick is not _SAME else each.default
+        shown = tyro.conf.arg(metavar=about.get("metavar") or None, help_behavior_hint=_hint(about))
+        hint = _ANNOTATED[hint, shown]
+        hint = tyro.conf.Positional[hint] if about.get("positional") else hint
+        default = about["quick"] if quick and about.get("quick", _SAME) is not _SAME else each.default
         made.append((each.name, hint, field(default=tyro.MISSING if default is MISSING else default)))
     unchecked = {"__post_init__": lambda self: None}
-    frozen = kind.__dataclass_params__.frozen
-    return make_dataclass(kind.__name__, made, bases=(kind,), frozen=frozen, namespace=unchecked)
+    return make_dataclass(kind.__name__, made, bases=(kind,), frozen=True, namespace=unchecked)
 
 
-def _hint(names: Sequence[str], quick: Any) -> Callable[[str], str]:
+def _hint(about: Any) -> Callable[[str], str]:
     """Return what the help says after an option's text: known names, its default and its quick value."""
 
     def hint(default: str) -> str:
+        names, quick = _names(about), about.get("quick", _SAME)
         parts = [f"known: {', '.join(names)}"] if names else []
         if default not in ("", "None", "True", "False"):
             parts.append("required" if default == "(required)" else f"default: {default}")
@@ -138,5 +89,6 @@ def _hint(names: Sequence[str], quick: Any) -> Callable[[str], str]:
     return hint
 
 
-def _names(names: Names | None) -> list[str]:
-    return list(names() if callable(names) else names or ())
+def _names(about: Any) -> list[str]:
+    names = about.get("known", ())
+    return list(names() if callable(names) else names)

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from asm_gym.monitors.hub import push
 from asm_gym.scripts.command import run
-from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.scripts.options import check_options, option
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Args:
     """A calibrated monitor, such as asm-gym fit writes."""
     repo: str = option(positional=True, metavar="OWNER/NAME")
     """Repository on the hub; it is made where there is none."""
-    card: Path | None = fixed(None)
+    card: Path | None = option(None)
     """What it was learned from, and how well it judges; by default what the file says of itself."""
-    private: bool = fixed(False)
+    private: bool = option(False)
     """Only you see a repository that is made."""
 
     def __post_init__(self) -> None:
@@ -41,7 +41,7 @@ def upload(args: Args, console: Console) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Uploads, and returns the exit code."""
-    return run("push", Args, upload, argv, __doc__)
+    return run("push", Args, upload, argv)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.training.run import Plan, success_rate, train
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import run
-from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.scripts.options import check_options, option
 from asm_gym.tasks import ROBOTS, TASKS, env_id
 
 
@@ -36,7 +36,7 @@ from asm_gym.tasks import ROBOTS, TASKS, env_id
 class Args:
     """An agent for a task."""
 
-    task: str = option("Lift", positional=True, check=env_id, listed=TASKS, metavar="TASK")
+    task: str = option("Lift", positional=True, check=env_id, known=TASKS, metavar="TASK")
     """Name of a task, or any Gymnasium id with Box spaces."""
     robot: str | None = option(None, known=ROBOTS)
     """The arm; the task's own by default."""
@@ -60,7 +60,7 @@ class Args:
     """Folder of the run."""
     quick: bool = False
     """Few demonstrations, few steps: to see that everything runs."""
-    evaluate_every: int = fixed(5_000, quick=150, least=1)
+    evaluate_every: int = option(5_000, quick=150, least=1)
     """Control steps between evaluations."""
 
     def __post_init__(self) -> None:
@@ -122,7 +122,7 @@ def train_and_report(args: Args, console: Console) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Train, and return the exit code."""
-    return run("train", Args, train_and_report, argv, __doc__)
+    return run("train", Args, train_and_report, argv)
 
 
 if __name__ == "__main__":

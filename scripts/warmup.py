@@ -67,7 +67,7 @@ def warm_up(args: Args, console: Console) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Compile, and return the exit code."""
-    return run("warmup", Args, warm_up, argv, __doc__)
+    return run("warmup", Args, warm_up, argv)
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ from asm_gym.guard.live import follow
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
-from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.scripts.options import check_options, option
 from asm_gym.validation import check_number
 
 AT_ONCE = 64
@@ -65,7 +65,7 @@ class Args:
     """For how long a controller or a topic that has died may take to come back; then it is watched anew."""
     rerun: Path | None = option(None, metavar="FILE.rrd")
     """Where to write the most surprising episodes of a recording for Rerun's viewer."""
-    figures: int = fixed(4, check=partial(check_number, "figures", low=1, whole=True))
+    figures: int = option(4, check=partial(check_number, "figures", low=1, whole=True))
     """How many of the most surprising episodes are drawn."""
 
     def __post_init__(self) -> None:
@@ -180,7 +180,7 @@ def watch(args: Args, console: Console) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Watches, and returns the exit code."""
-    return run("watch", Args, watch, argv, __doc__)
+    return run("watch", Args, watch, argv)
 
 
 if __name__ == "__main__":

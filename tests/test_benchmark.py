@@ -3,28 +3,27 @@
 import numpy as np
 import pytest
 
-from asm_gym.scripts.benchmark import Turns, main
+from asm_gym.scripts.benchmark import main, ratio
 
 
-def test_each_benchmark_prints_its_rivals_and_writes_them(capsys, tmp_path):
+def test_each_benchmark_prints_its_rivals_and_writes_them(tmp_path):
     assert main(["--quick", "--steps", "3", "--members", "2", "--out", str(tmp_path)]) == 0
     shown = (tmp_path / "benchmark.md").read_text()
     for rival in ("gru+evidence", "64 streams", "20 Hz, guarded", "100 Hz, guarded", "2 members, guarded", "robosuite"):
         assert rival in shown
-    assert shown.count("×") == 13
 
 
 def test_a_ratio_is_of_medians_and_its_spread_over_parts():
     one, other = np.repeat(np.arange(1.0, 11.0), 3), np.ones(30)
     one[::3] = 100.0  # a hiccup in each part
-    found = Turns({"a": one, "b": other}).ratio("a", "b")
+    found = ratio(one, other)
     assert found.mean == pytest.approx(5.5)
     assert found.sd == pytest.approx(np.std(np.arange(1, 11), ddof=1))
 
 
 def test_an_unknown_benchmark_or_task_is_refused(capsys, tmp_path):
-    assert main(["memry", "--out", str(tmp_path / "out")]) == 2
-    assert "did you mean 'memory'?" in capsys.readouterr().err
+    assert main(["montor", "--out", str(tmp_path / "out")]) == 2
+    assert "did you mean 'monitor'?" in capsys.readouterr().err
     assert main(["env", "--task", "Lfit", "--out", str(tmp_path / "out")]) == 2
     assert "'Lift'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -15,7 +15,7 @@ from typing import Literal
 import pytest
 
 from asm_gym.scripts import cli, command, reproduce
-from asm_gym.scripts.options import check_options, fixed, option
+from asm_gym.scripts.options import check_options, option
 
 ROOT = Path(__file__).resolve().parents[1]
 STUDIES = [f"reproduce {study}" for study in ("all", *reproduce.STUDIES)]
@@ -45,8 +45,8 @@ class Options:
     """How often."""
     quick: bool = False
     """Little."""
-    hidden: int = fixed(50, quick=5, least=1)
-    """Set in Python only."""
+    hidden: int = option(50, quick=5, least=1)
+    """How many are hidden."""
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -73,7 +73,7 @@ def test_an_unknown_option_is_refused(name, capsys):
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
 def test_a_command_runs_as_a_module_too(name):
-    module = importlib.import_module(f"asm_gym.scripts.{cli.COMMANDS[name].module}")
+    module = cli.module_of(name)
     assert callable(module.main)
 
 
@@ -91,7 +91,6 @@ def test_help_names_defaults_choices_known_names_and_quick_values(capsys, monkey
         "How large.",
     ):
         assert part in shown
-    assert "hidden" not in shown
 
 
 def test_the_shell_completes_commands_studies_and_options(capsys, tmp_path):
@@ -177,7 +176,6 @@ def test_a_value_that_is_not_accepted_is_refused_in_one_line(argv, message, caps
         (["--count", "many"], "--count"),
         (["--coutn", "3"], "--count INT"),
         (["--how", "boiled"], "'raw', 'baked'"),
-        (["--hidden", "3"], "--hidden"),
     ],
 )
 def test_an_option_that_cannot_be_read_is_named(argv, named, capsys, monkeypatch):

@@ -29,7 +29,7 @@ from asm_gym.evaluation.statistics import auroc
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.skills import name_skills, named_skills
-from asm_gym.scripts.options import fixed, option
+from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import FREE, Backpropagated, Expresser, ExpressionMemory
 from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters, repertoire
@@ -75,7 +75,7 @@ class Config(kit.Config):
     """Passes over the writings."""
     updates: int = option(600, quick=20, least=1)
     """Batches of the GRU."""
-    calibration: int = fixed(16, quick=12, least=1)
+    calibration: int = option(16, quick=12, least=1)
     """Writings of each letter that set the threshold."""
 
 

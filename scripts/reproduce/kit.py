@@ -87,7 +87,7 @@ def main(study: ModuleType, argv: Sequence[str] | None = None) -> int:
             console.print(ConsoleTable(table))
         console.print(f"Wrote {config.out / name}{', '.join(written)}")
 
-    return command.run(f"reproduce {name}", study.Config, work, argv, study.__doc__)
+    return command.run(f"reproduce {name}", study.Config, work, argv)
 
 
 def write(path: Path, found: Findings, config: Any, seconds: float) -> list[str]:

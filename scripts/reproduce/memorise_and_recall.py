@@ -21,7 +21,7 @@ from asm_gym.episode import Episode
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import SETTLING
-from asm_gym.scripts.options import fixed, option
+from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
@@ -79,9 +79,9 @@ class Config(kit.Config):
     """Batches of 64 rows for the networks of the memory."""
     updates: int = option(1200, quick=40, least=1)
     """Batches of 16 letters for the networks trained by backpropagation through time."""
-    hidden: int = fixed(64, quick=32, check=partial(wide_enough, channels=4))
+    hidden: int = option(64, quick=32, check=partial(wide_enough, channels=4))
     """Hidden units of a GRU."""
-    writings: int = fixed(8, quick=4, least=1)
+    writings: int = option(8, quick=4, least=1)
     """Writings of each letter to learn from."""
 
     def __post_init__(self) -> None:

@@ -26,7 +26,7 @@ from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import DYNAMICS
 from asm_gym.memory.inference import iterations_within
-from asm_gym.scripts.options import fixed, option
+from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import ExpressionMemory, Rows
 from asm_gym.scripts.reproduce.handwriting import DT, Letter, check_letters, copybook, repertoire, wide_enough, written
@@ -62,7 +62,7 @@ class Config(kit.Config):
     """Letters."""
     hidden: int = option(64, quick=32, check=partial(wide_enough, channels=4))
     """Hidden units."""
-    writings: int = fixed(12, quick=4, least=1)
+    writings: int = option(12, quick=4, least=1)
     """Writings of each letter."""
     steps: int = option(16000, quick=1500, least=1)
     """Batches of 64 rows."""
