@@ -1,12 +1,12 @@
-"""Guards a policy that runs in LeRobot: a step of the pipeline between the policy and the robot.
+"""Guard a policy that runs in LeRobot: a step of the pipeline between the policy and the robot.
 
     row_t = [observation_t, action_t]          as LeRobot records them, by the names of motors
     s_t   = surprise of row_t, judged before action_t is sent
 
     pipeline = RobotProcessorPipeline([LeRobotGuard("so101.asm")], …)      robot_action_processor of its loops
 
-While it is in alarm, and until ``quiet_s`` after, the robot gets what the response says, and that is what the memory is
-told. A hold is a rest: a memory that has seen none is surprised by it, and the hold does not end.
+From an alarm on, until ``quiet_s`` without one, the reaction is sent and judged in place of the policy's action. A hold
+is a rest: a memory that was fitted without rests is surprised by it, and the hold does not end.
 
 Source: LeRobot 0.4, ``lerobot/processor/pipeline.py`` (ProcessorStep).
 """
@@ -15,32 +15,62 @@ from __future__ import annotations
 
 import logging
 import re
+import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.gaps import blamed, reason
 from asm_gym.data.rows import SLOWER, Pace
+from asm_gym.guard.checks import check_monitor
+from asm_gym.guard.engine import Engine
+from asm_gym.guard.options import GuardOptions
+from asm_gym.guard.report import FAILURE, RowReport
+from asm_gym.guard.robots import Robots
 from asm_gym.monitors import Monitor, load_monitor
 from asm_gym.validation import check_choice, check_number
 
 Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
 
 _log = logging.getLogger("asm_gym.lerobot")
 
-RESPONSES = ("hold", "stop", "slow", "monitor")
-"""Stay where it stood until it is quiet; stay until ``reset``; go a fifth of the way; only say so. What goes on slowly
-presses on, only later: it is for arms that can hurt nobody."""
+ON_ALARM = ("hold", "stop", "slow", "monitor")
+"""Stay where the arm stood until it is quiet; stay until ``reset``; go a fifth of the way; only report. Under ``slow``
+the arm presses on, only later: it is for arms that can hurt nobody."""
 
 SLOW = 0.2
-"""Of the way from where it stands to where the policy wants it."""
+"""Share of the way from where the arm stands to where the policy wants it."""
 
 _SENSED, _COMMANDED = (re.compile(rf"{what}(?:\[(.+)\])?") for what in (r"observation\.state", "action"))
 _GRIPPER = re.compile(r".*(gripper|hand|jaw).*")
+
+
+class _Seen(NamedTuple):
+    """What a reaction acts on: where to stay (A,), and where the policy wants the arm (A,)."""
+
+    present: Floats
+    wanted: Floats
+
+
+class _Reaction:
+    """Stays where the arm stood when the override began, or goes a part of the policy's way."""
+
+    def __init__(self, slow: bool) -> None:
+        self._slow = slow
+
+    def predict(
+        self, observation: _Seen, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[Floats, Floats]:
+        present, wanted = observation
+        held = present if state is None else np.where(np.isfinite(state), state, present)
+        if not self._slow:
+            return held, held
+        return present + SLOW * (np.where(np.isfinite(wanted), wanted, present) - present), held
 
 
 class LeRobotGuard:
@@ -48,18 +78,18 @@ class LeRobotGuard:
 
     Args:
         monitor: calibrated, on a LeRobot dataset of this robot (``asm-gym fit DATASET``); or its file.
-        on_alarm: one of ``RESPONSES``.
+        on_alarm: one of ``ON_ALARM``.
         quiet_s: how long without an alarm until the policy acts again [s].
-        clock: seconds that go on, for the rate.
+        clock: a clock in seconds, for the rate.
 
     Attributes:
         alarm: whether there was an alarm at the newest row.
         intervened: whether something else was sent than the policy asked for.
-        said: surprise in thresholds, why, and the channel, of the newest alarm.
+        last_alarm: surprise in thresholds, reason and channel of the newest alarm; empty before the first.
 
     Example:
-        >>> from asm_gym.wrappers.lerobot import RESPONSES
-        >>> RESPONSES[0]
+        >>> from asm_gym.wrappers.lerobot import ON_ALARM
+        >>> ON_ALARM[0]
         'hold'
     """
 
@@ -70,16 +100,17 @@ class LeRobotGuard:
         quiet_s: float = 1.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        check_choice("on_alarm", on_alarm, RESPONSES)
+        check_choice("on_alarm", on_alarm, ON_ALARM)
         self.on_alarm = on_alarm
         self.quiet_s = check_number("quiet_s", quiet_s, low=0.0)
         self.path = str(monitor) if isinstance(monitor, str | Path) else ""
         self.monitor: Any = load_monitor(Path(monitor)) if isinstance(monitor, str | Path) else monitor
-        self.threshold = float(self.monitor.threshold)  # raises where it has none
-        self._labels = [_name_of(label) for label in self.monitor.spec.labels]
+        self._spec = self.monitor.spec
+        check_monitor(self.monitor, self._spec)
+        self._labels = [_motor_of(label) for label in self._spec.labels]
         self._clock = clock
         try:
-            from lerobot.processor import ProcessorStep  # it is theirs to say what a step is
+            from lerobot.processor import ProcessorStep
         except ImportError:
             pass
         else:
@@ -87,110 +118,116 @@ class LeRobotGuard:
         self.reset()
 
     def reset(self) -> None:
-        """A new episode: nothing came before, and a stop is over."""
-        self._state = self.monitor.initial_state(1)
-        self._pace = Pace(self.monitor.spec.dt)
+        """Begin a new episode; a stop is over."""
+        self._engine: Engine | None = None  # made once the names of the actions are known
+        self._pace = Pace(self._spec.dt)
         self._sent: dict[str, float] = {}
-        self._held: dict[str, float] = {}
-        self._quiet = 0
         self.alarm = self.intervened = False
-        self.said: dict[str, Any] = {}
+        self.last_alarm: dict[str, Any] = {}
 
     def __call__(self, transition: Mapping[str, Any]) -> dict[str, Any]:
-        """The transition, with the action that is to be sent."""
+        """Return the transition with the action that is to be sent, and ``info["asm"]``."""
         observation, action = transition["observation"] or {}, transition["action"]
         if not isinstance(action, Mapping):
-            raise TypeError(f"LeRobotGuard stands where actions have names, got {type(action).__name__}")
+            raise TypeError(f"LeRobotGuard needs actions with names, got {type(action).__name__}")
         sent = self.guarded(observation, dict(action))
-        said = {"alarm": self.alarm, "intervened": self.intervened, **self.said}
-        return {**transition, "action": sent, "info": {**(transition.get("info") or {}), "asm": said}}
+        asm = {"alarm": self.alarm, "intervened": self.intervened, **self.last_alarm}
+        return {**transition, "action": sent, "info": {**(transition.get("info") or {}), "asm": asm}}
 
     def guarded(self, observation: Mapping[str, Any], action: dict[str, Any]) -> dict[str, Any]:
-        """What is to be sent in place of an action."""
-        self._told_the_rate()
-        before, acting = self._state, bool(self._held) and self.on_alarm != "monitor"
-        asked = self._response(observation, action) if acting else action  # what the policy wants now comes to nothing
-        row = self._row(observation, asked)
-        value, shares = self._judged(before, row)
-        self.alarm = not value <= self.threshold
+        """Return what is to be sent in place of an action; nothing where no place to stay is known."""
+        self._follow_rate()
+        if self._engine is None:
+            self._names = tuple(action)
+            self._engine = self._guard()
+        engine, acts = self._engine, self.on_alarm != "monitor"
+        wanted = np.array([action.get(name, np.nan) for name in self._names], np.float64)
+        seen = _Seen(np.array([self._present(name, observation) for name in self._names]), wanted)
+        asked = wanted.astype(np.float32)
+
+        def command() -> Floats32:
+            return engine.act(asked[None], lambda _: seen).actions[0]
+
+        executed = command() if acts else asked
+        row = self._row(observation, executed)
+        overriding, in_alarm = bool(engine.overriding[0]), self.alarm
+        report = engine.judge(row[None], executed[None])
+        self.alarm, self.intervened = bool(report.alarm[0]), bool(engine.overriding[0])
         if self.alarm:
-            at = blamed(row, shares)
-            channel = "" if at is None else self.monitor.spec.labels[at]
-            if not self.said or not self._held:
-                _log.warning("%s %.3g thresholds: %s", channel, value / self.threshold, self.on_alarm)
-            self.said = {"surprise": value / self.threshold, "reason": reason(row), "channel": channel}
-        self._quiet = 0 if self.alarm else self._quiet + 1
-        if self.alarm and not self._held:
-            self._held = {name: self._present(name, observation) for name in action}
-        elif self.on_alarm != "stop" and self._quiet * self.monitor.spec.dt >= self.quiet_s:
-            self._held = {}
-        self.intervened = bool(self._held) and self.on_alarm != "monitor"
-        sent = self._response(observation, action) if self.intervened else action
-        if self.intervened and not acting:
-            self._judged(before, self._row(observation, sent))
-        self._sent = {name: float(value) for name, value in sent.items() if np.isfinite(value)}
-        return sent
+            self.last_alarm = self._described(row, report)
+            if not (overriding or in_alarm):
+                _log.warning("%(channel)s %(surprise).3g thresholds", self.last_alarm)
+        if self.intervened and not overriding:
+            executed = command()
+            engine.amend(self._row(observation, executed)[None])
+        if self.intervened:
+            action = {n: float(value) for n, value in zip(self._names, executed, strict=True) if np.isfinite(value)}
+        self._sent = {name: float(value) for name, value in action.items() if np.isfinite(value)}
+        return action
 
-    def _judged(self, before: Any, row: Floats) -> tuple[float, Floats]:
-        """Surprise of a row (D,) after that state, and the shares (D,) in it; the state goes on from there."""
-        try:
-            self._state, surprise = self.monitor.observe(before, row[None])
-        except Exception:  # an override that was asked for happens
-            _log.exception("the monitor failed: an alarm")
-            return float("inf"), np.zeros(len(row))
-        return float(surprise.value[0]), surprise.attribution[0]
+    def _guard(self) -> Engine:
+        """Return the engine of one arm whose actions are known by name alone: no action of zeros makes it stay."""
+        dt = self._spec.dt
+        low, high, unknown = (np.full(len(self._names), value, np.float32) for value in (-np.inf, np.inf, np.nan))
+        robots = Robots(1, low, high, rest=unknown, rests=False, dt=dt)
+        policies = [] if self.on_alarm == "monitor" else [_Reaction(self.on_alarm == "slow")]
+        quiet_rows = sys.maxsize if self.on_alarm == "stop" else max(1, int(np.ceil(self.quiet_s / dt)))
+        options = GuardOptions(policies[0] if policies else "monitor", quiet_rows, 1.0, contact_limits=None)
+        return Engine(robots, self.monitor, options, policies)
 
-    def _response(self, observation: Mapping[str, Any], action: dict[str, Any]) -> dict[str, Any]:
-        if self.on_alarm != "slow":
-            return {name: self._held.get(name, self._present(name, observation)) for name in action}
-        here = {name: self._present(name, observation) for name in action}
-        there = {name: float(v) if np.isfinite(v) else here[name] for name, v in action.items()}
-        return {name: at + SLOW * (there[name] - at) for name, at in here.items()}
+    def _described(self, row: Floats32, report: RowReport) -> dict[str, Any]:
+        """Return what there is to say of an alarm."""
+        at = blamed(row, report.surprise.attribution[0])
+        return {
+            "surprise": float(report.surprise.value[0] / report.threshold[0]),
+            "reason": FAILURE if report.failure else reason(row),
+            "channel": "" if at is None else self._spec.labels[at],
+        }
 
     def _present(self, name: str, observation: Mapping[str, Any]) -> float:
-        """Where to stay: what is sensed; of a gripper what it was last told, or it would let go; of a speed nothing."""
-        sensed = float(observation.get(name, np.nan))
+        """Return where to stay: what is sensed; for a gripper the last command, or it would let go; for a speed 0."""
         if name.endswith(".vel"):
             return 0.0
+        sensed = float(observation.get(name, np.nan))
         last = self._sent.get(name, sensed)
         return last if _GRIPPER.fullmatch(name.lower()) or not np.isfinite(sensed) else sensed
 
-    def _row(self, observation: Mapping[str, Any], action: Mapping[str, Any]) -> Floats:
-        """(D,) NaN where something is missing."""
-        numbers = [v for v in observation.values() if isinstance(v, float)], list(action.values())
+    def _row(self, observation: Mapping[str, Any], action: Floats32) -> Floats32:
+        """Return (D,) the row of the stream; NaN where something is missing."""
+        named = observation, dict(zip(self._names, action.tolist(), strict=True))
+        ordered = [v for v in observation.values() if isinstance(v, float)], action.tolist()
         row = []
         for commanded, name in self._labels:
-            said: Mapping[str, Any] = action if commanded else observation
-            if name.isdigit():  # of a dataset that names no motors: by their order
-                ordered = numbers[commanded]
-                row.append(float(ordered[int(name)]) if int(name) < len(ordered) else np.nan)
+            if name.isdigit():  # a dataset that names no motors numbers them
+                values = ordered[commanded]
+                row.append(float(values[int(name)]) if int(name) < len(values) else np.nan)
             else:
-                row.append(float(said.get(name, np.nan)))
-        return np.array(row)
+                row.append(float(named[commanded].get(name, np.nan)))
+        return np.array(row, np.float32)
 
-    def _told_the_rate(self) -> None:
+    def _follow_rate(self) -> None:
         self._pace.lost(self._clock())
         if self._pace.change:
             _log.warning(self._pace.change if self._pace.kind != SLOWER else self._pace.change.partition(":")[0])
 
     def get_config(self) -> dict[str, Any]:
-        """What LeRobot saves of it."""
+        """Return what LeRobot saves of this step."""
         return {"monitor": self.path, "on_alarm": self.on_alarm, "quiet_s": self.quiet_s}
 
     def state_dict(self) -> dict[str, Any]:
-        """No tensors: the memory has a file of its own."""
+        """Return no tensors: the memory has a file of its own."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Takes none."""
+        """Take no tensors."""
 
     def transform_features(self, features: Any) -> Any:
-        """It adds and removes none."""
+        """Return the features unchanged."""
         return features
 
 
-def _name_of(label: str) -> tuple[bool, str]:
-    """Whether a number of the memory was commanded, and what LeRobot calls its motor."""
+def _motor_of(label: str) -> tuple[bool, str]:
+    """Return whether a number of the memory was commanded, and LeRobot's name of its motor."""
     for commanded, pattern in enumerate((_SENSED, _COMMANDED)):
         found = pattern.fullmatch(label)
         if found:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
@@ -13,8 +14,13 @@ import numpy as np
 from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
 from asm_gym.data.live import SourceDied
 from asm_gym.data.rows import ClockWentBack, Row, RowReader
-from asm_gym.detection.events import KNOCK, NO_EVENT, STOP
+from asm_gym.detection.events import EVENTS, KNOCK, NO_EVENT, STOP
+from asm_gym.guard.engine import Engine
+from asm_gym.guard.options import GuardOptions
+from asm_gym.guard.report import RowReport
+from asm_gym.guard.robots import Robots
 from asm_gym.spec import StreamSpec
+from asm_gym.validation import as_float32
 
 MOST_LOST = 1000
 """Lost rows that a bridge is asked about one by one."""
@@ -22,8 +28,8 @@ MOST_LOST = 1000
 LATENCIES = 10_000
 """Newest rows whose latency is kept."""
 
-TRIES_S = 0.2
-"""How long after a source could not be opened it is tried again [s]."""
+RETRY_S = 0.2
+"""Time between two attempts to open a source again [s]."""
 
 Opened = Callable[[], Iterator[str]]
 
@@ -49,48 +55,52 @@ def follow(
     Raises:
         ValueError: no row came, or a line is no row.
     """
-    watching = _Watch(monitor, say, seconds)
+    watch = _Watch(monitor, say, seconds)
     source: Iterable[str] | None = lines
-    try:
-        while source is not None:
-            died = watching.follow(source, again is not None)
-            source = None if not died or again is None or not watching.rows else watching.reopened(again, wait)
-    except KeyboardInterrupt:
-        if watching.rows:
-            watching.summarise()
-        raise
-    watching.summarise()
-    return watching.alarms
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*rows under this policy alarm")  # every alarm is said here
+        try:
+            while source is not None:
+                died = watch.follow(source, again is not None)
+                source = watch.reopened(again, wait) if died and again is not None and watch.rows else None
+        except KeyboardInterrupt:
+            if watch.rows:
+                watch.summarise()
+            raise
+    watch.summarise()
+    return watch.alarms
 
 
 class _Watch:
-    """The state of a source while it is watched.
-
-    Args:
-        monitor: calibrated.
-        say: prints a line.
-        seconds: that something may be missing without an alarm.
-    """
+    """The state of a source while it is watched; the arguments are those of ``follow``."""
 
     def __init__(self, monitor: Any, say: Callable[[str], None], seconds: float) -> None:
-        self.monitor, self.say, self.seconds = monitor, say, seconds
-        self.spec: StreamSpec = monitor.spec
+        self.say, self.seconds, self.spec = say, seconds, monitor.spec
+        spec: StreamSpec = monitor.spec
+        self.engine = Engine(Robots.unknown(spec), monitor, GuardOptions("monitor", contact_limits=None))
+        self.no_action = np.zeros((1, spec.motor.size), np.float32)
         self.latencies: deque[float] = deque(maxlen=LATENCIES)
         self.rows = self.alarms = 0
+        self._judge(np.zeros(spec.size), bridged=False)  # compiles
         self._begin()
-        self.monitor.observe(self.state, np.zeros((1, self.spec.size)))  # compiles; the state is a value and stays
 
     def _begin(self) -> None:
-        """Begin anew: rows before are no past of those that follow."""
-        self.state = self.monitor.initial_state(1)
+        """Begin anew: no row before is the past of those that follow."""
+        self.engine.begin()
         self.bridge = Bridge(self.seconds, self.spec.dt, self.spec.size)
         self.above = self.late = False
         self.event = NO_EVENT
 
-    def alarm(self, what: str) -> None:
-        """Count an alarm, and say when it was."""
+    def _judge(self, numbers: Any, bridged: bool) -> RowReport:
+        return self.engine.judge(as_float32(numbers)[None], self.no_action, bridged=np.array([bridged]))
+
+    def alarm(self, what: str, row: int | None = None) -> None:
+        """Count an alarm, and say at which row it was, by default at the newest."""
         self.alarms += 1
-        self.say(f"{self.rows * self.spec.dt:.3f} s  {what}")
+        self._note(what, row)
+
+    def _note(self, what: str, row: int | None = None) -> None:
+        self.say(f"{(self.rows if row is None else row) * self.spec.dt:.3f} s  {what}")
 
     def follow(self, lines: Iterable[str], returns: bool) -> bool:
         """Watch rows until the source ends or dies; return whether it died."""
@@ -118,19 +128,18 @@ class _Watch:
                 first = None
             if first is not None:
                 self._begin()
-                self.say(f"{self.rows * self.spec.dt:.3f} s  the source is back after {time.monotonic() - start:.1f} s")
+                self._note(f"the source is back after {time.monotonic() - start:.1f} s")
                 return chain([first], lines)
-            time.sleep(TRIES_S)
+            time.sleep(RETRY_S)
         self.say(f"the source did not come back within {wait:g} s")
         return None
 
     def _row(self, row: Row, arrived: float) -> None:
-        if row.change:
-            if row.read:
-                self.say(f"{self.rows * self.spec.dt:.3f} s  {row.change}")
-            else:
-                self.alarm(row.change)
-                self._begin()
+        if row.change and row.read:
+            self._note(row.change)
+        elif row.change:
+            self.alarm(row.change)
+            self._begin()
         if not row.read:
             return
         if row.lost:
@@ -138,31 +147,27 @@ class _Watch:
         self.late = row.lost > 0
         self.rows += 1 + row.lost
         numbers = row.numbers
-        self.state, surprise = self.monitor.observe(self.state, numbers[None])
-        value = 0.0 if self.bridge.over(np.isnan(numbers)) else float(surprise.value[0])
+        report = self._judge(numbers, bridged=self.bridge.over(np.isnan(numbers)))
         self.latencies.append(1e3 * (time.perf_counter() - arrived))
-        threshold = self.monitor.threshold
-        if value > threshold and not self.above:
-            at, why = blamed(numbers, surprise.attribution[0]), reason(numbers)
+        excess = float(report.surprise.value[0] / report.threshold[0])
+        if excess > 1.0 and not self.above:
+            at, why = blamed(numbers, report.surprise.attribution[0]), reason(numbers)
             channel = "" if at is None else self.spec.labels[at] + "  "
-            late = f"{self.latencies[-1]:.2f} ms after the row came"
             because = "" if why == SURPRISING else f"  ({why})"
-            self.alarm(f"{channel}{value / threshold:.2f} thresholds  {late}{because}")
-        event = NO_EVENT if value == 0.0 else surprise.event(threshold)
+            self.alarm(f"{channel}{excess:.2f} thresholds  {self.latencies[-1]:.2f} ms after the row came{because}")
+        event = EVENTS[report.event[0]]
         if event in (KNOCK, STOP) and event != self.event:
-            self.say(f"{self.rows * self.spec.dt:.3f} s  {event}: no alarm")
-        self.above, self.event = value > threshold, event
+            self._note(f"{event}: no alarm")
+        self.above, self.event = excess > 1.0, event
 
     def _lost(self, lost: int) -> None:
-        """Rows that did not come: the memory runs on over as many as may be missing."""
-        nothing = np.full(self.spec.size, np.nan)
-        over = [self.bridge.over(np.isnan(nothing)) for _ in range(min(lost, MOST_LOST))]
+        """Go on over rows that did not come, as many as the bridge allows."""
+        missing = np.ones(self.spec.size, bool)
+        over = [self.bridge.over(missing) for _ in range(min(lost, MOST_LOST))]
         for _ in over if all(over) else over[:1]:
-            self.state, _ = self.monitor.observe(self.state, nothing[None])
+            self._judge(np.full(self.spec.size, np.nan), bridged=True)
         if not all(over) and not self.late:  # of rows that are late again and again it is said once
-            self.alarms += 1
-            when = (self.rows + 1) * self.spec.dt
-            self.say(f"{when:.3f} s  {lost} row{'s' * (lost != 1)} lost: an alarm ({LATE})")
+            self.alarm(f"{lost} row{'s' * (lost != 1)} lost: an alarm ({LATE})", self.rows + 1)
 
     def summarise(self) -> None:
         """Say how many rows and alarms there were, and how long a row took."""
