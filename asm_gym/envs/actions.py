@@ -14,6 +14,7 @@ from asm_gym.validation import as_float32
 
 _CHANGES = ("OSC_POSE", "JOINT_POSITION")
 """Controllers whose actions are changes of the arm's pose."""
+_LEAST, _MOST = np.float32(-1.0), np.float32(1.0)
 
 
 class Actions:
@@ -45,7 +46,7 @@ class Actions:
             raise ValueError(f"{self._task} takes an action of shape {self.space.shape}, got {action.shape}")
         if not np.isfinite(action).all():
             raise ValueError(f"the action must be finite, got {action}")
-        return np.clip(action, -1.0, 1.0)
+        return np.minimum(np.maximum(action, _LEAST), _MOST)
 
     def scaled(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the action (A,) in the units of robosuite's controllers, which for most are the same."""

@@ -132,33 +132,45 @@ def choose_object(env: Any, task: TaskSpec) -> None:
 
 
 def speed_up_contacts(env: Any) -> None:
-    """Replace robosuite's ``check_contact``, on which its rewards rest, for the loaded model.
+    """Replace robosuite's ``check_contact`` and ``_check_grasp``, on which rewards rest, for the loaded model.
 
-    Robosuite looks up two names for each contact and pair of groups; this one compares ids in one pass.
+    Robosuite puts the names of geoms together at every call, and looks up two for each contact and pair of groups;
+    these compare ids in one pass.
     """
     data, count = env.sim.data._data, env.sim.model.ngeom
     ids = {name: env.sim.model.geom_name2id(name) for name in env.sim.model.geom_names}
 
     @lru_cache
-    def members(names: tuple[str, ...]) -> NDArray[np.bool_]:
+    def members(group: Any) -> NDArray[np.bool_]:
+        names = getattr(group, "contact_geoms", group)  # of a model
+        names = (names,) if isinstance(names, str) else names
         mask = np.zeros(count, bool)
         mask[[ids[name] for name in names if name in ids]] = True
         return mask
 
-    def group(geoms: Any) -> NDArray[np.bool_]:
-        geoms = getattr(geoms, "contact_geoms", geoms)  # of a model
-        return members((geoms,) if isinstance(geoms, str) else tuple(geoms))
+    def mask(geoms: Any) -> NDArray[np.bool_]:
+        return members(tuple(geoms) if isinstance(geoms, list) else geoms)
 
     def check_contact(geoms_1: Any, geoms_2: Any = None) -> bool:
         """Whether any geom of one group touches any of the other; of anything where there is no other."""
         first, second = data.contact.geom.T  # (ncon,)
-        one = group(geoms_1)
+        one = mask(geoms_1)
         if geoms_2 is None:
             return bool((one[first] | one[second]).any())
-        other = group(geoms_2)
+        other = mask(geoms_2)
         return bool((one[first] & other[second] | one[second] & other[first]).any())
 
-    env.check_contact = check_contact
+    @lru_cache
+    def pads(gripper: Any) -> tuple[tuple[str, ...], ...]:
+        return tuple(tuple(gripper.important_geoms[f"{side}_fingerpad"]) for side in ("left", "right"))
+
+    def check_grasp(gripper: Any, object_geoms: Any) -> bool:
+        """Whether the pads on both sides of a gripper, or of any of several, touch an object."""
+        if isinstance(gripper, dict):
+            return any(check_grasp(each, object_geoms) for each in gripper.values())
+        return all(check_contact(pad, object_geoms) for pad in pads(gripper))
+
+    env.check_contact, env._check_grasp = check_contact, check_grasp
 
 
 class ObjectSensors:

@@ -24,8 +24,7 @@ from asm_gym.spec import StreamSpec
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_choice, check_flag, check_number, check_numbers, check_text, short_repr
 
-_BAD = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-
+_BAD = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
 
 LARGEST_PICTURE = 4096
 """Height or width [pixels]."""

@@ -230,12 +230,17 @@ class Simulation:
         if low == high:
             return None
         controller, motors = robot.composite_controller.part_controllers[name], robot._ref_actuators_indexes_dict[name]
-        gripper, limits, ctrl = robot.gripper[arm], self.views.ctrlrange, self.views.ctrl
+        controller.scale_action(np.zeros(controller.control_dim))  # which works out the numbers below
+        c, gripper, ctrl = controller, robot.gripper[arm], self.views.ctrl
+        middle, half = 0.5 * (c.actuator_max + c.actuator_min), 0.5 * (c.actuator_max - c.actuator_min)
+        least, most = self.views.ctrlrange[motors].T.copy()
 
         def move(action: NDArray[np.float64]) -> None:
-            controller.set_goal(gripper.format_action(action[start + low : start + high]))
-            bounds = limits[motors]
-            ctrl[motors] = np.clip(controller.run_controller(), bounds[:, 0], bounds[:, 1])
+            # As robosuite's controller does it, less its reading of the joints, which nothing here uses.
+            asked = gripper.format_action(action[start + low : start + high])
+            goal = np.minimum(np.maximum(asked, c.input_min), c.input_max)
+            goal = (goal - c.action_input_transform) * c.action_scale + c.action_output_transform
+            ctrl[motors] = np.minimum(np.maximum(middle + half * goal, least), most)
 
         return move
 
