@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import pytest
 
 import asm_gym
-from asm_gym.faults import FAULTS
 from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import MONITORS
 from asm_gym.policies.registry import REGISTERED
@@ -91,7 +90,7 @@ def python_page(page: Path) -> Any:
 @pytest.fixture(autouse=True)
 def registries():
     """Undo what an example registers."""
-    kept = [(registry, dict(registry)) for registry in (FAULTS, KINDS, MONITORS, OWN, REGISTERED)]
+    kept = [(registry, dict(registry)) for registry in (KINDS, MONITORS, OWN, REGISTERED)]
     yield
     for registry, before in kept:
         registry.clear()

@@ -28,8 +28,7 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Raises:
         TypeError: the environment has other spaces, or ``faults`` is not a sequence of them.
-        ValueError: a fault that this environment cannot have (an unknown body or joint, an onset past the horizon), or
-            two that contradict each other.
+        ValueError: a fault that this environment cannot have: an unknown body or joint, an onset past the horizon.
 
     Example:
         >>> import gymnasium as gym
@@ -58,10 +57,6 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             fault.check(inner)
             if inner.horizon is not None and fault.onset >= inner.horizon:
                 raise ValueError(f"{fault} starts at or after the horizon of {inner.horizon} steps")
-        before = env.get_wrapper_attr("every_fault") if env.has_wrapper_attr("every_fault") else ()
-        self.every_fault: tuple[Fault, ...] = (*before, *faults)
-        """The faults of this wrapper and of those inside it."""
-        _check_contradictions(self.every_fault, inner)
         self.faults = tuple(faults)
         self._inner = inner
         self._running: dict[int, Generator[None, None, None]] = {}
@@ -98,18 +93,6 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             self._running.popitem()[1].close()
         if self.env.has_wrapper_attr("undo_faults"):
             self.env.get_wrapper_attr("undo_faults")()
-
-
-def _check_contradictions(faults: Sequence[Fault], env: Any) -> None:
-    """Raises ValueError where two faults give one thing a value of their own at the same time."""
-    for i, first in enumerate(faults):
-        for second in faults[i + 1 :]:
-            ends = [math.inf if f.duration is None else f.onset + f.duration for f in (first, second)]
-            both = first.holds(env) & second.holds(env)
-            if both and max(first.onset, second.onset) < min(ends):
-                raise ValueError(
-                    f"{first} and {second} contradict each other: both decide over {', '.join(sorted(both))}"
-                )
 
 
 class OracleReflex(gym.Wrapper[Any, Any, Any, Any]):

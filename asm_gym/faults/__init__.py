@@ -11,7 +11,7 @@ from asm_gym.faults.action import (
     SignFlip,
 )
 from asm_gym.faults.actuator import Backlash, GripperOpens, JointFriction, StuckJoint, WeakGripper, WeakJoint
-from asm_gym.faults.base import FAULTS, Fault, make_fault
+from asm_gym.faults.base import Fault
 from asm_gym.faults.body import CablePull, Collision, HeldByPerson, Payload, Push, Touch
 from asm_gym.faults.object import Heavy, Missing, ObjectFriction, ObjectMass, Slip, Snatch, Teleport
 from asm_gym.faults.sensor import (
@@ -28,7 +28,6 @@ from asm_gym.faults.sensor import (
 )
 
 __all__ = [
-    "FAULTS",
     "ActionBias",
     "ActionDelay",
     "ActionDrop",
@@ -67,5 +66,4 @@ __all__ = [
     "Touch",
     "WeakGripper",
     "WeakJoint",
-    "make_fault",
 ]

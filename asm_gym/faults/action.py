@@ -6,24 +6,24 @@ The stream's efference copy carries the action as commanded, without the fault.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.faults.base import LONGEST, Apply, Fault, Interface, group_labels, listed, within
+from asm_gym.faults.base import LONGEST, Clock, HookedFault, Interface, within
 
 Action = NDArray[np.float32]
 
 
-class ActionFault(Fault):
+class ActionFault(HookedFault):
     """One that acts on the commanded action."""
 
     anywhere = True
+    hooks = "deliveries"
+    groups = ("joint", "torque", "hand")
     grippers_too: ClassVar[bool] = False
     """Whether it acts on the numbers that command grippers as well."""
 
@@ -32,33 +32,24 @@ class ActionFault(Fault):
         if not 0 <= axis < len(_arm_axes(env)):
             raise ValueError(f"axis must be 0 to {len(_arm_axes(env)) - 1}, got {axis}")
 
-    def begin(self) -> Any:
-        """Return the fault's memory for one injection."""
-        return None
-
     @abstractmethod
-    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Any:
-        """Return what arrives instead of the numbers that were ``commanded``, k steps since the onset."""
+    def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Any:
+        """Return what arrives instead of the numbers that were ``commanded``, k steps since the onset.
 
-    @contextmanager
-    def applied(self, env: Interface) -> Iterator[Apply]:
-        intensity, k, memory = 0.0, -1, self.begin()
+        Args:
+            memory: empty at the onset, and the fault's own.
+        """
+
+    def hook(self, env: Interface, clock: Clock) -> Callable[[Action], Action]:
+        memory: list[Action] = []
         axes = np.arange(gym.spaces.flatdim(env.action_space)) if self.grippers_too else _arm_axes(env)
-
-        def apply(share: float) -> None:
-            nonlocal intensity, k
-            intensity, k = share, k + 1
 
         def change(action: Action) -> Action:
             delivered = action.copy()
-            delivered[axes] = self.deliver(action[axes], intensity, k, memory)
+            delivered[axes] = self.deliver(action[axes], clock.k, memory)
             return delivered
 
-        with listed(env.deliveries, change):
-            yield apply
-
-    def labels(self, env: Interface) -> frozenset[str]:
-        return group_labels(env, "joint", "torque", "hand")
+        return change
 
 
 def _arm_axes(env: Interface) -> NDArray[np.intp]:
@@ -70,17 +61,13 @@ def _arm_axes(env: Interface) -> NDArray[np.intp]:
 class ActionDelay(ActionFault):
     """Deliver actions ``steps`` control steps late."""
 
-    graded = False
     grippers_too = True
 
     steps: int = within(4, low=1, high=LONGEST)
 
-    def begin(self) -> deque[Action]:
-        return deque()
-
-    def deliver(self, commanded: Action, intensity: float, k: int, memory: deque[Action]) -> Action:
+    def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Action:
         memory.append(commanded)
-        return memory.popleft() if len(memory) > self.steps else memory[0]
+        return memory.pop(0) if len(memory) > self.steps else memory[0]
 
 
 class ActionDrop(ActionFault):
@@ -88,8 +75,8 @@ class ActionDrop(ActionFault):
 
     probability: float = within(0.5, low=0, high=1)
 
-    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Any:
-        return 0.0 if self.rng(2 + k).random() < intensity * self.probability else commanded
+    def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Any:
+        return 0.0 if self.rng(2 + k).random() < self.probability else commanded
 
 
 class ActionBias(ActionFault):
@@ -98,8 +85,8 @@ class ActionBias(ActionFault):
     axis: int = 0
     amount: float = within(0.3, low=-2, high=2)
 
-    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Action:
-        commanded[self.axis] = commanded[self.axis] + intensity * self.amount
+    def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Action:
+        commanded[self.axis] = commanded[self.axis] + self.amount
         return commanded
 
 
@@ -108,22 +95,18 @@ class ActionScale(ActionFault):
 
     factor: float = within(0.5, low=0, high=100)
 
-    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Action:
-        return commanded * (1 + intensity * (self.factor - 1))
+    def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Action:
+        return commanded * self.factor
 
 
 class ActionRepeat(ActionFault):
     """Repeat each action for ``steps`` control steps, and lose those in between."""
 
-    graded = False
     grippers_too = True
 
     steps: int = within(5, low=1, high=LONGEST)
 
-    def begin(self) -> list[Action]:
-        return []
-
-    def deliver(self, commanded: Action, intensity: float, k: int, memory: list[Action]) -> Action:
+    def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Action:
         if k % self.steps == 0 or not memory:
             memory[:] = [commanded]
         return memory[0]
@@ -132,11 +115,9 @@ class ActionRepeat(ActionFault):
 class SignFlip(ActionFault):
     """Reverse one ``axis``, counted among those that move arms."""
 
-    graded = False
-
     axis: int = 0
 
-    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Action:
+    def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Action:
         commanded[self.axis] = -commanded[self.axis]
         return commanded
 
@@ -147,9 +128,9 @@ class ActionNoise(ActionFault):
     share: float = within(1.0, low=0, high=1)
     std: float = within(0.5, low=0, high=2)
 
-    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Any:
-        share = intensity * self.share
-        return (1.0 - share) * commanded + share * (self.std * self.rng(2 + k).standard_normal(len(commanded)))
+    def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Any:
+        noise = self.std * self.rng(2 + k).standard_normal(len(commanded))
+        return (1.0 - self.share) * commanded + self.share * noise
 
 
 class Adversary(ActionFault):
@@ -157,5 +138,5 @@ class Adversary(ActionFault):
 
     size: float = within(0.4, low=0, high=2)
 
-    def deliver(self, commanded: Action, intensity: float, k: int, memory: Any) -> Action:
-        return commanded - intensity * self.size * np.sign(commanded)
+    def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Action:
+        return commanded - self.size * np.sign(commanded)

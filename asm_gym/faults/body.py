@@ -10,38 +10,23 @@ import mujoco
 import numpy as np
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import (
-    Apply,
-    Edit,
-    EditingFault,
-    Fault,
-    Floats,
-    Vector3,
-    along,
-    body_id,
-    data_of,
-    group_labels,
-    listed,
-    model_of,
-    within,
-)
+from asm_gym.faults.base import Clock, Edit, EditingFault, Fault, Floats, Vector3, along, body_id, within
 
 HAND = "robot0_right_hand"
 
 
-class _OnBody(Fault):
-    """Acts on one body of the model, such as ``robot0_link5``."""
+class BodyFault(Fault):
+    """One that acts on a ``body`` of the model, such as ``robot0_link5``."""
+
+    groups = ("torque", "wrench")
 
     body: str = "robot0_link5"
 
     def check(self, env: RobosuiteEnv) -> None:
         body_id(env, self.body)
 
-    def labels(self, env: RobosuiteEnv) -> frozenset[str]:
-        return group_labels(env, "torque", "wrench")
 
-
-class Push(_OnBody, EditingFault):
+class Push(BodyFault, EditingFault):
     """A steady force on a body of the robot, or of anything else.
 
     Args:
@@ -56,7 +41,7 @@ class Push(_OnBody, EditingFault):
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
         force = self.newtons * along(self.direction)
         where = (body_id(env, self.body), slice(0, 3))
-        return [(data_of(env).xfrc_applied, [where], lambda i, others: others + i * force)]
+        return [(env.simulation.data.xfrc_applied, [where], lambda others: others + force)]
 
 
 class Touch(Push):
@@ -68,59 +53,51 @@ class Touch(Push):
 
     harmless = True
 
-    newtons: float = 1.5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if abs(self.newtons) > 2.0:
-            raise ValueError(f"a touch has at most 2 N, got {self.newtons}: that is a Push")
+    newtons: float = within(1.5, low=-2, high=2)
 
 
-class Payload(_OnBody, EditingFault):
+class Payload(BodyFault, EditingFault):
     """A mass of so many ``kilograms`` on a ``body`` that the controller does not know of."""
 
     body: str = HAND
     kilograms: float = within(1.0, above=0, high=1e3)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        return [(model_of(env).body_mass, [body_id(env, self.body)], lambda i, mass: mass + i * self.kilograms)]
+        return [(env.simulation.model.body_mass, [body_id(env, self.body)], lambda mass: mass + self.kilograms)]
 
 
 Force = Callable[[Floats, Floats], Floats]
 """(3,) force on a body [N] from its position (3,) [m] and velocity (3,) [m/s]."""
 
 
-class _ForceField(_OnBody):
+class ForceField(BodyFault):
     """A force that follows the body's position and velocity, brought up to date in every physics substep."""
 
     @abstractmethod
     def force(self, env: RobosuiteEnv, position: Floats, velocity: Floats) -> Force:
-        """Return the force at full intensity, from where the body is at the onset."""
+        """Return the force, from where the body is at the onset."""
 
     @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        model, data, body = model_of(env), data_of(env), body_id(env, self.body)
+    def applied(self, env: RobosuiteEnv, clock: Clock) -> Iterator[None]:
+        model, data, body = env.simulation.model, env.simulation.data, body_id(env, self.body)
         velocity = np.zeros(6)
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
         force = self.force(env, data.xipos[body].copy(), velocity[3:].copy())
-        share = 0.0 if self.graded else 1.0
         with env.edits.edit(data.xfrc_applied, (body, slice(0, 3))) as change:
 
-            def update(_: int = 0) -> None:
+            def update(substep: int) -> None:
                 mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
-                now = share * force(data.xipos[body], velocity[3:])
+                now = force(data.xipos[body], velocity[3:])
                 change(lambda others: others + now)
 
-            def apply(intensity: float) -> None:
-                nonlocal share
-                share = intensity
-
-            update()
-            with listed(env.substep_hooks, update):
-                yield apply
+            env.substep_hooks.append(update)
+            try:
+                yield
+            finally:
+                env.substep_hooks.remove(update)
 
 
-class Collision(_ForceField):
+class Collision(ForceField):
     """An obstacle that appears in the way: a stiff wall, across the direction in which the body moves at the onset.
 
     A penalty contact on the body itself, F = k·depth - d·v while the body is inside: what a collision does to the arm,
@@ -133,8 +110,6 @@ class Collision(_ForceField):
         damping: d, on the way in [N s/m].
         newtons: the most it pushes back with [N].
     """
-
-    graded = False
 
     body: str = HAND
     gap: float = within(0.005, low=0, high=10)
@@ -155,7 +130,7 @@ class Collision(_ForceField):
         return push
 
 
-class CablePull(_ForceField):
+class CablePull(ForceField):
     """A cable that has caught: elastic, and taut from the onset on.
 
     Args:
@@ -180,7 +155,7 @@ class CablePull(_ForceField):
         return pull
 
 
-class HeldByPerson(_ForceField):
+class HeldByPerson(ForceField):
     """A person holds the arm: a spring and damper to a hand that sways.
 
     Args:
@@ -196,7 +171,7 @@ class HeldByPerson(_ForceField):
     sway: float = within(0.02, low=0, high=10)
 
     def force(self, env: RobosuiteEnv, position: Floats, velocity: Floats) -> Force:
-        data = data_of(env)
+        data = env.simulation.data
         start = float(data.time)
         direction = self.rng().standard_normal(3)
         direction /= np.linalg.norm(direction)
@@ -212,4 +187,4 @@ class HeldByPerson(_ForceField):
 
 def touches_body(fault: Fault) -> bool:
     """Whether a fault acts on the robot's body from outside."""
-    return isinstance(fault, _OnBody)
+    return isinstance(fault, BodyFault)

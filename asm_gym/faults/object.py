@@ -9,20 +9,7 @@ import mujoco
 import numpy as np
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import (
-    Apply,
-    Edit,
-    EditingFault,
-    Fault,
-    Floats,
-    Vector3,
-    along,
-    data_of,
-    group_labels,
-    model_of,
-    within,
-)
-from asm_gym.validation import check_numbers
+from asm_gym.faults.base import Clock, Edit, EditingFault, Fault, Floats, Vector3, along, within
 
 _AWAY = np.array([8.0, 8.0, 0.5])
 """Where a missing object lies [m]."""
@@ -30,13 +17,15 @@ _AWAY = np.array([8.0, 8.0, 0.5])
 
 def movable(env: RobosuiteEnv) -> dict[str, int]:
     """Return the joints of the objects that can be moved about, by name: each body with a free joint."""
-    model = model_of(env)
+    model = env.simulation.model
     free = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
     return {model.body(int(model.jnt_bodyid[j])).name.removesuffix("_main"): j for j in free}
 
 
 class ObjectFault(Fault):
     """One that acts on an ``object``, such as ``cube``; on the first of the task where empty."""
+
+    groups = ("gripper", "wrench", "torque", "object")
 
     object: str = ""
 
@@ -58,14 +47,11 @@ class ObjectFault(Fault):
 
     def body_of(self, env: RobosuiteEnv) -> int:
         """Return the object's body."""
-        return int(model_of(env).jnt_bodyid[self.joint_of(env)])
-
-    def labels(self, env: RobosuiteEnv) -> frozenset[str]:
-        return group_labels(env, "gripper", "wrench", "torque", "object")
+        return int(env.simulation.model.jnt_bodyid[self.joint_of(env)])
 
     def friction_of(self, env: RobosuiteEnv) -> list[tuple[int, slice]]:
         """Return the indices in ``geom_friction`` of the shapes that the object touches others with."""
-        model = model_of(env)
+        model = env.simulation.model
         own = model.body_rootid[model.geom_bodyid] == model.body_rootid[self.body_of(env)]
         touching = (model.geom_contype | model.geom_conaffinity) != 0
         return [(int(g), slice(0, 1)) for g in np.flatnonzero(own & touching)]
@@ -74,16 +60,16 @@ class ObjectFault(Fault):
         """Put the object elsewhere, at rest."""
         joint = self.joint_of(env)
         _position(env, joint)[:] = position
-        start = model_of(env).jnt_dofadr[joint]
-        data_of(env).qvel[start : start + 6] = 0.0
+        start = env.simulation.model.jnt_dofadr[joint]
+        env.simulation.data.qvel[start : start + 6] = 0.0
         # Contacts and the solver's first guess belong to the place where it was.
-        mujoco.mj_forward(model_of(env), data_of(env))
+        mujoco.mj_forward(env.simulation.model, env.simulation.data)
 
 
 def _position(env: RobosuiteEnv, joint: int) -> Floats:
     """Return a view of the position (3,) of a free joint [m]."""
-    start = model_of(env).jnt_qposadr[joint]
-    position: Floats = data_of(env).qpos[start : start + 3]
+    start = env.simulation.model.jnt_qposadr[joint]
+    position: Floats = env.simulation.data.qpos[start : start + 3]
     return position
 
 
@@ -93,11 +79,11 @@ class Slip(ObjectFault, EditingFault):
     friction: float = within(0.05, above=0, high=10)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        model, entries = model_of(env), self.friction_of(env)
+        model, entries = env.simulation.model, self.friction_of(env)
         return [
-            (model.geom_friction, list(entries), lambda i, mu: mu * (self.friction / mu) ** i),
+            (model.geom_friction, list(entries), lambda mu: mu * (self.friction / mu)),
             # Between two surfaces the higher friction counts, unless one has priority.
-            (model.geom_priority, [geom for geom, _ in entries], lambda _, priority: priority + 1),
+            (model.geom_priority, [geom for geom, _ in entries], lambda priority: priority + 1),
         ]
 
 
@@ -116,38 +102,27 @@ class Snatch(ObjectFault, EditingFault):
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
         force = self.newtons * along(self.direction)
         where = (self.body_of(env), slice(0, 3))
-        return [(data_of(env).xfrc_applied, [where], lambda i, others: others + i * force)]
+        return [(env.simulation.data.xfrc_applied, [where], lambda others: others + force)]
 
 
 class Teleport(ObjectFault):
     """The ``object`` is suddenly elsewhere by ``offset`` [m], at rest; a reset puts it back."""
 
-    graded = False
-
-    offset: Vector3 = (0.05, 0.05, 0.0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_numbers("offset", self.offset, 3, low=-10, high=10)
+    offset: Vector3 = within((0.05, 0.05, 0.0), low=-10, high=10)
 
     @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+    def applied(self, env: RobosuiteEnv, clock: Clock) -> Iterator[None]:
         self.move(env, _position(env, self.joint_of(env)) + np.asarray(self.offset))
-        yield lambda _: None
+        yield
 
 
 class Missing(ObjectFault):
     """The ``object`` is gone; a reset brings it back."""
 
-    graded = False
-
-    def holds(self, env: RobosuiteEnv) -> frozenset[str]:
-        return frozenset({f"object {model_of(env).body(self.body_of(env)).name}"})
-
     @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
+    def applied(self, env: RobosuiteEnv, clock: Clock) -> Iterator[None]:
         self.move(env, _AWAY)
-        yield lambda _: None
+        yield
 
 
 class Heavy(ObjectFault, EditingFault):
@@ -156,7 +131,7 @@ class Heavy(ObjectFault, EditingFault):
     kilograms: float = within(0.5, above=0, high=1e3)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        return [(model_of(env).body_mass, [self.body_of(env)], lambda i, mass: mass + i * self.kilograms)]
+        return [(env.simulation.model.body_mass, [self.body_of(env)], lambda mass: mass + self.kilograms)]
 
 
 class ObjectMass(ObjectFault, EditingFault):
@@ -167,8 +142,7 @@ class ObjectMass(ObjectFault, EditingFault):
     factor: float = within(1.1, above=0, high=100)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        scale = self.factor - 1.0
-        return [(model_of(env).body_mass, [self.body_of(env)], lambda i, mass: mass * (1.0 + i * scale))]
+        return [(env.simulation.model.body_mass, [self.body_of(env)], lambda mass: mass * self.factor)]
 
 
 class ObjectFriction(ObjectFault, EditingFault):
@@ -179,5 +153,4 @@ class ObjectFriction(ObjectFault, EditingFault):
     factor: float = within(0.9, low=0, high=100)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        scale = self.factor - 1.0
-        return [(model_of(env).geom_friction, [*self.friction_of(env)], lambda i, mu: mu * (1.0 + i * scale))]
+        return [(env.simulation.model.geom_friction, [*self.friction_of(env)], lambda mu: mu * self.factor)]

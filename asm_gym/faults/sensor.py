@@ -6,29 +6,17 @@ The arm's own controller is closer to the motors than the sensors' bus and is no
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import (
-    LONGEST,
-    Apply,
-    Fault,
-    Floats,
-    Interface,
-    check_joint,
-    joint_labels,
-    listed,
-    within,
-)
+from asm_gym.faults.base import LONGEST, Clock, Fault, Floats, HookedFault, Interface, JointFault, within
 
 
-class SensorFault(Fault):
+class SensorFault(HookedFault):
     """One that acts on numbers of one channel.
 
     Args:
@@ -38,6 +26,7 @@ class SensorFault(Fault):
     """
 
     anywhere = True
+    hooks = "corruptions"
 
     channel: str = "joint_position"
     element: int | None = 3
@@ -60,28 +49,22 @@ class SensorFault(Fault):
     def labels(self, env: Interface) -> frozenset[str]:
         return frozenset(env.measured_spec.labels[i] for i in self.where(env))
 
-    def begin(self, last: Floats) -> Any:
-        """Return the fault's memory for one injection, from the readings (n,) before the onset."""
-        return last
-
     @abstractmethod
-    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Any:
-        """Return what is read instead of the ``true`` readings (n,), at the k-th control step since the onset."""
+    def read(self, true: Floats, k: int, memory: list[Floats]) -> Any:
+        """Return what is read instead of the ``true`` readings (n,), at the k-th control step since the onset.
 
-    @contextmanager
-    def applied(self, env: Interface) -> Iterator[Apply]:
-        where, intensity, k = self.where(env), 0.0, -1
-        memory = self.begin(env.measured[where])
+        Args:
+            memory: holds the readings before the onset at first, and is the fault's own.
+        """
+
+    def hook(self, env: Interface, clock: Clock) -> Callable[[Floats], None]:
+        where = self.where(env)
+        memory = [env.measured[where]]
 
         def edit(row: Floats) -> None:
-            row[where] = self.read(row[where], intensity, k, memory)
+            row[where] = self.read(row[where], clock.k, memory)
 
-        def apply(share: float) -> None:
-            nonlocal intensity, k
-            intensity, k = share, k + 1
-
-        with listed(env.corruptions, edit):
-            yield apply
+        return edit
 
 
 class Bias(SensorFault):
@@ -89,8 +72,8 @@ class Bias(SensorFault):
 
     amount: float = within(0.05, low=-1e6, high=1e6)
 
-    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Floats:
-        return true + intensity * self.amount
+    def read(self, true: Floats, k: int, memory: list[Floats]) -> Floats:
+        return true + self.amount
 
 
 class Drift(SensorFault):
@@ -98,8 +81,8 @@ class Drift(SensorFault):
 
     rate: float = within(0.002, low=-1e6, high=1e6)
 
-    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Floats:
-        return true + intensity * self.rate * (k + 1)
+    def read(self, true: Floats, k: int, memory: list[Floats]) -> Floats:
+        return true + self.rate * (k + 1)
 
 
 class Scale(SensorFault):
@@ -107,8 +90,8 @@ class Scale(SensorFault):
 
     factor: float = within(1.2, low=0, high=1e3)
 
-    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Floats:
-        return true * (1.0 + intensity * (self.factor - 1.0))
+    def read(self, true: Floats, k: int, memory: list[Floats]) -> Floats:
+        return true * self.factor
 
 
 class Noise(SensorFault):
@@ -116,8 +99,8 @@ class Noise(SensorFault):
 
     std: float = within(0.02, low=0, high=1e6)
 
-    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Floats:
-        return true + intensity * self.std * self.rng(2 + k).standard_normal(len(true))
+    def read(self, true: Floats, k: int, memory: list[Floats]) -> Floats:
+        return true + self.std * self.rng(2 + k).standard_normal(len(true))
 
 
 class Spikes(SensorFault):
@@ -126,116 +109,73 @@ class Spikes(SensorFault):
     amount: float = within(0.5, low=-1e6, high=1e6)
     probability: float = within(0.2, low=0, high=1)
 
-    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Floats:
+    def read(self, true: Floats, k: int, memory: list[Floats]) -> Floats:
         rng = self.rng(2 + k)
         hit = rng.random(len(true)) < self.probability
-        off: Floats = intensity * self.amount * hit * rng.choice([-1.0, 1.0], len(true))
+        off: Floats = self.amount * hit * rng.choice([-1.0, 1.0], len(true))
         return true + off
 
 
 class Dropout(SensorFault):
     """Lose readings, each with ``probability``: they read 0."""
 
-    graded = False
-
     probability: float = within(0.3, low=0, high=1)
 
-    def read(self, true: Floats, intensity: float, k: int, memory: Any) -> Any:
+    def read(self, true: Floats, k: int, memory: list[Floats]) -> Any:
         return 0.0 if self.rng(2 + k).random() < self.probability else true
 
 
 class Freeze(SensorFault):
     """Keep the last reading, to the last digit."""
 
-    graded = False
-
-    def holds(self, env: Interface) -> frozenset[str]:
-        return self.labels(env)
-
-    def read(self, true: Floats, intensity: float, k: int, memory: Floats) -> Floats:
-        return memory
+    def read(self, true: Floats, k: int, memory: list[Floats]) -> Floats:
+        return memory[0]
 
 
 class Delay(SensorFault):
     """Deliver readings ``steps`` control steps late."""
 
-    graded = False
-
     steps: int = within(3, low=1, high=LONGEST)
 
-    def begin(self, last: Floats) -> deque[Floats]:
-        # What was sensed before the onset is on its way already, and arrives first.
-        return deque([last] * self.steps)
-
-    def read(self, true: Floats, intensity: float, k: int, memory: deque[Floats]) -> Floats:
+    def read(self, true: Floats, k: int, memory: list[Floats]) -> Floats:
         memory.append(true)
-        return memory.popleft()
+        return memory.pop(0) if len(memory) > self.steps else memory[0]
 
 
-class FrozenEncoder(Fault):
+class FrozenEncoder(JointFault, HookedFault):
     """Keep a joint's position at its last reading, to the last digit, and its velocity at 0.
 
     Args:
         joint: counted from the base, 0 first; a second arm's go on after the first one's.
     """
 
-    graded = False
+    hooks = "corruptions"
 
-    joint: int = 3
-
-    def check(self, env: RobosuiteEnv) -> None:
-        check_joint(env, self.joint)
-
-    @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        labels = list(env.measured_spec.labels)
-        position, velocity = (
-            labels.index(next(iter(joint_labels(env, self.joint, name))))
-            for name in ("joint_position", "joint_velocity")
-        )
+    def hook(self, env: RobosuiteEnv, clock: Clock) -> Callable[[Floats], None]:
+        position, velocity = (self.element(env, name) for name in self.channels)
         stuck_at = env.measured[position]
 
         def freeze(row: Floats) -> None:
             row[position], row[velocity] = stuck_at, 0.0
 
-        with listed(env.corruptions, freeze):
-            yield lambda _: None
-
-    def labels(self, env: RobosuiteEnv) -> frozenset[str]:
-        return joint_labels(env, self.joint, "joint_position", "joint_velocity")
-
-    def holds(self, env: RobosuiteEnv) -> frozenset[str]:
-        return self.labels(env)
+        return freeze
 
 
-class NoisySensors(Fault):
+class NoisySensors(HookedFault):
     """Multiply the standard deviation of every sensor's noise by ``factor``."""
 
     harmless = True
+    hooks = "corruptions"
 
     factor: float = within(2.0, low=1, high=1e3)
 
-    def check(self, env: RobosuiteEnv) -> None:
-        """Every environment has sensors."""
-
-    def labels(self, env: RobosuiteEnv) -> frozenset[str]:
-        return frozenset()
-
-    @contextmanager
-    def applied(self, env: RobosuiteEnv) -> Iterator[Apply]:
-        share, k = 0.0, -1
-        usual = env.measured_spec.noise * env.sensor_noise
+    def hook(self, env: RobosuiteEnv, clock: Clock) -> Callable[[Floats], None]:
+        extra = np.sqrt(self.factor**2 - 1.0) * (env.measured_spec.noise * env.sensor_noise)
 
         def add(row: Floats) -> None:
-            extra = np.sqrt((1.0 + share * (self.factor - 1.0)) ** 2 - 1.0)
-            row += extra * usual * self.rng(2 + k).standard_normal(len(row))
+            row += extra * self.rng(2 + clock.k).standard_normal(len(row))
 
-        def apply(intensity: float) -> None:
-            nonlocal share, k
-            share, k = intensity, k + 1
-
-        with listed(env.corruptions, add):
-            yield apply
+        return add
 
 
 def corrupts_senses(fault: Fault) -> bool:
