@@ -1,4 +1,4 @@
-"""One memory of a body, for any policy: records motor babbling, learns from it, and examines the memory.
+"""Learn one memory of a body, for any policy: record motor babbling, learn from it, and examine the memory.
 
 The memory alarms at what no body does, whatever the policy. It is examined on policies and on tasks that babbling never
 showed. A run lives in one folder and can be killed at any time: what was recorded is not recorded again.
@@ -25,7 +25,6 @@ from asm_gym.evaluation.tables import ConsoleTable, markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.shipped import USUAL
-from asm_gym.policies import make_policy
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
 from asm_gym.rollouts.collect import record_missing
 from asm_gym.rollouts.parallel import ParallelConfig
@@ -38,7 +37,7 @@ from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.staging import environment
 from asm_gym.rollouts.trial import RolloutConfig, nominal_trials
 from asm_gym.scripts.command import run
-from asm_gym.scripts.options import check_options, option
+from asm_gym.scripts.options import Options, option
 from asm_gym.tasks import ROBOTS, TASKS
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_choice
@@ -54,13 +53,11 @@ _GRIPPED = tuple(name for name, task in TASKS.items() if task.arms == 1 and name
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Options):
     """A memory of a body, from motor babbling."""
 
     robot: str = option("Panda", known=ROBOTS)
     """The arm."""
-    guides: tuple[str, ...] = option((), metavar="AGENT")
-    """Agents that lead in turn with the experts, by name or the files of asm-gym train; none by default."""
     episodes: int = option(60, quick=18, least=1)
     """Lessons in each task; a second call with more of them continues."""
     reaching: bool = False
@@ -75,33 +72,21 @@ class Args:
     """Healthy episodes of each examination; 0 examines nothing."""
     workers: str = option("2", check=ParallelConfig.named, metavar="N")
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
-    seed: int = option(0, least=0)
-    """Seed of all that is drawn: the same seed gives the same result."""
     out: Path = option(Path("runs/babble"), metavar="FOLDER")
     """Folder of the run."""
-    quick: bool = False
-    """To see that everything runs, not to judge the figures."""
     tasks: tuple[str, ...] | None = option(None)
     """Tasks to babble in; by default seven with the Panda, and those of them that other arms' experts do."""
     false_alarms_per_hour: float = option(5.0, quick=120.0, check=check_per_hour)
     """False alarms per hour of healthy episodes."""
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         for name in self.shown:
             check_choice("task of one arm with a gripper", name, _GRIPPED)
-        for name in self.guides:
-            if not name.endswith(".npz"):  # a file is checked later
-                check_choice("agent", name, agents())
         if not self.shown:
             raise ValueError("there must be at least one task to babble in")
         each = sum(map(held_out, range(self.episodes))) + self.healthy_episodes
         check_hours(self.false_alarms_per_hour, each * sum(task_spec(t).horizon for t in self.shown) / USUAL / 3600)
-
-    @property
-    def parallel(self) -> ParallelConfig:
-        """Who does the work."""
-        return ParallelConfig.named(self.workers)
 
     @property
     def shown(self) -> tuple[str, ...]:
@@ -128,34 +113,18 @@ class Args:
         return [
             *(Exam(t, "scripted", known=True) for t in self.shown),
             *(Exam(t, "scripted", known=False) for t in self._able(LEFT_OUT) if t not in self.shown),
-            *(Exam(t, p, known=p in self.guides) for p, t in homes.items()),
+            *(Exam(t, p, known=False) for p, t in homes.items()),
         ]
-
-
-def check_guides(args: Args) -> None:
-    """Refuse agents that cannot lead, before the folder is claimed.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is damaged, of another arm, or of a task in which nothing babbles.
-    """
-    there = {task_spec(name).id for name in args.shown}
-    for guide in args.guides:
-        home = trained_in(guide)
-        if home not in there:
-            raise ValueError(
-                f"{guide} was trained in {home or 'an environment without a name'} and can lead only there; "
-                f"tasks to babble in: {', '.join(args.shown)}"
-            )
-        make_policy(guide, environment(home, args.config.settings))
 
 
 def record_lessons(args: Args, console: Console) -> Lessons:
     """Record the lessons that are missing, and select what is healthy."""
-    wanted = curriculum(args.shown, args.episodes, args.seed, args.guides, args.reaching)
+    wanted = curriculum(args.shown, args.episodes, args.seed, reaching=args.reaching)
     with stage("babbling", console, {}) as progress:
         make = partial(record_lesson, config=args.config, folder=args.out.resolve())
-        files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, args.parallel, progress)
+        files = make_missing(
+            make, wanted, lambda lesson: args.out / lesson.path, ParallelConfig.named(args.workers), progress
+        )
     return healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
 
 
@@ -164,7 +133,7 @@ def record_hours(args: Args, console: Console) -> list[Episode]:
     seeds = {task: role_seeds(HOURS_SEED, task, "hours", args.healthy_episodes) for task in args.shown}
     trials = [trial for task, own in seeds.items() for trial in nominal_trials(task_spec(task).id, "nominal", own)]
     with stage("healthy hours", console, {}) as progress:
-        found = record_missing(trials, args.config, args.out / "hours", args.parallel, progress)
+        found = record_missing(trials, args.config, args.out / "hours", ParallelConfig.named(args.workers), progress)
     if args.corpus is not None:
         found += Corpus.open(args.corpus).episodes(*NOMINAL_ROLES, policies=("scripted",), tasks=args.shown)
     return [episode for episode in found if episode.success]
@@ -181,7 +150,6 @@ def learn(args: Args, console: Console) -> NeuralASM:
         "name": args.name,
         "controller": inner.controller,
         "tasks": list(args.shown),
-        "guides": list(args.guides),
         **{n: getattr(args, n) for n in ("reaching", "episodes", "seed", "false_alarms_per_hour")},
         "lessons": len(lessons.fit),
         "rows": sum(map(len, lessons.fit)),
@@ -198,12 +166,12 @@ def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
     usual: dict[str, float] = {}  # of each task, by its expert, who comes first
     for exam in args.exams:
         config = replace(args.config, policy=exam.policy)
-        folder = args.out / "exams" / exam.policy.removesuffix(".npz").replace("/", "-")
+        folder = args.out / "exams" / exam.policy
         inner: Any = environment(task_spec(exam.task).id, config.settings).unwrapped
         kinds = [] if exam.known else [k for k in kinds_of((TEST,)) if possible(k, inner)]
         trials = exam.trials(args.exam_episodes, kinds, args.seed, 0 if exam.known else 3)
         with stage(exam.name, console, {}) as progress:
-            recordings = record_missing(trials, config, folder, args.parallel, progress)
+            recordings = record_missing(trials, config, folder, ParallelConfig.named(args.workers), progress)
             expected = usual.setdefault(exam.task, usual_force(recordings))
             marks.append(examine(memory, exam.name, recordings, WINDOW_S, expected))
     return marks
@@ -211,8 +179,7 @@ def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
 
 def babble(args: Args, console: Console) -> None:
     """Record, learn, examine, and print the results."""
-    check_guides(args)
-    claim = {n: getattr(args, n) for n in ("robot", "guides", "stream_freq", "seed", "reaching")}
+    claim = {n: getattr(args, n) for n in ("robot", "stream_freq", "seed", "reaching")}
     with claimed(args.out, "babble.json", claim):
         memory = learn(args, console)
         marks = examined(args, memory, console) if args.exam_episodes else []
@@ -224,9 +191,7 @@ def babble(args: Args, console: Console) -> None:
     console.print(f"Wrote {args.out / args.name}.asm: NeuralASMSafety(env, NeuralASM.load(...)) watches with it")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Babble, and return the exit code."""
-    return run("babble", Args, babble, argv)
+main = partial(run, "babble", Args, babble)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import ConsoleTable, Table, markdown
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.scripts.command import run
-from asm_gym.scripts.options import check_options, option
+from asm_gym.scripts.options import Options, option
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.stream_source import StreamSource
 from asm_gym.tasks import env_id
@@ -45,7 +45,7 @@ Rivals = dict[str, Callable[[], Any]]
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Options):
     """Speeds as ratios against rivals."""
 
     what: tuple[str, ...] = option(("monitor", "safety", "env"), least=1, known=lambda: BENCHMARKS, positional=True)
@@ -56,15 +56,8 @@ class Args:
     """Control steps of each rival; five times as many calls of observe()."""
     members: int = option(4, least=1)
     """Environments under one vector wrapper."""
-    seed: int = option(0, least=0)
-    """Seed of actions, streams and the order of calls."""
     out: Path = option(Path("runs/benchmark"), metavar="FOLDER")
     """Folder of benchmark.md."""
-    quick: bool = False
-    """Few calls: to see that everything runs, not to judge the figures."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 def take_turns(rivals: Rivals, turns: int, seed: int, console: Console) -> dict[str, NDArray[np.float64]]:
@@ -214,9 +207,7 @@ def measure(args: Args, console: Console) -> None:
     console.print(f"Wrote {file}")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run benchmarks and return the exit code."""
-    return run("benchmark", Args, measure, argv)
+main = partial(run, "benchmark", Args, measure)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Records a policy's episodes, in worker processes, into a Minari dataset.
+"""Record a policy's episodes, in worker processes, into a Minari dataset.
 
 Every episode is written to a file as soon as it has ended: a run that is killed loses those that were running, and the
 same command continues with the rest.
@@ -7,7 +7,9 @@ same command continues with the rest.
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -22,12 +24,12 @@ from asm_gym.rollouts.run_folder import claimed, versions
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import run
-from asm_gym.scripts.options import check_options, option
+from asm_gym.scripts.options import Options, option
 from asm_gym.tasks import ROBOTS, TASKS, env_id
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Options):
     """Episodes of a policy, as a Minari dataset."""
 
     task: str = option("Lift", positional=True, check=env_id, known=TASKS, metavar="TASK")
@@ -42,62 +44,40 @@ class Args:
     """Leave failed episodes out of the dataset."""
     workers: str = option("2", check=ParallelConfig.named, metavar="N")
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
-    seed: int = option(0, least=0)
-    """Seed of all that is drawn: the same seed gives the same episodes."""
     out: Path = option(Path("runs/collect"), metavar="FOLDER")
     """Folder of the episodes and of the dataset."""
-    quick: bool = False
-    """To see that everything runs."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
-
-    @property
-    def config(self) -> RolloutConfig:
-        """How the episodes are made."""
-        return RolloutConfig(self.policy, self.robot)
-
-    @property
-    def dataset_id(self) -> str:
-        """Minari's name of the dataset."""
-        name = env_id(self.task).rsplit(":", 1)[-1].rsplit("/", 1)[-1].rsplit("-v", 1)[0].lower()
-        return f"asm_gym/{name}-{Path(self.policy).stem}-v0"
 
 
-def write(args: Args, files: list[Path], console: Console) -> None:
-    """Write the dataset of recorded episodes, and print where it is."""
-    episodes = [load_episode(file) for file in files]
-    kept = [e for e in episodes if e.success or not args.only_successful]
-    if not kept:
-        raise ValueError(f"none of {len(episodes)} episodes succeeded, so none is left for the dataset")
-    settings = dict(args.config.settings)
-    details = {"algorithm_name": args.policy, "versions": versions(), "settings": settings}
-    env = gym.make(env_id(args.task), **settings)
-    try:
-        folder = write_dataset(args.out, args.dataset_id, kept, env, details)
-    finally:
-        env.close()
-    steps, solved = sum(map(len, kept)), sum(e.success for e in kept)
-    console.print(f"{len(kept)} episodes, {steps} steps, {solved} successful: {folder}")
-    console.print(f"MINARI_DATASETS_PATH={args.out} lets minari.load_dataset({args.dataset_id!r}) find it")
+def dataset_id(task: str, policy: str) -> str:
+    """Return Minari's name of a dataset."""
+    name = env_id(task).rsplit(":", 1)[-1].rsplit("/", 1)[-1].rsplit("-v", 1)[0].lower()
+    return f"asm_gym/{name}-{Path(policy).stem}-v0"
 
 
 def collect(args: Args, console: Console) -> None:
     """Record the episodes that are missing, and write the dataset of all."""
     require_minari()
-    task, settings = env_id(args.task), dict(args.config.settings)
-    check(task, args.config)
+    task, config = env_id(args.task), RolloutConfig(args.policy, args.robot)
+    settings, name = dict(config.settings), dataset_id(args.task, args.policy)
+    check(task, config)
     claim = {"env_id": task, "policy": args.policy, "settings": settings, "seed": args.seed}
     with claimed(args.out, "collect.json", claim):
         with stage("recording", console, {}) as progress:
             seeds, workers = episode_seeds(args.seed, args.episodes), ParallelConfig.named(args.workers)
-            files = collect_to(args.out / "episodes", task, args.config, seeds, workers, progress)
-        write(args, files, console)
+            files = collect_to(args.out / "episodes", task, config, seeds, workers, progress)
+        episodes = [load_episode(file) for file in files]
+        kept = [e for e in episodes if e.success or not args.only_successful]
+        if not kept:
+            raise ValueError(f"none of {len(episodes)} episodes succeeded, so none is left for the dataset")
+        details = {"algorithm_name": args.policy, "versions": versions(), "settings": settings}
+        with closing(gym.make(task, **settings)) as env:
+            folder = write_dataset(args.out, name, kept, env, details)
+    steps, solved = sum(map(len, kept)), sum(e.success for e in kept)
+    console.print(f"{len(kept)} episodes, {steps} steps, {solved} successful: {folder}")
+    console.print(f"MINARI_DATASETS_PATH={args.out} lets minari.load_dataset({name!r}) find it")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Record, and return the exit code."""
-    return run("collect", Args, collect, argv)
+main = partial(run, "collect", Args, collect)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Records the corpus that every table of detection is judged on: healthy motion, and faults with their healthy twins.
+"""Record the corpus that every table of detection is judged on: healthy motion, and faults with their healthy twins.
 
 It can be killed at any time: what was recorded is not recorded again. A corpus of which some rounds are missing can be
 used already.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -67,9 +68,7 @@ def make(args: Args, console: Console) -> None:
     console.print(ConsoleTable(contents(Corpus.open(args.out))))
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Record, and return the exit code."""
-    return run("corpus", Args, make, argv)
+main = partial(run, "corpus", Args, make)
 
 
 if __name__ == "__main__":

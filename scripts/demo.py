@@ -10,14 +10,12 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from matplotlib.figure import Figure
 from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
@@ -40,7 +38,7 @@ from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.staging import play, staged
 from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.scripts.command import run
-from asm_gym.scripts.options import check_options, option
+from asm_gym.scripts.options import Options, option
 from asm_gym.tasks import TASKS, env_id
 from asm_gym.wrappers import NeuralASMSafety
 
@@ -49,7 +47,7 @@ PUSHED_AT = 40
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Options):
     """Collect, fit, calibrate, break things, and see who notices."""
 
     task: str = option("Lift", positional=True, check=env_id, known=TASKS, metavar="TASK")
@@ -60,12 +58,8 @@ class Args:
     """Make no video; there is none where this machine cannot render."""
     workers: int = option(os.cpu_count() or 1, least=1)
     """Processes."""
-    seed: int = option(0, least=0)
-    """Seed: the same seed gives the same table."""
     out: Path = option(Path("runs/demo"), metavar="FOLDER")
     """Folder to write to."""
-    quick: bool = False
-    """A third of the episodes: to see that everything runs, not to judge the figures."""
     fit_episodes: int = option(60, quick=20, least=1)
     """Nominal episodes to learn from."""
     calibration_episodes: int = option(60, quick=20, least=conformal_episodes(FALSE_ALARM_RATE))
@@ -76,14 +70,6 @@ class Args:
     """Episodes to test on for each fault."""
     epochs: int = option(40, quick=13, least=1)
     """Passes over the episodes in learning."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
-
-    @property
-    def name(self) -> str:
-        """Name of the task in file names."""
-        return env_id(self.task).rsplit("/", 1)[-1].rsplit("-v", 1)[0].lower()
 
 
 def faults(seed: int, episodes: int) -> list[tuple[str, Fault]]:
@@ -116,26 +102,28 @@ def trials(args: Args) -> list[Trial]:
     ]
 
 
-def without_fitting(args: Args) -> str:
+def shipped_memory(args: Args) -> str:
     """Return what the shipped memory notices of a healthy episode and of a push; where none fits, say so."""
     seed = episode_seeds(args.seed, 1, stage=3)[0]
     push = Push(body="robot0_link5", newtons=20.0, direction=(0.0, 1.0, 0.0), onset=PUSHED_AT, duration=10)
     surprises = []
-    for wrong in ((), (push,)):
+    for faults in ((), (push,)):
         infos: list[dict[str, Any]] = []
-        with staged(Trial(env_id(args.task), seed, faults=wrong), RolloutConfig()) as env:
+        trial = Trial(env_id(args.task), seed, faults=faults)
+        with staged(trial, RolloutConfig()) as env:
             try:
-                watched = NeuralASMSafety(env, on_alarm="monitor", on_overrun="ignore")
+                guarded = NeuralASMSafety(env, on_alarm="monitor", on_overrun="ignore")
             except ValueError:
                 return f"No shipped memory fits {args.task}."
-            play(Trial(env_id(args.task), seed), RolloutConfig(), watched, infos.append)
-        surprises.append(np.array([info["asm"]["surprise"] for info in infos]) / watched.threshold)
-    healthy, pushed = surprises
-    noticed = np.flatnonzero(pushed[PUSHED_AT:] > 1.0)
-    when = f"noticed after {1e3 * (noticed[0] + 1) * watched.monitor.spec.dt:.0f} ms" if len(noticed) else "not noticed"
+            play(trial, RolloutConfig(), guarded, infos.append)
+        surprises.append(np.array([info["asm"]["surprise"] for info in infos]) / guarded.threshold)
+    noticed = np.flatnonzero(surprises[1][PUSHED_AT:] > 1.0)
+    after = (
+        f"noticed after {1e3 * (noticed[0] + 1) * guarded.monitor.spec.dt:.0f} ms" if len(noticed) else "not noticed"
+    )
     return (
-        f"{watched.monitor!r} ships with the package. In a healthy episode surprise reaches {healthy.max():.0%} of its "
-        f"threshold; a push of 20 N is {when}."
+        f"{guarded.monitor!r} ships with the package. Healthy, surprise reaches {surprises[0].max():.0%} of its "
+        f"threshold; a push of 20 N is {after}."
     )
 
 
@@ -148,21 +136,10 @@ def fit(args: Args, console: Console) -> tuple[Path, Share]:
     with stage("learning", console, {}) as progress:
         memory.fit(episodes[: args.fit_episodes], progress=progress)
     memory.calibrate(episodes[args.fit_episodes :], false_alarm_rate=FALSE_ALARM_RATE)
-    file = args.out / f"{args.name}.asm"
+    name = env_id(args.task).rsplit("/", 1)[-1].rsplit("-v", 1)[0].lower()
+    file = args.out / f"{name}.asm"
     memory.save(file)
     return file, Share.of([e.success for e in episodes])
-
-
-def drawn(rows: Sequence[DetectionMetrics]) -> dict[str, Figure]:
-    """Return the figures by caption."""
-    examples = [typical(m.watched) for m in rows]
-    frozen = next(t for t in examples if t.kind == "frozen encoder")
-    return {
-        "Surprise over time in a typical episode of each condition": figures.surprise_figure(examples),
-        "Time until faults were noticed": figures.delay_figure(rows),
-        "Faults against nominal episodes at the same time": figures.roc_figure(rows),
-        "Source of the surprise when an encoder froze": figures.attribution_figure(frozen),
-    }
 
 
 def as_json(m: DetectionMetrics) -> dict[str, Any]:
@@ -183,7 +160,7 @@ def as_json(m: DetectionMetrics) -> dict[str, Any]:
 def demonstrate(args: Args, console: Console) -> None:
     """Run the demo."""
     args.out.mkdir(parents=True, exist_ok=True)
-    console.print(without_fitting(args), highlight=False)
+    console.print(shipped_memory(args), highlight=False)
     can_show = args.video and can_record_video(console)
     memory, expert = fit(args, console)
     todo = trials(args)
@@ -195,35 +172,38 @@ def demonstrate(args: Args, console: Console) -> None:
     table = tabulate(title, CONDITION_COLUMNS, rows)
     console.print("", ConsoleTable(table, plain=True), "")
     low, high = binomial_interval(args.nominal_episodes, FALSE_ALARM_RATE)
-    expected = (
-        f"At a false-alarm rate of {FALSE_ALARM_RATE:g}, {low} to {high} of {args.nominal_episodes} nominal episodes "
-        f"raise an alarm by chance (95 %). The expert succeeded in {expert.k} of {expert.n} episodes."
+    result = (
+        f"{headline(rows)} At a false-alarm rate of {FALSE_ALARM_RATE:g}, {low} to {high} of {args.nominal_episodes} "
+        f"nominal episodes raise an alarm by chance (95 %). The expert succeeded in {expert.k} of {expert.n} episodes."
     )
-    console.print(f"{headline(rows)} {expected}")
-    video = None
+    console.print(result)
+    examples, video = [typical(m.watched) for m in rows], None
     if can_show:
-        examples = {(t.kind, t.seed) for t in (typical(m.watched) for m in rows)}
-        shown = [t for t in todo if (t.kind, t.seed) in examples]
+        shown = [t for t in todo if (t.kind, t.seed) in {(e.kind, e.seed) for e in examples}]
         with stage("recording a video", console, {}) as progress:
             video = record_video(shown, RolloutConfig(), NeuralASM.load(memory), args.out / "demo.mp4", progress)
     details = {**asdict(args), "out": str(args.out)}
     numbers = {"arguments": details, "versions": versions("numba"), "window_s": WINDOW_S, "expert_success": expert}
     write_json(args.out / "demo.json", numbers | {"results": [as_json(m) for m in rows]})
+    drawn = {
+        "Surprise over time in a typical episode of each condition": figures.surprise_figure(examples),
+        "Time until faults were noticed": figures.delay_figure(rows),
+        "Faults against nominal episodes at the same time": figures.roc_figure(rows),
+        "Source of the surprise when an encoder froze": figures.attribution_figure(
+            next(e for e in examples if e.kind == "frozen encoder")
+        ),
+    }
     intro = (
         f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "
-        f"watched others, some of them faulty. {headline(rows)} {expected}"
+        f"watched others, some of them faulty. {result}"
     )
-    command = f"asm-gym demo {args.task} --seed {args.seed}"
+    details = {"command": f"asm-gym demo {args.task} --seed {args.seed}", **details}
     report = args.out / "report.html"
-    write_report(
-        report, f"asm-gym demo: {args.task}", intro, [table], drawn(rows), video, {"command": command, **details}
-    )
+    write_report(report, f"asm-gym demo: {args.task}", intro, [table], drawn, video, details)
     console.print(f"Wrote {report} and {memory}" + (f" and {video}" if video else ""))
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the demo and return the exit code."""
-    return run("demo", Args, demonstrate, argv)
+main = partial(run, "demo", Args, demonstrate)
 
 
 if __name__ == "__main__":

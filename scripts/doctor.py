@@ -8,6 +8,7 @@ import platform
 import subprocess
 import sys
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from typing import NamedTuple
 
@@ -125,9 +126,7 @@ def report(args: Args, console: Console) -> int:
     return DONE
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Check this machine; return 1 where asm-gym cannot run on it."""
-    return run("doctor", Args, report, argv)
+main = partial(run, "doctor", Args, report)
 
 
 if __name__ == "__main__":

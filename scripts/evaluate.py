@@ -1,4 +1,4 @@
-"""Records nominal, faulty and harmless episodes once, lets every monitor judge them, and reports who noticed what.
+"""Record nominal, faulty and harmless episodes once, let every monitor judge them, and report who noticed what.
 
 A run lives in one folder and can be killed at any time: what was recorded, and what was fitted, is not made again. The
 same arguments give the same table.
@@ -19,7 +19,6 @@ import gymnasium as gym
 from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
-from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.corpus import VERSION, skill_labels
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_S
 from asm_gym.evaluation.detection_tables import brief_monitors_table, harmless_table, kept_table, kinds_table
@@ -37,7 +36,7 @@ from asm_gym.rollouts.run_folder import claimed, make_missing
 from asm_gym.rollouts.staging import record
 from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial
 from asm_gym.scripts.command import one_line, run
-from asm_gym.scripts.options import check_options, option
+from asm_gym.scripts.options import Options, option
 from asm_gym.stream_source import StreamSource
 from asm_gym.tasks import ROBOTS, env_id, is_task
 from asm_gym.validation import check_choice, check_number
@@ -53,7 +52,7 @@ _QUICK = (
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Options):
     """Tasks × monitors × faults: who notices what, how fast, and how often for nothing."""
 
     tasks: tuple[str, ...] = option(
@@ -94,19 +93,15 @@ class Args:
     """Share of nominal episodes that may raise an alarm."""
     workers: str = option("2", check=ParallelConfig.named, metavar="N")
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
-    seed: int = option(0, least=0)
-    """Seed of all that is drawn: the same seed gives the same table."""
     out: Path = option(Path("runs/evaluate"), metavar="FOLDER")
     """Folder of the run."""
-    quick: bool = False
-    """To see that everything runs, not to judge the figures."""
     corpus: Path | None = option(None, metavar="FOLDER")
     """Judge the recordings of asm-gym corpus, all of its skills, faults and splits; nothing is recorded."""
     window: float = option(WINDOW_S, check=partial(check_number, "window", above=0))
     """A fault must be noticed this soon after its onset [s]."""
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if self.elsewhere and len(self.tasks) > 1:
             raise ValueError(f"one memory has one stream: name one environment at a time, got {', '.join(self.tasks)}")
         if self.steps is not None and not self.elsewhere:
@@ -173,8 +168,8 @@ def trials_of(args: Args, task: str) -> list[Trial]:
     return evaluation_trials(env_id(task), task, args.config, args.episodes, *what, args.seed)
 
 
-def evaluate(args: Args, console: Console) -> BenchmarkResult:
-    """Record, fit, judge and publish."""
+def evaluate(args: Args, console: Console) -> None:
+    """Record, fit, judge and publish; print the tables in brief."""
     args = without_unfit_monitors(args, console)
     workers, seconds = ParallelConfig.named(args.workers), dict[str, float]()
     timed = partial(stage, console=console, seconds=seconds)
@@ -198,12 +193,6 @@ def evaluate(args: Args, console: Console) -> BenchmarkResult:
             details = json.loads(json.dumps(asdict(args), default=str))
             details |= {"python": platform.python_version(), "machine": platform.machine(), "seconds": seconds}
             publish(args.out, result, details)
-    return result
-
-
-def evaluate_and_report(args: Args, console: Console) -> None:
-    """Evaluate, and print the tables in brief."""
-    result = evaluate(args, console)
     tables = [brief_monitors_table(result), kept_table(result)]
     if args.elsewhere:
         tables.append(kinds_table(result))
@@ -214,9 +203,7 @@ def evaluate_and_report(args: Args, console: Console) -> None:
     console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.parquet'}")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Evaluate, and return the exit code."""
-    return run("evaluate", Args, evaluate_and_report, argv)
+main = partial(run, "evaluate", Args, evaluate)
 
 
 if __name__ == "__main__":

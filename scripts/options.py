@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import MISSING, field, fields, make_dataclass
+from dataclasses import MISSING, dataclass, field, fields, make_dataclass
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 from asm_gym.validation import check_choice
@@ -37,6 +37,19 @@ def option(
     about = {"quick": quick, "least": least, "known": known, "check": check}
     made: T = field(default=default, metadata={**about, "metavar": metavar, "positional": positional})
     return made
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of every command."""
+
+    seed: int = option(0, least=0)
+    """Seed of all that is drawn: the same seed gives the same result."""
+    quick: bool = False
+    """Little of everything: to see that it runs, not to judge the figures."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
 
 def check_options(options: Any) -> None:

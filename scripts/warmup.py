@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -65,9 +66,7 @@ def warm_up(args: Args, console: Console) -> None:
     console.print(f"Compiled after {time.perf_counter() - start:.0f} s; kept in {where}", soft_wrap=True, markup=False)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Compile, and return the exit code."""
-    return run("warmup", Args, warm_up, argv)
+main = partial(run, "warmup", Args, warm_up)
 
 
 if __name__ == "__main__":

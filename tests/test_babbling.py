@@ -1,6 +1,5 @@
 """Motor babbling: its curriculum, what of it is healthy, the command, and the examination of a memory."""
 
-import re
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -39,7 +38,7 @@ from asm_gym.rollouts.pretraining.healthy import KNOWN, healthy, held_out
 from asm_gym.rollouts.pretraining.reaching import AROUND, PACE, TURNED, Reaching
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.trial import RolloutConfig
-from asm_gym.scripts.babble import Args, check_guides, main
+from asm_gym.scripts.babble import Args, main
 from asm_gym.spec import Channel, StreamSpec
 from tests.fakes import FakeEnv
 
@@ -319,7 +318,6 @@ def test_a_task_needs_a_solved_lesson_without_noise_and_something_must_be_left()
         ({"robot": "Pandas"}, "did you mean 'Panda'"),
         ({"tasks": ("Wipe",)}, "unknown task of one arm with a gripper 'Wipe'"),
         ({"tasks": ()}, "at least one task"),
-        ({"guides": ("lift",)}, "unknown agent 'lift'"),
         ({"exam_episodes": -1}, "exam_episodes must be at least 0, got -1"),
         ({"false_alarms_per_hour": 1.0, "healthy_episodes": 0, "tasks": ("Lift",)}, "1 false alarms an hour need"),
     ],
@@ -329,29 +327,9 @@ def test_the_command_refuses_what_makes_no_sense(given, why):
         Args(**given)
 
 
-@pytest.mark.parametrize(
-    ("options", "why"),
-    [
-        (["--guides", "none.npz"], "none.npz: no such file"),
-        (["--guides", "lift_sac", "--robot", "Sawyer"], "Panda"),
-        (["--guides", "damaged.npz"], "damaged.npz"),
-    ],
-)
-def test_guides_that_cannot_lead_are_refused_when_the_command_starts(options, why, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "damaged.npz").write_bytes((SHIPPED / "lift_sac.npz").read_bytes()[:1000])
-    Args(guides=("runs/of/somebody.npz",))  # a page's command is read where its files are not
-    with pytest.raises(ValueError, match=r"Lift-v0.* only there.*: Door, Stack"):
-        check_guides(Args(guides=(str(SHIPPED / "lift_sac.npz"),), tasks=("Door", "Stack"), episodes=90))
-    assert main([*options, "--episodes", "90", "--out", "run"]) == 2
-    assert re.search(why, " ".join(capsys.readouterr().err.split()))
-    assert not (tmp_path / "run").exists()
-
-
 def test_agents_are_examined_where_they_were_trained_and_nowhere_else():
-    panda = {(e.task, e.policy): e.known for e in Args(guides=("door_sac",)).exams}
+    panda = {(e.task, e.policy): e.known for e in Args().exams}
     assert panda["Lift", "lift_sac"] is False
-    assert panda["Door", "door_sac"] is True
     assert panda["PickPlaceMilk", "scripted"] is False
     assert panda["PickPlaceCan", "scripted"] is True
     assert {e.policy for e in Args(robot="Sawyer").exams} == {"scripted"}
