@@ -91,25 +91,21 @@ class Diagnostician:
         self._spec, self._diagnosis, self._table, self._asked = spec, diagnosis, table, asked
         measured = diagnosis is not None and named(spec, "external_torque").size > 0
         self._contact = ContactEstimator(robots, diagnosis.completion) if measured and diagnosis is not None else None
-        self._incidents: dict[int, _Incident] = {}
+        self.incidents: dict[int, _Incident] = {}
+        """Of the robots that have not been calm for long enough."""
 
     @property
     def rows(self) -> int:
         """How many rows it looks back."""
         return WINDOW + 1 + round(LASTING["actuator"] / self._spec.dt)
 
-    @property
-    def incidents(self) -> tuple[int, ...]:
-        """The robots that have not been calm for long enough."""
-        return tuple(self._incidents)
-
     def begin(self, robot: int) -> None:
         """A new episode of a robot."""
-        self._incidents.pop(robot, None)
+        self.incidents.pop(robot, None)
 
     def watch(self, robot: int, rows: NDArray[np.float32], policy_acts: bool) -> Response:
         """Return what is known of a robot's last row (T, D), which is no alarm."""
-        incident = self._incidents.get(robot)
+        incident = self.incidents.get(robot)
         if incident is None:
             return NO_RESPONSE
         incident.calm += 1
@@ -122,7 +118,7 @@ class Diagnostician:
 
     def respond(self, robot: int, alarm: Alarm) -> tuple[Response, NDArray[np.intp]]:
         """Return what is to be done about an alarm, and the columns to complete where it is ``"complete"``."""
-        incident = self._incidents.setdefault(robot, _Incident())
+        incident = self.incidents.setdefault(robot, _Incident())
         incident.calm, touched = 0, self._touched(robot, alarm.rows)
         incident.age()
         cause = self._cause(incident, alarm)
@@ -149,7 +145,7 @@ class Diagnostician:
 
     def knocked(self, robot: int, rows: NDArray[np.float32]) -> Response:
         """Return what is done about a knock that presses no more: the arm is braked until the contact has gone."""
-        incident = self._incidents.setdefault(robot, _Incident())
+        incident = self.incidents.setdefault(robot, _Incident())
         incident.touched, incident.calm = True, 0
         said = as_info(None) | {"family": "contact", "part": "", "probability": 1.0}
         return Response("hold" if self._asked else "", said, self._touched(robot, rows), "contact")
@@ -196,7 +192,7 @@ class Diagnostician:
 
     def _touched(self, robot: int, rows: NDArray[np.float32]) -> bool | None:
         """Return whether what touched the body still does; None where nobody knows."""
-        incident = self._incidents.get(robot)
+        incident = self.incidents.get(robot)
         if not self._asked or incident is None or not incident.touched or self._contact is None or len(rows) < 2:
             return None
         if not self._contact.presses(rows[-2:]):

@@ -25,9 +25,9 @@ from asm_gym.guard.motion import Command, Motions
 from asm_gym.guard.observer import Observation, Observer, joined
 from asm_gym.guard.options import TRUST_S, GuardOptions
 from asm_gym.guard.reflexes import GRADED, REFLEXES, Reflexes
-from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, NOTHING, SURPRISE, Outcome, RowReport
+from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPRISE, Outcome, RowReport
 from asm_gym.guard.responses import NO_RESPONSE, Response, responses_from
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.robots import NOTHING, Robots
 from asm_gym.guard.rows import Believed, Rows
 from asm_gym.guard.severity import FAST, Felt, Severity, SeverityEstimator, Weighed
 from asm_gym.monitors import ExpectsActions, LearnsOnTheJob, Monitor
@@ -183,7 +183,6 @@ class Engine:
         failures: Mapping[int, str] | None = None,
         ends_step: bool = True,
         active: Mask | None = None,
-        bridged: Mask | None = None,
     ) -> RowReport:
         """Judge the next rows, and decide who acts next.
 
@@ -194,18 +193,15 @@ class Engine:
             failures: what failed when the rows were sensed, by robot.
             ends_step: the rows end a control step.
             active: (n,) whose rows count; all by default.
-            bridged: (n,) whose missing numbers are no alarm.
         """
         active = self._everyone if active is None else active
         held, refused, self._refused = self._held, self._refused, self._nobody
         refused = refused if refused is self._nobody else refused & active
         failed = self._failures(failures or NOTHING, refused, active)
         believed = self._rows.next(rows, active)
-        if bridged is not None:
-            believed = believed._replace(lost={i: lost for i, lost in believed.lost.items() if not bridged[i]})
         for i, said in believed.failures.items():
             failed[i] = joined(failed.get(i, ""), said)
-        observed = self._observed(believed, failed, held, active if bridged is None else active & ~bridged)
+        observed = self._observed(believed, failed, held, active)
         intervened = held if refused is self._nobody else held | refused
         decides = self._known_to_decide(believed, observed.failures, refused)
         severity, weighed = self._severity.weigh(
@@ -213,7 +209,8 @@ class Engine:
         )
         row = _Row(believed, observed, severity, weighed, executed, intervened, refused, active)
         unfelt = self._motions.feel(believed.rows, executed, intervened, active) if ends_step else NOTHING
-        self._motions.expect(observed.expected)
+        if observed.expected is not None:
+            self._motions.expect(observed.expected)
         outcomes = (
             {i: self._decide(i, row) for i in np.flatnonzero(weighed.decides).tolist()} if weighed.some else NOTHING
         )
@@ -225,7 +222,8 @@ class Engine:
             self._limits.follow(believed.rows, policy if ends_step else pressed, pressed)
         unforgotten = self._forget(row, outcomes) if outcomes or self._rows.repairs else NOTHING
         report = self._report(row, outcomes, (unfelt, unforgotten))
-        self._rows.drop_repairs()
+        if self._rows.repairs:
+            self._rows.drop_repairs()
         return report
 
     @property
@@ -236,10 +234,6 @@ class Engine:
         found = {i: (self._rows.last(i, 1)[0], repair.missing) for i, repair in self._rows.repairs.items()}
         return {i: (row, missing) for i, (row, missing) in found.items() if missing.any()}
 
-    def amend(self, rows: NDArray[np.float32]) -> None:
-        """Tell the monitor that the last rows (n, D) were these: something else was commanded than it seemed."""
-        self._observer.amend(rows)
-
     def _failures(self, failures: Mapping[int, str], refused: Mask, active: Mask) -> dict[int, str]:
         """Return all that is known to have failed before the rows are looked at, by robot."""
         found = {i: said for i, said in failures.items() if active[i]} if failures else {}
@@ -249,34 +243,30 @@ class Engine:
             found |= {i: joined(found.get(i, ""), STALE) for i in map(int, np.flatnonzero(active))}
         return found
 
-    def _observed(self, believed: Believed, failures: dict[int, str], held: Mask, judged: Mask) -> Observation:
-        """Return what counts of the surprise at the rows; none of it where they are not ``judged`` (n,)."""
+    def _observed(self, believed: Believed, failures: dict[int, str], held: Mask, active: Mask) -> Observation:
+        """Return what counts of the surprise at the rows; none of it where they are not ``active`` (n,)."""
         observed = self._observer.observe(believed.rows, failures)
-        surprise, failed = self._rows.counted(observed.surprise, observed.failures), observed.failures
-        if self._late(observed.latency):
+        late, rate, failed = self._late(observed.latency), self.options.online_learning_rate, observed.failures
+        if active is self._everyone and not (late or rate or failed or self._rows.repairs):
+            return observed
+        surprise = self._rows.counted(observed.surprise, failed)
+        if late:
             surprise = surprise._replace(value=np.full(self._count, np.inf))
-        rate = self.options.online_learning_rate
         if rate > 0 and not failed and not held.any() and (said := self._observer.learn(believed.rows, surprise, rate)):
             failed = dict.fromkeys(range(self._count), said)
             surprise = surprise._replace(value=np.full(self._count, np.inf))
-        if not (judged is self._everyone or judged.all()):
-            surprise = surprise.silenced(~judged)
+        if not active.all():
+            surprise = surprise.silenced(~active)
         for i, said in failed.items():
             self._warn(i, said, "which counts as an alarm")
         return Observation(surprise, observed.expected, failed, observed.latency)
 
     def _known_to_decide(self, believed: Believed, failures: Mapping[int, str], refused: Mask) -> Mask:
         """Return (n,) where there is something to decide, whatever surprise and severity are."""
-        decides = refused.copy()
-        for known in (
-            believed.lost,
-            believed.contradictions,
-            failures,
-            self._rows.repairs,
-            self._diagnostician.incidents,
-        ):
-            for i in known:
-                decides[i] = True
+        decides, incidents = refused.copy(), self._diagnostician.incidents
+        known = *believed.lost, *believed.contradictions, *failures, *self._rows.repairs, *incidents
+        if known:
+            decides[list(known)] = True
         return decides
 
     def _decide(self, robot: int, row: _Row) -> Outcome:
@@ -361,6 +351,7 @@ class Engine:
                 alarm[i], event[i] = True, outcome.event
         for some in failures:
             failed = {**failed, **{i: joined(failed.get(i, ""), said) for i, said in some.items()}} if some else failed
+        repairs = self._rows.repairs
         said = RowReport(
             row.observed.surprise,
             self.threshold.copy(),
@@ -371,11 +362,11 @@ class Engine:
             row.severity,
             outcomes,
             failed,
-            {i: (repair.names, repair.unread) for i, repair in self._rows.repairs.items()},
+            {i: (repair.names, repair.unread) for i, repair in repairs.items()} if repairs else NOTHING,
             row.believed.lost,
             row.observed.latency,
         )
-        return said if row.active.all() else said.of(row.active)
+        return said if row.active is self._everyone or row.active.all() else said.of(row.active)
 
     def _late(self, latency: float) -> bool:
         """Return whether the monitor took so long that it counts as an alarm."""

@@ -104,6 +104,9 @@ class HandAgainstJoints:
         self._kept = np.zeros(n, np.int64)  # how many of them there are
         self._good = np.zeros((n, len(self._q)))  # angles that were believed last
         self._cases: dict[int, _Case] = {}
+        how = self._at, *self._geometry, self._late, self._weights, self._gain, self._cap, LIMIT
+        state = self._mean, self._size_of, self._whole, self._recent, self._kept, self._good
+        self._arguments: tuple[Any, ...] = *how, *state
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
@@ -113,12 +116,10 @@ class HandAgainstJoints:
 
     def compare(self, rows: NDArray[np.float32]) -> list[int]:
         """Take in the next rows (n, D) as they were sensed; return which robots' contradict themselves."""
-        state: tuple[Any, ...] = self._mean, self._size_of, self._whole, self._recent, self._kept, self._good
-        how: tuple[Any, ...] = self._at, *self._geometry, self._late, self._weights, self._gain, self._cap, LIMIT
-        some = _compare(rows, *how, *state)
+        some = _compare(rows, *self._arguments)
         for robot in [robot for robot in self._cases if 0.0 <= self._size_of[robot] <= LIMIT]:
             del self._cases[robot]
-        return [int(i) for i in np.flatnonzero(self._size_of > LIMIT)] if some else []
+        return np.flatnonzero(self._size_of > LIMIT).tolist() if some else []
 
     def contradiction(self, robot: int, missing: Mask) -> Contradiction | None:
         """Return what is wrong with a robot whose last row contradicts itself, beside what is ``missing`` (D,)."""

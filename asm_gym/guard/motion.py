@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import compiled
 from asm_gym.guard.observer import joined
 from asm_gym.guard.reflexes import Motion, Reflexes
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.robots import NOTHING, Robots
 from asm_gym.policies.base import Policy, Reflex
 from asm_gym.validation import as_float32, short_repr
 
@@ -99,7 +99,7 @@ class Motions:
         """
         robots, executed = self._robots, np.empty_like(actions)
         if not _clip(actions, robots.low, robots.high, acts, idle, executed, self._last):
-            return Command(executed, self.nobody, self.nobody, {}), self.nobody
+            return Command(executed, self.nobody, self.nobody, NOTHING), self.nobody
         failures, brakes = {}, np.zeros(len(actions), bool)
         overridden: Mask = (acts | ~np.isfinite(actions).all(axis=1)) & ~idle
         refused = overridden & ~acts
@@ -130,10 +130,12 @@ class Motions:
     def feel(self, rows: Floats32, executed: Floats32, intervened: Mask, active: Mask) -> Mapping[int, str]:
         """Let the reflexes feel rows (n, D) and what was executed (n, A); return what failed, by robot."""
         failures = {}
-        if self._reflexes is not None and self._reflexes.possible - {"hold", "recall"}:
-            r = self._reflexes
+        r = self._reflexes
+        if r is not None and r.feels:
             _feel(rows, r.torques, executed, intervened, active, r.torque, r.usual, r.path, r.steps)
-        for i in np.flatnonzero(active) if self._policies else ():
+        if not self._policies:
+            return NOTHING
+        for i in np.flatnonzero(active):
             policy = self._policies[i]
             if not isinstance(policy, Reflex):
                 continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -69,24 +70,17 @@ class Observer:
             state, surprise = self._monitor.observe(self._before, rows)
             latency = time.perf_counter() - start
             surprise = self._checked(surprise)
-            expected = self._expected(state)
+            expected = None if self._recalls is None else self._expected(self._recalls, state)
             self._state = state
         except Exception as error:  # nothing has judged these rows
             surprise = Surprise(np.zeros(self._count), np.zeros((self._count, self._size)))
             everywhere = dict.fromkeys(range(self._count), f"monitor: {error!r}")
             failures = {i: joined(failures.get(i, ""), said) for i, said in everywhere.items()}
             return Observation(_infinite(surprise, failures), None, failures, latency)
-        if not surprise.value.min() > -np.inf:  # NaN too
-            wrong = {int(i): f"monitor: its surprise is {surprise.value[i]}" for i in _nonsense(surprise.value)}
-            failures = {**failures, **{i: joined(failures.get(i, ""), said) for i, said in wrong.items()}}
+        for i, value in enumerate(surprise.value.tolist()):
+            if not value > -math.inf:  # NaN too
+                failures = {**failures, i: joined(failures.get(i, ""), f"monitor: its surprise is {value}")}
         return Observation(_infinite(surprise, failures) if failures else surprise, expected, failures, latency)
-
-    def amend(self, rows: NDArray[np.float32]) -> None:
-        """Observe other rows (n, D) in the place of the last ones: something else was commanded than it seemed."""
-        try:
-            self._state, _ = self._monitor.observe(self._before, rows)
-        except Exception:  # the state stays as it is: the next row is judged from there
-            return
 
     def forget(self, acted_on: Mask) -> str:
         """Let the evidence begin anew in the streams of ``acted_on`` (n,); return what failed."""
@@ -120,10 +114,8 @@ class Observer:
             )
         return surprise._replace(value=value, attribution=attribution) if self._copies else surprise
 
-    def _expected(self, state: Any) -> NDArray[np.float32] | None:
-        if self._recalls is None:
-            return None
-        expected = np.asarray(self._recalls.expected_action(state), np.float32)
+    def _expected(self, monitor: ExpectsActions, state: Any) -> NDArray[np.float32]:
+        expected = np.asarray(monitor.expected_action(state), np.float32)
         if expected.shape != (self._count, self._monitor.spec.motor.size):
             raise ValueError(f"expected_action has the shape {expected.shape}")
         return expected
@@ -146,10 +138,6 @@ def choose(mask: Mask, new: Any, old: Any) -> Any:
     if not isinstance(old, np.ndarray) or len(old) != len(mask):
         raise TypeError(f"a monitor's state must be arrays whose first axis is {len(mask)} long, got {old!r}")
     return np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-
-def _nonsense(values: NDArray[np.float64]) -> NDArray[np.intp]:
-    return np.flatnonzero(~(values > -np.inf))
 
 
 def _infinite(surprise: Surprise, failures: Mapping[int, str]) -> Surprise:

@@ -71,6 +71,8 @@ class Reflexes:
             if name in lacks and name != GRADED:
                 raise ValueError(lacks[name])
         self.possible = frozenset(name for name in wanted if name not in lacks)
+        self.feels = bool(self.possible - {"hold", "recall"})
+        """One of them depends on what was felt and done."""
         self.robots = robots
         self.tolerated = TOLERATED.get(on_alarm, TOLERATED_ALONE)
         self.torque, self.usual = np.zeros((n, len(self.torques))), np.zeros((n, len(self.torques)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from asm_gym.detection.events import EVENTS, KNOCK
 from asm_gym.guard.arbiter import ENDED, STATES, Decision
 from asm_gym.guard.observer import joined
 from asm_gym.guard.responses import NO_RESPONSE, Response
+from asm_gym.guard.robots import NOTHING
 from asm_gym.guard.severity import Severity
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec
@@ -29,9 +29,6 @@ INFO = "full", "flat"
 KNOCKED = EVENTS.index(KNOCK)
 
 Mask = NDArray[np.bool_]
-
-NOTHING: Mapping[int, Any] = MappingProxyType({})
-"""Where there is nothing to say of any robot."""
 
 
 class Outcome(NamedTuple):

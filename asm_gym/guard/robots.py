@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -14,6 +15,9 @@ from asm_gym.kinematics import Chain
 from asm_gym.spec import Channel, StreamSpec
 
 NO_COLUMNS = np.zeros(0, np.intp)
+
+NOTHING: Mapping[int, Any] = MappingProxyType({})
+"""Where there is nothing to say of any robot."""
 
 
 @dataclass(frozen=True, eq=False)

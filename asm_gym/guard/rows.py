@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import compiled
 from asm_gym.guard.hand import NEEDS, Contradiction, HandAgainstJoints
 from asm_gym.guard.repair import Repair
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.robots import NOTHING, Robots
 from asm_gym.memory.completion import Completion
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec
@@ -89,15 +89,16 @@ class Rows:
         if self._end == self._history.shape[1]:
             self._history[:, : self._kept] = self._history[:, -self._kept :]
             self._end = self._kept
+        finite = _keep(rows, self._history, self._end, self._seen)
+        contradictory = [hand.compare(rows) for hand in self._hands]
+        if finite and not self._repairs and not any(contradictory):
+            self._end += 1
+            return Believed(rows, NOTHING, NOTHING, NOTHING)
         lost: dict[int, tuple[str, ...]] = {}
-        if not _keep(rows, self._history, self._end, self._seen):
+        if not finite:
             for i in np.flatnonzero(~np.isfinite(rows).all(axis=1) & active).tolist():
                 lost[i] = tuple(self._spec.labels[k] for k in np.flatnonzero(~np.isfinite(rows[i])))
-        contradictory = [hand.compare(rows) for hand in self._hands]
         unusual = {i for i in (*self._repairs, *lost, *(i for found in contradictory for i in found)) if active[i]}
-        if not unusual:
-            self._end += 1
-            return Believed(rows, lost, {}, {})
         believed, contradictions, failures = rows.copy(), {}, {}
         for i in sorted(unusual):
             missing = self._missing(i)

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from functools import partial
 from threading import Lock
 from typing import Any, NamedTuple
@@ -20,9 +21,9 @@ from asm_gym.compilation import compiled, must_compile
 from asm_gym.detection.detector import _step
 from asm_gym.detection.events import Excuses
 from asm_gym.detection.events import _step as _excuse
-from asm_gym.detection.evidence import POWER, TINY
+from asm_gym.detection.evidence import POWER, TINY, Evidence
 from asm_gym.detection.evidence_detection import EvidenceDetection, EvidenceState
-from asm_gym.detection.repetition import repeated
+from asm_gym.detection.repetition import Repetition, repeated
 from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.memory.association import Association, normalised_errors
 from asm_gym.memory.energy import activate, outward
@@ -99,24 +100,6 @@ class LearnedExcuses(NamedTuple):
     on_its_way: float
 
 
-class RowState(NamedTuple):
-    """What one row hands to the next."""
-
-    memory: MemoryState
-    detection: EvidenceState
-    excuses: NDArray[np.int64]  # (B, 3 + J); (B, 0) where nothing is excused
-
-
-class RowSurprise(NamedTuple):
-    """The surprise of a row, with and without what is excused."""
-
-    value: NDArray[np.float64]  # (B,)
-    attribution: NDArray[np.float64]  # (B, D)
-    raw: NDArray[np.float64]  # (B,)
-    excuse: NDArray[np.int8]  # (B,)
-    divisor: NDArray[np.float64]  # (B,) of what is excused
-
-
 class RowKernel:
     """``observe`` of a memory under the detection of evidence, for the weights as they are.
 
@@ -131,30 +114,55 @@ class RowKernel:
         assert d is not None
         if must_compile(observe_rows):
             print("asm-gym: compiling the memory, once on this machine (about a minute)", file=sys.stderr)
-        steps, most, offset = detection.repeating
-        arrays = d.whitening, d.ceiling, d.tail, d.context_quantile, d.context_range, d.gains
-        whole = map(np.ascontiguousarray, arrays)
-        evidence = LearnedEvidence._make([*whole, float(d.bound), steps, most, offset])
-        looks = bool(d.context_quantile[:-1].any())
+        m, none = memory, np.zeros(0, np.intp)
+        columns, ends = ([none] * 4, np.zeros((0, 2))) if excuses is None else excuses.arrays
+        scalars = m.prior_precision, m.sensory_precision, m.curvature, m.iterations, m.settles, d.bound
+        excused = (False, 0.0) if excuses is None else (True, excuses.on_its_way)
+        context = bool(d.context_quantile[:-1].any())
+        numbers = np.array([*scalars, context, *excused], np.float64)
+        detector = d.whitening, d.ceiling, d.tail, d.context_quantile, d.context_range, d.gains
+        singles = *m.traces, *m.settling, *m.association, m.W_K, m.b_K
+        doubles = numbers, m.mean, m.spread, m.change, *detector, *detection.repeating, ends
+        places = m.sensory, m.motor, m.slow, m.spans, *columns
+        packed = [_packed(*part) for part in ((np.float32, singles), (np.float64, doubles), (np.int64, places))]
+        self._learned: tuple[Any, ...] = *(flat for flat, _ in packed), np.array([w for _, at in packed for w in at])
         self._excuses = excuses
-        self._learned = memory._replace(context=looks), evidence, _learned_excuses(excuses)
 
     def __call__(
         self, state: MonitorState, rows: NDArray[np.float64]
     ) -> tuple[MonitorState, Surprise, NDArray[np.float64]]:
         """Return the new state, the surprise of the next rows (B, D), perhaps not finite, and its divisor (B,)."""
-        B = len(rows)
-        old = RowState(state.model, state.detection, state.excuses)
-        new = uninitialised(old)
-        found = RowSurprise(np.empty(B), np.empty(rows.shape), np.empty(B), np.empty(B, np.int8), np.empty(B))
+        B, empty = len(rows), np.empty
+        (traces, expected, (before, earlier, steps), skill), (evidence, repetition) = state.model, state.detection
+        old = traces, expected, before, earlier, steps, skill, *evidence, *repetition, state.excuses
+        new = [empty(a.shape, a.dtype) for a in old]
+        value, attribution, raw, excuse, divisor = empty(B), empty(rows.shape), empty(B), empty(B, np.int8), empty(B)
+        arguments: tuple[Any, ...] = rows, *old, *new, value, attribution, raw, excuse, divisor, *self._learned
         if B == 1:  # calls no BLAS
-            observe_rows(rows, old, new, found, *self._learned)
+            observe_rows(*arguments)
         else:
             with _ONE_THREAD:
-                observe_rows(rows, old, new, found, *self._learned)
-        raw = (found.raw, found.excuse) if self._excuses is not None else (None, None)
-        surprise = Surprise(found.value, found.attribution, None, None, None, *raw)
-        return MonitorState(new.memory, new.detection, new.excuses), surprise, found.divisor
+                observe_rows(*arguments)
+        surprise = Surprise(value, attribution)
+        if self._excuses is not None:
+            surprise = Surprise(value, attribution, None, None, None, raw, excuse)
+        memory = MemoryState(new[0], new[1], RowHistory(new[2], new[3], new[4]), new[5])
+        detection = EvidenceState(Evidence(new[6], new[7], new[8]), Repetition(new[9], new[10], new[11]))
+        return MonitorState(memory, detection, new[12]), surprise, divisor
+
+
+def _packed(kind: Any, arrays: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], list[tuple[int, int, int]]]:
+    """Return arrays end to end, each at the beginning of a line of the cache; and where, and of which shape, each is.
+
+    A vector is a matrix of one row, an array of three axes one of as many rows as its first two axes hold.
+    """
+    flat, where, end, line = [], [], 0, 64 // np.dtype(kind).itemsize
+    for array in arrays:
+        columns = array.shape[-1]
+        where.append((end, int(np.prod(array.shape[:-1])), columns))
+        flat += [np.ravel(array).astype(kind), np.zeros(-array.size % line, kind)]
+        end += array.size + flat[-1].size
+    return np.concatenate(flat), where
 
 
 class _OneThread:
@@ -187,14 +195,6 @@ def uninitialised(state: Any) -> Any:
     if isinstance(state, np.ndarray):
         return np.empty(state.shape, state.dtype)
     return type(state)(*map(uninitialised, state))
-
-
-def _learned_excuses(excuses: Excuses | None) -> LearnedExcuses:
-    if excuses is None:
-        none = np.zeros(0, np.intp)
-        return LearnedExcuses(False, none, none, none, np.zeros(3, np.int64), np.zeros((0, 2)), 0.0)
-    (wrist, joints, fingers, rows), ends = excuses.arrays
-    return LearnedExcuses(True, wrist, joints, fingers, rows, ends, excuses.on_its_way)
 
 
 @compiled
@@ -260,45 +260,146 @@ def expect_rows(rows: Any, old: MemoryState, new: MemoryState, learned: LearnedM
     return error, finite
 
 
+@compiled
+def _matrix(flat: Any, where: Any, k: int) -> Any:
+    begin, rows, columns = where[k]
+    return flat[begin : begin + rows * columns].reshape((rows, columns))
+
+
+@compiled
+def _vector(flat: Any, where: Any, k: int) -> Any:
+    begin, rows, columns = where[k]
+    return flat[begin : begin + rows * columns]
+
+
+@compiled
+def _unpacked(singles: Any, doubles: Any, places: Any, where: Any) -> Any:
+    """Return what was learned, from the arrays of a ``RowKernel``, in their order."""
+    S, D, P, w = singles, doubles, places, where
+    numbers = _vector(D, w, 18)
+    traces = Weights(_matrix(S, w, 0), _matrix(S, w, 1), _matrix(S, w, 2), _vector(S, w, 3))
+    settling = SettlingWeights(_matrix(S, w, 4), _matrix(S, w, 5), _matrix(S, w, 6), _vector(S, w, 7), _matrix(S, w, 8))
+    association = Association(
+        _matrix(S, w, 9),
+        _matrix(S, w, 10),
+        _matrix(S, w, 11),
+        _matrix(S, w, 12),
+        _vector(S, w, 13),
+        _matrix(S, w, 14),
+        _vector(S, w, 15),
+    )
+    sensory = _vector(P, w, 32)
+    memory = LearnedMemory(
+        _vector(D, w, 19),
+        _vector(D, w, 20),
+        _vector(D, w, 21),
+        sensory,
+        _vector(P, w, 33),
+        _vector(P, w, 34),
+        traces,
+        settling,
+        numbers[4] != 0.0,
+        np.float32(numbers[0]),
+        np.float32(numbers[1]),
+        np.float32(numbers[2]),
+        int(numbers[3]),
+        association,
+        _matrix(P, w, 35),
+        _matrix(S, w, 16),
+        _vector(S, w, 17),
+        numbers[6] != 0.0,
+    )
+    evidence = LearnedEvidence(
+        _matrix(D, w, 22),
+        _matrix(D, w, 23),
+        _matrix(D, w, 24),
+        _vector(D, w, 25),
+        _vector(D, w, 26),
+        _vector(D, w, 27),
+        numbers[5],
+        _vector(D, w, 28).reshape((2, 2, len(sensory))),
+        _vector(D, w, 29),
+        _vector(D, w, 30),
+    )
+    columns = _vector(P, w, 36), _vector(P, w, 37), _vector(P, w, 38), _vector(P, w, 39)
+    excuses = LearnedExcuses(numbers[7] != 0.0, *columns, _matrix(D, w, 31), numbers[8])
+    return memory, evidence, excuses
+
+
 @partial(compiled, calls=("memory", "detection", "."))
 def observe_rows(
     rows: Any,
-    old: RowState,
-    new: RowState,
-    found: RowSurprise,
-    memory: LearnedMemory,
-    evidence: LearnedEvidence,
-    excuses: LearnedExcuses,
+    traces: Any,
+    expected: Any,
+    before: Any,
+    earlier: Any,
+    steps: Any,
+    skill: Any,
+    vector: Any,
+    context: Any,
+    counted: Any,
+    last: Any,
+    again: Any,
+    unlikely: Any,
+    excused: Any,
+    new_traces: Any,
+    new_expected: Any,
+    new_before: Any,
+    new_earlier: Any,
+    new_steps: Any,
+    new_skill: Any,
+    new_vector: Any,
+    new_context: Any,
+    new_counted: Any,
+    new_last: Any,
+    new_again: Any,
+    new_unlikely: Any,
+    new_excused: Any,
+    value: Any,
+    attribution: Any,
+    raw: Any,
+    excuse: Any,
+    divisor: Any,
+    singles: Any,
+    doubles: Any,
+    places: Any,
+    where: Any,
 ) -> None:
-    """Write the ``new`` state after rows (B, D), and the surprise that is ``found``."""
-    error, finite = expect_rows(rows, old.memory, new.memory, memory)
-    was, now = old.detection.evidence, new.detection.evidence
-    errors, context = error.astype(np.float64), new.memory.expected.astype(np.float64)
+    """Write the new state after rows (B, D), and their surprise.
+
+    The arrays come one by one: numba takes longer to look through named tuples of them than to compute with them.
+
+    Args:
+        rows: (B, D).
+        traces: and on to ``excused`` the old state, the fields of ``MemoryState`` and ``EvidenceState``, and what is
+            excused; after them, as ``new``, the new one.
+        value, attribution, raw, excuse: of the surprise, see ``Surprise``.
+        divisor: (B,) of what is excused.
+        singles: and on to ``where`` what was learned, see ``_unpacked``.
+    """
+    learned, evidence, excuses = _unpacked(singles, doubles, places, where)
+    old = MemoryState(traces, expected, RowHistory(before, earlier, steps), skill)
+    new = MemoryState(new_traces, new_expected, RowHistory(new_before, new_earlier, new_steps), new_skill)
+    error, finite = expect_rows(rows, old, new, learned)
+    errors, now = error.astype(np.float64), new_expected.astype(np.float64)
     white = evidence.whitening, evidence.ceiling, evidence.tail
     usual = evidence.context_quantile, evidence.context_range, evidence.gains
-    (now.vector[:], now.context[:], now.steps[:]), _, shares = _step(
-        was.vector, was.context, was.steps, errors, context, *white, *usual, evidence.bound
+    (new_vector[:], new_context[:], new_counted[:]), _, shares = _step(
+        vector, context, counted, errors, now, *white, *usual, evidence.bound
     )
-    before, after = old.detection.repetition, new.detection.repetition
-    after.row[:], after.again[:], after.unlikely[:] = repeated(
-        before.row,
-        before.again,
-        before.unlikely,
-        rows[:, memory.sensory],
-        evidence.repetition_steps,
-        evidence.repetition_most,
+    steps_of, most = evidence.repetition_steps, evidence.repetition_most
+    new_last[:], new_again[:], new_unlikely[:] = repeated(
+        last, again, unlikely, rows[:, learned.sensory], steps_of, most
     )
-    stuck = after.unlikely, evidence.repetition_offset
-    _attribute(shares, *stuck, memory.sensory, finite, found.value, found.attribution)
-    found.raw[:], found.excuse[:], found.divisor[:] = found.value, 0, 1.0
+    _attribute(shares, new_unlikely, evidence.repetition_offset, learned.sensory, finite, value, attribution)
+    raw[:], excuse[:], divisor[:] = value, 0, 1.0
     if excuses.active:
         senses = excuses.wrist, excuses.joints, excuses.ends, excuses.fingers
-        lasting = excuses.rows, excuses.on_its_way
-        new.excuses[:], found.excuse[:], found.divisor[:] = _excuse(old.excuses, rows, *senses, *lasting)
+        new_excused[:], excuse[:], divisor[:] = _excuse(excused, rows, *senses, excuses.rows, excuses.on_its_way)
         for n in range(len(rows)):
-            if found.divisor[n] != 1.0:
-                found.value[n] /= found.divisor[n]
-                found.attribution[n] /= found.divisor[n]
+            if divisor[n] != 1.0:
+                value[n] /= divisor[n]
+                attribution[n] /= divisor[n]
 
 
 @compiled
