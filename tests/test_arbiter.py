@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from asm_gym.guard.arbiter import STATES, Arbiter, Judged
+from asm_gym.guard.arbiter import STATES, TRANSITIONS, Arbiter, Judged, Situation, State, following
 from asm_gym.guard.options import GuardOptions, ReleaseRule
 from asm_gym.guard.responses import GOING_ON, NO_RESPONSE, RESPONSES
-from asm_gym.guard.transitions import TRANSITIONS, Situation, State, following
 
 ACTING = (State.POLICY, State.TRIAL)
 EVERYONE = np.ones(1, bool)

@@ -6,8 +6,7 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 
 from asm_gym import collect
-from asm_gym.contact_limits import ContactLimits, healthy_forces
-from asm_gym.familiar_speed import UNKNOWN, FamiliarSpeed
+from asm_gym.detection.contact_limits import UNKNOWN, ContactLimits, FamiliarSpeed, healthy_forces
 from asm_gym.guard.checks import limits_of
 from asm_gym.guard.limits import EpisodeLimits
 from asm_gym.monitors import NeuralASM, make_monitor

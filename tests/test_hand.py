@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
+from asm_gym.detection.kinematics import Chain
 from asm_gym.guard.hand import LIMIT, HandAgainstJoints
-from asm_gym.kinematics import Chain
 from asm_gym.monitors import NeuralASM
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 

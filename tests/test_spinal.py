@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from asm_gym.contact_limits import ContactLimits
+from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.faults import Push
 from asm_gym.wrappers import FaultInjection
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from asm_gym.guard.checks import shipped_memory
 from asm_gym.guard.robots import Robots
-from asm_gym.guard.severity import Felt
+from asm_gym.guard.severity import nothing_felt
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies.reflexes import changed_by, nearest_to_rest, no_rest, outside, resting_action
 from asm_gym.spec import StreamSpec, control_period
@@ -175,23 +175,22 @@ def _known(
     return robots, places
 
 
-def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | None = None) -> Felt:
+def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
     """Return what environments say in ``info`` of what their arms felt within a step.
 
     Args:
         infos: of one environment, or of n with arrays whose first axis is n.
         there: (n,) whose information is there; of all where None.
     """
-    n, size = robots.count, robots.felt_size
+    numbers = nothing_felt(robots.count, robots.felt_size)
     if "contact_load" not in infos:
-        return Felt.nothing(n, size)
-    numbers = np.full((n, 2 + size), np.nan)
+        return numbers
     numbers[:, 0], numbers[:, 1] = infos["contact_load"], infos.get("contact_left_s", np.nan)
     if "contact_felt" in infos:
         numbers[:, 2:] = infos["contact_felt"]
     if there is not None:
         numbers[~there] = np.nan
-    return Felt(numbers)
+    return numbers
 
 
 def body_memory(env: gym.Env[Any, Any], watched: StreamSpec) -> NeuralASM:

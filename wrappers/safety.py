@@ -10,15 +10,14 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection import AdaptiveThreshold
+from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.arbiter import ENDED
 from asm_gym.guard.checks import LOG, Fitted, check_answer, check_monitor, diagnosis_of
 from asm_gym.guard.engine import Engine
-from asm_gym.guard.lazy_info import LazyInfo
 from asm_gym.guard.motion import Command
 from asm_gym.guard.options import GuardOptions, OnAlarm
-from asm_gym.guard.report import INFO, RowReport, report
+from asm_gym.guard.report import INFO, LazyInfo, RowReport, report
 from asm_gym.monitors import Monitor
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, HoldsItself

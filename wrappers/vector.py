@@ -11,13 +11,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
-from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection import AdaptiveThreshold
+from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.checks import LOG, Fitted, check_answer, check_monitor, diagnosis_of
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions, OnAlarm
-from asm_gym.guard.report import INFO, RowReport, side_by_side
-from asm_gym.guard.severity import Felt
+from asm_gym.guard.report import INFO, LazyInfo, RowReport, side_by_side
 from asm_gym.monitors import Monitor
 from asm_gym.policies.base import Policy, Reflex
 from asm_gym.policies.reflexes import Hold
@@ -270,13 +269,13 @@ class VectorNeuralASMSafety(VectorWrapper):
         sensed = infos["final_obs"][i] if last else observations[i]
         return as_float32(np.concatenate([np.ravel(sensed), np.ravel(executed[i])]))
 
-    def _felt(self, infos: dict[str, Any], last: Mask) -> Felt:
+    def _felt(self, infos: dict[str, Any], last: Mask) -> NDArray[np.float64]:
         """Return what the arms felt in this step, those of episodes in their ``last`` one before they began anew."""
         now = felt_by(self._robots, infos, infos.get(f"_{FELT[0]}"))
         if not last.any():
             return now
         before = felt_by(self._robots, infos["final_info"], infos["final_info"].get(f"_{FELT[0]}"))
-        return Felt(np.where(last[:, None], before.numbers, now.numbers))
+        return np.where(last[:, None], before, now)
 
     def _repaired(self, observations: Any, infos: dict[str, Any], where: Mask) -> Any:
         """Return the observations, and set the streams, with what is completed in the environments of ``where``."""
@@ -338,11 +337,11 @@ class VectorNeuralASMSafety(VectorWrapper):
             "cost_sum": self._alarms.astype(np.float64),
         }
         if self._full:
-            asm = side_by_side(said, self._spec) | {"executed_action": executed.copy(), "alarms": self._alarms.copy()}
+            asm: dict[str, Any] = {"executed_action": executed.copy(), "alarms": self._alarms.copy()}
             if self._engine.running is not None:
                 n, running = self.num_envs, self._engine.running
                 asm |= {"ceiling": np.full(n, running.ceiling), "level": np.full(n, running.level)}
-            found["asm"] = asm
+            found["asm"] = LazyInfo(lambda: side_by_side(said, self._spec) | asm)
         infos.update(found | {f"_{key}": present for key in found})
 
 

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.contact_limits import ContactLimits
+from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.edits import SimulatorEdits

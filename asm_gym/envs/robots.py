@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.detection.kinematics import Chain
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.mujoco_views import JOINT_POSITION, JOINTS, OSC_POSE, Arms, Ints, NominalViews, Views
-from asm_gym.kinematics import Chain
 from asm_gym.tasks import ROBOTS, TaskSpec
 from asm_gym.validation import check_choice, check_text, short_repr
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import must_compile
-from asm_gym.contact_limits import ContactLimits
+from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.control import hold_at
 from asm_gym.envs.mujoco_views import ACTS, ARMED, FELT, JOINTS, PASSED_IN, Floats, Goals, SubstepLimits, Views

@@ -1,4 +1,4 @@
-"""Who acts for each of n robots, the policy or a reflex: what the table of transitions makes of each row.
+"""Who acts for each of n robots, the policy or a reflex: four states, and one table of transitions.
 
 A requested override takes effect: what fails, be it the policy's action, the stream, the monitor or the reflex, is an
 alarm, and ends in the reflex or in staying, never in the policy. While the arm presses harder than healthy motion does,
@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
+from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -16,18 +18,8 @@ from numpy.typing import NDArray
 
 from asm_gym.guard.options import ReleaseRule
 from asm_gym.guard.responses import GOING_ON, Response
-from asm_gym.guard.transitions import Situation, State, Transition, following
 
 LOG = logging.getLogger("asm_gym.safety")
-
-STATES = tuple(State)
-POLICY, TRIAL, REFLEX, ENDED = (STATES.index(s) for s in (State.POLICY, State.TRIAL, State.REFLEX, State.ENDED))
-
-COUNTS = CALM, ACTED, HELD, FREE, RETURNED, SINCE, WENT_ON, STRIKES, ROWS, ALARMS = range(10)
-"""What is counted of each robot in an episode, in rows: of low surprise, in a row; under the reflex, those before a
-hand-back that came too early included; under the reflex since it took over; without a contact, in a row; hand-backs
-that came too early, in a row; under the policy since control was handed back; in alarm under the policy; how often it
-has pressed too hard. In all episodes: rows under the policy, and how many of them alarmed."""
 
 MOSTLY_AFTER = 200
 """Rows under the policy after which it is said that most of them alarm."""
@@ -35,45 +27,92 @@ MOSTLY_AFTER = 200
 Mask = NDArray[np.bool_]
 
 
+class State(StrEnum):
+    """Who acts; on ``TRIAL`` the policy, so recently that an alarm which comes back had not gone."""
+
+    POLICY = "policy"
+    TRIAL = "trial"
+    REFLEX = "reflex"
+    ENDED = "ended"
+
+
+STATES = tuple(State)
+POLICY, TRIAL, REFLEX, ENDED = range(4)
+
+COUNTS = CALM, ACTED, HELD, FREE, RETURNED, SINCE, WENT_ON, STRIKES, ROWS, ALARMS = range(10)
+"""What is counted of each robot in an episode, in rows: of low surprise, in a row; under the reflex, those before a
+hand-back that came too early included; under the reflex since it took over; without a contact, in a row; hand-backs
+that came too early, in a row; under the policy since control was handed back; in alarm under the policy; how often it
+has pressed too hard. In all episodes: rows under the policy, and how many of them alarmed."""
+
+
+class Situation(NamedTuple):
+    """All that a row tells the table of transitions."""
+
+    alarm: bool = False  # surprise is over the threshold, or something failed, is missing or presses
+    presses: bool = False  # a contact limit was passed within the step
+    spent: bool = False  # the arm has pressed too often, or with too much impulse, in this episode
+    goes_on: bool = False  # the response lets the policy act
+    stops: bool = False  # the response ends the episode, and has been held for long enough
+    overdue: bool = False  # the reflex has acted for as long as it may
+    calm: bool = False  # surprise has been low for long enough, and nothing touches
+    free: bool = False  # the contact has been gone for long enough, and nothing presses
+    waited: bool = False  # held for long enough for a trial, nothing presses, and no sense tells of a contact
+    settled: bool = False  # the trial has gone well for long enough
+
+
+class Transition(NamedTuple):
+    """A row of the table: in one of the states ``within``, where ``when`` holds, ``to`` is next."""
+
+    name: str  # as ``info["asm"]["transition"]`` says it; empty for none, "*" for the response's own name
+    within: tuple[State, ...]
+    to: State | None  # None: the state stays
+    when: Callable[[Situation], bool]
+    why: str
+
+
+POLICY_ACTS, REFLEX_ACTS = (State.POLICY, State.TRIAL), (State.REFLEX,)
+TRANSITIONS = (
+    Transition("give_up", (*POLICY_ACTS, *REFLEX_ACTS), State.ENDED, lambda s: s.spent, "pressed too often or much"),
+    Transition("override", POLICY_ACTS, State.REFLEX, lambda s: s.presses, "presses harder than healthy motion"),
+    Transition("*", POLICY_ACTS, None, lambda s: s.alarm and s.goes_on, "an alarm whose cause lets the policy go on"),
+    Transition("override", POLICY_ACTS, State.REFLEX, lambda s: s.alarm, "any other alarm"),
+    Transition("", (State.TRIAL,), State.POLICY, lambda s: s.settled, "no alarm for `release_after`"),
+    Transition("*", REFLEX_ACTS, State.TRIAL, lambda s: s.alarm and s.goes_on, "the cause turns out to be a sensor"),
+    Transition("release", REFLEX_ACTS, State.TRIAL, lambda s: s.calm, "calm for `release_after`, nothing touches"),
+    Transition("release", REFLEX_ACTS, State.TRIAL, lambda s: s.free, "the contact has gone"),
+    Transition("give_up", REFLEX_ACTS, State.ENDED, lambda s: s.stops, "response `stop`, held for `try_after`"),
+    Transition("give_up", REFLEX_ACTS, State.ENDED, lambda s: s.overdue, "acted for `max_override`"),
+    Transition("trial", REFLEX_ACTS, State.TRIAL, lambda s: s.waited, "held for `try_after`, nothing known to touch"),
+)
+"""What leads from one state to another: the first that holds. Where none does, nothing changes."""
+
+
+def following(state: State, situation: Situation) -> Transition | None:
+    """Return the first of ``TRANSITIONS`` that holds; None where nothing changes."""
+    return next((t for t in TRANSITIONS if state in t.within and t.when(situation)), None)
+
+
 class Judged(NamedTuple):
-    """A row of one robot, as far as it decides who acts next.
+    """A row of one robot, as far as it decides who acts next."""
 
-    Attributes:
-        surprise: infinite where something has failed.
-        over: it is over the threshold.
-        knocked: it is over the threshold but for what a knock excuses.
-        alarm: for whatever reason.
-        presses: a contact limit was passed within the step.
-        impulse: how much the arm has pressed in this episode, beyond healthy motion [N s].
-        intervened: something else than the policy acted.
-        refused: the policy's action was not finite, so that the reflex took over before this row.
-        response: to the alarm.
-    """
-
-    surprise: float
-    over: bool
-    knocked: bool
-    alarm: bool
-    presses: bool
-    impulse: float
-    intervened: bool
-    refused: bool
-    response: Response
+    surprise: float  # infinite where something has failed
+    over: bool  # it is over the threshold
+    knocked: bool  # it is over the threshold but for what a knock excuses
+    alarm: bool  # for whatever reason
+    presses: bool  # a contact limit was passed within the step
+    impulse: float  # how much the arm has pressed in this episode, beyond healthy motion [N s]
+    intervened: bool  # something else than the policy acted
+    refused: bool  # the policy's action was not finite, so that the reflex took over before this row
+    response: Response  # to the alarm
 
 
 class Decision(NamedTuple):
-    """What a row of one robot has led to.
+    """What a row of one robot has led to."""
 
-    Attributes:
-        transition: the name in ``TRANSITIONS``, or the response under which the policy goes on; empty where nothing
-            changes.
-        takes_over: the reflex acts from now on.
-        acted_on: the surprise has had its consequence, so that its evidence is not to be counted again.
-    """
-
-    transition: str = ""
-    takes_over: bool = False
-    acted_on: bool = False
+    transition: str = ""  # the name in ``TRANSITIONS``, or the response under which the policy goes on
+    takes_over: bool = False  # the reflex acts from now on
+    acted_on: bool = False  # the surprise has had its consequence: its evidence is not to be counted again
 
 
 class Arbiter:

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from asm_gym.contact_limits import ContactLimits
-from asm_gym.familiar_speed import FamiliarSpeed
+from asm_gym.detection.contact_limits import ContactLimits, FamiliarSpeed
 from asm_gym.monitors import CalibratedMonitor, ExplainsItself, Monitor, NeuralASM, pretrained_for
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec

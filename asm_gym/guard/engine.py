@@ -29,7 +29,7 @@ from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPR
 from asm_gym.guard.responses import NO_RESPONSE, Response, responses_from
 from asm_gym.guard.robots import NOTHING, Robots
 from asm_gym.guard.rows import Believed, Rows
-from asm_gym.guard.severity import FAST, Felt, Severity, SeverityEstimator, Weighed
+from asm_gym.guard.severity import FAST, Severity, SeverityEstimator, Weighed, nothing_felt
 from asm_gym.monitors import ExpectsActions, LearnsOnTheJob, Monitor
 from asm_gym.policies.base import Policy
 
@@ -104,7 +104,7 @@ class Engine:
         """The threshold that follows a policy; None where it does not."""
         self.confirmed = np.zeros(n, bool)
         """(n,) an alarm in this episode was no false one."""
-        self._nothing_felt = Felt.nothing(n, robots.felt_size)
+        self._nothing_felt = nothing_felt(n, robots.felt_size)
         self._everyone, self._nobody = np.ones(n, bool), self._motions.nobody
         self._held = self._nobody  # whose reflex acts next
         self._command = Command(np.zeros((n, robots.rest.size), np.float32), self._nobody, self._nobody, NOTHING)
@@ -179,7 +179,7 @@ class Engine:
         self,
         rows: NDArray[np.float32],
         executed: NDArray[np.float32],
-        felt: Felt | None = None,
+        felt: NDArray[np.float64] | None = None,
         failures: Mapping[int, str] | None = None,
         ends_step: bool = True,
         active: Mask | None = None,
@@ -205,7 +205,7 @@ class Engine:
         intervened = held if refused is self._nobody else held | refused
         decides = self._known_to_decide(believed, observed.failures, refused)
         severity, weighed = self._severity.weigh(
-            believed.rows, felt or self._nothing_felt, held, observed.surprise, active, decides
+            believed.rows, self._nothing_felt if felt is None else felt, held, observed.surprise, active, decides
         )
         row = _Row(believed, observed, severity, weighed, executed, intervened, refused, active)
         unfelt = self._motions.feel(believed.rows, executed, intervened, active) if ends_step else NOTHING
@@ -307,7 +307,7 @@ class Engine:
         if weighed.knocked(i) and not certain:
             return diagnostician.knocked(i, rows)
         force, _, speed = severity.numbers[i].tolist()
-        feels = bool(np.isfinite(severity.felt.numbers[i, 0]) or np.isfinite(force))
+        feels = bool(np.isfinite(severity.felt[i, 0]) or np.isfinite(force))
         response, columns = diagnostician.respond(
             i,
             Alarm(

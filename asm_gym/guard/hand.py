@@ -1,6 +1,6 @@
 """The hand against its joints: two senses of one thing, of which one is wrong where they contradict each other.
 
-    z = (x - x(q)) / σ      x: the hand as it is sensed; x(q): by the joints' angles, see ``asm_gym.kinematics``
+    z = (x - x(q)) / σ      x: the hand as it is sensed; x(q): by the angles of the joints, see ``Chain``
     m ← m + g (z - m)       |m| > LIMIT is a contradiction, at whatever rate it came about
     q̂_S = argmin |z|² + |q_S - q̄_S|²/ε²    what the angles S at fault must be; q̄, ε: completion, and its error
 
@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
+from asm_gym.detection.kinematics import HAND, Chain, hand_at
 from asm_gym.guard.robots import NO_COLUMNS
-from asm_gym.kinematics import HAND, Chain, hand_at
 from asm_gym.memory.completion import sensors_of
 from asm_gym.spec import StreamSpec
 

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.contact_limits import ContactLimits
-from asm_gym.familiar_speed import PLACE, FamiliarSpeed
+from asm_gym.detection.contact_limits import PLACE, ContactLimits, FamiliarSpeed
 from asm_gym.guard.robots import Robots
 from asm_gym.spec import StreamSpec
 

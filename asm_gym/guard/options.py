@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from asm_gym.contact_limits import ContactLimits
 from asm_gym.detection.adaptive import AdaptiveThreshold
+from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.reflexes import GRADED, REFLEXES
 from asm_gym.guard.responses import responses_from
 from asm_gym.policies.base import Policy

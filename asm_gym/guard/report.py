@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,51 +32,30 @@ Mask = NDArray[np.bool_]
 
 
 class Outcome(NamedTuple):
-    """What became of the row of one robot about which there was something to decide.
+    """What became of the row of one robot about which there was something to decide."""
 
-    Attributes:
-        alarm: for whatever reason.
-        reason: one of ``REASONS``; empty where there is no alarm.
-        event: a place in ``EVENTS``; 0 where there is no alarm.
-        response: what is done about it.
-        decision: what it has led to.
-    """
-
-    alarm: bool
-    reason: str
-    event: int
-    response: Response
-    decision: Decision
+    alarm: bool  # for whatever reason
+    reason: str  # one of ``REASONS``; empty where there is no alarm
+    event: int  # a place in ``EVENTS``; 0 where there is no alarm
+    response: Response  # what is done about it
+    decision: Decision  # what it has led to
 
 
 class RowReport(NamedTuple):
-    """What became of a row of each of n robots; mappings hold those robots alone of which there is something to say.
+    """What became of a row of each of n robots; mappings hold those robots alone of which there is something to say."""
 
-    Attributes:
-        surprise: as it counts, repaired senses left out.
-        threshold: (n,).
-        alarm, intervened: (n,).
-        event: (n,) places in ``EVENTS``.
-        state: (n,) who acts next, places in ``STATES``.
-        severity: of each.
-        outcomes, failure: by robot.
-        repairs: by robot, the sensors that are not believed now, and those of them that stand in no observation.
-        lost: by robot, the numbers that were not finite.
-        latency: of the monitor [s].
-    """
-
-    surprise: Surprise
-    threshold: NDArray[np.float64]
-    alarm: Mask
-    intervened: Mask
-    event: NDArray[np.int8]
-    state: NDArray[np.int8]
+    surprise: Surprise  # as it counts, repaired senses left out
+    threshold: NDArray[np.float64]  # (n,)
+    alarm: Mask  # (n,)
+    intervened: Mask  # (n,)
+    event: NDArray[np.int8]  # (n,) places in ``EVENTS``
+    state: NDArray[np.int8]  # (n,) who acts next, places in ``STATES``
     severity: Severity
     outcomes: Mapping[int, Outcome] = NOTHING
     failure: Mapping[int, str] = NOTHING
-    repairs: Mapping[int, tuple[tuple[str, ...], tuple[str, ...]]] = NOTHING
-    lost: Mapping[int, tuple[str, ...]] = NOTHING
-    latency: float = 0.0
+    repairs: Mapping[int, tuple[tuple[str, ...], tuple[str, ...]]] = NOTHING  # not believed, and not observed either
+    lost: Mapping[int, tuple[str, ...]] = NOTHING  # the numbers that were not finite
+    latency: float = 0.0  # of the monitor [s]
 
     @property
     def gave_up(self) -> Mask:
@@ -138,8 +117,8 @@ def report(
         ``"missing"``, or a ``"failure"``. ``event``: ``"fault"`` of the body, its senses or its commands; ``"knock"``,
         from which the policy goes on after a pause; ``"stop"``, a joint at its stop, which is no alarm; or empty.
         ``intervened``: something else than the policy acted, in a part of this step at least. ``state``: who acts next,
-        one of ``asm_gym.guard.transitions.State``. ``gave_up``: the episode ends. ``transition``: the name in
-        ``asm_gym.guard.transitions.TRANSITIONS`` of what has led there, ``"override"``, ``"release"``, ``"trial"``,
+        one of ``asm_gym.guard.arbiter.State``. ``gave_up``: the episode ends. ``transition``: the name in
+        ``asm_gym.guard.arbiter.TRANSITIONS`` of what has led there, ``"override"``, ``"release"``, ``"trial"``,
         ``"give_up"``, or how the policy goes on in alarm, ``"go on"``, ``"complete"``; empty where nothing changes.
         They go to the log ``asm_gym.safety`` with the cause. ``failure``: what failed in this step, ``policy: …``,
         ``stream: …``, ``monitor: …``, ``completion: …`` or ``reflex: …``; or empty. ``cause``: at an alarm, ``family``
@@ -175,7 +154,7 @@ def report(
         "cause": caused.cause,
         "response": caused.name,
         "case": caused.case,
-        "severity": {name: part[robot].item() for name, part in last.severity.named.items()},
+        "severity": last.severity.named(robot),
         "executed_action": None if executed is None else np.array(executed),
         "attribution": dict(zip(spec.labels, worst.attribution[robot].tolist(), strict=True)),
         "surprises": surprises,
@@ -193,39 +172,63 @@ def _largest(parts: Iterable[NDArray[np.float64] | None], robot: int, unknown: f
 
 def side_by_side(row: RowReport, spec: StreamSpec) -> dict[str, Any]:
     """Return what ``report`` says of one row of each robot, in arrays whose first axis is n."""
-    n, value = len(row.alarm), row.surprise.value
-    outcomes = [row.outcome(i) for i in range(n)]
-    caused = [o.response if o.response.why else NO_RESPONSE for o in outcomes]
-    completed, unread = zip(*(row.repairs.get(i, ((), ())) for i in range(n)), strict=True)
+    each = [report([row], i, spec) for i in range(len(row.alarm))]
+    found: dict[str, Any] = {key: _array([said[key] for said in each]) for key in each[0]}
+    for key in ("severity", "attribution"):
+        found[key] = {name: np.array([said[key][name] for said in each]) for name in each[0][key]}
+    return found | {"executed_action": None, "surprises": row.surprise.value[:, None]}
 
-    def listed(values: Sequence[Any]) -> NDArray[Any]:
-        array = np.empty(n, object)
-        for i, value in enumerate(values):
-            array[i] = value
-        return array
 
-    return {
-        "surprise": value,
-        "surprise_body": value if row.surprise.of_body is None else row.surprise.of_body,
-        "surprise_skill": np.full(n, np.nan) if row.surprise.of_skill is None else row.surprise.of_skill,
-        "threshold": row.threshold,
-        "alarm": row.alarm,
-        "reason": np.array([o.reason for o in outcomes]),
-        "event": np.array(EVENTS)[row.event],
-        "state": np.array([str(state) for state in STATES])[row.state],
-        "intervened": row.intervened,
-        "gave_up": row.gave_up,
-        "transition": np.array([o.decision.transition for o in outcomes]),
-        "failure": np.array([row.failure.get(i, "") for i in range(n)]),
-        "cause": listed([response.cause for response in caused]),
-        "response": np.array([response.name for response in caused]),
-        "case": np.array([response.case for response in caused]),
-        "severity": row.severity.named,
-        "executed_action": None,
-        "attribution": dict(zip(spec.labels, row.surprise.attribution.T, strict=True)),
-        "surprises": value[:, None],
-        "latency_us": np.full(n, 1e6 * row.latency),
-        "completed": listed(completed),
-        "unread": listed(unread),
-        "lost": listed([row.lost.get(i, ()) for i in range(n)]),
-    }
+def _array(values: list[Any]) -> NDArray[Any]:
+    """Return values in an array, each of them one element."""
+    if not isinstance(values[0], dict | tuple):
+        return np.array(values)
+    array = np.empty(len(values), object)
+    array[:] = values
+    return array
+
+
+class LazyInfo(dict[str, Any]):
+    """A dict whose content is made when it is first read; copied or pickled it is a plain dict.
+
+    Args:
+        make: returns the content, from values that never change.
+    """
+
+    def __init__(self, make: Callable[[], Mapping[str, Any]]) -> None:
+        super().__init__()
+        self._make: Callable[[], Mapping[str, Any]] | None = make
+
+    def __missing__(self, key: str) -> Any:
+        if self._make is None:
+            raise KeyError(key)
+        self.fill()
+        return self[key]
+
+    def fill(self) -> None:
+        """Make the content now; what was written before stays."""
+        make, self._make = self._make, None
+        if make is not None:
+            written = dict.copy(self)
+            dict.clear(self)
+            dict.update(self, make(), **written)
+
+    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
+        return dict, (dict(self),)
+
+
+def _filled_first(name: str) -> Callable[..., Any]:
+    own = getattr(dict, name)
+
+    def method(self: LazyInfo, *args: Any, **kwargs: Any) -> Any:
+        self.fill()
+        return own(self, *args, **kwargs)
+
+    return method
+
+
+for _name in (
+    *("__iter__", "__reversed__", "__len__", "__contains__", "__eq__", "__ne__", "__repr__", "__delitem__", "__or__"),
+    *("__ror__", "__ior__", "keys", "values", "items", "get", "pop", "popitem", "setdefault", "copy", "clear"),
+):
+    setattr(LazyInfo, _name, _filled_first(_name))

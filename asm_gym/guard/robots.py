@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.kinematics import Chain
+from asm_gym.detection.kinematics import Chain
 from asm_gym.spec import Channel, StreamSpec
 
 NO_COLUMNS = np.zeros(0, np.intp)

@@ -33,105 +33,72 @@ BLOW = 2900.0
 FAST = 0.35
 """No healthy hand is faster [m/s]."""
 
+UNKNOWN = np.array([np.nan, 0.0, np.nan])
+"""Force, impulse and speed of a robot of which nothing is known."""
+
 KNOCKED = EVENTS.index(KNOCK)
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-class Felt(NamedTuple):
-    """What n arms felt in the physics substeps of a control step; not a number where nothing feels there.
-
-    Attributes:
-        numbers: (n, 2 + F) the largest share of a contact limit, when in the step a limit was passed [s], and the mean
-            of what was felt, in the order of ``Robots.felt_channels`` [N], [N m].
-    """
-
-    numbers: Floats
-
-    @classmethod
-    def nothing(cls, count: int, size: int) -> Self:
-        """Return that nothing was felt by ``count`` arms, in ``size`` numbers."""
-        return cls(np.full((count, 2 + size), np.nan))
+def nothing_felt(count: int, size: int) -> Floats:
+    """Return that ``count`` arms felt nothing within a step; arguments and result as ``felt`` in ``Severity``."""
+    return np.full((count, 2 + size), np.nan)
 
 
 class Severity(NamedTuple):
-    """How bad it is for each of n robots.
+    """How bad it is for each of n robots; what is not sensed is not a number."""
 
-    Attributes:
-        felt: in the substeps of this step.
-        numbers: (n, 3) contact force on the arm, estimated from wrist and joints, the mean of the step [N]; what that
-            force has added up to beyond ``FREE_FORCE`` in this episode [N s]; the speed of the fastest hand [m/s].
-            Force and speed are not a number where they are not sensed.
-        presses: (n,) a limit was passed, or the arm leans on something.
-        held: (n,) the arm is kept where it is.
-    """
-
-    felt: Felt
+    felt: Floats
+    """(n, 2 + F) in the physics substeps of this control step: the largest share of a contact limit, when in the step a
+    limit was passed [s], and the mean of what was felt, in the order of ``Robots.felt_channels`` [N], [N m]."""
     numbers: Floats
-    presses: Mask
-    held: Mask
+    """(n, 3) contact force on the arm, estimated from wrist and joints, the mean of the step [N]; what that force has
+    added up to beyond ``FREE_FORCE`` in this episode [N s]; speed of the fastest hand [m/s]."""
+    presses: Mask  # (n,) a limit was passed, or the arm leans on something
+    held: Mask  # (n,) the arm is kept where it is
 
     @classmethod
     def unknown(cls, count: int) -> Self:
         """Return that nothing is known of ``count`` robots."""
         no = np.zeros(count, bool)
-        return cls(Felt.nothing(count, 0), np.tile([np.nan, 0.0, np.nan], (count, 1)), no, no)
+        return cls(nothing_felt(count, 0), np.tile(UNKNOWN, (count, 1)), no, no)
 
-    @property
-    def named(self) -> dict[str, NDArray[Any]]:
-        """What ``info["asm"]["severity"]`` says.
+    def named(self, robot: int) -> dict[str, Any]:
+        """Return what ``info["asm"]["severity"]`` says of a robot.
 
-        ``load``: (n,) the largest share of a contact limit that was felt in a physics substep; ``presses``; ``force``;
+        ``load``: the largest share of a contact limit that was felt in a physics substep; ``presses``; ``force``;
         ``impulse``; ``speed``; ``predicted_force``: of the blow if the hand met something stiff now [N]; ``held``;
         ``left_s``: when in the step a limit was passed [s].
         """
-        (load, left_s), (force, impulse, speed) = self.felt.numbers.T[:2], self.numbers.T
-        return {
-            "load": load,
-            "presses": self.presses,
-            "force": force,
-            "impulse": impulse,
-            "speed": speed,
-            "predicted_force": BLOW * speed,
-            "held": self.held,
-            "left_s": left_s,
-        }
+        load, left_s = self.felt[robot, :2].tolist()
+        force, impulse, speed = self.numbers[robot].tolist()
+        forces = {"force": force, "impulse": impulse, "speed": speed, "predicted_force": BLOW * speed}
+        presses, held = bool(self.presses[robot]), bool(self.held[robot])
+        return {"load": load, "presses": presses, **forces, "held": held, "left_s": left_s}
 
     def where(self, known: Mask) -> Severity:
         """Return it of those robots alone that are ``known`` (n,)."""
-        none, at = np.array([np.nan, 0.0, np.nan]), known[:, None]
-        felt = Felt(np.where(at, self.felt.numbers, np.nan))
-        return Severity(felt, np.where(at, self.numbers, none), self.presses & known, self.held & known)
+        felt, numbers = (np.where(known[:, None], a, b) for a, b in ((self.felt, np.nan), (self.numbers, UNKNOWN)))
+        return Severity(felt, numbers, self.presses & known, self.held & known)
 
 
-class ForceColumns(NamedTuple):
-    """Where numbers stand that tell of a contact force: (W, 3) forces at wrists, and (J,) external torques."""
-
-    wrists: NDArray[np.intp]
-    torques: NDArray[np.intp]
-
-    @classmethod
-    def of(cls, channels: Sequence[Channel]) -> Self:
-        """Return those of numbers in the order of ``channels``, by their names."""
-        places = _places(channels)
-        wrists = [own for name, own in places.items() if name.endswith("wrist_force") and len(own) == 3]
-        torques = [own for name, own in places.items() if name.endswith("external_torque")]
-        return cls(_triples(wrists), np.concatenate([np.zeros(0, np.intp), *torques]).astype(np.intp))
-
-
-def hand_velocities(spec: StreamSpec) -> NDArray[np.intp]:
-    """Return the (H, 3) columns of hands' velocities."""
-    return _triples([own for name, own in _places(spec.channels).items() if name.endswith("hand_velocity")])
-
-
-def _places(channels: Sequence[Channel]) -> dict[str, NDArray[np.intp]]:
+def _columns(channels: Sequence[Channel], ending: str) -> list[NDArray[np.intp]]:
+    """Return where the numbers of the channels stand whose names end so, in the order of ``channels``."""
     ends = np.cumsum([0, *(c.size for c in channels)])
-    return {c.name: np.arange(ends[i], ends[i + 1]) for i, c in enumerate(channels)}
+    return [np.arange(ends[i], ends[i + 1]) for i, c in enumerate(channels) if c.name.endswith(ending)]
 
 
-def _triples(found: Sequence[NDArray[np.intp]]) -> NDArray[np.intp]:
-    return np.array([own for own in found if own.size == 3], np.intp).reshape(-1, 3)
+def _vectors(channels: Sequence[Channel], ending: str) -> NDArray[np.intp]:
+    """Return (N, 3) the columns of such channels that are vectors."""
+    return np.array([own for own in _columns(channels, ending) if own.size == 3], np.intp).reshape(-1, 3)
+
+
+def _forces(channels: Sequence[Channel]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the columns that tell of a contact force: (W, 3) forces at wrists, and (J,) external torques."""
+    torques = np.concatenate([np.zeros(0, np.intp), *_columns(channels, "external_torque")])
+    return _vectors(channels, "wrist_force"), torques.astype(np.intp)
 
 
 @compiled
@@ -188,7 +155,7 @@ def _weigh(
     """Judge rows (n, D), and count those about which there is nothing to decide; return how many there are to decide.
 
     Args:
-        felt: as in ``Felt``.
+        felt: as in ``Severity``.
         pressed: (2, n) impulse, and for how long each arm has leant; they are moved on.
         value, raw, excuse: (n,) as ``Surprise``.
         threshold: (n,) of surprise.
@@ -228,19 +195,12 @@ def _weigh(
 
 
 class Weighed(NamedTuple):
-    """What surprise and severity come to.
+    """What surprise and severity come to."""
 
-    Attributes:
-        over: (n,) surprise is over the threshold.
-        event: (n,) what excuses a surprise that is over the threshold but for that, a place in ``EVENTS``.
-        decides: (n,) there is something to decide.
-        some: how many of them.
-    """
-
-    over: Mask
-    event: NDArray[np.int8]
-    decides: Mask
-    some: int
+    over: Mask  # (n,) surprise is over the threshold
+    event: NDArray[np.int8]  # (n,) what excuses a surprise that is over the threshold but for that, of ``EVENTS``
+    decides: Mask  # (n,) there is something to decide
+    some: int  # how many of them
 
     def knocked(self, robot: int) -> bool:
         """Return whether a knock, and nothing else, excuses the surprise at a robot's row."""
@@ -259,7 +219,7 @@ class SeverityEstimator:
     """
 
     def __init__(self, count: int, spec: StreamSpec, felt: Sequence[Channel], leans_s: float, arbiter: Arbiter) -> None:
-        columns = *ForceColumns.of(felt), *ForceColumns.of(spec.channels), hand_velocities(spec)
+        columns = *_forces(felt), *_forces(spec.channels), _vectors(spec.channels, "hand_velocity")
         self._pressed, self._no_excuse = np.zeros((2, count)), np.zeros(count, np.int8)
         self._how: tuple[Any, ...] = *columns, spec.dt, leans_s, arbiter.most_impulse, self._pressed
         self._arbiter: tuple[Any, ...] = arbiter.threshold, arbiter.state, arbiter.counts, arbiter.largest
@@ -269,7 +229,7 @@ class SeverityEstimator:
         self._pressed[:, which] = 0.0
 
     def weigh(
-        self, rows: NDArray[np.float32], felt: Felt, held: Mask, surprise: Surprise, active: Mask, decides: Mask
+        self, rows: NDArray[np.float32], felt: Floats, held: Mask, surprise: Surprise, active: Mask, decides: Mask
     ) -> tuple[Severity, Weighed]:
         """Judge the next rows (n, D), which may have numbers that are not finite.
 
@@ -282,6 +242,6 @@ class SeverityEstimator:
         presses, over, event, numbers = np.empty(n, bool), np.empty(n, bool), np.empty(n, np.int8), np.empty((n, 3))
         judged: tuple[Any, ...] = value, value if raw is None else raw, self._no_excuse if excuse is None else excuse
         found: tuple[Any, ...] = numbers, presses, over, event
-        arguments: tuple[Any, ...] = rows, felt.numbers, *self._how, *judged, *self._arbiter, active, decides, *found
+        arguments: tuple[Any, ...] = rows, felt, *self._how, *judged, *self._arbiter, active, decides, *found
         some = _weigh(*arguments)
         return Severity(felt, numbers, presses, held), Weighed(over, event, decides, some)

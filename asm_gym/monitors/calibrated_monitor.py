@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint
-from asm_gym.contact_limits import healthy_forces
 from asm_gym.detection import Detection, Nominal
 from asm_gym.detection.conformal import HOUR
+from asm_gym.detection.contact_limits import FamiliarSpeed, healthy_forces
 from asm_gym.episode import Episode
-from asm_gym.familiar_speed import FamiliarSpeed
 from asm_gym.monitors.base import Model, Progress, State, Surprise
 from asm_gym.monitors.calibration import LOG, AlarmRate, Calibrated, require_sight, warn_of_crashes
 from asm_gym.monitors.files import SavedMonitor, write_monitor

@@ -21,9 +21,9 @@ from asm_gym.detection import (
 )
 from asm_gym.detection.base import Array
 from asm_gym.detection.conformal import EPISODE, HOUR
+from asm_gym.detection.contact_limits import FamiliarSpeed
 from asm_gym.detection.hourly import check_hours
 from asm_gym.episode import Episode
-from asm_gym.familiar_speed import FamiliarSpeed
 from asm_gym.monitors.base import Surprise
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import typed

@@ -13,7 +13,7 @@ from asm_gym.checkpoint import Checkpoint, write_checkpoint
 from asm_gym.detection import Blocks, EvidenceDetection
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.conformal import EPISODE, HOUR
-from asm_gym.familiar_speed import FamiliarSpeed
+from asm_gym.detection.contact_limits import FamiliarSpeed
 from asm_gym.monitors.packing import is_older, packed, unpacked
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_number

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from asm_gym.contact_limits import ContactLimits
+from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.evaluation.statistics import wilson_interval

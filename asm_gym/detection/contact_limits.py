@@ -11,23 +11,37 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from asm_gym.spec import Channel, StreamSpec
-from asm_gym.validation import check_flag, check_number
+from asm_gym.validation import check_flag, check_number, check_numbers
 
 FELT = "external_torque", "wrist_force"
 """Ends of the names of the channels that limits are about."""
 
 LEFT_OUT = 0.05
-"""Share of healthy episodes, those that pressed hardest, that say nothing of what healthy motion needs: a knock in one
-of twenty is a knock."""
+"""Share of healthy episodes, those that pressed hardest, left out of what healthy motion needs: one knock in twenty."""
 
 MOST = 2.5
 """What was seen counts up to so many times the usual limits: 200 N, 100 N m."""
+
+CELL, NEAR = 0.02, 0.04
+"""Edge of the cubes in which speeds are learned, and distance within which a cube counts [m]."""
+
+QUANTILE = 0.95
+"""Of the speeds in a cube."""
+
+MORE = 1.2
+"""Faster by so many times than healthy episodes were is familiar still."""
+
+UNKNOWN = 0.05
+"""Speed where nothing is known [m/s]: the first blow on a stiff table stays below 100 N."""
+
+PLACE, VELOCITY = "hand_position", "hand_velocity"
+"""Channels that tell of one hand."""
 
 
 @dataclass(frozen=True)
@@ -57,20 +71,15 @@ class ContactLimits:
     stays: bool = True
 
     def __post_init__(self) -> None:
-        check_number("wrist_force", self.wrist_force, above=0, infinite=True)
-        check_number("external_torque", self.external_torque, above=0, infinite=True)
-        check_number("hand_speed", self.hand_speed, above=0, infinite=True)
+        for name in ("wrist_force", "external_torque", "hand_speed"):
+            check_number(name, getattr(self, name), above=0, infinite=True)
         for value in self.healthy:
             check_number("healthy", value, low=0)
         check_flag("by_place", self.by_place)
         check_flag("stays", self.stays)
 
     def most(self, felt: Sequence[Channel]) -> NDArray[np.float64]:
-        """(N,) the limit of each number of what is felt.
-
-        Raises:
-            ValueError: ``healthy`` is of another arm.
-        """
+        """Return (N,) the limit of each number that is felt. Raises ValueError where ``healthy`` is of another arm."""
         fixed = [self.wrist_force if c.name.endswith("wrist_force") else self.external_torque for c in felt]
         most = np.repeat(fixed, [c.size for c in felt]).astype(np.float64)
         if self.healthy and len(self.healthy) != len(most):
@@ -80,7 +89,7 @@ class ContactLimits:
         return np.maximum(most, self.healthy) if self.healthy else most
 
     def stricter(self, forces: float, speed: float) -> ContactLimits:
-        """With a share of the limits on ``forces``, and at most ``speed`` [m/s]."""
+        """Return limits with a share of those on ``forces``, and at most ``speed`` [m/s]."""
         return replace(
             self,
             wrist_force=forces * self.wrist_force,
@@ -96,18 +105,17 @@ class ContactLimits:
 
 
 def healthy_forces(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> tuple[float, ...]:
-    """The most that healthy motion was seen to reach, (N,) of each number that an arm feels [N m], [N].
+    """Return (N,) the most that healthy motion reached, of each number that an arm feels [N m], [N].
 
     Args:
         streams: (T, D) of healthy episodes; peaks within rows count where they are sensed.
-
-    Returns:
-        Empty where the stream senses no such forces. See ``LEFT_OUT`` and ``MOST``.
+        spec: of the streams; where it senses no such forces, nothing is returned.
     """
     felt = [c for c in spec.channels if c.name.endswith(FELT)]
     if not streams or not felt:
         return ()
-    columns = np.concatenate([np.arange(spec.size)[_peaks(spec, c)] for c in felt])
+    peaks = [spec.slices.get(f"{c.name}_peak", spec.slices[c.name]) for c in felt]
+    columns = np.concatenate([np.arange(spec.size)[peak] for peak in peaks])
     reached = np.stack([np.nanmax(np.abs(stream[:, columns].astype(np.float64)), axis=0) for stream in streams])
     usual = ContactLimits().most(felt)
     shares = (reached / usual).max(axis=1)
@@ -115,6 +123,45 @@ def healthy_forces(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpe
     return tuple(np.minimum(reached[kept].max(axis=0), MOST * usual).tolist())
 
 
-def _peaks(spec: StreamSpec, channel: Channel) -> slice:
-    """Where the peaks of a channel stand, or else the channel."""
-    return spec.slices.get(f"{channel.name}_peak", spec.slices[channel.name])
+class FamiliarSpeed(NamedTuple):
+    """How fast a hand has healthily gone at each place: the 95 % quantile in cubes of ``CELL``.
+
+    Attributes:
+        places: (n, 3) middles of cubes [m].
+        speeds: (n,) [m/s].
+    """
+
+    places: NDArray[np.float64]
+    speeds: NDArray[np.float64]
+
+    @classmethod
+    def learned(cls, streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> Self | None:
+        """Learn it from healthy episodes (T, D); None where their stream tells of no hand, or of two."""
+        if not streams or PLACE not in spec.slices or VELOCITY not in spec.slices:
+            return None
+        rows = np.concatenate([np.asarray(stream, np.float64) for stream in streams])
+        cells = np.floor(rows[:, spec.slices[PLACE]] / CELL).astype(np.int64)
+        speeds = np.linalg.norm(rows[:, spec.slices[VELOCITY]], axis=1)
+        finite = np.isfinite(speeds) & np.isfinite(rows[:, spec.slices[PLACE]]).all(axis=1)
+        known, which = np.unique(cells[finite], axis=0, return_inverse=True)
+        usual = [np.quantile(speeds[finite][which.ravel() == n], QUANTILE) for n in range(len(known))]
+        return cls((known + 0.5) * CELL, np.array(usual))
+
+    @classmethod
+    def restored(cls, rows: ArrayLike) -> Self | None:
+        """Return what ``rows`` says; None of nothing. Raises ValueError where it is something else."""
+        if not np.size(rows):
+            return None
+        saved = check_numbers("familiar speeds", rows, len(np.asarray(rows)), 4)
+        return cls(saved[:, :3], saved[:, 3])
+
+    @property
+    def rows(self) -> list[list[float]]:
+        """What a file keeps: place and speed, a row each."""
+        found: list[list[float]] = np.column_stack([self.places, self.speeds]).round(4).tolist()
+        return found
+
+    def at(self, place: NDArray[np.floating[Any]]) -> float:
+        """Return how fast a hand may go at ``place`` (3,) [m/s], by the fastest of the cubes within ``NEAR``."""
+        near = np.linalg.norm(self.places - place, axis=1) <= NEAR
+        return max(UNKNOWN, MORE * float(self.speeds[near].max())) if near.any() else UNKNOWN
