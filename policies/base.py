@@ -1,11 +1,16 @@
-"""What everything that acts has in common: stable-baselines3's ``predict``."""
+"""What everything that acts has in common: stable-baselines3's ``predict``; and one episode of it."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
+
+from asm_gym.validation import check_number, typed
 
 PolicyState = Any
 """What a policy carries from step to step: a value, passed in and handed back. None starts an episode."""
@@ -28,20 +33,14 @@ class Policy(Protocol):
 
 @runtime_checkable
 class Reflex(Policy, Protocol):
-    """A policy that is told of every step, and starts from what was done last."""
+    """A policy that is told of every step, and starts from the action executed last."""
 
     def reset(self) -> None:
-        """A new episode begins."""
+        """Begin a new episode."""
         ...
 
     def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
-        """Take in what was sensed in a step, and what was done.
-
-        Args:
-            row: (D,) of the stream; NaN where it is missing.
-            executed: (A,).
-            acting: whether this reflex did it.
-        """
+        """Take in the row (D,) of a step, NaN where it is missing, the action (A,), and whether this reflex did it."""
         ...
 
     def begin(self, executed: NDArray[np.float32]) -> Any:
@@ -56,3 +55,62 @@ class Seeded(Protocol):
     def set_random_seed(self, seed: int) -> None:
         """All that is drawn from now on follows from ``seed``."""
         ...
+
+
+class StatefulPolicy(ABC):
+    """A policy whose state begins anew in every episode."""
+
+    @abstractmethod
+    def begin(self, observation: Any) -> Any:
+        """Return the first state of an episode."""
+
+    @abstractmethod
+    def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
+        """Return the action (A,) and the next state."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: PolicyState = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], PolicyState]:
+        """Return the action (A,), and the state to pass in next time; None, or ``episode_start``, begins an episode."""
+        if state is None or (episode_start is not None and np.any(episode_start)):
+            state = self.begin(observation)
+        return self.act(observation, state, deterministic)
+
+
+@typed
+def rollout(
+    env: gym.Env[Any, Any],
+    policy: Policy,
+    seed: int | None = None,
+    on_step: Callable[[dict[str, Any]], None] | None = None,
+    steps: int | None = None,
+) -> bool:
+    """Run one episode, until it is terminated or truncated; return whether it succeeded at some step.
+
+    In steps in which another acted, as ``info["overridden"]`` says, the policy's state stays what it was, so that it
+    resumes where it was left.
+
+    Args:
+        on_step: is shown every step's ``info``.
+        steps: where to leave it, if it has not ended before.
+    """
+    if steps is not None:
+        check_number("steps", steps, low=1, whole=True)
+    observation, _ = env.reset(seed=seed)
+    state, success, done, taken = None, False, False, 0
+    start = np.ones(1, dtype=bool)
+    while not done:
+        action, next_state = policy.predict(observation, state=state, episode_start=start, deterministic=False)
+        observation, _, terminated, truncated, info = env.step(action)
+        if not info.get("overridden", False):
+            state, start = next_state, np.zeros(1, dtype=bool)
+        taken += 1
+        done = bool(terminated or truncated) or taken == steps
+        success = success or bool(info.get("success", False))
+        if on_step is not None:
+            on_step(info)
+    return success

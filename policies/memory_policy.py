@@ -1,8 +1,15 @@
 """The Neural ASM as a policy: what the memory expects to be commanded next is what is commanded.
 
-row → memory: expect, infer → motor prediction â → action, grippers by ``grip`` → env → row
+row → memory: expect, infer → motor prediction â → action, grippers by evidence → env → row
 
-Nothing selects a skill: the row says what lies about, and the memory's state what is being done with it.
+A gripper changes its command once there is enough evidence for the other one,
+
+    E_t = exp(-Δt/τ) E_{t-1} + Δt p_t,    E_t > θ:  the other command is given, and E = 0,
+
+where p_t is how surely the other command is expected, from 0 to 1. The prediction is a mean over what was shown in
+similar situations: by its sign alone a gripper would hold on for ever where one demonstration in five lets go.
+
+Source: Usher and McClelland 2001 (Psychological Review 108(3)), without their mutual inhibition.
 """
 
 from __future__ import annotations
@@ -16,12 +23,54 @@ from numpy.typing import NDArray
 
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import State
-from asm_gym.policies.grip import CommandReadout, Grip
+from asm_gym.policies.base import StatefulPolicy
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.validation import typed
 
 OBJECT = "object"
-"""The group of what lies about; the objects of other tasks are out of play, and read 0."""
+"""The group of objects; those of other tasks are out of play, and read 0."""
+
+FORGETS = 1.6
+"""τ [s]."""
+
+ENOUGH = 0.15
+"""θ: so long a command must be expected without a doubt [s]."""
+
+
+class Grip(NamedTuple):
+    """What the G grippers are told; a value."""
+
+    high: NDArray[np.bool_]  # (G,) told the upper end of the action's range, else the lower
+    evidence: NDArray[np.float64]  # (G,) E [s]
+
+
+class CommandReadout:
+    """Makes actions of expected commands: kept in the space, and each gripper at one end of its range.
+
+    Args:
+        env: whose actions they are; its ``gripper_actions`` say which of them are grippers'.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        self._space: Any = env.action_space
+        self._grip = np.asarray(getattr(env.unwrapped, "gripper_actions", ()), dtype=int)
+        self._dt = control_period(env)
+        # However long a step lasts, one must not be enough for what is less likely than not.
+        self._enough = max(ENOUGH, 0.5 * self._dt)
+
+    def __call__(self, expected: NDArray[np.float32], before: Grip | None) -> tuple[NDArray[np.float32], Grip]:
+        """Return the action (A,) for expected commands (A,), and the grip to pass in next time; None at first."""
+        low, high = self._space.low, self._space.high
+        action = np.clip(np.nan_to_num(expected), low, high).astype(np.float32)
+        g = self._grip
+        share = ((action - low)[g] / (high - low)[g]).astype(np.float64)  # (G,) 1 where the upper end is certain
+        before = before or Grip(share > 0.5, np.zeros(len(share)))
+        other = np.where(before.high, 1.0 - share, share)
+        evidence = np.exp(-self._dt / FORGETS) * before.evidence + self._dt * other
+        changes = evidence > self._enough
+        grip = Grip(before.high ^ changes, np.where(changes, 0.0, evidence))
+        action[g] = np.where(grip.high, high[g], low[g])
+        return action, grip
 
 
 class StreamReader:
@@ -36,41 +85,45 @@ class StreamReader:
     """
 
     def __init__(self, spec: StreamSpec, env: gym.Env[Any, Any]) -> None:
-        inner: Any = env.unwrapped
-        self._inner, self._measures = inner, hasattr(inner, "measured_spec")
-        theirs = inner.measured_spec if self._measures else _of_spaces(env)
-        if self._measures and spec.dt != control_period(env):
-            raise ValueError(
-                f"the memory reads a row every {spec.dt} s, and is asked to act every {control_period(env)} s"
-            )
+        dt, inner = control_period(env), env.unwrapped
+        self._inner: Any = inner if hasattr(inner, "measured_spec") else None
+        if self._inner and spec.dt != dt:
+            raise ValueError(f"the memory reads a row every {spec.dt} s, and is asked to act every {dt} s")
+        own = StreamSpec.from_spaces
+        theirs = self._inner.measured_spec if self._inner else own(env.observation_space, env.action_space, dt)
+        _check_fit(spec, theirs)
         self.spec = spec
-        self._from, self._to = self.between(spec, theirs)
-
-    @staticmethod
-    def between(spec: StreamSpec, theirs: StreamSpec) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Which columns of ``theirs`` there are in ``spec``, and where.
-
-        Raises:
-            ValueError: ``theirs`` lacks channels, or has other ones by the same name.
-        """
-        lines = [line for line in spec.difference(theirs) if not _harmless(line, spec, theirs)]
-        if spec.source and theirs.source and spec.source != theirs.source:
-            lines.append(f"robot: {spec.source} against {theirs.source}")
-        objects = [c.name for c in spec.channels if c.group == OBJECT]
-        if objects and not any(name in theirs.slices for name in objects):
-            lines.append(f"objects: {', '.join(objects)} are known, none of which is here")
-        if lines:
-            raise ValueError("the memory does not fit this environment:\n  " + "\n  ".join(lines))
         shared = [name for name in spec.slices if name in theirs.slices]
-        source, target = ([i for n in shared for i in range(s.size)[s.slices[n]]] for s in (theirs, spec))
-        return np.array(source, np.intp), np.array(target, np.intp)
+        self._from, self._to = (
+            np.array([i for n in shared for i in range(s.size)[s.slices[n]]], np.intp) for s in (theirs, spec)
+        )
 
     def __call__(self, observation: Any, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(D,) what is sensed now, after ``action`` (A,)."""
-        measured = self._inner.measured if self._measures else np.concatenate([np.ravel(observation), np.ravel(action)])
+        """Return the row (D,) that is sensed now, after ``action`` (A,)."""
+        measured = self._inner.measured if self._inner else np.concatenate([np.ravel(observation), np.ravel(action)])
         row = np.zeros(self.spec.size, np.float32)
         row[self._to] = measured[self._from]
         return row
+
+
+def _check_fit(spec: StreamSpec, theirs: StreamSpec) -> None:
+    """Raise ValueError unless an environment that measures ``theirs`` has what a memory of ``spec`` reads.
+
+    Further channels, another order, and objects of other tasks do not matter.
+    """
+    objects = [c.name for c in spec.channels if c.group == OBJECT]
+    absent = [f"{name}: missing" for name in objects]
+    lines = [
+        line
+        for line in spec.difference(theirs)
+        if line not in absent and not line.endswith(": new") and not line.startswith(("order: ", "dt: "))
+    ]
+    if spec.source and theirs.source and spec.source != theirs.source:
+        lines.append(f"robot: {spec.source} against {theirs.source}")
+    if objects and not any(name in theirs.slices for name in objects):
+        lines.append(f"objects: {', '.join(objects)} are known, none of which is here")
+    if lines:
+        raise ValueError("the memory does not fit this environment:\n  " + "\n  ".join(lines))
 
 
 class ActingState(NamedTuple):
@@ -81,7 +134,7 @@ class ActingState(NamedTuple):
     grip: Grip | None = None  # what grippers are told; None before the first step
 
 
-class NeuralASMPolicy:
+class NeuralASMPolicy(StatefulPolicy):
     """Drives an environment by a memory's motor prediction.
 
     The memory reads every row that the environment measures, its own command among it. Fit it on streams that hold the
@@ -111,16 +164,11 @@ class NeuralASMPolicy:
         """With the memory in a file; raises as ``NeuralASM.load`` does too."""
         return cls(NeuralASM.load(path), env)
 
-    def predict(
-        self,
-        observation: Any,
-        state: ActingState | None = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], ActingState]:
-        """The action (A,) that the memory expects, and the state to pass in next time; nothing is drawn at random."""
-        if state is None or (episode_start is not None and np.any(episode_start)):
-            state = ActingState(self.memory.initial_state(), np.zeros(self._size, np.float32))
+    def begin(self, observation: Any) -> ActingState:
+        return ActingState(self.memory.initial_state(), np.zeros(self._size, np.float32))
+
+    def act(self, observation: Any, state: ActingState, deterministic: bool) -> tuple[NDArray[np.float32], ActingState]:
+        """Return the action (A,) that the memory expects, and the next state; nothing is drawn at random."""
         row = self._read(observation, state.action)
         memory, _ = self.memory.observe(state.memory, row[None])
         action, grip = self._readout(self.memory.expected_action(memory)[0], state.grip)
@@ -137,14 +185,3 @@ def require_motor(spec: StreamSpec, env: gym.Env[Any, Any]) -> int:
     if len(spec.motor) != int(np.prod(space.shape)):
         raise ValueError(f"this memory predicts {len(spec.motor)} commands, the environment takes {space.shape}")
     return len(spec.motor)
-
-
-def _of_spaces(env: gym.Env[Any, Any]) -> StreamSpec:
-    return StreamSpec.from_spaces(env.observation_space, env.action_space, control_period(env))
-
-
-def _harmless(line: str, spec: StreamSpec, theirs: StreamSpec) -> bool:
-    """Whether a difference keeps nobody from reading: what is not asked for, where it stands, objects out of play."""
-    name, what = line.split(": ", 1)
-    absent = what == "missing" and any(c.name == name and c.group == OBJECT for c in spec.channels)
-    return absent or what == "new" or name == "order" or name == "dt"

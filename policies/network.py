@@ -57,11 +57,10 @@ class NetworkPolicy:
     ) -> None:
         check_choice("activation", activation, ACTIVATIONS)
         check_choice("squash", squash, SQUASHES)
-        if not layers:
-            raise ValueError("a network needs at least one layer, got none")
         self.layers = [(np.asarray(W, np.float32), np.asarray(b, np.float32)) for W, b in layers]
-        if self.layers[0][0].ndim != 2:
-            raise ValueError(f"layer 0 needs weights in two dimensions, got {self.layers[0][0].shape}")
+        if not self.layers or self.layers[0][0].ndim != 2:
+            got = self.layers[0][0].shape if self.layers else "none"
+            raise ValueError(f"a network needs at least one layer, with weights in two dimensions, got {got}")
         size = self.observation_size = int(self.layers[0][0].shape[1])
         for n, (W, b) in enumerate(self.layers):
             if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
@@ -71,11 +70,14 @@ class NetworkPolicy:
             size = len(W)
         self.action_size = size
         self.activation, self.squash = activation, squash
-        self.mean = np.zeros(self.observation_size, np.float32) if mean is None else np.asarray(mean, np.float32)
-        self.scale = np.ones(self.observation_size, np.float32) if scale is None else np.asarray(scale, np.float32)
+        inputs = self.observation_size
+        self.mean, self.scale = (
+            np.full(inputs, usual, np.float32) if given is None else np.asarray(given, np.float32)
+            for given, usual in ((mean, 0.0), (scale, 1.0))
+        )
         for what, array in {"mean": self.mean, "scale": self.scale}.items():
-            if array.shape != (self.observation_size,) or not np.isfinite(array).all():
-                raise ValueError(f"{what} must be {self.observation_size} finite numbers, got {array.shape}")
+            if array.shape != (inputs,) or not np.isfinite(array).all():
+                raise ValueError(f"{what} must be {inputs} finite numbers, got {array.shape}")
         if not (self.scale > 0).all():
             raise ValueError(f"scale must be positive, got {self.scale.min()}")
         self.trained_in = dict(trained_in or {})
@@ -139,21 +141,21 @@ class NetworkPolicy:
             ValueError: the file is damaged, or no agent.
         """
         saved = read_checkpoint(path, KIND)
+        header, arrays = saved.header, saved.arrays
         try:
-            count = sum(name.startswith("W") for name in saved.arrays)
-            layers = [(saved.arrays.pop(f"W{n}"), saved.arrays.pop(f"b{n}")) for n in range(count)]
-            header, mean, scale = saved.header, saved.arrays.pop("mean"), saved.arrays.pop("scale")
-            if saved.arrays:
-                raise ValueError(f"an agent has no {', '.join(saved.arrays)}")
-            how = header["activation"], header["squash"]
-            return cls(layers, *how, mean=mean, scale=scale, trained_in=header["trained_in"])
+            count = sum(name.startswith("W") for name in arrays)
+            layers = [(arrays.pop(f"W{n}"), arrays.pop(f"b{n}")) for n in range(count)]
+            scaling = {name: arrays.pop(name) for name in ("mean", "scale")}
+            if arrays:
+                raise ValueError(f"an agent has no {', '.join(arrays)}")
+            return cls(layers, header["activation"], header["squash"], trained_in=header["trained_in"], **scaling)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged: {error}") from error
 
 
 def describe(env: gym.Env[Any, Any]) -> dict[str, Any]:
     """Return what an agent's actions depend on beside the observation, as far as ``env`` says it."""
-    inner = env.unwrapped
+    inner: Any = env.unwrapped
     found: dict[str, Any] = {"env": inner.spec.id} if inner.spec is not None else {}
     if hasattr(inner, "robots"):
         found["robots"] = list(inner.robots)

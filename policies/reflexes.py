@@ -97,7 +97,7 @@ class Hold:
 
 
 def nearest_to_rest(space: spaces.Box) -> NDArray[np.float32]:
-    """(A,) the action of a space that comes nearest to none."""
+    """Return the action (A,) of a space that is nearest to zero."""
     nearest: NDArray[np.float32] = np.clip(np.zeros(space.shape), space.low, space.high).astype(np.float32)
     return nearest
 

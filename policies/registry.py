@@ -13,14 +13,11 @@ from asm_gym.policies.memory_policy import NeuralASMPolicy
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.reflexes import Hold
 from asm_gym.policies.sb3 import read_archive
+from asm_gym.policies.scripted.carry import NutAssemblyExpert, StackExpert
 from asm_gym.policies.scripted.door import DoorExpert
 from asm_gym.policies.scripted.lift import LiftExpert
-from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
-from asm_gym.policies.scripted.peg_in_hole import PegInHoleExpert
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
-from asm_gym.policies.scripted.stack import StackExpert
-from asm_gym.policies.scripted.sway import EXPERTS as OTHER_EXPERTS
-from asm_gym.policies.scripted.sway import Swaying
+from asm_gym.policies.scripted.sway import Arm, Pusher, Swaying
 from asm_gym.policies.scripted.two_arm_lift import TwoArmLiftExpert
 from asm_gym.policies.scripted.wipe import WipeExpert
 from asm_gym.registries import Registry, target
@@ -33,7 +30,6 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
     "Door": DoorExpert,
     "Wipe": WipeExpert,
     "TwoArmLift": TwoArmLiftExpert,
-    "TwoArmPegInHole": PegInHoleExpert,
     **{f"NutAssembly{which}": NutAssemblyExpert for which in ("", "Single", "Square", "Round")},
     **{f"PickPlace{which}": PickPlaceExpert for which in ("", "Single", "Can", "Milk", "Bread", "Cereal")},
 }
@@ -42,15 +38,11 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
 POLICIES = ("scripted", "hold", "sway")
 """Names that ``make_policy`` knows, besides agents."""
 
-
 REGISTERED: Registry[Callable[..., Policy]] = Registry("policy", "asm_gym.policies.registry:REGISTERED")
 """Policies that ``register_policy`` added."""
 
 SHIPPED = Path(__file__).resolve().parent / "agents"
-"""Trained agents that come with the package.
-
-:meta hide-value:
-"""
+"""Trained agents that come with the package."""
 
 
 def register_policy(name: str, make: Callable[..., Policy] | str) -> None:
@@ -78,15 +70,7 @@ def agents() -> tuple[str, ...]:
 
 
 def trained_in(name: str) -> str:
-    """Return the id of the environment that an agent was trained in; empty where its file does not say.
-
-    Args:
-        name: of an agent that comes with the package, or the path of what ``asm-gym train`` left.
-
-    Raises:
-        FileNotFoundError: there is no such agent.
-        ValueError: the file is damaged.
-    """
+    """Return the id of the environment that an agent, by name or path, was trained in; empty where it does not say."""
     return str(NetworkPolicy.load(_agent_file(name)).trained_in.get("env", ""))
 
 
@@ -124,7 +108,7 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
     if name in REGISTERED:
         return REGISTERED[name](env, seed=seed, **kwargs)
     if name == "scripted":
-        experts: dict[str, Callable[..., Policy]] = {**EXPERTS, **OTHER_EXPERTS}
+        experts = {**EXPERTS, "Pusher-v5": Pusher, "asm_gym/SyntheticArm-v0": Arm}
         task = getattr(env.unwrapped, "task", None)
         key = task.name if isinstance(task, TaskSpec) else env.spec.id if env.spec else ""
         if key not in experts:

@@ -1,7 +1,7 @@
 """Reads the policy of a stable-baselines3 archive without unpickling anything in it.
 
-An archive is a zip of ``data`` (JSON, in which what is no JSON is pickled) and of tensors. The network is rebuilt from
-the tensors and from the plain text of the JSON. A policy that its tensors do not describe is refused.
+The archive holds JSON, in which what is no JSON is pickled, and tensors. The network is rebuilt from the tensors and
+from the plain text of the JSON; a policy that its tensors do not describe is refused.
 """
 
 from __future__ import annotations
@@ -106,21 +106,12 @@ def network(algorithm: str, tensors: Tensors, activation: str, **kwargs: Any) ->
         algorithm: ``"SAC"``, ``"TD3"`` (as DDPG) or ``"PPO"`` (as A2C).
         kwargs: handed to ``NetworkPolicy``.
     """
-    if algorithm == "TD3":
-        return NetworkPolicy(_layers(tensors, "actor.mu"), activation, "tanh", **kwargs)
-    if algorithm == "SAC":
-        layers = [*_layers(tensors, "actor.latent_pi"), _layer(tensors, "actor.mu")]
-        return NetworkPolicy(layers, activation, "tanh", **kwargs)
-    layers = [*_layers(tensors, "mlp_extractor.policy_net"), _layer(tensors, "action_net")]
-    return NetworkPolicy(layers, activation, "clip", **kwargs)
-
-
-def _layers(tensors: Tensors, name: str) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Return the linear layers of a torch Sequential, in order."""
-    start, end = f"{name}.", ".weight"
-    numbers = [key[len(start) : -len(end)] for key in tensors if key.startswith(start) and key.endswith(end)]
-    return [_layer(tensors, f"{name}.{n}") for n in sorted(map(int, numbers))]
-
-
-def _layer(tensors: Tensors, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    return tensors[f"{name}.weight"], tensors[f"{name}.bias"]
+    hidden, last, squash = {
+        "TD3": ("actor.mu", (), "tanh"),
+        "SAC": ("actor.latent_pi", ("actor.mu",), "tanh"),
+        "PPO": ("mlp_extractor.policy_net", ("action_net",), "clip"),
+    }[algorithm]
+    end = ".weight"
+    numbers = [k[len(hidden) + 1 : -len(end)] for k in tensors if k.startswith(f"{hidden}.") and k.endswith(end)]
+    names = [*(f"{hidden}.{n}" for n in sorted(map(int, numbers))), *last]
+    return NetworkPolicy([(tensors[f"{n}.weight"], tensors[f"{n}.bias"]) for n in names], activation, squash, **kwargs)

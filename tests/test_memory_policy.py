@@ -18,8 +18,7 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.acting import learn_to_act
 from asm_gym.monitors.packing import unpacked
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
-from asm_gym.policies.grip import ENOUGH, FORGETS, CommandReadout
-from asm_gym.policies.memory_policy import StreamReader
+from asm_gym.policies.memory_policy import ENOUGH, FORGETS, CommandReadout, StreamReader
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import Channel, StreamSpec
 

@@ -1,6 +1,6 @@
-"""Objects whose shapes are drawn for every seeded episode, changed in the loaded model instead of loading it anew.
+"""The shape of Lift's cube, drawn for every seeded episode in the loaded model instead of loading it anew.
 
-The object is made as robosuite makes it, from the same generator, and compiled alone. What MuJoCo's compiler finds of
+The cube is made as robosuite makes it, from the same generator, and compiled alone. What MuJoCo's compiler finds of
 its own shapes is written into the model; what depends on other bodies too, MuJoCo computes as it does after compiling.
 """
 
@@ -26,41 +26,28 @@ _OWN = {
 
 
 def draw(env: Any) -> bool:
-    """Draws the shapes that robosuite's task ``env`` draws when it is loaded, into its object and its loaded model.
+    """Draw the shape that Lift draws when it is loaded, into its cube and its loaded model.
 
     Generator, object and every number of the model are then as loading would leave them; the data must be reset.
 
     Returns:
-        Whether it was done: not for tasks that this module does not know, nor where others edit the model's text.
+        Whether it was done: not in other tasks, nor where others edit the model's text.
     """
-    if env._xml_processors != [env.edit_model_xml]:
+    if type(env).__name__ != "Lift" or env._xml_processors != [env.edit_model_xml]:
         return False
-    made = _made(env)
-    if made is None:
-        return False
-    thing, anew = made
-    vars(thing).update(vars(anew))
-    model, data, alone = env.sim.model._model, env.sim.data._data, _compiled_alone(env, anew)
-    bodies = (m.body(thing.root_body).id for m in (model, alone))
+    objects: Any = importlib.import_module("robosuite.models.objects")
+    # Sized as robosuite 1.5.2 does [m].
+    cube = objects.BoxObject("cube", size_min=[0.020] * 3, size_max=[0.022] * 3, rng=env.rng)
+    vars(env.cube).update(vars(cube))
+    model, data, alone = env.sim.model._model, env.sim.data._data, _compiled_alone(env, cube)
+    bodies = (m.body(cube.root_body).id for m in (model, alone))
     for (name, live), (_, drawn) in zip(*map(_rows, (model, alone), bodies), strict=True):
         if live.shape != drawn.shape:
-            raise RuntimeError(f"{name} of {thing.name} has {len(live)} rows, and {len(drawn)} when drawn anew")
+            raise RuntimeError(f"{name} of the cube has {len(live)} rows, and {len(drawn)} when drawn anew")
         live[:] = drawn
     mujoco.mj_resetData(model, data)
     mujoco.mj_setConst(model, data)
     return True
-
-
-def _made(env: Any) -> tuple[Any, Any] | None:
-    """Return the object whose shape is drawn, and the same drawn anew, sized as robosuite 1.5.2 does [m]."""
-    objects = importlib.import_module("robosuite.models.objects")
-    task = type(env).__name__
-    if task == "Lift":
-        return env.cube, objects.BoxObject("cube", size_min=[0.020] * 3, size_max=[0.022] * 3, rng=env.rng)
-    if task == "TwoArmPegInHole":
-        least, most = ((radius, env.peg_length) for radius in env.peg_radius)
-        return env.peg, objects.CylinderObject("peg", size_min=least, size_max=most, joints=None, rng=env.rng)
-    return None
 
 
 def _compiled_alone(env: Any, thing: Any) -> mujoco.MjModel:

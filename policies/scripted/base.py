@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -11,11 +11,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.geometry import Pose, Vector, matrix, move, rotation
+from asm_gym.policies.base import StatefulPolicy
+from asm_gym.policies.scripted.geometry import Pose, Vector, matrix, rotation
 from asm_gym.validation import check_number
 
 OPEN, CLOSE = -1.0, 1.0
-ARMS = 2
 _OVER = 0.006  # how far aside of its target a careful hand goes straight down [m]
 _STILL = 0.1  # below this a gripper's joints have come to rest [rad/s]
 
@@ -53,26 +53,16 @@ class Style:
 
 
 class ObservationReader:
-    """Named parts of an environment's flat or dict observation.
+    """Named parts of an environment's flat or dict observation."""
 
-    Args:
-        env: has the observation's layout.
-        robot: whose hand and fingers are meant where a name does not say, such as ``"robot0"``.
-    """
-
-    def __init__(self, env: gym.Env[Any, Any], robot: str = "") -> None:
-        self._robot = robot
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._flat = isinstance(env.observation_space, spaces.Box)
-        self._slices: dict[str, slice] = {}
-        start = 0
-        for name, size in env.unwrapped.observation_layout.items():  # type: ignore[attr-defined]
-            self._slices[name] = slice(start, start + size)
-            start += size
+        sizes = env.unwrapped.observation_layout  # type: ignore[attr-defined]
+        ends = np.cumsum([*sizes.values()]).tolist()
+        self._slices = {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
 
     def __call__(self, observation: Any, name: str) -> Vector:
         """Return the numbers of a channel."""
-        own = f"{self._robot}_{name}"
-        name = own if own in self._slices else name
         part = observation[self._slices[name]] if self._flat else observation[name]
         return np.asarray(part, dtype=np.float64)
 
@@ -98,7 +88,7 @@ class State(NamedTuple):
     drift: Vector  # correlated action noise
 
 
-class Expert(ABC):
+class Expert(StatefulPolicy):
     """A scripted expert: phases of a plan, each with the command it gives and the condition that ends it.
 
     Args:
@@ -111,37 +101,16 @@ class Expert(ABC):
     """Usual hand speed [action units]."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
-        self.env = env
+        self.inner: Any = env.unwrapped
+        self.robosuite: Any = self.inner.robosuite_env
         self.style = style or Style()
         self.np_random = np.random.default_rng(seed)
         self.read = ObservationReader(env)
-        inner: Any = env.unwrapped
         size = int(np.prod(env.action_space.shape or ()))
-        self.moves = np.setdiff1d(np.arange(size), inner.gripper_actions)
+        self.moves = np.setdiff1d(np.arange(size), self.inner.gripper_actions)
         """Indices of the action that move arms."""
-        self._careful = set(inner.robots) != {"Panda"}
+        self._careful = set(self.inner.robots) != {"Panda"}
         """Plans have the Panda's pace; other arms drift further from their course."""
-
-    @property
-    def robosuite(self) -> Any:
-        """The environment underneath."""
-        return self.env.unwrapped.robosuite_env  # type: ignore[attr-defined]
-
-    def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], Any]:
-        """Return the action (A,) and the next state; ``deterministic`` leaves the action noise out, not the style."""
-        if state is None or (episode_start is not None and np.any(episode_start)):
-            state = self.begin(observation)
-        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
-        scene = self.look(observation)
-        state = self.advance(state, scene)
-        command = self.act(state, scene, np.zeros_like(state.drift) if deterministic else state.drift)
-        return np.clip(command, -1.0, 1.0).astype(np.float32), state
 
     @abstractmethod
     def begin(self, observation: Any) -> State:
@@ -150,6 +119,15 @@ class Expert(ABC):
     def start(self, speed: float, spread: Any = 0.0, plan: Any = None, noises: int = 7, anchor: Any = None) -> State:
         """Return a first state; ``noises`` is how many numbers of the action are noisy."""
         return State(0, 0, speed, spread, plan, np.zeros(3) if anchor is None else anchor, np.zeros(noises))
+
+    def act(self, observation: Any, state: State, deterministic: bool) -> tuple[NDArray[np.float32], State]:
+        """Return the action (A,) and the next state; ``deterministic`` leaves the action noise out, not the style."""
+        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
+        scene = self.look(observation)
+        state = self.advance(state, scene)
+        command = self.command(state, scene)
+        command[self.moves] += 0.0 if deterministic else state.drift[self.moves]
+        return np.clip(command, -1.0, 1.0).astype(np.float32), state
 
     @abstractmethod
     def look(self, observation: Any) -> Any:
@@ -171,39 +149,6 @@ class Expert(ABC):
     def entered(self, state: State, scene: Any, phase: int) -> State:
         """Return the state at the beginning of a phase."""
         return state._replace(phase=phase, since=0, anchor=scene.hand.at)
-
-    def act(self, state: State, scene: Any, noise: Vector) -> Vector:
-        """Return the action (A,) with noise in the numbers that move arms."""
-        command = self.command(state, scene)
-        command[self.moves] += noise[self.moves]
-        return command
-
-
-class TwoArmExpert(Expert):
-    """An expert with two arms: its scene has ``hands``, a pose of each."""
-
-    def hands(self, observation: Any) -> tuple[Pose, Pose]:
-        """Return the poses of both hands."""
-        first, second = (self.read.hand(observation, f"robot{i}_") for i in range(ARMS))
-        return first, second
-
-    def bases(self) -> Vector:
-        """Return (2, 3, 3) orientations of the arms' bases, in whose frames their controllers take commands."""
-        return np.stack([np.array(robot.base_ori, np.float64) for robot in self.robosuite.robots])
-
-    def places(self) -> Vector:
-        """Return (2, 3) positions of the arms' bases [m]."""
-        return np.stack([np.array(robot.base_pos, np.float64) for robot in self.robosuite.robots])
-
-    def entered(self, state: State, scene: Any, phase: int) -> State:
-        """Return the state at the beginning of a phase."""
-        return state._replace(phase=phase, since=0, anchor=np.stack([hand.at for hand in scene.hands]))
-
-
-def move_arm(base: Vector, hand: Pose, target: Vector, turned: Vector, speed: float, gain: float = 1.0) -> Vector:
-    """Return the command (6,), in the frame of its ``base`` (3, 3), that moves a hand towards a pose in the world."""
-    command = move(hand, target, turned, speed, gain)
-    return np.concatenate([base.T @ command[:3], base.T @ command[3:]])
 
 
 def has_settled(velocity: Vector, since: int, usual: int) -> bool:

@@ -1,4 +1,4 @@
-"""Picks an object up and puts it somewhere: what stacking, sorting and fitting nuts have in common."""
+"""Picks an object up and puts it somewhere: what stacking, fitting nuts and sorting have in common."""
 
 from __future__ import annotations
 
@@ -9,13 +9,26 @@ import gymnasium as gym
 import numpy as np
 
 from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State, Style, has_settled, over_first
-from asm_gym.policies.scripted.geometry import Pose, Vector, about_vertical, angle_between, gripping, move, wrapped, yaw
+from asm_gym.policies.scripted.geometry import (
+    UP,
+    Pose,
+    Vector,
+    about_vertical,
+    angle_between,
+    flattest_side,
+    gripping,
+    move,
+    wrapped,
+    yaw,
+)
 
 REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT = range(8)
 
 _AHEAD = 1.0  # how far to turn the hand at once [rad]
 _ROOM = 0.9  # how far from its stops the last joint is to stay [rad]
 _EXACT = 0.005  # what has to fit as exactly as this is not lowered beside its place [m]
+_SMALL, _LARGE = 0.02, 0.025  # half the edges of the two cubes of Stack [m]
+_HANDLE = {"SquareNut": 0.054, "RoundNut": 0.06}  # from a nut's middle to that of its handle [m]
 
 
 class CarryTask(NamedTuple):
@@ -80,10 +93,6 @@ class CarryExpert(Expert):
     def look(self, observation: Any) -> CarryScene:
         return CarryScene(observation, self.read.hand(observation), self.read(observation, "gripper_velocity"))
 
-    def pose(self, observation: Any, name: str) -> Pose:
-        """Return the pose of an object."""
-        return self.read.pose(observation, name)
-
     def advance(self, state: State, scene: CarryScene) -> State:
         if state.plan is None:
             return state
@@ -94,7 +103,7 @@ class CarryExpert(Expert):
 
     def next_phase(self, state: State, scene: CarryScene) -> int:
         task, phase, since = state.plan, state.phase, state.since
-        at, turned = thing = self.pose(scene.observation, task.name)
+        at, turned = thing = self.read.pose(scene.observation, task.name)
         off = scene.hand.at - thing.point(task.grip)
         far, beside = np.linalg.norm(off), np.linalg.norm(at[:2] - task.place[:2])
         if phase == REACH:
@@ -128,7 +137,7 @@ class CarryExpert(Expert):
         task, phase, hand, speed = state.plan, state.phase, scene.hand, state.speed
         if task is None:
             return np.append(np.zeros(6), OPEN)
-        at, turned = thing = self.pose(scene.observation, task.name)
+        at, turned = thing = self.read.pose(scene.observation, task.name)
         down = gripping(hand.turned, None)
         if phase in (REACH, DESCEND):
             grip = thing.point(task.grip)
@@ -173,10 +182,10 @@ class CarryExpert(Expert):
         """
         if task.closing is None:
             return task
-        thing = self.pose(observation, task.name)
+        thing = self.read.pose(observation, task.name)
         turned = thing.turned
         hand = self.read.hand(observation)
-        robot, model = self.robosuite.robots[0], self.env.unwrapped.simulation.model  # type: ignore[attr-defined]
+        robot, model = self.robosuite.robots[0], self.inner.simulation.model
         most = model.jnt_range[robot._ref_joint_indexes[-1], 1] - _ROOM
         now, base = self._wrist(observation), robot.base_pos
         along = now + yaw(hand.turned[:, 1]) - yaw(hand.at - base)
@@ -220,6 +229,67 @@ class CarryExpert(Expert):
     def _held(self, task: CarryTask, hand: Vector, turned: Vector) -> Vector:
         """Return how (3, 3) to hold the hand so that the object in it comes to fit its place."""
         return about_vertical(_turn_to_fit(task.headings, turned)) @ gripping(hand, None)
+
+
+class StackExpert(CarryExpert):
+    """A scripted expert for Stack."""
+
+    pace = 0.5
+
+    def next_task(self, observation: Any) -> CarryTask | None:
+        """Return the red cube, until it lies on the green one."""
+        red, green = (self.read.pose(observation, name) for name in ("cubeA", "cubeB"))
+        place = green.at + np.array([0.0, 0.0, _SMALL + _LARGE])
+        if np.linalg.norm(red.at - place) < (0.025 if self._careful else 0.02):
+            return None
+        side, turns = flattest_side(red.turned), np.pi / 2
+        if self._careful:  # a wide gripper would stand on the green cube with one finger
+            sides = (side, np.cross(UP, side))
+            side, turns = min(sides, key=lambda s: abs(s @ (green.at - red.at))), np.pi
+        return CarryTask(
+            name="cubeA",
+            grip=np.zeros(3),
+            closing=red.turned.T @ side,
+            turns=turns,
+            clearance=0.08,
+            place=place,
+            over=0.06,
+            fit=0.006,
+        )
+
+
+class NutAssemblyExpert(CarryExpert):
+    """A scripted expert for NutAssembly, with one nut or with both."""
+
+    pace = 0.5
+
+    def next_task(self, observation: Any) -> CarryTask | None:
+        """Return a nut that is not around its peg; None where all are."""
+        env = self.robosuite
+        aside = np.pi / 2 if self._careful else 0.5  # a Panda's elbow reaches its stop sooner than others'
+        for i, nut in enumerate(env.nuts):
+            if env.single_object_mode and i != env.nut_id:
+                continue
+            at, _ = self.read.pose(observation, nut.name)
+            if not env.on_peg(at, i):
+                peg = env.sim.data.body_xpos[(env.peg1_body_id, env.peg2_body_id)[i]]
+                square = nut.name == "SquareNut"
+                task = CarryTask(
+                    name=nut.name,
+                    grip=np.array([_HANDLE[nut.name], 0.0, 0.0]),
+                    closing=np.array([0.0, 1.0, 0.0]),
+                    turns=np.pi,
+                    clearance=0.1,
+                    # Lower, and the palm would stand on the peg.
+                    place=np.array([peg[0], peg[1], env.table_offset[2] + 0.05]),
+                    over=0.14,
+                    # The handle points towards the robot, which could not reach further.
+                    headings=(np.pi,) if square else (np.pi - aside, np.pi, np.pi + aside),
+                    heading_fit=0.06 if square else 0.2,
+                    fit=0.005,
+                )
+                return self.at_ease(task, observation)
+        return None
 
 
 def _turn_to_fit(headings: tuple[float, ...], turned: Vector) -> float:

@@ -64,7 +64,7 @@ class DoorExpert(Expert):
 
     def _hardware(self, along: float) -> _Hardware:
         """Return the door as it stands at the beginning, closed; the grip is moved ``along`` the handle [m]."""
-        simulation = self.env.unwrapped.simulation  # type: ignore[attr-defined]
+        simulation = self.inner.simulation
         model, data = simulation.model, simulation.data
         hinge, latch = model.joint("Door_hinge").id, model.joint("Door_latch_joint").id
         handle = model.geom("Door_handle").id

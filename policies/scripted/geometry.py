@@ -80,12 +80,6 @@ def flattest_side(turned: Vector) -> Vector:
     return side
 
 
-def pointing_down(hand: Vector, cube: Vector | None = None) -> Vector:
-    """Return the rotation nearest ``hand`` (3, 3) whose fingers point down and close along a side of the cube."""
-    # A cube looks the same every quarter turn.
-    return gripping(hand, None) if cube is None else gripping(hand, flattest_side(cube), np.pi / 2)
-
-
 def gripping(hand: Vector, closing: Vector | None, turns: float = np.pi) -> Vector:
     """Return the rotation nearest ``hand`` (3, 3) whose fingers point down and close along ``closing``.
 
@@ -101,15 +95,6 @@ def gripping(hand: Vector, closing: Vector | None, turns: float = np.pi) -> Vect
     y = np.array([np.cos(angle), np.sin(angle), 0.0])
     z = np.array([0.0, 0.0, -1.0])
     return np.stack([np.cross(y, z), y, z], axis=1)
-
-
-def grasping(hand: Vector, approach: Vector, closing: Vector) -> Vector:
-    """Return the rotation nearest ``hand`` (3, 3) whose fingers point along ``approach`` and close along ``closing``.
-
-    Both are unit vectors (3,) at right angles.
-    """
-    y = closing * (1.0 if hand[:, 1] @ closing > 0 else -1.0)
-    return np.stack([np.cross(y, approach), y, approach], axis=1)
 
 
 def move(hand: Pose, target: Vector, turned: Vector, speed: float, gain: float = 1.0) -> Vector:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State, has_settled, over_first
-from asm_gym.policies.scripted.geometry import Pose, Vector, move, pointing_down
+from asm_gym.policies.scripted.geometry import Pose, Vector, flattest_side, gripping, move
 
 REACH, DESCEND, GRASP, LIFT = range(4)
 
@@ -71,5 +71,6 @@ class LiftExpert(Expert):
                 target = target + over_first(scene.hand.at, cube.at)
         else:
             target = state.anchor + (plan.goal if phase == LIFT else 0.0)
-        aligned = pointing_down(scene.hand.turned, cube.turned if phase <= DESCEND else None)
+        side = flattest_side(cube.turned) if phase <= DESCEND else None  # a cube looks the same every quarter turn
+        aligned = gripping(scene.hand.turned, side, np.pi / 2)
         return np.append(move(scene.hand, target, aligned, state.speed), OPEN if phase <= DESCEND else CLOSE)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
-from asm_gym.policies.scripted.base import Style
 from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
 from asm_gym.policies.scripted.geometry import Vector, about_vertical, matrix
 
@@ -24,53 +21,38 @@ _CLEAR = 0.04  # how much room a box needs beside it, for half a wall and for ho
 
 
 class PickPlaceExpert(CarryExpert):
-    """A scripted expert for PickPlace, with one object or with all four.
-
-    Args:
-        env, seed, style: as for ``CarryExpert``.
-        things: names of the objects to sort; None for all.
-    """
+    """A scripted expert for PickPlace, with one object or with all four."""
 
     pace = 0.65
 
-    def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        seed: int | None = None,
-        style: Style | None = None,
-        things: Collection[str] | None = None,
-    ) -> None:
-        super().__init__(env, seed, style)
-        self.things = things
-
     def next_task(self, observation: Any) -> CarryTask | None:
-        """The nearest object that is not in its bin; None where all are."""
-        env = self.robosuite
-        hand = self.read(observation, "hand_position")
+        """Return the nearest object that is not in its bin; None where all are."""
+        env, hand = self.robosuite, self.read(observation, "hand_position")
         left = []
         for i, thing in enumerate(env.objects):
             if env.single_object_mode and i != env.object_id:
                 continue
-            if self.things is not None and thing.name not in self.things:
-                continue
-            at, _ = self.pose(observation, thing.name)
+            at, _ = self.read.pose(observation, thing.name)
             if env.not_in_bin(at, i):
                 left.append((float(np.linalg.norm(at - hand)), i))
         if not left:
             return None
         _, nearest = min(left)
         name = env.objects[nearest].name
-        at, turned = self.pose(observation, name)
+        at, turned = self.read.pose(observation, name)
         half = self._half_extents(name)
         grip = max(0.0, half[2] - 0.02)
-        place = self._place(env, nearest, half, grip, self._careful)
-        if self._careful:  # let go over the walls: stretched out, the arm may stand nearer to one than it should
-            place[2] += 0.04
+        place = self._place(env, nearest, half, grip)
+        to_walls = env.bin_size[:2] / 2 - np.abs(at[:2] - env.bin1_pos[:2])
         if not self._careful and at[2] + grip + _ABOVE < env.bin1_pos[2] + _WALLS:
-            closing, room = self._beside_walls(half, at, turned, env.bin1_pos, env.bin_size)
+            closing, room = beside_walls(half, turned, to_walls)
         else:
-            closing = self._closing(half, at, turned, env.bin1_pos, env.bin_size, self._careful and name == "Can")
-            room = _SPARE
+            closing, room = _closing(half, turned, to_walls, self._careful and name == "Can"), _SPARE
+        headings: tuple[float, ...] = ()
+        if self._careful:  # over its bin, wide fingers open across the arm's reach
+            reach = place - env.robots[0].base_pos
+            across = float(np.arctan2(reach[0], -reach[1]) - np.arctan2(closing[1], closing[0]))
+            headings = across, across + np.pi
         task = CarryTask(
             name=name,
             grip=np.array([0.0, 0.0, grip]),
@@ -79,75 +61,38 @@ class PickPlaceExpert(CarryExpert):
             clearance=0.1,
             place=place,
             over=0.12,
-            headings=self._headings(closing, place - env.robots[0].base_pos) if self._careful else (),
+            headings=headings,
             heading_fit=0.3,
             fit=0.03,
             haste=1.0 if room >= _SPARE else _SLOWLY,
         )
         return self.at_ease(task, observation)
 
-    @staticmethod
-    def _headings(closing: Vector, reach: Vector) -> tuple[float, ...]:
-        """Where an object may point over its bin so that wide fingers open across the arm's ``reach``."""
-        across = float(np.arctan2(reach[0], -reach[1]) - np.arctan2(closing[1], closing[0]))
-        return across, across + np.pi
-
-    @staticmethod
-    def _closing(half: Vector, at: Vector, turned: Vector, bin_at: Vector, bin_size: Vector, round_: bool) -> Vector:
-        """(3,) along which of the object's axes to close: of those it is narrow enough along, away from the walls."""
-        axes = _narrow(half)
-        if round_:
-            axes += [np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.array([1.0, -1.0, 0.0]) / np.sqrt(2)]
-
-        def room(axis: Vector) -> float:
-            along = np.abs((turned @ axis)[:2])
-            return float(np.min((bin_size[:2] / 2 - np.abs(at[:2] - bin_at[:2])) / np.maximum(along, 1e-6)))
-
-        return max(axes, key=room)
-
-    @staticmethod
-    def _beside_walls(
-        half: Vector, at: Vector, turned: Vector, bin_at: Vector, bin_size: Vector
-    ) -> tuple[Vector, float]:
-        """Along which direction (3,) to close, in the object's frame, and what room the palm then has by the walls [m].
-
-        Square to the object where there is room, else as far askew as it takes; square in corners, where nothing helps.
-        """
-        left = bin_size[:2] / 2 - np.abs(at[:2] - bin_at[:2])
-        narrow = _narrow(half)
-
-        def room(closing: Vector) -> float:
-            along = np.abs((turned @ closing)[:2])
-            return float(np.min(left - _PALM[0] * along - _PALM[1] * along[::-1]))
-
-        ways = [about_vertical(askew) @ axis for askew in _ASKEW for axis in narrow]
-        fitting = [closing for closing in ways if room(closing) >= _SPARE]
-        best = fitting[0] if fitting else max(narrow, key=room)
-        return best, room(best)
-
-    @staticmethod
-    def _place(env: Any, compartment: int, half: Vector, grip: float, careful: bool) -> Vector:
-        """(3,) where to let go: nearer to the arm, because it is stretched out at the far side of the bins."""
+    def _place(self, env: Any, compartment: int, half: Vector, grip: float) -> Vector:
+        """Return where (3,) to let go: nearer to the arm, because it is stretched out at the far side of the bins."""
         place = np.array(env.target_bin_placements[compartment], np.float64)
         away = place[:2] - env.robots[0].base_pos[:2]
-        if np.linalg.norm(away) > _REACH and not careful:
+        far = np.linalg.norm(away) > _REACH
+        if far and not self._careful:
             # Also away from the nearest wall, and higher: the arm reaches furthest at the height of its shoulder.
             inwards = env.bin2_pos[:2] - place[:2]
             place[:2] += 0.08 * inwards / np.linalg.norm(inwards)
             place[2] += 0.02
         else:
-            nearer = (0.07 if careful else 0.04) * away / np.linalg.norm(away)
-            if careful and np.linalg.norm(away) <= _REACH:  # a tall box would stand on a wall
+            nearer = (0.07 if self._careful else 0.04) * away / np.linalg.norm(away)
+            if self._careful and not far:  # a tall box would stand on a wall
                 room = np.maximum(np.asarray(env.bin_size[:2]) / 4 - _CLEAR - np.linalg.norm(half[:2]), 0.0)
                 nearer = np.clip(nearer, -room, room)
             place[:2] -= nearer
-        # Lower, and the palm would stand on a wall.
+        # Lower, and the palm would stand on a wall; stretched out, another arm may stand nearer to one than it should.
         place[2] += max(half[2] + 0.015, _WALL - grip)
+        if self._careful:
+            place[2] += 0.04
         return place
 
     def _half_extents(self, name: str) -> Vector:
-        """(3,) half the object's size along its own axes [m]."""
-        model = self.env.unwrapped.simulation.model  # type: ignore[attr-defined]
+        """Return half (3,) the object's size along its own axes [m]."""
+        model = self.inner.simulation.model
         body = model.body(f"{name}_main").id
         (geom,) = (g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_group[g] == 0)
         turn = matrix(model.geom_quat[geom][[1, 2, 3, 0]])
@@ -155,6 +100,35 @@ class PickPlaceExpert(CarryExpert):
         return half
 
 
+def _closing(half: Vector, turned: Vector, to_walls: Vector, round_: bool) -> Vector:
+    """Return along which of the object's axes (3,) to close: of the narrow ones, away from the walls."""
+    axes = _narrow(half)
+    if round_:
+        axes += [np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.array([1.0, -1.0, 0.0]) / np.sqrt(2)]
+    return max(axes, key=lambda axis: float(np.min(to_walls / np.maximum(np.abs((turned @ axis)[:2]), 1e-6))))
+
+
+def beside_walls(half: Vector, turned: Vector, to_walls: Vector) -> tuple[Vector, float]:
+    """Return along which direction (3,) to close, in the object's frame, and the palm's room by the walls then [m].
+
+    Square to the object where there is room, else as far askew as it takes; square in corners, where nothing helps.
+
+    Args:
+        half, turned: half the object's size (3,) [m], and its orientation (3, 3).
+        to_walls: (2,) from its middle to the nearer walls of the bin [m].
+    """
+    narrow = _narrow(half)
+
+    def room(closing: Vector) -> float:
+        along = np.abs((turned @ closing)[:2])
+        return float(np.min(to_walls - _PALM[0] * along - _PALM[1] * along[::-1]))
+
+    ways = [about_vertical(askew) @ axis for askew in _ASKEW for axis in narrow]
+    fitting = [closing for closing in ways if room(closing) >= _SPARE]
+    best = fitting[0] if fitting else max(narrow, key=room)
+    return best, room(best)
+
+
 def _narrow(half: Vector) -> list[Vector]:
-    """Which of its own horizontal axes (3,) an object of half this size (3,) can be gripped along [m]."""
+    """Return those horizontal axes (3,) along which an object of half this size (3,) [m] can be gripped."""
     return [np.eye(3)[i] for i in (0, 1) if half[i] < 0.035]

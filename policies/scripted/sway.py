@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.policies.base import Policy, PolicyState
+from asm_gym.policies.base import PolicyState
 from asm_gym.spec import control_period
 
 Floats = NDArray[np.float64]
@@ -101,7 +100,3 @@ class Arm(Swaying):
         there = 10 * s**3 - 15 * s**4 + 6 * s**5
         sway: Floats = self.width * np.sin(2 * np.pi * np.linspace(0.5, 1.5, 7) * t)
         return np.asarray(self.poses[k] + there * (self.poses[k + 1] - self.poses[k]) + sway, np.float64)
-
-
-EXPERTS: dict[str, Callable[..., Policy]] = {"Pusher-v5": Pusher, "asm_gym/SyntheticArm-v0": Arm}
-"""The scripted policy of environments that are not robosuite's, by id."""

@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from asm_gym.policies.scripted.base import ARMS, CLOSE, OPEN, State, TwoArmExpert, move_arm
-from asm_gym.policies.scripted.geometry import Pose, Vector, gripping, matrix
+from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State
+from asm_gym.policies.scripted.geometry import Pose, Vector, gripping, matrix, move
 
 REACH, DESCEND, GRASP, LIFT, LOWER = range(5)
+ARMS = 2
 
 _OVER = 0.07  # how far above the handles to come from [m]
 _DEPTH = 0.01  # how far below the bars' middle to grasp them: held by the fingers' tips, they slip [m]
@@ -22,7 +23,7 @@ class _Scene(NamedTuple):
     across: Vector  # (3,) from one handle's bar to the other's
 
 
-class TwoArmLiftExpert(TwoArmExpert):
+class TwoArmLiftExpert(Expert):
     """A scripted expert for TwoArmLift; the plan of its state is how high to lift [m]."""
 
     pace = 0.45
@@ -36,7 +37,11 @@ class TwoArmLiftExpert(TwoArmExpert):
 
     def look(self, observation: Any) -> _Scene:
         handles = np.stack([self.read(observation, f"handle{i}_xpos") for i in range(ARMS)])
-        return _Scene(self.hands(observation), handles, matrix(self.read(observation, "pot_quat"))[:, 1])
+        first, second = (self.read.hand(observation, f"robot{i}_") for i in range(ARMS))
+        return _Scene((first, second), handles, matrix(self.read(observation, "pot_quat"))[:, 1])
+
+    def entered(self, state: State, scene: _Scene, phase: int) -> State:
+        return state._replace(phase=phase, since=0, anchor=np.stack([hand.at for hand in scene.hands]))
 
     def next_phase(self, state: State, scene: _Scene) -> int:
         # One hand waits for the other.
@@ -59,9 +64,11 @@ class TwoArmLiftExpert(TwoArmExpert):
 
     def command(self, state: State, scene: _Scene) -> Vector:
         targets, command = self._targets(state, scene), np.zeros((ARMS, 7))
-        for i, (base, hand) in enumerate(zip(self.bases(), scene.hands, strict=True)):
+        for i, (robot, hand) in enumerate(zip(self.robosuite.robots, scene.hands, strict=True)):
+            base = np.array(robot.base_ori, np.float64)  # (3, 3) in whose frame the controller takes commands
             held = gripping(hand.turned, scene.across)
-            command[i, :6] = move_arm(base, hand, targets[i], held, state.speed, gain=1.5)
+            moves = move(hand, targets[i], held, state.speed, gain=1.5)
+            command[i, :6] = np.concatenate([base.T @ moves[:3], base.T @ moves[3:]])
         command[:, 6] = OPEN if state.phase < GRASP else CLOSE
         return command.reshape(-1)
 
