@@ -10,9 +10,7 @@ import pytest
 
 from asm_gym.episode import Episode
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.reproduce.arm_faults import FAULTS, NEWTONS, SLIP, Piece, jacobian, with_fault
-from asm_gym.scripts.reproduce.arm_recordings import ARMS
-from asm_gym.scripts.reproduce.real_arms import Job, on_an_arm
+from asm_gym.scripts.reproduce.real_arms import ARMS, FAULTS, NEWTONS, SLIP, Job, Piece, examined, jacobian, with_fault
 from tests.streams import pendulum_columns
 
 REAL = Path(os.environ.get("ASM_GYM_REAL", "/nowhere"))
@@ -36,7 +34,7 @@ def test_faults_change_one_joint_from_the_onset_on_and_nothing_else():
     for kind in ("frozen", "slipped", "late", "step"):
         found = with_fault(kind, piece, rng)
         changed = found.stream != episode.stream
-        own = slices[FAULTS[kind][0]]
+        own = slices[FAULTS[kind]]
         assert not changed[:100].any()
         assert changed[100:, own].any(axis=0).sum() == 1
         assert not np.delete(changed, np.arange(episode.spec.size)[own], axis=1).any()
@@ -59,10 +57,10 @@ def test_a_push_does_the_work_of_its_force():
 def test_the_study_runs_on_files_of_the_same_shape_and_names_a_missing_one(tmp_path, capsys):
     folder = tiago(tmp_path / "arms")
     out = ["--out", str(tmp_path / "out"), "--monitors", "association_values+evidence", "friction_rule"]
-    assert main(["reproduce", "real_arms", str(folder), *out, "--experiments", "tiago", "cobot"]) == 0
+    assert main(["reproduce", "real_arms", str(folder), *out, "--experiments", "tiago", "ur10"]) == 0
     text = (tmp_path / "out" / "real_arms.md").read_text()
     assert "PAL TIAGo" in text
-    assert "is missing: it is UCI 963" in text
+    assert "ur10_exciting_trajectory.db3 is missing: it is unisa-acg" in text
     assert main(["reproduce", "real_arms", str(tmp_path), *out]) == 2
     assert "is missing: it is unisa-acg/inverse-dynamics-solver" in capsys.readouterr().err
 
@@ -91,7 +89,7 @@ def test_the_study_gives_monitors_a_body_model_or_names_the_missing_file(tmp_pat
 def test_every_monitor_meets_the_same_faults(tmp_path):
     folder = tiago(tmp_path / "arms")
     one, other = (
-        [r["kind"] for r in on_an_arm(Job("tiago", m, 0, 1), folder)] for m in ("channel_limit", "friction_rule")
+        [r["kind"] for r in examined(Job("tiago", m, 0, 1), folder)] for m in ("channel_limit", "friction_rule")
     )
     assert one == other
     assert set(one) == {"step", "frozen", "slipped", "late", ""}

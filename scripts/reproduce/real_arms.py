@@ -1,35 +1,41 @@
-"""What monitors find in recordings of real arms: faults added to them, and events that happened; and false alarms.
+"""What monitors find in recordings of real arms: faults added to them, and false alarms.
 
-The recordings are of others and lie in a folder; a missing one is named, with where it is published. A recording of an
-arm that did nothing wrong is cut into pieces. A quarter of them is tested, in turn; of the others two in three are
-learned from, and the greatest surprise of the rest is the threshold. Each tested piece is watched as it is, and with
-each fault from its middle on. Pieces are of one trajectory: no table says how a monitor fares on another.
-
-The UR3 of CobotOps stopped and lost its grip by itself.
+The recordings are of others and lie in a folder; a missing one is named, with where it is published. Each is of an arm
+that did nothing wrong, cut into pieces. A quarter of them is tested, in turn; of the others two in three are learned
+from, and the greatest surprise of the rest is the threshold. Each tested piece is watched as it is, and with each fault
+from its middle on. Pieces are of one trajectory: no table says how a monitor fares on another.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.body_model import read_urdf
+from asm_gym.data.bags import read_bag
 from asm_gym.data.selection import complete_parts, pieces
+from asm_gym.data.text import read_text
 from asm_gym.detection.scores import Largest
 from asm_gym.episode import Episode, spans
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.rollouts.staging import environment
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.arm_faults import FAULTS, Piece, with_fault
-from asm_gym.scripts.reproduce.arm_recordings import ARMS, COBOT, COBOT_EVENTS, COBOT_SOURCE, read_cobot, there
 from asm_gym.scripts.reproduce.kit import Findings, Record, where
+from asm_gym.tasks import env_id
+
+Floats = NDArray[np.float64]
+Columns = dict[str, NDArray[Any]]
 
 RULE = "friction_rule"
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -39,11 +45,149 @@ SETTINGS: dict[str, dict[str, Any]] = {
 """The first as ``asm-gym fit`` fits a log, the other without whitening, as the first has it."""
 WITH_BODY = {"neural_asm, body": "neural_asm", "association_values, body": "association_values+evidence"}
 """Monitors with a body model in place of sines of angles."""
-EXPERIMENTS = (*ARMS, "cobot")
 PIECE_S, FOLDS = 1.0, 4
 """Length of a piece [s], and folds of which one is tested at a time."""
-AROUND_S = 5.0
-"""An alarm this long before or after an event of the cobot belongs to it [s]."""
+
+
+def _bag(path: Path) -> Columns:
+    """Read a ROS 2 bag of joint states."""
+    columns = read_bag(path)
+    made: Columns = {"time": columns["time"]}
+    for kind in ("position", "velocity", "effort"):
+        made[kind] = np.column_stack([v for n, v in columns.items() if re.fullmatch(rf".*\.{kind}\[.*\]", n)])
+    return made
+
+
+def _three_files(path: Path) -> Columns:
+    """Read one file each of positions, velocities and efforts, interpolated at the times of the first one."""
+    tables = [read_text(file) for file in sorted(path.glob("*.csv"))]
+    times = [table.pop("t") for table in tables]
+    due = times[0][(times[0] >= max(t[0] for t in times)) & (times[0] <= min(t[-1] for t in times))]
+    whole = {name: np.interp(due, t, v) for t, table in zip(times, tables, strict=True) for name, v in table.items()}
+    kinds = ("position", "velocity", "effort")
+    return {"time": due} | {kind: np.column_stack([v for n, v in whole.items() if n.endswith(kind)]) for kind in kinds}
+
+
+@dataclass(frozen=True)
+class RealArm:
+    """A recording of an arm that did nothing wrong.
+
+    Attributes:
+        robot: its name.
+        place: file or folder below that of all recordings.
+        source: where it is published: repository at a commit, path, licence.
+        read: function from its place to columns: time, position [rad], velocity, effort (T, J) each.
+        urdf: file of its body model, in the folder ``urdf`` of that of all recordings.
+    """
+
+    robot: str
+    place: str
+    source: str
+    read: Callable[[Path], Columns]
+    urdf: str
+
+    def body(self, folder: Path) -> str:
+        """Return the text of its body model."""
+        path = folder / "urdf" / self.urdf
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} is missing: it is in example-robot-data 6.0.0 (PyPI)")
+        return read_urdf(path)
+
+    def missing(self, folder: Path) -> str:
+        """Return where the recording is published, if it is not in the folder; empty if it is."""
+        path = folder / self.place
+        return "" if path.exists() else f"{path} is missing: it is {self.source}"
+
+    def episode(self, folder: Path) -> Episode:
+        """Return the recording."""
+        return Episode.from_table(self.read(folder / self.place), success=True)
+
+
+UNISA = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
+FIGAROH = "thanhndv212/figaroh-examples @ c0b5c7f0 (Apache-2.0 by reference)"
+ARMS = {
+    "panda": RealArm("Franka Panda", "unisa_acg/panda_exciting_trajectory.db3", UNISA, _bag, "panda.urdf"),
+    "ur10": RealArm("UR10", "unisa_acg/ur10_exciting_trajectory.db3", UNISA, _bag, "ur10_robot.urdf"),
+    "tiago": RealArm("PAL TIAGo", "tiago_figaroh", FIGAROH, _three_files, "tiago.urdf"),
+}
+
+
+# ------------------------------------------------------------------ faults added to recordings
+
+
+class Piece(NamedTuple):
+    """A piece of a recording, and where a fault in it begins."""
+
+    episode: Episode
+    onset: int  # row
+    ranges: Floats  # (J,) of each effort in the whole recording
+    panda: bool  # whether the arm is a Panda, whose effort is in N m
+
+    def column(self, name: str) -> Floats:
+        """Return position or effort (T, J)."""
+        return self.episode.stream[:, self.episode.spec.slices[name]].astype(np.float64)
+
+
+NEWTONS, GRAVITY = 20.0, 9.81
+"""Push at the hand, and weight of a payload of 1 kg [N]."""
+STEP_SHARE, SLIP, LATE_S, RISE_S = 0.2, 0.05, 0.1, 0.1
+MOVES = 0.02
+"""Angle that an encoder must move by after the onset, or nothing shows that it is frozen [rad]."""
+FAULTS = dict.fromkeys(("push", "payload", "step"), "effort")
+FAULTS |= {"frozen": "position", "slipped": "position", "late": "effort"}
+"""Column that each fault changes: a push of 20 N sideways or a payload of 1 kg at a Panda's hand, through its Jacobian;
+a step of 20 % of a joint's effort range on another arm; an encoder that freezes or slips by 0.05 rad; an effort that
+comes 0.1 s late. None of them happened, and every table that counts them says so."""
+
+
+def jacobian(q: Floats) -> Floats:
+    """Return the velocity of a Panda's hand [m/s] by each joint's [rad/s] (3, J), at angles q (J,)."""
+    arm: Any = environment(env_id("Lift")).unwrapped
+    robot, model = arm.robosuite_env.robots[0], arm.simulation.model
+    data, found = mujoco.MjData(model), np.zeros((3, model.nv))
+    data.qpos[robot._ref_joint_pos_indexes] = q
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_jacSite(model, data, found, None, robot.eef_site_id["right"])
+    return found[:, robot._ref_joint_vel_indexes]
+
+
+def with_fault(kind: str, piece: Piece, rng: np.random.Generator) -> Episode | None:
+    """Return the piece with a fault from the onset on; None where the arm or the piece does not allow it."""
+    if kind in ("push", "payload", "step") and (kind == "step") is piece.panda:
+        return None
+    episode, onset, dt = piece.episode, piece.onset, piece.episode.spec.dt
+    q, effort = piece.column("position"), piece.column("effort")
+    after, strong = slice(onset, len(q)), np.flatnonzero(piece.ranges > 0.1 * piece.ranges.max())
+    rise = np.minimum(1.0, (1 + np.arange(len(q) - onset)) * dt / RISE_S)
+    added = np.zeros_like(q[after])  # (T - onset, J)
+    if kind in ("push", "payload"):
+        force = np.array([0.0, 0.0, -GRAVITY])
+        if kind == "push":
+            angle = rng.uniform(0, 2 * np.pi)
+            force = NEWTONS * np.array([np.cos(angle), np.sin(angle), 0.0])
+        added[:] = np.array([jacobian(row).T @ force for row in q[after]]) * rise[:, None]
+    elif kind == "step":
+        j = int(rng.choice(strong))
+        added[:, j] = rng.choice([-1, 1]) * STEP_SHARE * piece.ranges[j] * rise
+    elif kind == "frozen":
+        moving = np.flatnonzero(np.ptp(q[after], axis=0) > MOVES)
+        if not len(moving):
+            return None
+        j = int(rng.choice(moving))
+        added[:, j] = q[onset - 1, j] - q[after, j]
+    elif kind == "slipped":
+        angle = rng.choice([-1, 1]) * SLIP
+        added[:, int(rng.integers(len(piece.ranges)))] = angle
+    else:  # late
+        j, rows = int(rng.choice(strong)), max(1, round(LATE_S / dt))
+        added[:, j] = effort[onset - rows : len(effort) - rows, j] - effort[after, j]
+    stream = episode.stream.copy()
+    stream[after, episode.spec.slices[FAULTS[kind]]] += added.astype(np.float32)
+    return Episode.from_stream(stream, episode.spec, faults=np.arange(len(stream)) >= onset)
+
+
+# ------------------------------------------------------------------ the study
 
 
 @dataclass(frozen=True)
@@ -54,7 +198,7 @@ class Config(kit.Config):
     """Folder of the recordings."""
     seeds: int = option(1, least=1)
     """How often pieces are drawn anew."""
-    experiments: tuple[str, ...] = option(EXPERIMENTS, quick=("panda",), least=1, known=EXPERIMENTS)
+    experiments: tuple[str, ...] = option(tuple(ARMS), quick=("panda",), least=1, known=ARMS)
     """Recordings; missing ones are left out, and named."""
     monitors: tuple[str, ...] = option(
         (
@@ -79,7 +223,7 @@ class Job(NamedTuple):
 
 def run(config: Config) -> Findings:
     """Run the experiments whose recordings are in the folder."""
-    missing = {name: why for name in config.experiments if (why := absent(name, config.folder))}
+    missing = {name: why for name in config.experiments if (why := ARMS[name].missing(config.folder))}
     found = [name for name in config.experiments if name not in missing]
     if not found:
         raise FileNotFoundError("; ".join(missing.values()))
@@ -87,33 +231,40 @@ def run(config: Config) -> Findings:
         Job(name, monitor, seed, fold)
         for name in found
         for monitor in config.monitors
-        if monitor not in WITH_BODY or (name in ARMS and ARMS[name].urdf)
         for seed in config.repetitions
         for fold in range(FOLDS)
     ]
     records = kit.together(kit.each("watching", partial(examined, folder=config.folder), jobs, config))
-    first, *others = (table(where(records, experiment=name), name, config.monitors) for name in found)
+    first, *others = (table(where(records, experiment=name), ARMS[name], config.monitors) for name in found)
     left_out = "".join(f" Left out: {why}." for why in missing.values())
     return Findings(records, [replace(first, caption=first.caption + left_out), *others])
 
 
-def absent(experiment: str, folder: Path) -> str:
-    """Return why an experiment cannot be run; empty where it can."""
-    place, source = (ARMS[experiment].place, ARMS[experiment].source) if experiment in ARMS else (COBOT, COBOT_SOURCE)
-    try:
-        there(folder / place, source)
-    except FileNotFoundError as error:
-        return str(error)
-    return ""
-
-
 def examined(job: Job, folder: Path) -> list[Record]:
-    """Return the records of one monitor on one fold."""
-    found = on_the_cobot(job, folder) if job.experiment == "cobot" else on_an_arm(job, folder)
-    return [job._asdict() | record for record in found]
+    """Return a record for each tested piece as it is, and for each fault in it."""
+    arm = ARMS[job.experiment]
+    whole = arm.episode(folder)
+    effort = whole.stream[:, whole.spec.slices["effort"]].astype(np.float64)
+    ranges = np.quantile(effort, 0.95, axis=0) - np.quantile(effort, 0.05, axis=0)
+    cut = [piece for part in complete_parts(whole) for piece in pieces(part, PIECE_S)]
+    order = [int(i) for i in np.random.default_rng(job.seed).permutation(len(cut))]
+    tested, others = sorted(order[job.fold :: FOLDS]), [i for n, i in enumerate(order) if n % FOLDS != job.fold]
+    if len(others) < 4:
+        raise ValueError(f"{job.experiment} has {len(cut)} pieces of {PIECE_S:g} s: too few")
+    learned, calibration = [cut[i] for n, i in enumerate(others) if n % 3], [cut[i] for i in others[::3]]
+    monitor = fitted(job, learned, arm.body(folder) if job.monitor in WITH_BODY else "")
+    threshold = max(float(s.value.max()) for s in monitor.score_episodes(calibration))
+    rng = np.random.default_rng([job.seed, job.fold])  # the same faults for every monitor
+    watched = [("", cut[i]) for i in tested]
+    for i, kind in ((i, kind) for i in tested for kind in FAULTS):
+        faulty = with_fault(kind, Piece(cut[i], len(cut[i]) // 2, ranges, job.experiment == "panda"), rng)
+        watched += [] if faulty is None else [(kind, faulty)]
+    scores = monitor.score_episodes([episode for _, episode in watched])
+    ratios = [s.value / threshold for s in scores]
+    return [job._asdict() | judged(kind, v, whole.spec.dt) for (kind, _), v in zip(watched, ratios, strict=True)]
 
 
-def fitted(job: Job, episodes: Sequence[Episode], urdf: str = "") -> Any:
+def fitted(job: Job, episodes: Sequence[Episode], urdf: str) -> Any:
     """Return the monitor of a job, fitted but not calibrated: no rate could be promised of so few pieces."""
     spec, name = episodes[0].spec, WITH_BODY.get(job.monitor, job.monitor)
     if job.monitor == RULE:
@@ -122,31 +273,7 @@ def fitted(job: Job, episodes: Sequence[Episode], urdf: str = "") -> Any:
     return make_monitor(name, spec, seed=job.seed, **settings).fit(list(episodes))
 
 
-# ------------------------------------------------------------------ faults added to recordings
-
-
-def on_an_arm(job: Job, folder: Path) -> list[Record]:
-    """Return a record for each tested piece as it is, and for each fault in it."""
-    arm = ARMS[job.experiment]
-    whole = arm.episode(folder)
-    effort = whole.stream[:, whole.spec.slices["effort"]]
-    ranges = np.quantile(effort, 0.95, axis=0) - np.quantile(effort, 0.05, axis=0)
-    cut = [piece for part in complete_parts(whole) for piece in pieces(part, PIECE_S)]
-    tested, learned, calibration = parted(len(cut), job)
-    monitor = fitted(job, [cut[i] for i in learned], arm.body(folder) if job.monitor in WITH_BODY else "")
-    threshold = max(float(s.value.max()) for s in monitor.score_episodes([cut[i] for i in calibration]))
-    rng = np.random.default_rng([job.seed, job.fold])  # the same faults for every monitor
-    watched = [("", cut[i]) for i in tested]
-    for i, kind in ((i, kind) for i in tested for kind in FAULTS):
-        episode = with_fault(
-            kind, Piece(cut[i], len(cut[i]) // 2, ranges.astype(np.float64), job.experiment == "panda"), rng
-        )
-        watched += [] if episode is None else [(kind, episode)]
-    scores = monitor.score_episodes([episode for _, episode in watched])
-    return [judged(kind, s.value / threshold, whole.spec.dt) for (kind, _), s in zip(watched, scores, strict=True)]
-
-
-def judged(kind: str, value: NDArray[np.float64], dt: float) -> Record:
+def judged(kind: str, value: Floats, dt: float) -> Record:
     """Return the record of a piece by its surprise as a multiple of the threshold (T,)."""
     if not kind:
         counted = {"alarms": len(spans(value > 1)), "alarm_s": (value > 1).sum() * dt, "seconds": len(value) * dt}
@@ -157,96 +284,30 @@ def judged(kind: str, value: NDArray[np.float64], dt: float) -> Record:
     return {"kind": kind, "found": found, "delay": dt * (over[0] + 1) if found else None, "excess": float(after.max())}
 
 
-def parted(count: int, job: Job) -> tuple[list[int], list[int], list[int]]:
-    """Return the pieces that are tested, learned from, and set the threshold."""
-    order = np.random.default_rng(job.seed).permutation(count)
-    tested = order[job.fold :: FOLDS]
-    others = [int(i) for i in order if i not in set(tested.tolist())]
-    if len(others) < 4:
-        raise ValueError(f"{job.experiment} has {count} pieces of {PIECE_S:g} s: too few")
-    return sorted(tested.tolist()), [i for n, i in enumerate(others) if n % 3], others[::3]
-
-
-# ------------------------------------------------------------------ events that happened
-
-
-def on_the_cobot(job: Job, folder: Path) -> list[Record]:
-    """Return a record for each event of a fold, a contiguous part of the recording, and one of the rest of it."""
-    columns, events = read_cobot(folder)
-    whole = Episode.from_table(columns, success=True)
-    marks = {
-        name: np.nan_to_num(Episode.from_table({**columns, "mark": rows.astype(float)}).stream[:, -1], nan=0.0) > 0.5
-        for name, rows in events.items()
-    }
-    dt, rows = whole.spec.dt, np.arange(len(whole))
-    near = round(AROUND_S / dt)
-    close = np.convolve(np.logical_or.reduce(list(marks.values())), np.ones(4 * near + 1), "same") > 0
-    known = np.isfinite(whole.stream).all(axis=1)
-    edges = np.quantile(np.flatnonzero(known), np.linspace(0, 1, FOLDS + 1)).astype(int)
-    mine = (rows >= edges[job.fold]) & (rows < edges[job.fold + 1])
-
-    def cut(chosen: NDArray[np.bool_], least: int) -> list[tuple[int, Episode]]:
-        parts = [(a, b) for a, b in spans(chosen) if b - a >= least]
-        return [(a, Episode.from_stream(whole.stream[a:b], whole.spec, success=True)) for a, b in parts]
-
-    healthy = [episode for _, episode in cut(known & ~close & ~mine, 30)]
-    order = np.random.default_rng(job.seed).permutation(len(healthy))
-    monitor = fitted(job, [healthy[i] for i in order[::2]])
-    maxima = [float(s.value.max()) for s in monitor.score_episodes([healthy[i] for i in order[1::2]])]
-    threshold = float(np.quantile(maxima, 0.95))
-    alarm, watched = (np.zeros(len(whole), np.bool_) for _ in range(2))
-    tested = cut(known & mine, 5)
-    for (a, _), score in zip(tested, monitor.score_episodes([episode for _, episode in tested]), strict=True):
-        alarm[a : a + len(score.value)] = score.value > threshold
-        watched[a : a + len(score.value)] = True
-    begins = alarm & ~np.concatenate([[False], alarm[:-1]])  # an alarm that lasts has found nothing new
-    records: list[Record] = []
-    for name in COBOT_EVENTS:
-        for a, b in spans(marks[name] & mine):
-            around = slice(max(0, a - near), b + near)
-            if watched[around].any():
-                over = np.flatnonzero(begins[around])
-                delay = (around.start + int(over[0]) - a) * dt if len(over) else None
-                records.append({"kind": name, "found": bool(len(over)), "delay": delay})
-    quiet = watched & ~close
-    alarms = sum(bool(quiet[a]) for a, _ in spans(alarm))
-    counted = {"alarms": alarms, "alarm_s": float((alarm & quiet).sum() * dt), "seconds": float(quiet.sum() * dt)}
-    return [*records, {"kind": "", **counted}]
-
-
-# ------------------------------------------------------------------ tables
-
-
-def table(own: Sequence[Record], experiment: str, monitors: Sequence[str]) -> Table:
-    """Return the table of an experiment, a row for each monitor."""
-    kinds = [kind for kind in (*FAULTS, *COBOT_EVENTS) if where(own, kind=kind)]
-    added = experiment in ARMS
-    rows = [row(name, where(own, monitor=name), kinds, added) for name in monitors if where(own, monitor=name)]
-    seconds = sum(r["seconds"] for r in where(own, kind="", monitor=own[0]["monitor"]))
-    if added:
-        caption = (
-            f"{ARMS[experiment].robot} ({ARMS[experiment].place}), {seconds:.0f} s as recorded. * added to the "
-            "recording, found within half a piece. No false alarm: found by a threshold that no healthy piece passes."
+def table(records: Sequence[Record], arm: RealArm, monitors: Sequence[str]) -> Table:
+    """Return the table of a recording, a row for each monitor."""
+    kinds = [kind for kind in FAULTS if where(records, kind=kind)]
+    rows = []
+    for name in monitors:
+        own = where(records, monitor=name)
+        faulty, healthy = [r for r in own if r["kind"]], where(own, kind="")
+        found = {kind: [r["found"] for r in where(faulty, kind=kind)] for kind in kinds}
+        delays = [r["delay"] for r in faulty if r["found"]]
+        most = max(1.0, *(r["excess"] for r in healthy))
+        seconds, alarms, alarm_s = (sum(r[name] for r in healthy) for name in ("seconds", "alarms", "alarm_s"))
+        rows.append(
+            (
+                name,
+                *(f"{sum(f)} of {len(f)}" for f in found.values()),
+                f"{np.median(delays):.3g}" if delays else "",
+                f"{sum(r['excess'] > most for r in faulty)} of {len(faulty)}",
+                f"{3600 * alarms / seconds:.0f}",
+                f"{100 * alarm_s / seconds:.1f} %",
+            )
         )
-    else:
-        caption = f"UR3 of CobotOps, 1 Hz, events that happened, and {seconds / 3600:.1f} h between them."
-    headings = ["Monitor", *(f"{k} *" if added else k for k in kinds), "delay [s]"]
-    headings += ["no false alarm"] if added else []
-    return Table(caption, [*headings, "false alarms an hour", "quiet time in alarm"], rows)
-
-
-def row(name: str, mine: Sequence[Record], kinds: Sequence[str], added: bool) -> list[object]:
-    """Return the row of one monitor."""
-    faulty, quiet = [r for r in mine if r["kind"]], where(mine, kind="")
-    cells: list[object] = [name]
-    for kind in kinds:
-        found = [r["found"] for r in where(faulty, kind=kind)]
-        cells.append(f"{sum(found)} of {len(found)}")
-    delays = [r["delay"] for r in faulty if r["delay"] is not None]
-    cells.append(f"{np.median(delays):.3g}" if delays else "")
-    if added:
-        most = max(1.0, *(r["excess"] for r in quiet))
-        cells.append(f"{sum(r['excess'] > most for r in faulty)} of {len(faulty)}")
-    seconds = sum(r["seconds"] for r in quiet)
-    alarms, share = (sum(r[name] for r in quiet) / seconds for name in ("alarms", "alarm_s"))
-    return [*cells, f"{3600 * alarms:.0f}", f"{100 * share:.1f} %"]
+    caption = (
+        f"{arm.robot} ({arm.place}), {seconds:.0f} s as recorded. * added to the recording, found within half a piece. "
+        "No false alarm: found by a threshold that no healthy piece passes."
+    )
+    headings = ("Monitor", *(f"{kind} *" for kind in kinds), "delay [s]", "no false alarm")
+    return Table(caption, (*headings, "false alarms an hour", "healthy time in alarm"), rows)
