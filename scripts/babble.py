@@ -18,7 +18,6 @@ from rich.console import Console
 from asm_gym.detection import check_per_hour
 from asm_gym.detection.hourly import check_hours
 from asm_gym.episode import Episode, load_episode
-from asm_gym.evaluation.corpus import Corpus
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.recordings import NOMINAL_ROLES
 from asm_gym.evaluation.tables import ConsoleTable, markdown
@@ -27,6 +26,7 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.shipped import USUAL
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
 from asm_gym.rollouts.collect import record_missing
+from asm_gym.rollouts.corpus import Corpus
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
 from asm_gym.rollouts.pretraining.exam import Exam, Marks, card, examine, summary, usual_force

@@ -13,9 +13,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from asm_gym.evaluation.corpus import VERSION, Corpus
 from asm_gym.evaluation.tables import ConsoleTable, Table
-from asm_gym.rollouts.corpus import PARTS, QUICK, ROUNDS, record_corpus
+from asm_gym.rollouts.corpus import PARTS, QUICK, ROUNDS, VERSION, Corpus, record_corpus
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed

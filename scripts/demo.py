@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
+from scipy.stats import binom
 
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import figures
@@ -25,7 +26,7 @@ from asm_gym.evaluation.detection_tables import CONDITION_COLUMNS, headline
 from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, hourly_alarms, typical
 from asm_gym.evaluation.report import write_json, write_report
 from asm_gym.evaluation.scored_episode import NOMINAL
-from asm_gym.evaluation.statistics import Share, binomial_interval
+from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import ConsoleTable, tabulate
 from asm_gym.faults import Collision, Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
@@ -170,8 +171,8 @@ def demonstrate(args: Args, console: Console) -> None:
     rows = by_condition(traces, WINDOW_S)
     title = f"Noticed while the policy acts alone; solved and force: alone → {args.on_alarm}"
     table = tabulate(title, CONDITION_COLUMNS, rows)
-    console.print("", ConsoleTable(table, plain=True), "")
-    low, high = binomial_interval(args.nominal_episodes, FALSE_ALARM_RATE)
+    console.print("", ConsoleTable(table), "")
+    low, high = map(int, binom.interval(0.95, args.nominal_episodes, FALSE_ALARM_RATE))
     result = (
         f"{headline(rows)} At a false-alarm rate of {FALSE_ALARM_RATE:g}, {low} to {high} of {args.nominal_episodes} "
         f"nominal episodes raise an alarm by chance (95 %). The expert succeeded in {expert.k} of {expert.n} episodes."

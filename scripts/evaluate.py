@@ -19,7 +19,6 @@ import gymnasium as gym
 from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
-from asm_gym.evaluation.corpus import VERSION, skill_labels
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_S
 from asm_gym.evaluation.detection_tables import brief_monitors_table, harmless_table, kept_table, kinds_table
 from asm_gym.evaluation.report import publish
@@ -29,6 +28,7 @@ from asm_gym.faults import anywhere
 from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of
 from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.monitors.registry import check_monitor_name
+from asm_gym.rollouts.corpus import VERSION, skill_files
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 from asm_gym.rollouts.plan import evaluation_trials
 from asm_gym.rollouts.progress import stage
@@ -175,11 +175,11 @@ def evaluate(args: Args, console: Console) -> None:
     timed = partial(stage, console=console, seconds=seconds)
     claim: dict[str, Any] = {name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")}
     if args.corpus is not None:
-        labels, recorded = skill_labels(args.corpus), args.corpus / "scripted"
+        files = skill_files(args.corpus)
         claim["corpus"] = VERSION
     else:
         trials = [trial for task in args.tasks for trial in trials_of(args, task)]
-        labels, recorded = [trial.label for trial in trials], args.out
+        files = [args.out / trial.label.path for trial in trials]
     with claimed(args.out, "recordings.json", claim):
         if args.corpus is None:
             with timed("recording") as progress:
@@ -188,7 +188,7 @@ def evaluate(args: Args, console: Console) -> None:
         with timed("fitting and judging") as progress:
             each = partial(parallel_map, parallel=workers, progress=progress)
             how = args.false_alarm_rate, args.window, args.seed
-            result = benchmark(args.out, labels, args.monitors, *how, each, recorded)
+            result = benchmark(args.out, files, args.monitors, *how, each)
         with timed("drawing"):
             details = json.loads(json.dumps(asdict(args), default=str))
             details |= {"python": platform.python_version(), "machine": platform.machine(), "seconds": seconds}

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from asm_gym.episode import Episode, EpisodeLabel, load_episode
+from asm_gym.evaluation.ideal import detectability_of
 from asm_gym.evaluation.metrics import DetectionMetrics
-from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.evaluation.scoring import detectability_of, onset_row
+from asm_gym.evaluation.scored_episode import ScoredEpisode, onset_row
 from asm_gym.monitors import NeuralASM, Surprise
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.registry import SHIPPED
@@ -433,4 +433,4 @@ def test_a_fault_begins_in_the_row_of_its_step_where_a_step_has_several(rows):
     assert onset_row(twin) is None
     assert onset_row(replace(jump, contact_force=np.zeros(0, np.float32))) == 12  # nobody says otherwise
     (seen,) = detectability_of([twin], [jump], window_s=0.05)
-    assert seen.earliest == 0
+    assert seen.delay == pytest.approx(0.05)

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from asm_gym.episode import save_episode
-from asm_gym.evaluation.corpus import MANIFEST, VERSION, Corpus
 from asm_gym.rollouts import corpus as module
-from asm_gym.rollouts.corpus import ROUNDS, Source, record_corpus, trials
+from asm_gym.rollouts.corpus import MANIFEST, ROUNDS, VERSION, Corpus, Source, record_corpus, trials
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.trial import faulty_trial
 from asm_gym.scripts.corpus import contents
@@ -58,15 +57,14 @@ def test_what_is_there_is_not_recorded_again(recorded, monkeypatch):
         Corpus.open(folder)
     record_round(folder, 0)
     assert len(made) == 10
-    Corpus.open(folder).episodes().check()
+    assert len(Corpus.open(folder).episodes()) == 9
 
 
-def test_episodes_are_chosen_by_role_policy_and_task_and_read_one_by_one(recorded):
+def test_episodes_are_chosen_by_role_policy_and_task_and_checked(recorded):
     corpus = Corpus.open(recorded[0])
     assert len(corpus.episodes("nominal")) == 6
     assert [e.label.task for e in corpus.episodes(policies=("stack_sac",))] == ["Stack"] * 2
-    chosen = corpus.episodes("fit", "calibration", tasks=("Lift",))
-    assert [e.label.role for e in chosen[1:]] == [entry.label.role for entry in chosen.entries[1:]]
+    assert {e.label.role for e in corpus.episodes("fit", "calibration", tasks=("Lift",))} == {"fit", "calibration"}
     seconds = sum(e.seconds for e in corpus.entries)
     assert seconds == pytest.approx(sum(len(e) * e.spec.dt for e in corpus.episodes()))
     assert [row[0] for row in contents(corpus).rows] == ["Lift, scripted", "Stack, stack_sac"]
@@ -78,9 +76,9 @@ def test_one_changed_bit_is_refused(recorded):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
-    corpus.episodes()[2]
+    assert corpus.episodes("fit")
     with pytest.raises(ValueError, match=f"{path.name} is damaged"):
-        corpus.episodes()[3]
+        corpus.episodes()
 
 
 @pytest.mark.parametrize(

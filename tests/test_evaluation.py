@@ -14,8 +14,8 @@ from scipy import stats
 
 from asm_gym.detection import conformal_threshold
 from asm_gym.episode import EpisodeLabel, spans
-from asm_gym.evaluation import comparison, metrics, scoring
-from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
+from asm_gym.evaluation import metrics, scoring
+from asm_gym.evaluation.comparison import BenchmarkResult, MonitorResult, ideal_metrics
 from asm_gym.evaluation.detection_tables import (
     UNLIKELY,
     brief_monitors_table,
@@ -25,7 +25,15 @@ from asm_gym.evaluation.detection_tables import (
     lead_table,
     monitors_table,
 )
-from asm_gym.evaluation.ideal import auroc_bound, earliest, noise_floor, power_bound, separation
+from asm_gym.evaluation.ideal import (
+    Detectability,
+    auroc_bound,
+    earliest,
+    noise_floor,
+    power_bound,
+    separation,
+    visible_kinds,
+)
 from asm_gym.evaluation.metrics import (
     Delays,
     DetectionMetrics,
@@ -38,19 +46,10 @@ from asm_gym.evaluation.metrics import (
     time_matched_auroc,
     typical,
 )
-from asm_gym.evaluation.resampling import Calibration, interval, resample
+from asm_gym.evaluation.resampling import Calibration, Windows, by_episode, interval, resample
 from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode, TraceDetail, window_steps
 from asm_gym.evaluation.scoring import CODE, code_digest, fitted
-from asm_gym.evaluation.statistics import (
-    Estimate,
-    Rate,
-    Share,
-    Spread,
-    auroc,
-    binomial_interval,
-    poisson_interval,
-    wilson_interval,
-)
+from asm_gym.evaluation.statistics import Rate, Share, Spread, auroc, poisson_interval, wilson_interval
 from asm_gym.evaluation.tables import Column, ConsoleTable, Table, tabulate
 from tests.streams import sine_episodes
 
@@ -79,7 +78,7 @@ def test_spans_are_the_runs_of_true():
         ([1, 20, 1, 1, 1], 3, (1,), None),
         ([20, 20, 20, 20], 2, (0,), None),  # up before the onset
         ([20, 20, 20, 1, 20], 2, (0,), 2),  # raised again
-        ([1, 1, 20, 1], 2, (), 0),
+        ([20, 1, 1], 0, (), 0),
         ([20, 1, 20, 20], None, (0, 2), None),
     ],
 )
@@ -87,6 +86,9 @@ def test_an_alarm_is_false_before_the_onset_and_a_detection_when_raised_since(su
     trace = a_trace(surprise, onset)
     assert (trace.false_alarms, trace.detected_after) == (false, after)
     assert trace.delay == (None if after is None else pytest.approx(0.1 * (after + 1)))
+    if onset is not None:
+        assert Windows([trace], 1.0).detected(10.0).tolist() == [after is not None]
+        assert Windows([trace], 0.2).detected(10.0).tolist() == [after is not None and after < 2]
 
 
 @pytest.mark.parametrize(
@@ -106,9 +108,7 @@ def test_an_episode_refuses_what_it_cannot_mean(fields, message):
         a_trace(fields.pop("surprise", [1, 1, 1]), **fields)
 
 
-@pytest.mark.parametrize(
-    "fields", [{"attribution": np.zeros((3, 5))}, {"fault": np.zeros(2, bool)}, {"fault": np.zeros(3, int)}]
-)
+@pytest.mark.parametrize("fields", [{"attribution": np.zeros((3, 5))}, {"fault": np.zeros(2, bool)}])
 def test_the_detail_has_a_row_for_every_step(fields):
     with pytest.raises(ValueError, match=next(iter(fields))):
         TraceDetail(**{"attribution": np.zeros((3, 2)), "channels": ("a", "b"), "fault": np.zeros(3, bool), **fields})
@@ -217,17 +217,13 @@ def test_attribution_counts_alarms_alone_and_the_typical_episode_has_the_median_
 
 
 @pytest.mark.parametrize(
-    ("k", "n", "low", "high"),
-    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718), (0, 0, 0, 1)],
+    ("k", "n", "low", "high"), [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0, 0.1611), (0, 0, 0, 1)]
 )
 def test_wilson_gives_the_intervals_of_newcombe_1998(k, n, low, high):
     assert wilson_interval(k, n) == pytest.approx((low, high), abs=5e-5)
 
 
-@pytest.mark.parametrize(
-    ("k", "low", "high"),
-    [(0, 0.0, 3.6889), (1, 0.0253, 5.5716), (5, 1.6235, 11.6683), (10, 4.7954, 18.3904), (100, 81.3640, 121.6268)],
-)
+@pytest.mark.parametrize(("k", "low", "high"), [(0, 0.0, 3.6889), (1, 0.0253, 5.5716), (100, 81.3640, 121.6268)])
 def test_poisson_gives_the_intervals_of_garwood_1936(k, low, high):
     assert poisson_interval(k) == pytest.approx((low, high), abs=5e-5)
 
@@ -238,42 +234,27 @@ def test_a_rate_is_by_the_hour_and_unknown_without_time():
     assert math.isnan(Rate(0, 0.0).value)
 
 
-def test_the_binomial_interval_of_four_coins_by_hand():
-    # P(0) = P(4) = 1/16: with tails of at most 5 % both stay in, with tails of at most 10 % both fall out.
-    assert [binomial_interval(4, 0.5, c) for c in (0.9, 0.8)] == [(0, 4), (1, 3)]
-    assert [binomial_interval(7, p) for p in (0.0, 1.0)] == [(0, 0), (7, 7)]
-
-
 def test_auroc_is_the_mann_whitney_statistic_takes_infinity_and_refuses_nan():
     rng = np.random.default_rng(0)
     pos, neg = rng.integers(0, 9, 40), rng.integers(0, 7, 60)
     assert auroc(pos, neg) == pytest.approx(stats.mannwhitneyu(pos, neg).statistic / (40 * 60))
     assert auroc([math.inf, math.inf], [1.0, math.inf]) == pytest.approx(0.75)
-    for wrong, message in (([math.nan], "NaN"), ([], "hold some"), ([[1], [2, 3]], "shape")):
-        with pytest.raises(ValueError, match=message):
+    for wrong in ([math.nan], [], [[1.0]]):
+        with pytest.raises(ValueError, match="scores_pos"):
             auroc(wrong, [1.0])
 
 
 @pytest.mark.parametrize(
-    ("use", "name"),
-    [
-        (lambda: poisson_interval(-1), "k"),
-        (lambda: poisson_interval(1.5), "k"),
-        (lambda: wilson_interval(3, 2), "k"),
-        (lambda: wilson_interval(1, 2, confidence=95), "confidence"),
-        (lambda: binomial_interval(3, 1.5), "p"),
-    ],
+    "use", [lambda: poisson_interval(-1), lambda: poisson_interval(1.5), lambda: wilson_interval(3, 2)]
 )
-def test_impossible_counts_are_refused(use, name):
-    with pytest.raises(ValueError, match=f"{name} must be"):
+def test_impossible_counts_are_refused(use):
+    with pytest.raises(ValueError, match="k must be"):
         use()
 
 
-def test_a_spread_and_an_estimate_are_formatted():
+def test_a_spread_is_formatted():
     assert Spread.of([1.0, 2.0, 3.0]).text(digits=1) == "2.0 ± 1.0"
     assert Spread.of([0.5]).text(100, 1) == "50.0"
-    assert Estimate(0.5, 0.25, 0.75).percent() == "50 % (25 to 75)"
-    assert Estimate(math.nan, math.nan, math.nan).percent("none") == "none"
 
 
 # ------------------------------------------------------------------ the ideal observer
@@ -328,8 +309,8 @@ def judged(peak, kind="nominal", severity="", onset=None):
     return trace.attributed(np.ones((10, 1)), ("a",))
 
 
-def visibility(separation, kind="push", severity="strong", earliest=0):
-    return Detectability("Lift", kind, severity, 0, separation, earliest, 0.05)
+def visibility(separation, kind="push", severity="strong", delay=0.05):
+    return Detectability("Lift", kind, severity, 0, separation, delay)
 
 
 TRACES = [
@@ -338,14 +319,15 @@ TRACES = [
     judged(2.5, "push", "mild", onset=5),
     judged(0.0, "noise", "mild", onset=5),
 ]
-RESULT = MonitorResult(TRACES, [judged(9.0, "touch"), judged(0.0, "touch")], Calibration({0.01: 3.5, 0.05: 2.2}))
+ONE, FIVE = by_episode(0.01), by_episode(0.05)
+RESULT = MonitorResult(TRACES, [judged(9.0, "touch"), judged(0.0, "touch")], Calibration({ONE: 3.5, FIVE: 2.2}))
 
 
 def test_a_kind_is_visible_where_an_ideal_observer_finds_half_of_it():
     # Power at 1 %: Φ(√S - 2.326), one half at S = 5.41.
     found = [visibility(6.0), visibility(5.0, "touch"), visibility(100.0, "shove"), visibility(0.0, "shove")]
-    assert list(comparison.visible_kinds(found).values()) == [True, False, True]
-    ideal = comparison.ideal_metrics("ideal", [visibility(2.0, earliest=None), visibility(np.inf, earliest=1)])
+    assert list(visible_kinds(found).values()) == [True, False, True]
+    ideal = ideal_metrics("ideal", [visibility(2.0, delay=None), visibility(np.inf, delay=0.1)], 0.01)
     assert ideal.auroc == pytest.approx((0.8413447 + 1) / 2)  # Φ(√(2/2)) and 1
     assert ideal.delays == pytest.approx((100.0, math.inf, 1, 1))
 
@@ -353,7 +335,7 @@ def test_a_kind_is_visible_where_an_ideal_observer_finds_half_of_it():
 def test_scores_are_means_over_the_kinds_that_can_be_seen():
     asm = RESULT.metrics("asm", 1.0, {("push", "strong"): True, ("push", "mild"): True, ("noise", "mild"): False})
     assert asm.auroc == pytest.approx((1.0 + 0.5) / 2)
-    assert (asm.found[0.01].k, asm.found[0.05].k, asm.found[0.05].n) == (1, 2, 2)
+    assert (asm.found[ONE], asm.found[FIVE]) == ((1, 2), (2, 2))
     assert metrics.attribution_accuracy(asm.faulty) == (1, 1)
     assert [k.auroc for k in RESULT.metrics("asm", 1.0).kinds.values()] == [1.0, 0.5, 0.0]
 
@@ -365,10 +347,8 @@ def test_the_tables_of_a_benchmark_put_the_ideal_observer_first_and_hide_what_no
     ideal, asm = (dict(zip(table.headings, row, strict=True)) for row in table.rows)
     assert (ideal["Monitor"], ideal["AUROC, same steps"], ideal["False alarms"]) == ("ideal observer", "1.000", "")
     assert asm["AUROC, same steps"].startswith("0.750 (")
-    # Whole nominal episodes peak at 1, 2, 3 and 4: the push of 5 is above all, the one of 2.5 above half.
-    assert asm["AUROC, whole episodes"] == "0.750"
     assert (asm["Found at 1 %"], asm["Found at 0.5 %"]) == ("50 %", "needs 199")
-    assert (asm["False alarms"], asm["Median delay [ms]"], asm["p95 [ms]"]) == ("1 of 4 (5–70 %)", "50", "missed")
+    assert (asm["False alarms"], asm["Median delay [ms]"]) == ("1 of 4 (5–70 %)", "50")
     assert "noise mild" in table.caption
     assert set(brief_monitors_table(result).headings) < set(table.headings)
     assert brief_monitors_table(result).rows[1][1] == "0.750"
@@ -380,7 +360,7 @@ def promised(calibrated, tested):
     """One monitor, by its maxima."""
     nominal = [ScoredEpisode("nominal", s, 0.1, 1.0, np.array([0.0, p])) for s, p in enumerate(tested)]
     threshold = conformal_threshold(calibrated, 0.05)
-    one = MonitorResult(nominal, [], Calibration({0.05: threshold}, maxima=calibrated))
+    one = MonitorResult(nominal, [], Calibration({FIVE: threshold}, calibrated))
     return kept_table(BenchmarkResult({"asm": one}, [], 0.05, 0.5)).rows[0][1]
 
 
@@ -411,8 +391,8 @@ def scenes(rng, faults: int, n: int = 60):
 def test_more_faults_of_the_same_scenes_do_not_narrow_the_interval():
     widths = []
     for faults in (1, 20):
-        calibration = Calibration({0.05: 1.0}, maxima=np.ones(200))
-        drawn = resample(*scenes(np.random.default_rng(0), faults), calibration, 0.5, draws=200).found[0.05]
+        calibration = Calibration({FIVE: 1.0}, np.ones(200))
+        drawn = resample(*scenes(np.random.default_rng(0), faults), calibration, 0.5, draws=200).found[FIVE]
         widths.append(interval(0.5, drawn).high - interval(0.5, drawn).low)
     assert widths[1] == pytest.approx(widths[0], rel=0.05)
     assert widths[0] == pytest.approx(4 * np.sqrt(0.25 / 60), rel=0.25)  # ± 2 standard errors of 60 scenes
@@ -420,11 +400,11 @@ def test_more_faults_of_the_same_scenes_do_not_narrow_the_interval():
 
 def test_the_interval_holds_what_calibration_adds():
     # Peaks lie close about the threshold, so the threshold decides.
-    rng = np.random.default_rng(1)
+    rng, half = np.random.default_rng(1), by_episode(0.5)
     nominal = [peaked(1.0, s) for s in range(60)]
     faulty = [peaked(float(p), s, onset=5) for s, p in enumerate(1.0 + 0.01 * rng.standard_normal(60))]
     certain, unsure = (
-        resample(faulty, nominal, Calibration({0.5: 1.0}, maxima=maxima), 0.5, draws=200).found[0.5]
+        resample(faulty, nominal, Calibration({half: 1.0}, maxima), 0.5, draws=200).found[half]
         for maxima in (np.ones(40), 1 + 0.05 * rng.standard_normal(40))
     )
     assert np.std(unsure) > 1.5 * np.std(certain)
@@ -432,19 +412,18 @@ def test_the_interval_holds_what_calibration_adds():
 
 def test_resamples_agree_with_the_results_that_they_are_about():
     faulty, nominal = scenes(np.random.default_rng(2), 2)
-    calibration = Calibration({0.05: 1.0, 0.001: 2.0}, maxima=np.linspace(0.5, 1.01, 200))
+    calibration = Calibration({FIVE: 1.0}, np.linspace(0.5, 1.01, 200))
     found = DetectionMetrics("asm", faulty, nominal, 0.5, calibration)
     assert np.mean(found.draws.auroc) == pytest.approx(found.auroc, abs=0.02)
-    assert np.mean(found.draws.found[0.05]) == pytest.approx(found.found[0.05].value, abs=0.03)
-    assert 0.001 not in found.draws.found  # too few episodes for that rate
+    assert np.mean(found.draws.found[FIVE]) == pytest.approx(found.found[FIVE].value, abs=0.03)
     up = [peaked(3.0, s, onset=5, before=2.0) for s in range(4)]  # an alarm that was up already is no detection
-    assert not resample(up, nominal, calibration, 0.5, draws=20).found[0.05].any()
+    assert not resample(up, nominal, calibration, 0.5, draws=20).found[FIVE].any()
 
 
 def test_the_lead_over_a_monitor_that_judged_alike_is_nothing():
     faulty, nominal = scenes(np.random.default_rng(4), 1)
-    one = MonitorResult([*nominal, *faulty], [], Calibration({0.05: 1.0}, maxima=np.linspace(0.5, 1.1, 60)))
-    seen = [Detectability("Lift", "push", "", t.seed, 100.0, 0, 0.1) for t in faulty]
+    one = MonitorResult([*nominal, *faulty], [], Calibration({FIVE: 1.0}, np.linspace(0.5, 1.1, 60)))
+    seen = [Detectability("Lift", "push", "", t.seed, 100.0, 0.1) for t in faulty]
     table = lead_table(BenchmarkResult({"asm": one, "twin": one}, seen, 0.05, 0.5))
     assert table.rows == [("twin", "+0.000 (+0.000 to +0.000), within chance", "+0.0 (+0.0 to +0.0), within chance")]
 
@@ -456,7 +435,7 @@ def recordings():
     return [replace(episode, label=EpisodeLabel("Sines", "fit", seed=n)) for n, episode in enumerate(sine_episodes(8))]
 
 
-def test_a_fitted_monitor_is_kept_and_a_damaged_one_is_fitted_anew(tmp_path):
+def test_a_fitted_monitor_is_kept_and_a_damaged_one_is_fitted_anew(tmp_path, monkeypatch):
     first = fitted(tmp_path, "kalman", recordings(), 0)
     (kept,) = (tmp_path / "monitors").glob("*")
     written = kept.stat().st_mtime_ns
@@ -466,10 +445,6 @@ def test_a_fitted_monitor_is_kept_and_a_damaged_one_is_fitted_anew(tmp_path):
     kept.write_bytes(kept.read_bytes()[:100])
     fitted(tmp_path, "kalman", recordings(), 0)
     assert kept.stat().st_size > 1000
-
-
-def test_what_other_code_has_fitted_is_fitted_anew_with_a_warning(tmp_path, monkeypatch):
-    fitted(tmp_path, "kalman", recordings(), 0)
     monkeypatch.setattr(scoring, "code_digest", lambda: "01234567")
     with pytest.warns(UserWarning, match="kalman was fitted by other code"):
         fitted(tmp_path, "kalman", recordings(), 0)

@@ -21,7 +21,7 @@ def watched(cue=(2, 3, 6), length=8, on_alarm="monitor", **how):
 
 def test_an_episode_is_counted_by_hand():
     needs("stable_baselines3")
-    from asm_gym.rollouts.training.callback import SafetyCounter
+    from asm_gym.rollouts.safety_callback import SafetyCounter
 
     counter, env = SafetyCounter(0.05), watched(on_alarm="hold", release_after=2)
     env.reset()
@@ -40,7 +40,7 @@ def test_an_episode_is_counted_by_hand():
 
 def test_the_callback_logs_what_learning_met(tmp_path):
     sb3, logger = needs("stable_baselines3"), needs("stable_baselines3.common.logger")
-    from asm_gym.rollouts.training.callback import SafetyCallback
+    from asm_gym.rollouts.safety_callback import SafetyCallback
 
     callback = SafetyCallback(dt=0.05)
     agent = sb3.PPO("MlpPolicy", watched(), n_steps=16, batch_size=16, seed=0)
@@ -201,7 +201,7 @@ def test_sac_as_cleanrl_writes_it_learns_and_meets_every_cost():
 @pytest.mark.parametrize("kind", ["PPO", "SAC"])
 def test_stable_baselines_learns_and_meets_every_cost(kind: str):
     sb3 = needs("stable_baselines3")
-    from asm_gym.rollouts.training.callback import SafetyCallback
+    from asm_gym.rollouts.safety_callback import SafetyCallback
 
     how = {"n_steps": 64, "batch_size": 32} if kind == "PPO" else {"learning_starts": 32, "batch_size": 32}
     callback = SafetyCallback(dt=0.05)

@@ -72,7 +72,7 @@ def test_figures_are_the_same_bytes_whatever_the_users_style_and_leave_it_alone(
 
 def test_the_roc_curve_encloses_the_auroc_it_names(traces):
     ax = figures.roc_figure(by_condition(traces, 1.0)).axes[0]
-    alone = [t for t in traces if t.watched_only]
+    alone = [t for t in traces if t.acting == "policy alone"]
     nominal = [t for t in alone if t.condition == "nominal"]
     for line, condition in zip(ax.lines[1:], ("push", "weak joint"), strict=True):
         x, y = (np.asarray(v, float) / 100 for v in line.get_data())
@@ -101,19 +101,17 @@ def test_infinite_and_zero_surprise_can_be_drawn(traces, tmp_path: Path):
         assert figures.save(figure, tmp_path / f"{name}.png").stat().st_size > 5000
 
 
-def test_the_most_surprising_channels_come_first_beside_their_healthy_twin(traces):
+def test_the_most_surprising_channels_come_first(traces):
     trace = next(t for t in traces if t.delay is not None)
     order = np.argsort(-trace.detail.attribution[20:].max(axis=0))[:3]
     names = [trace.detail.channels[i] for i in order]
     labels = figures.attribution_figure(trace, top=3).axes[0].get_yticklabels()
     assert [text.get_text() for text in labels] == names
-    stream, twin = np.random.default_rng(0).normal(size=(2, len(trace), len(trace.detail.channels)))
-    detail = dataclasses.replace(trace.detail, stream=stream, twin=twin)
+    stream = np.random.default_rng(0).normal(size=(len(trace), len(trace.detail.channels)))
+    detail = dataclasses.replace(trace.detail, stream=stream)
     axes = figures.stream_figure(dataclasses.replace(trace, detail=detail), top=3).axes
     assert [ax.get_title(loc="left") for ax in axes] == names
-    healthy, sensed = (line.get_ydata() for line in axes[0].lines[:2])
-    np.testing.assert_array_equal(healthy, twin[:, order[0]])
-    np.testing.assert_array_equal(sensed, stream[:, order[0]])
+    np.testing.assert_array_equal(axes[0].lines[0].get_ydata(), stream[:, order[0]])
     with pytest.raises(ValueError, match="without its stream"):
         figures.stream_figure(trace)
     with pytest.raises(ValueError, match="without the detail"):

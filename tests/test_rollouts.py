@@ -15,7 +15,6 @@ from rich.console import Console
 from stable_baselines3 import SAC
 
 from asm_gym.episode import Episode, EpisodeLabel
-from asm_gym.evaluation.comparison import LeftOut
 from asm_gym.evaluation.recordings import NOMINAL_ROLES, Recordings
 from asm_gym.rollouts import collect, progress
 from asm_gym.rollouts.collect import record_episode
@@ -210,12 +209,12 @@ def test_episodes_that_fail_or_crash_by_themselves_are_not_normal():
     crash, failure = recording("nominal", 7, 21.0), recording("fit", 8, 90.0, success=False)
     faulty = [recording("faulty", seed, 300.0) for seed in (3, 7)]
     found = Recordings.of([*nominal, crash, failure, *faulty])
-    assert found.left_out == LeftOut(failed=1, crashed=1)
+    assert found.left_out == (1, 1)
     assert [e.labelled.seed for e in found.roles["faulty"]] == [3]
     assert [e.labelled.seed for role in NOMINAL_ROLES for e in found.roles[role]] == [0, 1, 2, 3]
     assert [e.labelled.seed for e in found.twins] == [3, 7]
     unfelt = [replace(recording(role, 0, 1.0), contact_force=np.zeros(0, np.float32)) for role in NOMINAL_ROLES]
-    assert Recordings.of(unfelt).left_out == LeftOut(0, 0)
+    assert Recordings.of(unfelt).left_out == (0, 0)
 
 
 # ------------------------------------------------------------------ progress

@@ -171,7 +171,7 @@ def test_a_class_of_robosuite_becomes_a_task_with_named_channels(registries):
 
 def test_a_callback_finds_out_the_control_period():
     sb3 = pytest.importorskip("stable_baselines3")
-    from asm_gym.rollouts.training.callback import SafetyCallback
+    from asm_gym.rollouts.safety_callback import SafetyCallback
 
     env = gym.make("asm_gym/SyntheticArm-v0", horizon=20)
     spec = StreamRecorder(env).stream_spec

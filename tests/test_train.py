@@ -14,9 +14,18 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from asm_gym.data.datasets import write_dataset
 from asm_gym.episode import Episode
 from asm_gym.policies.network import NetworkPolicy
-from asm_gym.rollouts.training.cloning import Anchor, Cloner, fill_buffer, steps_of
-from asm_gym.rollouts.training.learners import ACTOR_SHARE, export, make_learner, warm_critic
-from asm_gym.rollouts.training.run import Plan, standard_of, standardised, train
+from asm_gym.rollouts.training import (
+    ACTOR_SHARE,
+    Cloner,
+    Plan,
+    export,
+    fill_buffer,
+    make_learner,
+    standard_of,
+    standardised,
+    train,
+    warm_critic,
+)
 from asm_gym.scripts.cli import main
 from asm_gym.spec import StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
@@ -44,6 +53,11 @@ def linear_expert(count=4, steps=60, seed=0):
     return episodes
 
 
+def steps_of(episodes):
+    """Observations and actions of whole episodes, one after the other."""
+    return np.concatenate([e.observations[:-1] for e in episodes]), np.concatenate([e.actions for e in episodes])
+
+
 def test_cloning_finds_the_experts_rule_and_an_anchor_keeps_it(env):
     learner = make_learner(env, 0)
     observations, actions = steps_of(linear_expert())
@@ -55,9 +69,8 @@ def test_cloning_finds_the_experts_rule_and_an_anchor_keeps_it(env):
     with torch.no_grad():
         learner.actor.mu.weight.add_(0.3)
     moved = learner.predict(observations, deterministic=True)[0]
-    anchor = Anchor(cloner)
     for _ in range(300):
-        anchor._on_rollout_start()
+        cloner._on_rollout_start()
     kept = learner.predict(observations, deterministic=True)[0]
     assert np.abs(kept - actions).mean() < 0.3 * np.abs(moved - actions).mean()
 

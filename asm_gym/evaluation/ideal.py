@@ -11,18 +11,40 @@ observer who knew both courses would form the likelihood ratio under the sensor 
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from asm_gym.episode import Episode
 from asm_gym.evaluation.defaults import REPORTED_RATE
+from asm_gym.evaluation.scored_episode import onset_row, window_steps
 
 Array = NDArray[np.floating[Any]]
 
 RESOLUTION = 1e-3
 """Noise of a channel without any, as a share of its spread: commands are exact, but nobody predicts them exactly."""
+VISIBLE = 0.5
+"""A kind counts where the ideal observer finds at least this share of its faults at a false-alarm rate of 1 %."""
+
+
+class Detectability(NamedTuple):
+    """What the ideal observer could detect of one faulty episode.
+
+    Attributes:
+        task, kind, severity, seed: identify the episode.
+        separation: S at the end of the window.
+        delay: time from the onset until the observer is sure [s]; None if never.
+    """
+
+    task: str
+    kind: str
+    severity: str
+    seed: int
+    separation: float
+    delay: float | None
 
 
 def noise_floor(noise: Array, streams: list[Array]) -> NDArray[np.float64]:
@@ -70,3 +92,34 @@ def earliest(separation: Array, rate: float = REPORTED_RATE, power: float = 0.95
     """Return the first step since the onset at which the power reaches ``power``; None if never."""
     enough = np.flatnonzero(power_bound(separation, rate) >= power)
     return int(enough[0]) if enough.size else None
+
+
+def mean_power(faults: Sequence[Detectability], rate: float) -> float:
+    """Return the share of these faults that the ideal observer finds at a false-alarm ``rate``."""
+    return float(np.mean(power_bound(np.array([d.separation for d in faults]), rate)))
+
+
+def detectability_of(nominal: Sequence[Episode], faulty: Sequence[Episode], window_s: float) -> list[Detectability]:
+    """Return what an ideal observer could detect of the faulty episodes, whose nominal twins it knows."""
+    twins = {(e.labelled.task, e.labelled.seed): e.stream for e in nominal}
+    noises: dict[str, Any] = {}
+    found = []
+    for episode in faulty:
+        label, dt = episode.labelled, episode.spec.dt
+        if label.task not in noises:
+            own = [e.stream for e in nominal if e.labelled.task == label.task]
+            noises[label.task] = noise_floor(episode.spec.noise, own)
+        summed = separation(episode.stream, twins[label.task, label.seed], noises[label.task], onset_row(episode) or 0)
+        window = summed[: window_steps(window_s, dt)]
+        sure, most = earliest(window), float(window[-1]) if len(window) else 0.0
+        delay = None if sure is None else (sure + 1) * dt
+        found.append(Detectability(label.task, label.kind, label.severity, label.seed, most, delay))
+    return found
+
+
+def visible_kinds(detectability: Sequence[Detectability]) -> dict[tuple[str, str], bool]:
+    """Return whether an ideal observer could detect each kind and severity, in order of appearance."""
+    kinds: dict[tuple[str, str], list[Detectability]] = {}
+    for one in detectability:
+        kinds.setdefault((one.kind, one.severity), []).append(one)
+    return {kind: mean_power(own, REPORTED_RATE) >= VISIBLE for kind, own in kinds.items()}

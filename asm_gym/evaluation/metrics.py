@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection import alarms_in
-from asm_gym.evaluation.resampling import Calibration, Draws, resample
+from asm_gym.evaluation.resampling import Calibration, Draws, Windows, resample, wins
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE, ScoredEpisode, window_steps
-from asm_gym.evaluation.statistics import Floats, Rate, Share, auroc
+from asm_gym.evaluation.statistics import Floats, Rate, Share
+from asm_gym.monitors.calibration import AlarmRate
 
 Kind = tuple[str, str]
 """Kind and severity of a fault."""
@@ -35,14 +36,6 @@ def in_words(kind: Kind) -> str:
     return " ".join(part.replace("_", " ") for part in kind if part)
 
 
-def by_kind(faulty: Sequence[ScoredEpisode]) -> dict[Kind, list[ScoredEpisode]]:
-    """Group faults by kind and severity, in order of appearance."""
-    groups: dict[Kind, list[ScoredEpisode]] = {}
-    for trace in faulty:
-        groups.setdefault((trace.kind, trace.severity), []).append(trace)
-    return groups
-
-
 def placements(
     faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float
 ) -> NDArray[np.float64]:
@@ -50,15 +43,8 @@ def placements(
 
     Ties count half. Faults that no nominal episode of their task reaches are left out.
     """
-    values = []
-    for trace in faulty:
-        steps = trace.window(window_s)
-        if trace.onset is None or steps.stop <= steps.start:
-            continue
-        others = [n.surprise[steps].max() for n in nominal if n.task == trace.task and len(n) > steps.start]
-        if others:
-            values.append(1.0 - auroc([trace.surprise[steps].max()], others))
-    return np.array(values)
+    won = wins(faulty, nominal, window_s)
+    return np.array([1.0 - np.nanmean(row) for row in won if not np.isnan(row).all()])
 
 
 def time_matched_auroc(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float) -> float:
@@ -92,7 +78,7 @@ class Delays(NamedTuple):
             return None
         # Observed values, not interpolated ones: between a number and a miss there is nothing.
         median, p95 = (late[math.ceil(q * len(late)) - 1] for q in (0.5, 0.95))
-        detected = sum(map(math.isfinite, late))
+        detected = int(np.isfinite(late).sum())
         return cls(median, p95, detected, len(late) - detected)
 
 
@@ -107,7 +93,7 @@ def delays_ms(traces: Sequence[ScoredEpisode], window_s: float) -> NDArray[np.fl
 
 def detected(traces: Sequence[ScoredEpisode], window_s: float) -> Share:
     """Count the faults with an alarm raised within the window."""
-    return Share.of([math.isfinite(d) for d in delays_ms(traces, window_s)])
+    return Share.of(np.isfinite(delays_ms(traces, window_s)))
 
 
 def false_alarms(traces: Sequence[ScoredEpisode]) -> Share:
@@ -147,17 +133,17 @@ class KindMetrics(NamedTuple):
     Attributes:
         name: in words.
         auroc: over matched steps.
-        found: faults detected within the window, by false-alarm rate.
+        found: faults detected within the window, by the promised rate of false alarms.
         delays: at the threshold of the episodes; None without faults.
     """
 
     name: str
     auroc: float
-    found: Mapping[float, Share]
+    found: Mapping[AlarmRate, Share]
     delays: Delays | None
 
 
-class ActingMetrics(NamedTuple):
+class Outcomes(NamedTuple):
     """How episodes ended under one response.
 
     Attributes:
@@ -172,7 +158,7 @@ class ActingMetrics(NamedTuple):
     peak_force: float
 
     @classmethod
-    def of(cls, acting: str, traces: Sequence[ScoredEpisode]) -> ActingMetrics:
+    def of(cls, acting: str, traces: Sequence[ScoredEpisode]) -> Outcomes:
         """Summarise the episodes with this response."""
         ends = [t.outcome for t in traces if t.acting == acting]
         success, ended = Share.of([o.success for o in ends]), Share.of([o.ended_by_alarm for o in ends])
@@ -197,16 +183,6 @@ class DetectionMetrics:
     window_s: float
     calibration: Calibration = field(default_factory=Calibration)
 
-    @property
-    def thresholds(self) -> Mapping[float, float]:
-        """By false-alarm rate."""
-        return self.calibration.thresholds
-
-    @property
-    def hourly(self) -> Mapping[float, float]:
-        """Thresholds by false alarms per hour."""
-        return self.calibration.hourly
-
     @cached_property
     def draws(self) -> Draws:
         """The results over resampled scenes and calibration episodes."""
@@ -215,7 +191,7 @@ class DetectionMetrics:
     @cached_property
     def watched(self) -> list[ScoredEpisode]:
         """Episodes of the policy alone: detection is measured on them."""
-        return [t for t in self.traces if t.watched_only]
+        return [t for t in self.traces if t.acting == POLICY_ALONE]
 
     @cached_property
     def faulty(self) -> list[ScoredEpisode]:
@@ -225,39 +201,32 @@ class DetectionMetrics:
     @cached_property
     def kinds(self) -> dict[Kind, KindMetrics]:
         """By kind and severity, in order of appearance."""
+        groups: dict[Kind, list[ScoredEpisode]] = {}
+        for trace in self.faulty:
+            groups.setdefault((trace.kind, trace.severity), []).append(trace)
         return {
             kind: KindMetrics(
                 name=in_words(kind),
                 auroc=time_matched_auroc(own, self.nominal, self.window_s),
-                found={r: detected([t.at(q) for t in own], self.window_s) for r, q in self.thresholds.items()},
+                found=self._found(own),
                 delays=Delays.of(delays_ms(own, self.window_s)),
             )
-            for kind, own in by_kind(self.faulty).items()
+            for kind, own in groups.items()
         }
+
+    def _found(self, faulty: Sequence[ScoredEpisode]) -> dict[AlarmRate, Share]:
+        windows = Windows(faulty, self.window_s)
+        return {promise: Share.of(windows.detected(q)) for promise, q in self.calibration.thresholds.items()}
 
     @property
     def auroc(self) -> float:
         """Mean over kinds; NaN without faults."""
         return float(np.mean([k.auroc for k in self.kinds.values()])) if self.kinds else math.nan
 
-    @property
-    def unmatched_auroc(self) -> float:
-        """The peak in the window against the peak of whole nominal episodes; mean over kinds."""
-        nominal = [t.surprise.max() for t in self.nominal]
-        peaks = [
-            [t.surprise[t.window(self.window_s)].max(initial=0.0) for t in own] for own in by_kind(self.faulty).values()
-        ]
-        return float(np.mean([auroc(own, nominal) for own in peaks])) if peaks and nominal else math.nan
-
-    @property
-    def found(self) -> dict[float, Share]:
-        """All faults detected within the window, by false-alarm rate."""
-        return {r: detected([t.at(q) for t in self.faulty], self.window_s) for r, q in self.thresholds.items()}
-
     @cached_property
-    def found_hourly(self) -> dict[float, Share]:
-        """All faults detected within the window, by false alarms per hour."""
-        return {r: detected([t.at(q) for t in self.faulty], self.window_s) for r, q in self.hourly.items()}
+    def found(self) -> dict[AlarmRate, Share]:
+        """All faults detected within the window, by the promised rate of false alarms."""
+        return self._found(self.faulty)
 
     @cached_property
     def delays(self) -> Delays | None:
@@ -275,14 +244,14 @@ class DetectionMetrics:
         return Counter(t.top_channel for t in self.watched if t.top_channel).most_common(3)
 
     @cached_property
-    def outcomes(self) -> list[ActingMetrics]:
+    def outcomes(self) -> list[Outcomes]:
         """One for each response, the policy alone first."""
         actings = sorted(dict.fromkeys(t.acting for t in self.traces), key=lambda a: a != POLICY_ALONE)
-        return [ActingMetrics.of(a, self.traces) for a in actings]
+        return [Outcomes.of(a, self.traces) for a in actings]
 
 
 def by_condition(traces: Sequence[ScoredEpisode], window_s: float) -> list[DetectionMetrics]:
     """Return one for each condition, the nominal one first, then in order of appearance."""
-    nominal = [t for t in traces if t.kind == NOMINAL and t.watched_only]
+    nominal = [t for t in traces if t.kind == NOMINAL and t.acting == POLICY_ALONE]
     conditions = sorted(dict.fromkeys(t.condition for t in traces), key=lambda c: c != NOMINAL)
     return [DetectionMetrics(c, [t for t in traces if t.condition == c], nominal, window_s) for c in conditions]

@@ -6,7 +6,7 @@ import base64
 import io
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from string import Template
@@ -14,14 +14,15 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
 from asm_gym.evaluation import figures
-from asm_gym.evaluation.comparison import BenchmarkResult, Detectability
+from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.detection_tables import harmless_table, kept_table, kinds_table, lead_table, monitors_table
-from asm_gym.evaluation.scored_episode import ScoredEpisode, window_steps
+from asm_gym.evaluation.scored_episode import window_steps
 from asm_gym.evaluation.tables import Table, markdown
-from asm_gym.extras import needed_for
+from asm_gym.extras import require
 from asm_gym.files import written_whole
 
 _PAGE = Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
@@ -108,7 +109,9 @@ def _finite(value: Any) -> Any:
 
 def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -> None:
     """Write ``results.parquet``, ``results.json``, ``results.md`` and ``report.html``."""
-    _write_parquet(folder / "results.parquet", result)
+    require("pyarrow", what="results.parquet")
+    with written_whole(folder / "results.parquet") as file:
+        pd.DataFrame(_rows(result)).to_parquet(file, index=False)
     tables = [monitors_table(result), kept_table(result), kinds_table(result)]
     if len(result.monitors) > 1:
         tables.insert(1, lead_table(result))
@@ -121,11 +124,6 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
         f"{len(result.detectability)} faulty episodes, {len(result.monitors)} monitors. The ideal observer knows the "
         "healthy twin of every faulty episode and the sensors' noise: no monitor can do better than its row."
     )
-    drawn = _benchmark_figures(result)
-    write_report(folder / "report.html", "Who notices what", intro, tables, drawn, details=details)
-
-
-def _benchmark_figures(result: BenchmarkResult) -> dict[str, Figure]:
     drawn = {
         "AUROC by kind and severity of fault. In brackets: no observer could detect it.": figures.heat_map(
             result.kinds, result.visible
@@ -135,47 +133,27 @@ def _benchmark_figures(result: BenchmarkResult) -> dict[str, Figure]:
         ),
         "How soon faults were found.": figures.delay_figure(result.on_all),
     }
-    first, examples = next((name, monitor.examples) for name, monitor in result.monitors.items())
-    if examples:
-        drawn[f"Typical episodes as {first} scored them: surprise, threshold, fault and alarms."] = (
-            figures.surprise_figure(examples)
-        )
-    for trace in examples:
-        drawn[f"{trace.title}: the channels that surprised most."] = figures.stream_figure(trace)
-        drawn[f"{trace.title}: where the surprise came from."] = figures.attribution_figure(trace)
-    return drawn
+    write_report(folder / "report.html", "Who notices what", intro, tables, drawn, details=details)
 
 
-def _write_parquet(path: Path, result: BenchmarkResult) -> None:
-    with needed_for("results.parquet"):
-        import pyarrow as pa
-        import pyarrow.parquet as pq
+def _rows(result: BenchmarkResult) -> Iterator[dict[str, Any]]:
+    """Yield what each monitor made of each episode."""
     possible = {(d.task, d.kind, d.severity, d.seed): d for d in result.detectability}
-    rows = [
-        _row(trace, possible.get((trace.task, trace.kind, trace.severity, trace.seed)), result.window_s)
-        for which in ("traces", "harmless")
-        for monitor in result.monitors.values()
-        for trace in getattr(monitor, which)
-    ]
-    with written_whole(path) as file:
-        pq.write_table(pa.Table.from_pylist(rows), file, compression="zstd")
-
-
-def _row(trace: ScoredEpisode, possible: Detectability | None, window_s: float) -> dict[str, Any]:
-    after, affected = trace.detected_after, trace.affected_channels
-    blamed = trace.top_channel if after is not None else ""
-    return {
-        **{name: getattr(trace, name) for name in ("task", "monitor", "kind", "severity", "seed", "onset")},
-        "steps": len(trace),
-        "dt": trace.dt,
-        "threshold": trace.threshold,
-        "alarm": bool(trace.alarms),
-        "detected": after is not None and after < window_steps(window_s, trace.dt) if trace.onset is not None else None,
-        "delay_s": trace.delay,
-        "peak_in_window": float(trace.surprise[trace.window(window_s)].max(initial=0.0)),
-        "blamed": blamed or None,
-        "blamed_rightly": blamed in affected if blamed and affected else None,
-        "ideal_separation": possible.separation if possible else None,
-        "ideal_delay_s": possible.delay if possible else None,
-        "surprise": np.asarray(trace.surprise, np.float32).tolist(),
-    }
+    for monitor in result.monitors.values():
+        for trace in (*monitor.traces, *monitor.harmless):
+            ideal = possible.get((trace.task, trace.kind, trace.severity, trace.seed))
+            after, window = trace.detected_after, window_steps(result.window_s, trace.dt)
+            yield {
+                **{name: getattr(trace, name) for name in ("task", "monitor", "kind", "severity", "seed", "onset")},
+                "steps": len(trace),
+                "dt": trace.dt,
+                "threshold": trace.threshold,
+                "alarm": bool(trace.alarms),
+                "detected": None if trace.onset is None else after is not None and after < window,
+                "delay_s": trace.delay,
+                "peak_in_window": float(trace.surprise[trace.window(result.window_s)].max(initial=0.0)),
+                "blamed": trace.top_channel if after is not None else None,
+                "ideal_separation": ideal.separation if ideal else None,
+                "ideal_delay_s": ideal.delay if ideal else None,
+                "surprise": np.asarray(trace.surprise, np.float32),
+            }

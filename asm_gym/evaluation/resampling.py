@@ -1,4 +1,4 @@
-"""Confidence intervals of a comparison: scenes and calibration episodes resampled with replacement.
+"""Detections at many thresholds, and their confidence intervals: scenes and calibration episodes drawn again.
 
 All faults of one seed and task share a scene, and all are judged by one threshold. So scenes are resampled, not faults,
 and the threshold is set anew on resampled calibration episodes: a cluster bootstrap (Davison and Hinkley 1997, ch. 3.8)
@@ -8,19 +8,36 @@ with percentile intervals. Monitors are resampled alike, so their differences ar
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection import Blocks, conformal_episodes, conformal_threshold, hourly_threshold
+from asm_gym.detection import Blocks
+from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.evaluation.scored_episode import ScoredEpisode, window_steps
 from asm_gym.evaluation.statistics import Estimate, Floats
+from asm_gym.monitors.calibration import AlarmRate
 
 DRAWS = 400
 """Bootstrap resamples."""
+
+
+def by_episode(rate: float) -> AlarmRate:
+    """Return the promise that this share of nominal episodes has an alarm."""
+    return AlarmRate(rate, EPISODE)
+
+
+def by_hour(rate: float) -> AlarmRate:
+    """Return the promise of so many false alarms per hour."""
+    return AlarmRate(rate, HOUR)
+
+
+def rate_text(promise: AlarmRate) -> str:
+    """Format such as ``1 %`` or ``10/h``."""
+    return f"{promise.rate:g}/h" if promise.per == HOUR else f"{100 * promise.rate:g} %"
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,27 +45,24 @@ class Calibration:
     """The thresholds of a monitor, and the scores that they were set on.
 
     Attributes:
-        thresholds: by the share of nominal episodes that may raise an alarm.
-        hourly: by the false alarms per hour.
+        thresholds: by the promised rate of false alarms.
         maxima: (n,) the greatest surprise of each calibration episode.
         blocks: the maxima by the hour; None if not calibrated by the hour.
     """
 
-    thresholds: Mapping[float, float] = field(default_factory=dict)
-    hourly: Mapping[float, float] = field(default_factory=dict)
+    thresholds: Mapping[AlarmRate, float] = field(default_factory=dict)
     maxima: Floats = field(default_factory=lambda: np.zeros(0))
     blocks: Blocks | None = None
 
-    def resampled(self, rng: np.random.Generator) -> tuple[dict[float, float], dict[float, float]]:
-        """Return thresholds by rate, and by alarms per hour, from resampled episodes and blocks."""
-        maxima = self.maxima[rng.integers(len(self.maxima), size=len(self.maxima))]
-        possible = [r for r in self.thresholds if len(maxima) >= conformal_episodes(r)]
-        by_rate = {r: conformal_threshold(maxima, r) for r in possible}
-        if self.blocks is None or not self.hourly:
-            return by_rate, {}
-        again = rng.integers(len(self.blocks.maxima), size=len(self.blocks.maxima))
-        drawn = self.blocks._replace(maxima=self.blocks.maxima[again])  # the hours stay as they were
-        return by_rate, {r: hourly_threshold(drawn, r) for r in self.hourly}
+    def resampled(self, rng: np.random.Generator) -> dict[AlarmRate, float]:
+        """Return the thresholds from resampled episodes and blocks; the hours stay as they were."""
+        n, blocks = len(self.maxima), self.blocks
+        if not n:
+            return {}
+        maxima = self.maxima[rng.integers(n, size=n)]
+        if blocks is not None and any(promise.per == HOUR for promise in self.thresholds):
+            blocks = blocks._replace(maxima=blocks.maxima[rng.integers(len(blocks.maxima), size=len(blocks.maxima))])
+        return {promise: promise.threshold(maxima, blocks) for promise in self.thresholds}
 
 
 class Draws(NamedTuple):
@@ -56,13 +70,11 @@ class Draws(NamedTuple):
 
     Attributes:
         auroc: (R,) over matched steps, the mean over kinds.
-        found: (R,) share of faults detected within the window, by false-alarm rate.
-        hourly: (R,) the same, by false alarms per hour.
+        found: (R,) share of faults detected within the window, by the promised rate.
     """
 
     auroc: Floats
-    found: Mapping[float, Floats]
-    hourly: Mapping[float, Floats]
+    found: Mapping[AlarmRate, Floats]
 
 
 def interval(value: float, draws: Floats) -> Estimate:
@@ -71,6 +83,48 @@ def interval(value: float, draws: Floats) -> Estimate:
         return Estimate(value, math.nan, math.nan)
     low, high = np.nanquantile(draws, [0.025, 0.975])
     return Estimate(value, float(low), float(high))
+
+
+def wins(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float) -> Floats:
+    """Return (F, N) 1 where a fault surprised more than a nominal episode of its task in the same steps, ½ in ties.
+
+    NaN where they cannot be compared: another task, or no step in common.
+    """
+    won = np.full((len(faulty), len(nominal)), np.nan)
+    for row, trace in zip(won, faulty, strict=True):
+        steps = trace.window(window_s)
+        if trace.onset is None or steps.stop <= steps.start:
+            continue
+        peak = trace.surprise[steps].max()
+        for k, other in enumerate(nominal):
+            if other.task == trace.task and len(other) > steps.start:
+                theirs = other.surprise[steps].max()
+                row[k] = 0.5 * ((peak > theirs) + float(peak >= theirs))
+    return won
+
+
+class Windows:
+    """The surprise of faults within the window and one step before; a fault is detected where an alarm begins there.
+
+    Args:
+        faulty: episodes with an onset.
+        window_s: length of the window [s].
+    """
+
+    def __init__(self, faulty: Sequence[ScoredEpisode], window_s: float) -> None:
+        longest = max((window_steps(window_s, t.dt) for t in faulty), default=0)
+        self._surprise = np.full((len(faulty), longest + 1), -math.inf)  # (F, W + 1)
+        for row, trace in zip(self._surprise, faulty, strict=True):
+            steps = trace.window(window_s)
+            before = max(steps.start - 1, 0)
+            values = trace.surprise[before : steps.stop]
+            row[before - steps.start + 1 :][: len(values)] = values
+
+    def detected(self, threshold: float) -> NDArray[np.bool_]:
+        """Return (F,) which faults are detected at a threshold."""
+        over = self._surprise > threshold
+        found: NDArray[np.bool_] = (over[:, 1:] & ~over[:, :-1]).any(axis=1)
+        return found
 
 
 def resample(
@@ -94,73 +148,29 @@ def resample(
     rng = np.random.default_rng(seed)
     names = sorted({(t.task, t.seed) for t in (*nominal, *faulty)})
     place = {name: i for i, name in enumerate(names)}
-    tasks = [task for task, _ in names]
+    tasks = np.array([task for task, _ in names])
+    scenes_of = [np.flatnonzero(tasks == task) for task in dict.fromkeys(tasks)]
     kinds: dict[tuple[str, str], int] = {}
     kind = np.array([kinds.setdefault((t.kind, t.severity), len(kinds)) for t in faulty], int)
-    scene = np.array([place[t.task, t.seed] for t in faulty], int)
-    wins = _wins(faulty, nominal, place, window_s)
-    known, wins = ~np.isnan(wins), np.nan_to_num(wins)
-    detections = _detector(faulty, window_s)
-    own = [np.array([i for i, name in enumerate(tasks) if name == task]) for task in dict.fromkeys(tasks)]
+    own, theirs = (np.array([place[t.task, t.seed] for t in traces], int) for traces in (faulty, nominal))
+    won = wins(faulty, nominal, window_s)
+    comparable, won = ~np.isnan(won), np.nan_to_num(won)
+    windows = Windows(faulty, window_s)
     auroc = np.full(draws, math.nan)
-    found: tuple[dict[float, Floats], dict[float, Floats]] = {}, {}
+    found: dict[AlarmRate, Floats] = {}
     for k in range(draws):
         weights = np.zeros(len(names))  # how often each scene was drawn
-        for scenes in own:
+        for scenes in scenes_of:
             np.add.at(weights, rng.choice(scenes, len(scenes)), 1.0)
-        auroc[k] = _mean_auroc(wins, known, weights, weights[scene], kind, len(kinds))
-        for kept, thresholds in zip(found, calibration.resampled(rng), strict=True):
-            for rate, threshold in thresholds.items():
-                shares = kept.setdefault(rate, np.full(draws, math.nan))
-                shares[k] = _mean(detections(threshold), weights[scene])
-    return Draws(auroc, *found)
-
-
-def _wins(
-    faulty: Sequence[ScoredEpisode],
-    nominal: Sequence[ScoredEpisode],
-    place: Mapping[tuple[str, int], int],
-    window_s: float,
-) -> NDArray[np.float32]:
-    """Return (F, scenes) 1 where a fault surprised more than the nominal episode in the same steps, ½ in ties."""
-    won = np.full((len(faulty), len(place)), np.nan, np.float32)
-    for row, trace in zip(won, faulty, strict=True):
-        steps = trace.window(window_s)
-        if steps.stop <= steps.start:
-            continue
-        mine = trace.surprise[steps].max()
-        for other in nominal:
-            if other.task == trace.task and len(other) > steps.start:
-                theirs = other.surprise[steps].max()
-                row[place[other.task, other.seed]] = 0.5 * ((mine > theirs) + float(mine >= theirs))
-    return won
-
-
-def _mean_auroc(
-    wins: Floats, known: NDArray[np.bool_], scenes: Floats, faults: Floats, kind: NDArray[np.int_], kinds: int
-) -> float:
-    """Return the mean over kinds, each scene and each fault weighted by how often it was drawn."""
-    reached = known @ scenes
-    each = (wins @ scenes) / np.maximum(reached, 1.0)
-    counts = np.where(reached > 0, faults, 0.0)
-    total, drawn = (np.bincount(kind, w, kinds) for w in (counts * each, counts))
-    return float((total[drawn > 0] / drawn[drawn > 0]).mean()) if drawn.any() else math.nan
-
-
-def _mean(values: Floats, weights: Floats) -> float:
-    return float(values @ weights / weights.sum()) if weights.sum() else math.nan
-
-
-def _detector(faulty: Sequence[ScoredEpisode], window_s: float) -> Callable[[float], Floats]:
-    """Return a function of a threshold that gives (F,) 1 for each fault detected within the window."""
-    before = np.array([t.surprise[o - 1] if (o := t.onset or 0) and o <= len(t) else -math.inf for t in faulty])
-    peak = np.array([t.surprise[t.window(window_s)].max(initial=-math.inf) for t in faulty])
-
-    def detections(threshold: float) -> Floats:
-        hit = (peak > threshold).astype(float)
-        for i in np.flatnonzero(before > threshold):  # an alarm that was up already is no detection
-            late = faulty[i].at(threshold).detected_after
-            hit[i] = late is not None and late < window_steps(window_s, faulty[i].dt)
-        return hit
-
-    return detections
+        times = weights[own]  # (F,)
+        others = comparable @ weights[theirs]  # (F,) nominal episodes to compare with
+        counted = np.where(others > 0, times, 0.0)
+        each = (won @ weights[theirs]) / np.maximum(others, 1.0)
+        total, drawn = (np.bincount(kind, w, len(kinds)) for w in (counted * each, counted))
+        if drawn.any():
+            auroc[k] = (total[drawn > 0] / drawn[drawn > 0]).mean()
+        for promise, threshold in calibration.resampled(rng).items():
+            shares = found.setdefault(promise, np.full(draws, math.nan))
+            if times.any():
+                shares[k] = windows.detected(threshold) @ times / times.sum()
+    return Draws(auroc, found)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episode import spans
+from asm_gym.episode import Episode, spans
 
 Floats = NDArray[np.floating[Any]]
 
@@ -48,14 +48,12 @@ class TraceDetail:
         channels: D names.
         fault: (T,) bool, the ground truth.
         stream: (T, D) sensed values.
-        twin: (at least T, D) the stream of the same seed without the fault, where known.
     """
 
     attribution: Floats
     channels: tuple[str, ...]
     fault: NDArray[np.bool_]
     stream: Floats | None = None
-    twin: Floats | None = None
 
     def __post_init__(self) -> None:
         steps = len(self.attribution)
@@ -130,11 +128,6 @@ class ScoredEpisode:
         """The condition and the task."""
         return f"{self.condition} in {self.task}" if self.task else self.condition
 
-    @property
-    def watched_only(self) -> bool:
-        """Whether the monitor did not intervene: detection is measured on these."""
-        return self.acting == POLICY_ALONE
-
     @cached_property
     def alarm(self) -> NDArray[np.bool_]:
         """(T,) the rows in alarm."""
@@ -192,3 +185,10 @@ def window_steps(window_s: float, dt: float) -> int:
     if not window_s > 0:
         raise ValueError(f"window_s must be > 0, got {window_s}")
     return max(1, math.floor(window_s / dt + 1e-6))  # 0.3 / 0.1 is a hair below 3
+
+
+def onset_row(episode: Episode) -> int | None:
+    """Return the row at which the fault begins; the label counts control steps, of several rows each."""
+    label = episode.labelled
+    rows = len(episode) // (len(episode.contact_force) or len(episode))
+    return label.onset * rows if label.role == "faulty" and label.onset is not None else None

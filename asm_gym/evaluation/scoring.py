@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -16,18 +15,14 @@ import numpy as np
 
 import asm_gym
 from asm_gym.detection import conformal_episodes
-from asm_gym.episode import Episode, EpisodeLabel
-from asm_gym.evaluation.comparison import BenchmarkResult, Detectability, MonitorResult
+from asm_gym.episode import Episode
+from asm_gym.evaluation.comparison import BenchmarkResult, MonitorResult
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
-from asm_gym.evaluation.ideal import earliest, noise_floor, separation
-from asm_gym.evaluation.metrics import typical
+from asm_gym.evaluation.ideal import detectability_of
 from asm_gym.evaluation.recordings import read
-from asm_gym.evaluation.resampling import Calibration
-from asm_gym.evaluation.scored_episode import NOMINAL, InterventionOutcome, ScoredEpisode, TraceDetail, window_steps
+from asm_gym.evaluation.resampling import Calibration, by_episode, by_hour
+from asm_gym.evaluation.scored_episode import NOMINAL, InterventionOutcome, ScoredEpisode, onset_row
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
-
-EXAMPLES = ("push", "collision", "weak_joint", "frozen_encoder", "snatch")
-"""Kinds of which the report shows an episode."""
 
 CODE = ("memory", "detection", "monitors", "scaling.py", "spec.py")
 """Rooms and files of the package whose code decides what a monitor learns."""
@@ -40,47 +35,34 @@ Map = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
 
 
 def benchmark(
-    folder: Path,
-    labels: Sequence[EpisodeLabel],
-    monitors: Sequence[str],
-    rate: float,
-    window_s: float,
-    seed: int,
-    each: Map,
-    recorded: Path | None = None,
+    folder: Path, files: Sequence[Path], monitors: Sequence[str], rate: float, window_s: float, seed: int, each: Map
 ) -> BenchmarkResult:
     """Read the recordings, and score them with every monitor.
 
     Args:
-        folder: of the run.
-        labels: its episodes; fit and calibration episodes are learned from, all others scored.
+        folder: of the run, which keeps the fitted monitors.
+        files: episodes; those for fit and calibration are learned from, all others scored.
         monitors: names.
         rate: share of nominal episodes that may raise an alarm.
         window_s: an alarm within this time of the onset is a detection [s].
         seed: of the monitors.
         each: maps a function over items, as ``parallel_map`` does.
-        recorded: where the recordings are; in the folder of the run by default.
     """
-    recorded, wanted = (recorded or folder).resolve(), tuple(labels)
+    paths = tuple(file.resolve() for file in files)
     models: dict[str, list[str]] = {}  # one that is judged in two ways is fitted once
     for name in monitors:
         models.setdefault(name.removesuffix(EVIDENCE), []).append(name)
-    score = partial(_results, folder=folder.resolve(), recorded=recorded, labels=wanted, rate=rate, seed=seed)
+    score = partial(_results, folder=folder.resolve(), files=paths, rate=rate, seed=seed)
     found = {name: result for results in each(score, list(models.values())) for name, result in results.items()}
-    by_role, left_out, twins = read(recorded, wanted)
+    by_role, left_out, twins = read(paths)
     seen = detectability_of(twins, by_role.get("faulty", []), window_s)
     return BenchmarkResult({name: found[name] for name in monitors}, seen, rate, window_s, left_out)
 
 
 def _results(
-    names: Sequence[str],
-    folder: Path,
-    recorded: Path,
-    labels: tuple[EpisodeLabel, ...],
-    rate: float,
-    seed: int,
+    names: Sequence[str], folder: Path, files: tuple[Path, ...], rate: float, seed: int
 ) -> dict[str, MonitorResult]:
-    roles = read(recorded, labels).roles
+    roles = read(files).roles
     return {name: judged(name, fitted(folder, name, roles["fit"], seed), roles, rate) for name in names}
 
 
@@ -91,16 +73,15 @@ def judged(
     monitor.calibrate(by_role["calibration"], rate)
     rates = sorted({rate, *(r for r in RATES if len(by_role["calibration"]) >= conformal_episodes(r))})
     hours = 0.0 if monitor.blocks_ is None else monitor.blocks_.total
+    promises = [by_episode(r) for r in rates] + [by_hour(r) for r in PER_HOUR if r * hours >= 1.0]
     calibration = Calibration(
-        {r: monitor.threshold_at(r) for r in rates},
-        {r: monitor.threshold_at(false_alarms_per_hour=r) for r in PER_HOUR if r * hours >= 1.0},
+        {promise: monitor.threshold_at(**promise.named) for promise in promises},
         np.zeros(0) if monitor.maxima_ is None else monitor.maxima_,
         monitor.blocks_,
     )
-    tested = [*by_role["nominal"], *by_role.get("faulty", [])]
-    traces = traces_of(name, monitor, tested, calibration.thresholds[rate])
-    harmless = traces_of(name, monitor, by_role.get("harmless", []), calibration.thresholds[rate])
-    return MonitorResult(traces, harmless, calibration, _examples(monitor, traces, tested))
+    threshold = calibration.thresholds[by_episode(rate)]
+    traces = traces_of(name, monitor, [*by_role["nominal"], *by_role.get("faulty", [])], threshold)
+    return MonitorResult(traces, traces_of(name, monitor, by_role.get("harmless", []), threshold), calibration)
 
 
 @cache
@@ -136,74 +117,28 @@ def fitted(
     return monitor
 
 
-def onset_row(episode: Episode) -> int | None:
-    """Return the row at which the fault begins; the label counts control steps, of several rows each."""
-    label = episode.labelled
-    rows = len(episode) // (len(episode.contact_force) or len(episode))
-    return label.onset * rows if label.role == "faulty" and label.onset is not None else None
-
-
 def traces_of(
     name: str, monitor: CalibratedMonitor, episodes: Sequence[Episode], threshold: float
 ) -> list[ScoredEpisode]:
     """Score recordings, judged at this threshold."""
     made = []
-    for episode, surprise in zip(episodes, _scores(monitor, episodes), strict=True):
-        label = episode.labelled
-        trace = ScoredEpisode(
-            kind=label.kind or NOMINAL,
-            seed=label.seed,
-            dt=episode.spec.dt,
-            threshold=threshold,
-            surprise=surprise.value,
-            onset=onset_row(episode),
-            severity=label.severity,
-            task=label.task,
-            monitor=name,
-            affected_channels=label.affected_channels,
-            outcome=InterventionOutcome(episode.success),
-            excused=surprise.excused_by_event,
-        )
-        made.append(trace.attributed(surprise.attribution, episode.spec.labels))
+    for first in range(0, len(episodes), AT_ONCE):
+        some = episodes[first : first + AT_ONCE]
+        for episode, surprise in zip(some, monitor.score_episodes(some), strict=True):
+            label = episode.labelled
+            trace = ScoredEpisode(
+                kind=label.kind or NOMINAL,
+                seed=label.seed,
+                dt=episode.spec.dt,
+                threshold=threshold,
+                surprise=surprise.value,
+                onset=onset_row(episode),
+                severity=label.severity,
+                task=label.task,
+                monitor=name,
+                affected_channels=label.affected_channels,
+                outcome=InterventionOutcome(episode.success),
+                excused=surprise.excused_by_event,
+            )
+            made.append(trace.attributed(surprise.attribution, episode.spec.labels))
     return made
-
-
-def _scores(monitor: CalibratedMonitor, recordings: Sequence[Episode]) -> Iterator[Any]:
-    for first in range(0, len(recordings), AT_ONCE):
-        yield from monitor.score_episodes(recordings[first : first + AT_ONCE])
-
-
-def _examples(
-    monitor: CalibratedMonitor, traces: Sequence[ScoredEpisode], episodes: Sequence[Episode]
-) -> list[ScoredEpisode]:
-    """Return the typical episode of each of ``EXAMPLES`` at its strongest, with the detail that figures need."""
-    twins = {(e.labelled.task, e.labelled.seed): e.stream for e in episodes if e.labelled.role == "nominal"}
-    examples = []
-    for kind in EXAMPLES:
-        own = {t: e for t, e in zip(traces, episodes, strict=True) if t.kind == kind}
-        if own:
-            strongest = list(own)[-1].severity
-            chosen = typical([t for t in own if t.severity == strongest])
-            episode, twin = own[chosen], twins.get((chosen.task, chosen.seed))
-            attribution = monitor.score(episode).attribution
-            detail = TraceDetail(attribution, episode.spec.labels, episode.faults, episode.stream, twin)
-            examples.append(replace(chosen, detail=detail))
-    return examples
-
-
-def detectability_of(nominal: Sequence[Episode], faulty: Sequence[Episode], window_s: float) -> list[Detectability]:
-    """Return what an ideal observer could detect of the faulty episodes, whose nominal twins it knows."""
-    twins = {(e.labelled.task, e.labelled.seed): e.stream for e in nominal}
-    noises: dict[str, Any] = {}
-    found = []
-    for episode in faulty:
-        label = episode.labelled
-        if label.task not in noises:
-            own = [e.stream for e in nominal if e.labelled.task == label.task]
-            noises[label.task] = noise_floor(episode.spec.noise, own)
-        summed = separation(episode.stream, twins[label.task, label.seed], noises[label.task], onset_row(episode) or 0)
-        window = summed[: window_steps(window_s, episode.spec.dt)]
-        seen = float(window[-1]) if len(window) else 0.0
-        which = label.task, label.kind, label.severity, label.seed
-        found.append(Detectability(*which, seen, earliest(window), episode.spec.dt))
-    return found

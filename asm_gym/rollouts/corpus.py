@@ -1,16 +1,27 @@
-"""Record the corpus of ``asm_gym.evaluation.corpus``, in rounds: a corpus with some of its rounds is a smaller one."""
+"""The corpus on which every table of detection is judged: recorded in rounds, and checked while it is read.
+
+    FOLDER/manifest.json                              the files, with the SHA-256 of each
+    FOLDER/POLICY/episodes/TASK/ROLE/KIND-SEVERITY-SEED.npz
+
+Roles are ``fit`` to learn from, ``calibration`` for thresholds, ``nominal`` to test on, and ``faulty``: each the twin
+of the nominal episode with its seed, alike in all that is random but the fault. A corpus with some of its rounds is a
+smaller one.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from asm_gym.episode import load_episode
-from asm_gym.evaluation.corpus import MANIFEST, SKILLS, Entry, digest, read_manifest, write_manifest
-from asm_gym.faults.suite import SEVERITIES, TEST, kinds_of, possible
+from asm_gym.episode import Episode, EpisodeLabel, load_episode
+from asm_gym.faults.suite import KINDS, SEVERITIES, TEST, kinds_of, possible
+from asm_gym.files import written_whole
 from asm_gym.rollouts.parallel import ParallelConfig, Progress
 from asm_gym.rollouts.run_folder import make_missing, versions
 from asm_gym.rollouts.seeds import role_seeds
@@ -18,8 +29,14 @@ from asm_gym.rollouts.staging import environment, record
 from asm_gym.rollouts.trial import RolloutConfig, Trial, faulty_trial, nominal_trials
 from asm_gym.tasks import task as task_spec
 
+VERSION = 2
+"""Version of the recordings."""
 SEED = 2026
 """Seed of the corpus; no shipped memory has learned from its episodes."""
+SKILLS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblyRound", "PickPlaceMilk")
+"""Tasks with episodes to learn from, to calibrate on and to test on."""
+MANIFEST = "manifest.json"
+_LABEL = ("task", "role", "kind", "severity", "seed", "onset")
 
 
 class Source(NamedTuple):
@@ -48,6 +65,120 @@ PARTS: dict[str, tuple[Source, ...]] = {
 """Six skills of experts, to learn, to calibrate and to test on; and healthy motion of agents and in other tasks."""
 ROUNDS = 5
 QUICK = {"skills": (Source("Lift", "scripted", 2, 2, 2, faults=True),), "hours": (Source("Lift", "lift_sac", 0, 0, 2),)}
+
+
+class Entry(NamedTuple):
+    """A file of the corpus: the policy, the episode's label, the file's checksum, and its length [s]."""
+
+    policy: str
+    label: EpisodeLabel
+    sha256: str
+    seconds: float
+
+    @property
+    def path(self) -> Path:
+        """Path in the corpus."""
+        return self.policy / self.label.path
+
+
+@dataclass(frozen=True)
+class Corpus:
+    """A recorded corpus.
+
+    Example:
+        >>> from asm_gym.rollouts.corpus import Corpus
+        >>> corpus = Corpus.open("runs/corpus")  # doctest: +SKIP
+        >>> nominal = corpus.episodes("nominal", tasks=("Lift",))  # doctest: +SKIP
+    """
+
+    folder: Path
+    entries: tuple[Entry, ...]
+
+    @classmethod
+    def open(cls, folder: str | Path) -> Corpus:
+        """Read the manifest.
+
+        Raises:
+            FileNotFoundError: no corpus is there.
+            ValueError: it is of another version, damaged, or lacks files.
+        """
+        folder = Path(folder)
+        entries = read_manifest(folder)
+        missing = [entry.path for entry in entries if not (folder / entry.path).is_file()]
+        if missing:
+            raise ValueError(
+                f"{folder} is cut off: {len(missing)} of {len(entries)} files are missing, such as {missing[0]}; "
+                "asm-gym corpus records what is missing"
+            )
+        return cls(folder, tuple(entries))
+
+    def select(self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()) -> list[Entry]:
+        """Select by role, policy and task; all where none is named."""
+        return [
+            entry
+            for entry in self.entries
+            if (not roles or entry.label.role in roles)
+            and (not policies or entry.policy in policies)
+            and (not tasks or entry.label.task in tasks)
+        ]
+
+    def verified(self, entry: Entry) -> Path:
+        """Return the path of a file. Raises ValueError where it is damaged."""
+        path = self.folder / entry.path
+        if digest(path) != entry.sha256:
+            raise ValueError(f"{path} is damaged: its checksum is not the manifest's; delete it, and record it anew")
+        return path
+
+    def episodes(self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()) -> list[Episode]:
+        """Load episodes by role, policy and task, and compare each with its checksum; all where none is named."""
+        return [load_episode(self.verified(entry)) for entry in self.select(*roles, policies=policies, tasks=tasks)]
+
+
+def skill_files(folder: Path, tasks: Sequence[str] = SKILLS) -> list[Path]:
+    """Return the files of the experts' skills, verified, and sorted by kind and severity."""
+    corpus = Corpus.open(folder)
+    kinds = [(kind, severity) for kind in ("", *KINDS) for severity in ("", *SEVERITIES)]
+    chosen = corpus.select(policies=("scripted",), tasks=tasks)
+    return [
+        corpus.verified(entry) for entry in sorted(chosen, key=lambda e: kinds.index((e.label.kind, e.label.severity)))
+    ]
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def write_manifest(folder: Path, entries: Sequence[Entry]) -> None:
+    """Write the manifest of these files, and the versions that recorded them."""
+    about = {"format": "asm-gym corpus", "version": VERSION, "made_with": versions()}
+    lines = []
+    for entry in sorted(entries, key=lambda entry: entry.path):
+        label = {name: getattr(entry.label, name) for name in _LABEL}
+        lines.append(json.dumps({"policy": entry.policy, **label, "sha256": entry.sha256, "seconds": entry.seconds}))
+    files = ",\n".join(lines)
+    with written_whole(folder / MANIFEST) as file:
+        file.write(f'{json.dumps(about)[:-1]}, "files": [\n{files}\n]}}\n'.encode())
+
+
+def read_manifest(folder: Path) -> list[Entry]:
+    """Return the files of a corpus.
+
+    Raises:
+        FileNotFoundError: no corpus is there.
+        ValueError: it is of another version, or damaged.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        raise FileNotFoundError(2, "no corpus is there; asm-gym corpus records one", str(path))
+    try:
+        about = json.loads(path.read_text(encoding="utf-8"))
+        version, lines = about["version"], about["files"]
+        if version != VERSION:
+            raise ValueError(f"it holds version {version!r} of the corpus, and this asm-gym reads {VERSION}")
+        return [Entry(e["policy"], EpisodeLabel(**{n: e[n] for n in _LABEL}), e["sha256"], e["seconds"]) for e in lines]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} cannot be read: {error}; asm-gym corpus makes it anew") from error
 
 
 def trials(source: Source, number: int, rounds: int = ROUNDS) -> list[Trial]:
@@ -83,4 +214,4 @@ def record_corpus(
                 seconds = round(len(episode) * episode.spec.dt, 6)
                 entry = Entry(source.policy, trial.label, digest(file), seconds)
                 known[entry.path] = entry
-        write_manifest(folder, list(known.values()), versions())
+        write_manifest(folder, list(known.values()))

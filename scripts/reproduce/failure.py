@@ -24,7 +24,7 @@ from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.episode import Episode, EpisodeLabel, load_episode, save_episode
 from asm_gym.evaluation import defaults
 from asm_gym.evaluation.scored_episode import NOMINAL
-from asm_gym.evaluation.statistics import RESAMPLES, Estimate, Share, auroc
+from asm_gym.evaluation.statistics import Estimate, Share, auroc
 from asm_gym.evaluation.tables import Table, count
 from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.policies import make_policy
@@ -50,6 +50,8 @@ TESTED = {"as_it_is": "as it is", "weakened": "weakened", "disturbed": "disturbe
 """Roles of the episodes to test on, in words."""
 SHARES = (0.25, 0.5, 1.0)
 """Shares of an episode after which failure is predicted."""
+RESAMPLES = 2000
+"""Resamples of the bootstrap."""
 INCONSISTENCY = "inconsistency"
 WEAKEST = 0.3
 """Largest standard deviation of the share that a weight is off by; that of an episode is drawn below it."""

@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from asm_gym.evaluation.corpus import Corpus
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.detection_tables import kept_rate
 from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.monitors import NeuralASM
+from asm_gym.rollouts.corpus import Corpus
 from asm_gym.rollouts.pretraining.exam import SEVERITIES, Alarms, Exam, Marks, examine, usual_force
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit

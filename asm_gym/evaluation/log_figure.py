@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from asm_gym.data.channels import Column
 from asm_gym.data.inspection import Inspection, is_constant
-from asm_gym.evaluation.figures.style import BLUE, GREEN, GREY, ORANGE, VERMILLION, figure
+from asm_gym.evaluation.figures import BLUE, GREEN, GREY, ORANGE, VERMILLION, figure
 
 ACROSS, MOST_PANELS, MOST_POINTS = 4, 60, 4000
 """Panels side by side; channels drawn; points of a curve."""

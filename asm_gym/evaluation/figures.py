@@ -1,0 +1,261 @@
+"""Figures of detection and of scored episodes, as matplotlib Figures that :func:`save` writes.
+
+Nothing touches pyplot's state. Colours are those of Okabe & Ito, distinct with any colour vision; line styles and
+markers differ too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence, Sized
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from asm_gym.episode import spans
+from asm_gym.evaluation.metrics import DetectionMetrics, Kind, KindMetrics, delays_ms, in_words, placements
+from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail
+from asm_gym.evaluation.statistics import wilson_interval
+
+BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+ORANGE, SKY, BLACK, GREY = "#E69F00", "#56B4E9", "#000000", "#888888"
+DASHED = (0, (4, 2))
+_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, BLACK, SKY)
+_LINES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (6, 2, 1, 2)), (0, (1, 1)), (0, (8, 2, 2, 2, 2, 2)))
+_MARKERS = ("o", "s", "^", "D", "v", "P")
+_STYLE: dict[Any, Any] = {
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#555555",
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+}
+MOST_BANDS = 4
+"""More curves than these have no bands of uncertainty: they could not be told apart."""
+
+
+@contextmanager
+def figure(height: float, width: float = 8.0) -> Iterator[Figure]:
+    """Make a figure in the style above, whatever the user's matplotlibrc says; sizes in [in]."""
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_STYLE)
+        yield Figure(figsize=(width, height), layout="constrained")
+
+
+def save(fig: Figure, path: str | Path) -> Path:
+    """Write a PNG at 150 dpi; the same figure gives the same bytes."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(path, format="png", dpi=150, metadata={"Software": None})
+    return path
+
+
+def look(i: int) -> tuple[str, Any, str]:
+    """Return colour, line style and marker of the i-th curve."""
+    n = len(_COLOURS)
+    return _COLOURS[i % n], _LINES[(i + i // n) % n], _MARKERS[(i + i // n) % n]
+
+
+def _require_some(traces: Sized) -> None:
+    if not len(traces):
+        raise ValueError("there are no traces to draw")
+
+
+def roc_figure(groups: Sequence[DetectionMetrics]) -> Figure:
+    """Draw the ROC of each group over all its faults, against nominal episodes of the task in the same steps."""
+    faulty = [g for g in groups if g.faulty]
+    _require_some(faulty)
+    if not all(g.nominal for g in faulty):
+        raise ValueError("a ROC curve needs nominal traces")
+    with figure(height=4.6, width=8.4) as fig:
+        ax = fig.subplots()
+        ax.plot([0, 100], [0, 100], color=GREY, linewidth=1)
+        for i, group in enumerate(faulty):
+            u = np.sort(placements(group.faulty, group.nominal, group.window_s))
+            if not u.size:
+                continue
+            colour, line, _ = look(i)
+            x, y = 100 * np.concatenate([[0], u, [1]]), 100 * np.concatenate([np.arange(u.size + 1), [u.size]]) / u.size
+            label = f"{group.name}: {1 - u.mean():.3f}"
+            ax.step(x, y, where="post", color=colour, linestyle=line, linewidth=2, label=label, clip_on=False)
+        ax.set(xlim=(0, 100), ylim=(0, 100), box_aspect=1)
+        ax.set(xlabel="nominal episodes above [%]", ylabel="faulty episodes above [%]")
+        ax.grid()
+        fig.legend(loc="outside right upper", handlelength=3.5, title="AUROC")
+    return fig
+
+
+def delay_figure(groups: Sequence[DetectionMetrics]) -> Figure:
+    """Draw the share of faults detected within so many ms of the onset; with 95 % Wilson bands for few curves."""
+    faulty = [g for g in groups if g.faulty]
+    _require_some(faulty)
+    window_ms = 1e3 * max(g.window_s for g in faulty)
+    with figure(height=4.4) as fig:
+        ax = fig.subplots()
+        for i, group in enumerate(faulty):
+            delays = delays_ms(group.faulty, group.window_s)
+            found = delays[np.isfinite(delays)]
+            counts = np.append(np.arange(len(found) + 1), len(found))  # at 0, at each alarm, at the end
+            x = np.concatenate([[0.0], found, [window_ms]])
+            colour, line, _ = look(i)
+            if len(faulty) <= MOST_BANDS:
+                low, high = np.array([wilson_interval(int(k), len(delays)) for k in counts]).T
+                ax.fill_between(x, 100 * low, 100 * high, step="post", color=colour, alpha=0.12, linewidth=0)
+            label = f"{group.name} ({len(found)} of {len(delays)})"
+            ax.step(x, 100 * counts / len(delays), where="post", color=colour, linestyle=line, linewidth=2, label=label)
+        ax.set(xlim=(0, window_ms), ylim=(0, 102), xlabel="time since the onset of the fault [ms]")
+        ax.set_ylabel("faults detected [%]")
+        ax.grid()
+        fig.legend(loc="outside right upper", handlelength=3.5)
+    return fig
+
+
+def heat_map(metrics: Mapping[str, Mapping[Kind, KindMetrics]], visible: Mapping[Kind, bool]) -> Figure:
+    """Draw AUROC by kind of fault and monitor; kinds that no observer could detect are in brackets."""
+    kinds, monitors = list(visible), list(metrics)
+    values = np.array([[metrics[m][k].auroc if k in metrics[m] else math.nan for m in monitors] for k in kinds])
+    with figure(height=1.6 + 0.21 * len(kinds), width=2.8 + 0.62 * len(monitors)) as fig:
+        ax = fig.subplots()
+        image = ax.imshow(values, cmap="cividis", vmin=0.5, vmax=1.0, aspect="auto", interpolation="nearest")
+        for (row, column), value in np.ndenumerate(values):
+            if np.isfinite(value):
+                ink = "white" if value < 0.75 else "black"
+                ax.text(column, row, f"{value:.2f}", ha="center", va="center", color=ink, fontsize=7)
+        ax.set_yticks(range(len(kinds)), [in_words(k) if visible[k] else f"({in_words(k)})" for k in kinds])
+        ax.set_xticks(range(len(monitors)), monitors, rotation=40, ha="right", rotation_mode="anchor")
+        ax.tick_params(length=0, labelsize=8)
+        ax.spines[:].set_visible(False)
+        fig.colorbar(image, ax=ax, label="AUROC", pad=0.02)
+    return fig
+
+
+def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
+    """Draw surprise over time, one panel per episode: the threshold, the fault's span, the alarms."""
+    _require_some(traces)
+    floor, ceiling = _limits(traces)
+    with figure(height=0.9 + 1.35 * len(traces)) as fig:
+        panels = fig.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+        for ax, trace in zip(panels, traces, strict=True):
+            _surprise_panel(ax, trace)
+        longest = 1.01 * max(len(t) * t.dt for t in traces)
+        panels[0].set(yscale="log", ylim=(floor / 1.5, ceiling * 5), xlim=(0, longest))
+        panels[0].yaxis.set_major_locator(LogLocator(numticks=5))
+        panels[0].yaxis.set_minor_formatter(NullFormatter())
+        panels[-1].set_xlabel("time [s]")
+        fig.supylabel("surprise", fontsize=10)
+        handles = [
+            Line2D([], [], color=BLACK, linewidth=1, linestyle=DASHED, label="threshold"),
+            Patch(color=ORANGE, alpha=0.3, label="fault active"),
+            Line2D([], [], color=VERMILLION, linewidth=4, solid_capstyle="butt", label="in alarm"),
+        ]
+        fig.legend(handles=handles, loc="outside upper center", ncols=3)
+    return fig
+
+
+def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
+    ax.plot(_times(trace), np.clip(trace.surprise, *_limits([trace])), color=BLUE, linewidth=1.5)
+    ax.axhline(trace.threshold, color=BLACK, linewidth=1, linestyle=DASHED)
+    _shade_fault(ax, trace)
+    if trace.onset is not None:
+        ax.axvline(trace.onset * trace.dt, color=ORANGE, linewidth=1.5)
+    for ends in _alarm_times(trace):
+        top = ax.get_xaxis_transform()
+        ax.plot(ends, [0.96, 0.96], color=VERMILLION, linewidth=4, solid_capstyle="butt", transform=top)
+    late = "" if trace.delay is None else f": alarm {1e3 * trace.delay:.0f} ms after the onset"
+    missed = ": missed" if trace.onset is not None and trace.delay is None else ""
+    ax.set_title(f"{trace.title}{late}{missed}")
+    ax.grid(axis="y")
+
+
+def attribution_figure(trace: ScoredEpisode, top: int = 12) -> Figure:
+    """Draw the shares of the ``top`` channels in the surprise over time, in units of the threshold."""
+    detail = _detail(trace)
+    share = detail.attribution / trace.threshold  # (T, D)
+    # An infinite share takes the brightest finite colour, or it would leave all others dark.
+    share = np.nan_to_num(share, nan=0.0, posinf=float(share[np.isfinite(share)].max(initial=1.0)), neginf=0.0)
+    rows = np.argsort(-share[trace.onset or 0 :].max(axis=0), kind="stable")[:top]
+    high = max(float(share[:, rows].max()), 1.0)
+    with figure(height=1.5 + 0.24 * len(rows)) as fig:
+        ax = fig.subplots()
+        ends = (0.0, len(trace) * trace.dt, len(rows) - 0.5, -0.5)
+        norm = LogNorm(min(0.01, high / 100), high)
+        drawn = np.clip(share[:, rows].T, norm.vmin, None)
+        image = ax.imshow(drawn, norm=norm, cmap="cividis", aspect="auto", extent=ends, interpolation="nearest")
+        ax.set_yticks(range(len(rows)), [detail.channels[r] for r in rows])
+        ax.set_xlabel("time [s]")
+        ax.spines[:].set_visible(False)
+        if trace.onset is not None:
+            ax.axvline(trace.onset * trace.dt, color="white", linewidth=1.5)
+            if trace.delay is not None:
+                ax.axvline(trace.onset * trace.dt + trace.delay, color="white", linewidth=1.5, linestyle=DASHED)
+        ax.set_title(f"{trace.title} (white: fault, alarm)")
+        fig.colorbar(image, ax=ax, label="share of surprise / threshold", pad=0.02)
+    return fig
+
+
+def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
+    """Draw the ``top`` channels that surprised most; faults and alarms are shaded.
+
+    Raises:
+        ValueError: the episode has no stream.
+    """
+    detail = _detail(trace)
+    if detail.stream is None:
+        raise ValueError("this trace was kept without its stream")
+    share = np.nan_to_num(detail.attribution[trace.onset or 0 :], posinf=1e30)
+    rows = np.argsort(-share.max(axis=0), kind="stable")[:top]
+    with figure(height=1.0 + 1.15 * len(rows)) as fig:
+        axes = fig.subplots(len(rows), sharex=True, squeeze=False)[:, 0]
+        for ax, row in zip(axes, rows, strict=True):
+            _shade_fault(ax, trace)
+            for ends in _alarm_times(trace):
+                ax.axvspan(*ends, color=VERMILLION, alpha=0.2, linewidth=0)
+            ax.plot(_times(trace), detail.stream[:, row], color=BLUE)
+            ax.set_title(detail.channels[row])
+        axes[-1].set_xlabel("time [s]")
+        handles = [Line2D([], [], color=BLUE, label="sensed"), Patch(color=VERMILLION, alpha=0.2, label="alarm")]
+        fig.legend(handles=handles, loc="outside right upper", ncols=2)
+    return fig
+
+
+def _times(trace: ScoredEpisode) -> Any:
+    """Return when each row was known [s]: at the end of its step."""
+    return (np.arange(len(trace)) + 1) * trace.dt  # (T,)
+
+
+def _alarm_times(trace: ScoredEpisode) -> list[tuple[float, float]]:
+    return [((start + 1) * trace.dt, min(stop + 1, len(trace)) * trace.dt) for start, stop in spans(trace.alarm)]
+
+
+def _shade_fault(ax: Axes, trace: ScoredEpisode) -> None:
+    for start, stop in spans(trace.detail.fault) if trace.detail else []:
+        ax.axvspan(start * trace.dt, stop * trace.dt, color=ORANGE, alpha=0.3, linewidth=0)
+
+
+def _limits(traces: Sequence[ScoredEpisode]) -> tuple[float, float]:
+    """Return the range of surprise worth drawing: a log axis can show neither zero nor infinity."""
+    thresholds = [t.threshold for t in traces]
+    if not min(thresholds) > 0:
+        raise ValueError(f"a log axis needs thresholds > 0, got {sorted(thresholds)}")
+    finite = np.concatenate([t.surprise[np.isfinite(t.surprise)] for t in traces])
+    ceiling = max(float(finite.max(initial=0.0)), 10 * max(thresholds))
+    return max(float(finite.min(initial=np.inf)), min(thresholds) / 1000), ceiling
+
+
+def _detail(trace: ScoredEpisode) -> TraceDetail:
+    if trace.detail is None:
+        raise ValueError("this trace was kept without the detail that the figure needs")
+    return trace.detail

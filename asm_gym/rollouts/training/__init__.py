@@ -1,1 +1,0 @@
-"""Train agents with stable-baselines3, from demonstrations and from their own steps."""
