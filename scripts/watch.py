@@ -25,7 +25,7 @@ from asm_gym.data.live import lines_from, live_source
 from asm_gym.data.logs import Log, LogLayout, read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, traces_of
-from asm_gym.evaluation.rerun_view import LiveView
+from asm_gym.evaluation.rerun_view import write_rerun
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
@@ -98,7 +98,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     write_alarms(args.out / "alarms.csv", alarms)
     lacks = publish(args, said, alarms, worst)
     if args.rerun is not None:
-        write_rerun(args.rerun, worst, monitor)
+        write_rerun(args.rerun, monitor.spec, worst, getattr(monitor, "model", None))
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     for line in notes:
         say(f"Note: {line}.")
@@ -143,21 +143,6 @@ def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Scor
         details={"command": f"asm-gym watch {args.source} --monitor {args.monitor}"},
     )
     return ""
-
-
-def write_rerun(path: Path, traces: Sequence[ScoredEpisode], monitor: Any) -> None:
-    """Writes episodes for Rerun's viewer, one after another."""
-    seconds = 0.0
-    with LiveView(path, monitor.spec, getattr(monitor, "model", None)) as view:
-        for trace in traces:
-            assert trace.detail is not None
-            assert trace.detail.stream is not None
-            view.begin()
-            for row, surprise, shares in zip(
-                trace.detail.stream, trace.surprise, trace.detail.attribution, strict=True
-            ):
-                seconds += trace.dt
-                view.row(seconds, row, float(surprise), trace.threshold, shares)
 
 
 def watch(args: Args, console: Console) -> int:

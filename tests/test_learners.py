@@ -19,38 +19,22 @@ def watched(cue=(2, 3, 6), length=8, on_alarm="monitor", **how):
     return NeuralASMSafety(FakeEnv(length=length), CueMonitor(cue), on_alarm=on_alarm, **how)
 
 
-def test_an_episode_is_counted_by_hand():
-    needs("stable_baselines3")
-    from asm_gym.rollouts.safety_callback import SafetyCounter
-
-    counter, env = SafetyCounter(0.05), watched(on_alarm="hold", release_after=2)
-    env.reset()
-    for _ in range(8):
-        counter.add(env.step(ACT)[4])
-    # Alarms in rows 2, 3 and 6; the reflex acts from the step after the first on, and goes on after the second.
-    assert counter.total.surprise == 10.0
-    assert counter.total.alarms == 2
-    assert counter.total.cost == 3.0
-    assert counter.total.override_s == pytest.approx(4 * 0.05)
-    counter.clear()
-    assert counter.total.alarms == 0
-    with pytest.raises(KeyError, match="wrap the environment in NeuralASMSafety"):
-        counter.add({})
-
-
 def test_the_callback_logs_what_learning_met(tmp_path):
     sb3, logger = needs("stable_baselines3"), needs("stable_baselines3.common.logger")
     from asm_gym.rollouts.safety_callback import SafetyCallback
 
     callback = SafetyCallback(dt=0.05)
-    agent = sb3.PPO("MlpPolicy", watched(), n_steps=16, batch_size=16, seed=0)
+    guarded = watched(on_alarm="hold", release_after=2)
+    agent = sb3.PPO("MlpPolicy", guarded, n_steps=16, batch_size=16, seed=0)
     agent.set_logger(logger.configure(str(tmp_path), ["csv", "json"]))
     agent.learn(32, callback=callback)
-    assert len(callback.ended) == 4
-    assert {(e.alarms, e.cost) for e in callback.ended} == {(2, 3.0)}
+    # Alarms in rows 2, 3 and 6; the reflex acts from the step after the first on, and goes on after the second.
+    assert [(e.surprise, e.alarms, e.cost) for e in callback.ended] == [(10.0, 2, 3.0)] * 4
+    assert callback.ended[0].override_s == pytest.approx(4 * 0.05)
     rows = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
-    assert rows[-1]["safety/cost"] == 3.0
-    assert rows[-1]["safety/surprise"] == 10.0
+    assert (rows[-1]["safety/cost"], rows[-1]["safety/surprise"]) == (3.0, 10.0)
+    with pytest.raises(KeyError, match="wrap the environment in NeuralASMSafety"):
+        sb3.PPO("MlpPolicy", guarded.env, n_steps=16, batch_size=16).learn(16, callback=SafetyCallback(dt=0.05))
 
 
 def with_cost():

@@ -58,11 +58,13 @@ def read(paths: tuple[Path, ...]) -> Recordings:
     return Recordings.of([load_episode(path) for path in paths])
 
 
-def tasks_in(run: Path) -> list[str]:
-    """Return the names of the tasks that a run has recorded."""
-    return sorted(p.name for p in (run / "episodes").glob("*") if p.is_dir())
+def recorded(run: Path) -> Recordings:
+    """Load every recording of a run of ``asm-gym evaluate`` but the harmless variations.
 
-
-def files_in(run: Path, tasks: Sequence[str], *roles: str) -> list[Path]:
-    """Return the recordings of a run, by task, then by role, then by name."""
-    return [p for t in tasks for role in roles for p in sorted((run / "episodes" / t / role).glob("*.npz"))]
+    Raises:
+        ValueError: there is none.
+    """
+    paths = [p for role in (*NOMINAL_ROLES, "faulty") for p in sorted((run / "episodes").glob(f"*/{role}/*.npz"))]
+    if not paths:
+        raise ValueError(f"{run} holds no recordings: run asm-gym evaluate first")
+    return read(tuple(paths))

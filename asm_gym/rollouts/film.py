@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import imageio.v2 as imageio
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
-from asm_gym.evaluation.film import write_video
 from asm_gym.evaluation.scored_episode import POLICY_ALONE, InterventionOutcome, ScoredEpisode, TraceDetail
 from asm_gym.graphics import GET_ENCODER, GET_RENDERING, encoder_problem, rendering_backend, rendering_problem
 from asm_gym.monitors import Monitor, NeuralASM
@@ -89,24 +89,13 @@ def can_record_video(console: Console) -> bool:
 def record_video(
     trials: Sequence[Trial], config: RolloutConfig, monitor: Monitor, path: Path, progress: Progress
 ) -> Path:
-    """Film the trials, one after the other, with the surprise of a calibrated monitor."""
-
-    def frames() -> Iterator[NDArray[np.uint8]]:
+    """Film the trials, one after the other, with the surprise of a calibrated monitor, as H.264 in an MP4."""
+    with imageio.get_writer(path, fps=1.0 / monitor.spec.dt, macro_block_size=2) as writer:
         for k, trial in enumerate(trials):
-            yield from _frames(trial, config, monitor)
+            made = gym.make(trial.env_id, **dict(config.settings), **PICTURE)
+            with closing(made), staged(trial, config, made) as faulty:
+                guarded = _guarded(faulty, monitor, trial)
+                watched = SurpriseOverlay(guarded, caption=trial.kind, camera=PICTURE["camera"])
+                play(trial, config, watched, lambda _, film=watched: writer.append_data(film.render()))
             progress(k + 1, len(trials))
-
-    return write_video(path, frames(), fps=1.0 / monitor.spec.dt)
-
-
-def _frames(trial: Trial, config: RolloutConfig, monitor: Monitor) -> list[NDArray[np.uint8]]:
-    env = gym.make(trial.env_id, **dict(config.settings), **PICTURE)
-    frames: list[NDArray[np.uint8]] = []
-    try:
-        with staged(trial, config, env) as faulty:
-            guarded = _guarded(faulty, monitor, trial)
-            watched = SurpriseOverlay(guarded, caption=trial.kind, camera=PICTURE["camera"])
-            play(trial, config, watched, lambda _: frames.append(watched.render()))
-    finally:
-        env.close()
-    return frames
+    return path

@@ -22,7 +22,7 @@ from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.episode import Episode
 from asm_gym.evaluation import defaults
 from asm_gym.evaluation.metrics import detected, false_alarms, time_matched_auroc
-from asm_gym.evaluation.recordings import recorded, tasks_in
+from asm_gym.evaluation.recordings import recorded
 from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import DYNAMICS
@@ -57,13 +57,6 @@ class Config(kit.Config):
     """How soon after its onset a fault must be noticed [s]."""
     completed: int = option(8, quick=1, least=1)
     """Healthy episodes in which senses go missing."""
-
-    @property
-    def tasks(self) -> tuple[str, ...]:
-        """Tasks that the run has recorded; ValueError where there is none."""
-        if not (tasks := tuple(tasks_in(self.run))):
-            raise ValueError(f"{self.run} holds no recordings: run asm-gym evaluate first")
-        return tasks
 
 
 def in_turn(episodes: Sequence[Episode], seed: int) -> list[Episode]:
@@ -175,7 +168,7 @@ def tables(records: Sequence[Record], config: Config) -> list[Table]:
 
 def run(config: Config) -> Findings:
     """Run both dynamics and every seed."""
-    roles = dict(recorded(config.run, config.tasks).roles)
+    roles = dict(recorded(config.run).roles)
     roles["faulty"] = [e for e in roles["faulty"] if len(e) > (e.labelled.onset or 0)]
     healthy = in_turn(roles["calibration"], 0)  # a fifth sets τ, and no threshold
     roles["spreads"], roles["calibration"] = healthy[: len(healthy) // 5], healthy[len(healthy) // 5 :]
