@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from asm_gym.memory.association import Association, association_shapes
+from asm_gym.memory.association import Association, association_shapes, unbounded
 from asm_gym.memory.learning import Schedule, Trajectory
-from asm_gym.memory.precision import unbounded
 
 CHANGES = slice(5, 10)
 """Where the changes of five senses stand among the inputs."""

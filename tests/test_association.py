@@ -10,18 +10,34 @@ import pytest
 from asm_gym.detection import Promise, conformal_threshold
 from asm_gym.episode import Episode
 from asm_gym.memory.adaptation import followed, specialise
-from asm_gym.memory.association import Association, complete, existing, hidden_units, synapses
+from asm_gym.memory.association import (
+    LARGEST,
+    SMALLEST,
+    Association,
+    complete,
+    existing,
+    hidden_units,
+    log_variance,
+    synapses,
+    unbounded,
+)
 from asm_gym.memory.association_learning import (
     ALL_TICKS,
+    BATCH,
+    BATCHES,
     FEEDBACK,
     LEARNED,
     ROWS_PER_INPUT,
+    THIRDS,
     TRANSPORTED,
     association_change,
+    crossfit,
     learn_association,
+    learn_precision,
+    thirds,
+    trust,
+    usual_span,
 )
-from asm_gym.memory.crossfit import THIRDS, crossfit, thirds, trust
-from asm_gym.memory.inference import direct_synapses
 from asm_gym.memory.linear import (
     FEW_PENALTY,
     conditional,
@@ -30,18 +46,7 @@ from asm_gym.memory.linear import (
     learn_linear,
     moments,
 )
-from asm_gym.memory.network import Network
-from asm_gym.memory.network_learning import hebbian_change, initial_weights
-from asm_gym.memory.precision import (
-    BATCH,
-    BATCHES,
-    LARGEST,
-    SMALLEST,
-    learn_precision,
-    log_variance,
-    unbounded,
-    usual_span,
-)
+from asm_gym.memory.traces import Network, direct_synapses, hebbian_change, initial_weights
 from asm_gym.monitors import MemoryConfig, NeuralASM, make_monitor
 from asm_gym.scaling import ScaledRows
 from asm_gym.spec import Channel, StreamSpec

@@ -7,9 +7,8 @@ import pytest
 
 from asm_gym import Channel, Episode, NeuralASM, StreamSpec
 from asm_gym.memory.association import Association
-from asm_gym.memory.association_learning import association_change
+from asm_gym.memory.association_learning import association_change, precision_change
 from asm_gym.memory.free_energy import FreeEnergy, _between
-from asm_gym.memory.precision import precision_change
 from asm_gym.monitors.acting import learn_to_act
 
 SPEC = StreamSpec(

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from asm_gym import NeuralASM
-from asm_gym.memory.inference import Weights, direct_synapses, iterations_within
-from asm_gym.memory.network_learning import initial_weights
+from asm_gym.memory.energy import iterations_within
+from asm_gym.memory.traces import Weights, direct_synapses, initial_weights
 from asm_gym.scripts.reproduce import speed_accuracy
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,

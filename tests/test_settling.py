@@ -9,13 +9,13 @@ import pytest
 
 from asm_gym.checkpoint import read_checkpoint
 from asm_gym.episode import Episode
-from asm_gym.memory.inference import infer
-from asm_gym.memory.learning import Schedule, Trajectory
-from asm_gym.memory.practice import LONGEST_CUE, Practice, one_after_another
+from asm_gym.memory.energy import infer
+from asm_gym.memory.learning import LONGEST_CUE, Practice, Schedule, Trajectory, one_after_another
 from asm_gym.memory.recall import follow, run_on
-from asm_gym.memory.settling import SettlingNetwork, SettlingWeights
-from asm_gym.memory.settling_learning import (
+from asm_gym.memory.settling import (
     SettlingLearner,
+    SettlingNetwork,
+    SettlingWeights,
     initial_settling_weights,
     learn_settling,
     settling_change,

@@ -11,16 +11,35 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asm_gym.memory.dynamics import train
-from asm_gym.memory.energy import activate, energy_gradient, feedback, outward
-from asm_gym.memory.inference import STRIDE, direct, direct_synapses, infer
-from asm_gym.memory.learning import Synapse, Trajectory, cosine_decay, power_iteration
-from asm_gym.memory.network import Network
-from asm_gym.memory.network_learning import TracesLearner, hebbian_change, initial_weights, learn_traces
-from asm_gym.memory.practice import LONGEST_CUE, RECALL_UPDATES, UPDATES, Practice, one_after_another, passes
+from asm_gym.memory.energy import STRIDE, activate, energy_gradient, feedback, infer, outward
+from asm_gym.memory.learning import (
+    LONGEST_CUE,
+    RECALL_UPDATES,
+    UPDATES,
+    Practice,
+    Synapse,
+    Trajectory,
+    cosine_decay,
+    one_after_another,
+    passes,
+    power_iteration,
+)
 from asm_gym.memory.readout import KEPT, add_up, certainty, learn_readout
 from asm_gym.memory.recall import follow, run_on
 from asm_gym.memory.temporal import unassociated
-from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
+from asm_gym.memory.traces import (
+    DECAYS,
+    Network,
+    TracesLearner,
+    advance,
+    at_rest,
+    direct,
+    direct_synapses,
+    fit_gains,
+    hebbian_change,
+    initial_weights,
+    learn_traces,
+)
 from asm_gym.monitors import MemoryConfig, NeuralASM
 from asm_gym.monitors.acting import recall
 from tests.problems import CHANGES, energy, problem, schedule, some_association, some_rows, trajectory

@@ -17,14 +17,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import Association, Change, complete, hidden_units, synapses
+from asm_gym.memory.association import (
+    LARGEST,
+    SMALLEST,
+    Association,
+    Change,
+    complete,
+    hidden_units,
+    log_variance,
+    synapses,
+)
 from asm_gym.memory.energy import Array
 from asm_gym.memory.learning import coincidence
 from asm_gym.memory.linear import PENALTIES, held_out
-from asm_gym.memory.precision import LARGEST, SMALLEST, log_variance
 
-LARGEST_ERROR = 3.0
-"""Standard deviations to which errors are clipped when penalties are compared."""
+LARGEST_ERROR = 3.0  # standard deviations to which errors are clipped when penalties are compared
 
 
 def followed(association: Association, exists: Change, a: Array, delta: Array, rate: float) -> Association:

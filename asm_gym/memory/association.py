@@ -3,11 +3,12 @@
     a_t = [v_{t-1}, Δ_t, Δ_{t-1}, u_t, 1]          values before, changes now and before, the commanded action
     h_t = V a_t                                    hidden units; those of group g have no synapse from its own Δ_t
     Δ̂_t = D a_t + U f(h_t)                         group g is predicted by its own units only
-    log σ²_t = W_S f(h_t) + b_S, within span_S     expected variance of the error, see ``precision``
+    log σ²_t = W_S f(h_t) + b_S, within span_S     expected variance of the error
     ε_t = (Δ_t - Δ̂_t) / (s σ_t)                    normalised error; s is the spread that D alone leaves
 
 A joint that moves while the hand does not, or a commanded motion without a torque, is an error in any skill. The linear
-part D has a closed form (``linear``). The hidden units learn what D leaves (``association_learning``).
+part D has a closed form (``linear``). The hidden units learn what D leaves (``association_learning``). span_S are the
+limits of nominal contexts, so that a fault cannot excuse itself by an unusual context.
 
 Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning from prediction errors; Salvatori et al.
 2021 (NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest.
@@ -21,7 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.memory.energy import Array, activate, kernel, outward
-from asm_gym.memory.precision import log_variance
+
+SMALLEST, LARGEST = np.float32(-12.0), np.float32(8.0)
+"""Bounds of log σ²: errors of 0.25 % of a channel's spread, and of 55 times its spread."""
 
 
 class Association(NamedTuple):
@@ -93,6 +96,21 @@ def complete(f: Array, a: Array, U: Array, D: Array) -> Array:
     out = outward(f, U)
     out += outward(a, D)
     return out
+
+
+@kernel
+def log_variance(f: Array, W_S: Array, b_S: Array, span_S: Array) -> Array:
+    """Return log σ² (B, X) in the context ``f`` (B, M), within ``span_S`` (2, X)."""
+    out = outward(f, W_S)
+    for n in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            out[n, i] = min(max(out[n, i] + b_S[i], span_S[0, i]), span_S[1, i])
+    return out
+
+
+def unbounded(size: int) -> Array:
+    """Return the widest limits (2, X) for ``size`` X."""
+    return np.repeat(np.array([[SMALLEST], [LARGEST]]), size, axis=1)
 
 
 @kernel

@@ -2,20 +2,18 @@
 
     r_t = (Δ_t - D a_t) / s                        what the linear part leaves
     ε_t = ψ((r_t - U f(h_t)) / σ),  ψ(ε) = min(max(ε, -1), 1)
-    ΔU ∝ ε_t f(h_t)ᵀ
-    ΔV ∝ ε_h a_tᵀ,   ε_h = f'(h_t) ⊙ Bᵀ ε_t
+    ΔU ∝ ε_t f(h_t)ᵀ     ΔV ∝ ε_h a_tᵀ,   ε_h = f'(h_t) ⊙ Bᵀ ε_t
+    c = Σ_n ψ(r_n) Δ̂_n / Σ_n Δ̂_n², in [0, 1]       share of the hidden units' predictions Δ̂ to believe
+    ΔW_S ∝ (ε²/σ² - 1) f(h_t)ᵀ                     gradient of the Gaussian log likelihood
 
-How errors come back to the hidden units is one of three ways:
+By transported feedback B = U, the gradient of a Huber loss. By learned feedback B changes as U does and both decay, so
+that B approaches U, and each change is local. c and the precision are learned on cross-fitted errors: each row is
+predicted by what was learned from the two thirds of the episodes that it is not in. From very few rows neither is
+known: then D reads the past and the command only, and U and W_S are 0.
 
-    transported    B = U, the transpose of the weights that predict: the gradient of a Huber loss
-    learned        B changes as U does and both decay, so that B approaches U; each change of V, U and B is local
-    local          learned, and D too by a local rule (``linear.learn_by_delta``) in place of the closed form
-
-The predictions of the hidden units are scaled by how well they do on episodes that they have not learned, and the
-precision is learned on the errors of those (``crossfit``). From very few rows neither is known: then D reads the past
-and the command only, and U and W_S are 0.
-
-Sources: Huber 1964 for ψ; Kolen and Pollack 1994 and Akrout et al. 2019 (NeurIPS) for learned feedback.
+Sources: Huber 1964 for ψ; Kolen and Pollack 1994 and Akrout et al. 2019 (NeurIPS) for learned feedback; Stone 1974 and
+Chernozhukov et al. 2018 (Econometrics Journal) for cross-fitting; Friston 2005 (Phil. Trans. R. Soc. B) for the
+maximum-likelihood precision.
 """
 
 from __future__ import annotations
@@ -25,94 +23,43 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import Association, Change, complete, hidden_units, synapses
-from asm_gym.memory.crossfit import SMALLEST_SPREAD, THIRDS, crossfit, thirds, trust
+from asm_gym.memory.association import (
+    LARGEST,
+    SMALLEST,
+    Association,
+    Change,
+    complete,
+    hidden_units,
+    log_variance,
+    synapses,
+    unbounded,
+)
 from asm_gym.memory.energy import Array, kernel, outward
-from asm_gym.memory.learning import Synapse, coincidence, cosine_decay, shuffled
-from asm_gym.memory.linear import learn_by_delta, learn_from_past, learn_linear
-from asm_gym.memory.precision import PRECISION_EPOCHS, learn_precision, unbounded, usual_span
+from asm_gym.memory.learning import Synapse, Tick, coincidence, cosine_decay, shuffled
+from asm_gym.memory.linear import learn_from_past, learn_linear
 
-UPDATES, PASSES = 6000, 40
-"""Largest number of batches, and of passes over the rows."""
+TRANSPORTED, LEARNED = "transported", "learned"
+FEEDBACK = TRANSPORTED, LEARNED
+FEEDBACK_GAIN = 1e-3  # initial gain of learned feedback
+DECAY = 0.3  # share of its step size by which a synapse of U or B decays
 
-BATCH = 256
-RATE = 5e-3
-WARM_UP = 0.1
-"""Share of the updates in which the step size rises to ``RATE``; after that it falls along a cosine."""
+UPDATES, PASSES, BATCH = 6000, 40, 256  # largest number of batches, and of passes over the rows; rows of a batch
+RATE, WARM_UP = 5e-3, 0.1  # step size, and share of the updates in which it rises; after that it falls along a cosine
+TICKS = 20  # progress reports of one learning of the hidden units
+ROWS_PER_INPUT = 12  # with fewer rows for each input, the senses are not predicted from each other
+TRACKING = np.float32(0.01)  # weight of the newest batch in the running spread σ of each error
 
-TICKS = 20
-"""Progress reports of one learning of the hidden units."""
+THIRDS = 3
+LARGEST_ERROR = 3.0  # standard deviations to which errors are clipped in ``trust``
+SMALLEST_SPREAD = np.float32(1e-4)  # below this single precision is noise
+
+EXTREME = 0.0005  # share of nominal rows below the limits of log σ², and above
+LARGEST_RATIO = 30.0  # clips ε²/σ² (5.5 σ), so that one contact does not undo a thousand steps
+PRECISION_EPOCHS, PRECISION_RATE = 20, 1e-3
+PRECISION_BATCH, PRECISION_BATCHES = 64, 250  # rows of a batch, and most batches in an epoch; then they are larger
 
 ALL_TICKS = (THIRDS + 1) * TICKS + PRECISION_EPOCHS
 """Progress reports of ``learn_association``."""
-
-ROWS_PER_INPUT = 12
-"""With fewer rows for each input, the senses are not predicted from each other."""
-
-TRACKING = np.float32(0.01)
-"""Weight of the newest batch in the running spread σ of each error."""
-
-FEEDBACK_GAIN = 1e-3
-"""Initial gain of learned feedback."""
-
-DECAY = 0.3
-"""Share of its step size by which a synapse of U or B decays."""
-
-
-class Feedback:
-    """Errors come back by the transpose of the weights that predict."""
-
-    def linear(
-        self, a: Array, groups: NDArray[np.intp], changes: slice, exists: Array, rng: np.random.Generator
-    ) -> Array:
-        """Return D (X, I) from inputs (N, I); ``exists`` (X, I) is 1 where it has a synapse."""
-        return learn_linear(a, groups, changes)
-
-    def begin(self, exists: Array, rng: np.random.Generator) -> None:
-        """Start anew; ``exists`` (X, M) is 1 where U has a synapse."""
-
-    def back(self, U: Array) -> Array:
-        """Return B (X, M)."""
-        return U
-
-    def learn(self, U: Array, change: Array, rate: float) -> None:
-        """Follow a step in which U (X, M) was moved along ``change``."""
-
-
-class LearnedFeedback(Feedback):
-    """Errors come back by weights of their own, which learn what the weights that predict learn."""
-
-    B: Array  # (X, M)
-
-    def begin(self, exists: Array, rng: np.random.Generator) -> None:
-        each = np.maximum(exists.sum(axis=1, keepdims=True), 1.0)
-        self.B = (FEEDBACK_GAIN * rng.standard_normal(exists.shape) / np.sqrt(each)).astype(np.float32) * exists
-        self._synapse = Synapse(self.B)
-
-    def back(self, U: Array) -> Array:
-        return self.B
-
-    def learn(self, U: Array, change: Array, rate: float) -> None:
-        self._synapse.learn(change, rate)
-        for W in (U, self.B):
-            W *= np.float32(1.0 - DECAY * rate)
-
-
-class LocalFeedback(LearnedFeedback):
-    """Learned feedback, with the linear part by the delta rule."""
-
-    def linear(
-        self, a: Array, groups: NDArray[np.intp], changes: slice, exists: Array, rng: np.random.Generator
-    ) -> Array:
-        return learn_by_delta(a, changes, exists, rng)
-
-
-TRANSPORTED, LEARNED, LOCAL = "transported", "learned", "local"
-FEEDBACK: dict[str, Callable[[], Feedback]] = {
-    TRANSPORTED: Feedback,
-    LEARNED: LearnedFeedback,
-    LOCAL: LocalFeedback,
-}
 
 
 @kernel
@@ -160,10 +107,8 @@ def learn_association(
     changes: slice,
     size: int,
     rng: np.random.Generator,
-    tick: Callable[[], None] = lambda: None,
-    updates: int = UPDATES,
-    passes: int = PASSES,
-    feedback: Feedback | None = None,
+    tick: Tick = lambda: None,
+    feedback: str = TRANSPORTED,
     lengths: Sequence[int] = (),
     independent: int | None = None,
 ) -> Association:
@@ -175,14 +120,13 @@ def learn_association(
         groups, changes, size: as in ``synapses``.
         rng: draws initial weights and the order of the rows.
         tick: called ``ALL_TICKS`` times.
-        updates, passes: largest number of batches, and of passes over the rows.
-        feedback: one of ``FEEDBACK``; transported where None.
+        feedback: how errors come back to the hidden units, one of ``FEEDBACK``.
         lengths: rows of each episode; without them cross-fitting cuts the rows into three consecutive parts.
         independent: number of rows if overlapping changes are counted once; N where None.
     """
-    few, feedback = (independent or len(a)) < ROWS_PER_INPUT * a.shape[1], feedback or Feedback()
+    few = (independent or len(a)) < ROWS_PER_INPUT * a.shape[1]
     exists = synapses(groups, changes, a.shape[1], size)
-    D = learn_from_past(a, changes) if few else feedback.linear(a, groups, changes, exists.D, rng)
+    D = learn_from_past(a, changes) if few else learn_linear(a, groups, changes)
     left = delta - outward(a, D)
     remainder = np.maximum(np.sqrt(np.mean(left**2, axis=0)), SMALLEST_SPREAD)  # (X,)
     if few:
@@ -194,7 +138,7 @@ def learn_association(
     left /= remainder
 
     def learned(rows: NDArray[np.bool_] | slice) -> tuple[Array, Array]:
-        return _learn_hidden(a[rows], left[rows], exists, rng, tick, updates, passes, feedback)
+        return _learn_hidden(a[rows], left[rows], exists, rng, tick, feedback)
 
     def expect(learned_from: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Array:
         V, U = learned(learned_from)
@@ -205,9 +149,8 @@ def learn_association(
     V, U = learned(slice(None))
     share = trust(left, expected)
     U *= share[:, None]
-    W_S, b_S = np.zeros_like(U), np.zeros(len(U), np.float32)
     f = hidden_units(a, V)
-    learn_precision(f, left - share * expected, W_S, b_S, rng, tick)
+    W_S, b_S = learn_precision(f, left - share * expected, rng, tick)
     return Association(V, U * remainder[:, None], D, W_S, b_S, usual_span(f, W_S, b_S), remainder)
 
 
@@ -218,28 +161,28 @@ def _random(exists: Array, rng: np.random.Generator) -> Array:
 
 
 def _learn_hidden(
-    a: Array,
-    left: Array,
-    exists: Change,
-    rng: np.random.Generator,
-    tick: Callable[[], None],
-    updates: int,
-    passes: int,
-    feedback: Feedback,
+    a: Array, left: Array, exists: Change, rng: np.random.Generator, tick: Tick, feedback: str
 ) -> tuple[Array, Array]:
     """Return V and U learned from inputs (N, I) and what the linear part leaves (N, X), standardised."""
-    updates = max(TICKS, min(updates, passes * len(a) // BATCH))
+    updates = max(TICKS, min(UPDATES, PASSES * len(a) // BATCH))
     V = _random(exists.V, rng)
     U, no_linear = np.zeros_like(exists.U), exists.D[:, :0]
     into, out_of = Synapse(V), Synapse(U)
     spread = np.ones(left.shape[1], np.float32)
-    feedback.begin(exists.U, rng)
+    back = out_of
+    if feedback == LEARNED:
+        each = np.maximum(exists.U.sum(axis=1, keepdims=True), 1.0)
+        B = (FEEDBACK_GAIN * rng.standard_normal(exists.U.shape) / np.sqrt(each)).astype(np.float32) * exists.U
+        back = Synapse(B)
     for n, rows in zip(range(updates), shuffled(len(a), BATCH, rng), strict=False):
-        change, error = association_change(a[rows], left[rows], spread, V, U, no_linear, back=feedback.back(U))
+        change, error = association_change(a[rows], left[rows], spread, V, U, no_linear, back=back.W)
         rate, outward_change = _rate(n / updates), change.U * exists.U
         into.learn(change.V * exists.V, rate)
         out_of.learn(outward_change, rate)
-        feedback.learn(U, outward_change, rate)
+        if feedback == LEARNED:
+            back.learn(outward_change, rate)
+            for W in (U, back.W):
+                W *= np.float32(1.0 - DECAY * rate)
         now = np.sqrt(np.mean(np.minimum(error**2, 9 * spread**2), axis=0))
         spread += TRACKING * (np.maximum(now, SMALLEST_SPREAD) - spread)
         if (n + 1) * TICKS // updates > n * TICKS // updates:
@@ -251,3 +194,71 @@ def _rate(progress: float) -> float:
     if progress < WARM_UP:
         return RATE * progress / WARM_UP
     return cosine_decay(RATE, (progress - WARM_UP) / (1.0 - WARM_UP))
+
+
+def thirds(rows: int, lengths: Sequence[int], rng: np.random.Generator) -> NDArray[np.intp]:
+    """Return the third (N,) of each row: 0, 1 or 2.
+
+    Args:
+        rows: N.
+        lengths: rows of each episode. With fewer than three episodes, thirds are of consecutive rows.
+        rng: draws the third of each episode, as rows of one episode are alike.
+    """
+    if len(lengths) >= THIRDS:
+        return np.repeat(rng.permutation(len(lengths)) % THIRDS, lengths)
+    return np.arange(rows) * THIRDS // max(rows, 1)
+
+
+def crossfit(
+    expect: Callable[[NDArray[np.bool_], NDArray[np.bool_]], Array], third: NDArray[np.intp], size: int
+) -> Array:
+    """Return the prediction (N, X) of each row by what was learned from the other thirds.
+
+    Args:
+        expect: learns from the rows of one mask (N,), and predicts (M, X) the M rows of another.
+        third: (N,) of ``thirds``.
+        size: X.
+    """
+    found = np.zeros((len(third), size), np.float32)
+    for k in range(THIRDS):
+        asked = third == k
+        found[asked] = expect(~asked, asked)
+    return found
+
+
+def trust(left: Array, expected: Array) -> Array:
+    """Return c (X,) in [0, 1]: the share of the predictions (N, X) that leaves the least of the targets (N, X)."""
+    known = np.sum(expected**2, axis=0)
+    clipped = np.clip(left, -LARGEST_ERROR, LARGEST_ERROR)
+    share: Array = np.sum(clipped * expected, axis=0) / np.maximum(known, SMALLEST_SPREAD)
+    return np.clip(share, 0.0, 1.0).astype(np.float32)
+
+
+def usual_span(f: Array, W_S: Array, b_S: Array) -> Array:
+    """Return the limits (2, X) of log σ² in nominal contexts (N, M)."""
+    found: Array = np.quantile(log_variance(f, W_S, b_S, unbounded(len(b_S))), (EXTREME, 1.0 - EXTREME), axis=0)
+    return found.astype(np.float32)
+
+
+def precision_change(f: Array, error: Array, W_S: Array, b_S: Array) -> tuple[Array, Array]:
+    """Return the change of ``W_S`` (X, M) and ``b_S`` (X,) for contexts ``f`` (B, M) and errors (B, X)."""
+    excess = np.minimum(error**2 * np.exp(-log_variance(f, W_S, b_S, unbounded(len(b_S)))), np.float32(LARGEST_RATIO))
+    excess -= np.float32(1.0)
+    return coincidence(excess, f), excess.mean(axis=0)
+
+
+def learn_precision(f: Array, error: Array, rng: np.random.Generator, tick: Tick = lambda: None) -> tuple[Array, Array]:
+    """Return ``W_S`` (X, M) and ``b_S`` (X,) learned from contexts ``f`` (N, M) and the errors (N, X) in them."""
+    W_S = np.zeros((error.shape[1], f.shape[1]), np.float32)
+    b_S = np.zeros(len(W_S), np.float32)
+    b_S[:] = np.clip(np.log(np.mean(error**2, axis=0) + 1e-12), SMALLEST, LARGEST)
+    context, bias = Synapse(W_S), Synapse(b_S)
+    for epoch in range(PRECISION_EPOCHS):
+        order: NDArray[np.intp] = rng.permutation(len(f))
+        rate = cosine_decay(PRECISION_RATE, epoch / PRECISION_EPOCHS)
+        for rows in np.array_split(order, max(1, min(PRECISION_BATCHES, len(order) // PRECISION_BATCH))):
+            change, bias_change = precision_change(f[rows], error[rows], W_S, b_S)
+            context.learn(change, rate)
+            bias.learn(bias_change, rate)
+        tick()
+    return W_S, b_S

@@ -1,6 +1,6 @@
 """The two temporal networks by name, and the training of a whole memory.
 
-    traces      traces of senses and actions are carried on, and the state follows from them     ``network``
+    traces      traces of senses and actions are carried on, and the state follows from them     ``traces``
     settling    the state is carried on by learned synapses, and is inferred on every row        ``settling``
 
 Every synapse descends its own term of
@@ -19,15 +19,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association_learning import ALL_TICKS, Feedback, learn_association
-from asm_gym.memory.inference import Weights, weight_shapes
-from asm_gym.memory.learning import Schedule, Trajectory
-from asm_gym.memory.network import Network
-from asm_gym.memory.network_learning import learn_traces
-from asm_gym.memory.practice import passes
-from asm_gym.memory.settling import SettlingNetwork, SettlingWeights, settling_shapes
-from asm_gym.memory.settling_learning import learn_settling
+from asm_gym.memory.association_learning import ALL_TICKS, TRANSPORTED, learn_association
+from asm_gym.memory.learning import Schedule, Trajectory, passes
+from asm_gym.memory.settling import SettlingNetwork, SettlingWeights, learn_settling, settling_shapes
 from asm_gym.memory.temporal import Learn, TemporalNetwork, Trained
+from asm_gym.memory.traces import Network, Weights, learn_traces, weight_shapes
 
 TRACES, SETTLING = "traces", "settling"
 
@@ -65,7 +61,7 @@ def train(
     schedule: Schedule,
     rng: np.random.Generator,
     progress: Callable[[int, int], object] | None = None,
-    feedback: Feedback | None = None,
+    feedback: str = TRANSPORTED,
     dynamics: str = TRACES,
 ) -> Trained:
     """Learn the synapses through time, then those of association, from whole episodes.
@@ -79,7 +75,7 @@ def train(
         schedule: of the temporal network.
         rng: draws everything random.
         progress: called with steps done and their total.
-        feedback: how errors come back to the hidden units of association; transported where None.
+        feedback: how errors come back to the hidden units of association, one of ``FEEDBACK``.
         dynamics: one of ``DYNAMICS``.
     """
     done, total = 0, passes(trajectories, schedule) + ALL_TICKS
@@ -93,14 +89,6 @@ def train(
     network, energy = DYNAMICS[dynamics].learn(trajectories, hidden, schedule, rng, tick)
     inputs, lengths = np.concatenate([t.inputs for t in trajectories]), [len(t.inputs) for t in trajectories]
     deltas, layout = np.ascontiguousarray(inputs[:, changes]), (groups, changes, units)
-    association = learn_association(
-        inputs,
-        deltas,
-        *layout,
-        rng,
-        tick,
-        feedback=feedback,
-        lengths=lengths,
-        independent=sum(len(t.senses) for t in trajectories),  # changes over several rows overlap
-    )
+    independent = sum(len(t.senses) for t in trajectories)  # changes over several rows overlap
+    association = learn_association(inputs, deltas, *layout, rng, tick, feedback, lengths, independent)
     return Trained(network.with_association(association), energy)

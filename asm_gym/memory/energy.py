@@ -1,10 +1,13 @@
-"""The energy that inference descends and learning lowers, and its gradient.
+"""The energy of the state, its gradient, and inference, which descends it.
 
     F = ½ Π_z ‖z - μ‖² + ½ Σ_i Π_x,i (x_i - x̂_i)²,    x̂ = W_F f(z),    f = tanh
     ∂F/∂z = Π_z (z - μ) - f'(z) ⊙ W_Fᵀ Π_x ε_x,        f' = 1 - f²
+    z ← z - η ∂F/∂z,  η = 1.5 / (Π_z + Π_x‖W_F‖² + max|f''| ‖W_Fᵀ Π_x ε_x‖_∞)
 
-Source: Millidge et al. 2024 (PLOS Comput Biol), with f = tanh. Everything is in units of the
-standardised stream (1 = one standard deviation over the training episodes) and has a batch as its first axis.
+Inference begins at μ. The bracket bounds the largest curvature of F, so that no step raises F. Everything is in units
+of the standardised stream and has a batch as its first axis.
+
+Source: Millidge et al. 2024 (PLOS Comput Biol), with f = tanh.
 """
 
 from __future__ import annotations
@@ -17,13 +20,14 @@ import scipy.linalg.cython_blas  # noqa: F401  (the BLAS of the kernels; loaded 
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
+from asm_gym.validation import check_number
 
 Array = NDArray[np.floating[Any]]
 Scalar = float | np.floating[Any]
 
-STEEPEST = np.float32(0.77)
-"""An upper bound of |f''|; tanh has 4 / (3√3) = 0.7698."""
-
+STEEPEST = np.float32(0.77)  # above the largest |f''|, which is 4 / (3√3) for tanh
+STRIDE = np.float32(1.5)  # step of inference times the curvature; inference diverges from 2 on
+STILL = np.float32(1e-8)  # inference ends when no unit moves further in a step
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -58,8 +62,7 @@ def activate(z: Array) -> Array:
 def outward(a: Array, W: Array) -> Array:
     """Return a @ W.T, (B, P) from (B, Q), along the synapses ``W`` (P, Q).
 
-    A single row is summed here, as BLAS threads cost more than so small a product, and four rows of W at a time, which
-    is faster than one.
+    A single row is summed without BLAS, four rows of W at a time, which is faster.
     """
     out = np.empty((a.shape[0], W.shape[0]), a.dtype)
     if a.shape[0] > 1:
@@ -84,11 +87,7 @@ def outward(a: Array, W: Array) -> Array:
 
 @kernel
 def feedback(f: Array, x: Array, W_F: Array, pi_x: Array) -> Array:
-    """Return W_Fᵀ Π_x ε_x (B, H) for firing rates ``f`` (B, H).
-
-    For a single row each weight is read once for both directions, four rows of W_F at a time: reading them from the
-    second level of cache takes most of the time of inference.
-    """
+    """Return W_Fᵀ Π_x ε_x (B, H) for firing rates ``f`` (B, H); for a single row each weight is read once."""
     X, H = W_F.shape
     out = np.zeros(f.shape, f.dtype)
     if f.shape[0] > 1:
@@ -146,3 +145,35 @@ def energy_gradient(z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_
         for j in range(z.shape[1]):
             gradient[n, j] = pi_z * (z[n, j] - mu[n, j]) - (np.float32(1) - f[n, j] * f[n, j]) * gradient[n, j]
     return gradient, bend
+
+
+@kernel
+def infer(mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array, curvature: Scalar, iterations: int) -> Array:
+    """Return z_t (B, H) after steps down the energy from ``mu``; arguments as in ``energy_gradient``.
+
+    Args:
+        curvature: Π_z + max Π_x ‖W_F‖², spectral norm.
+        iterations: largest number of steps.
+    """
+    z = mu.copy()
+    for _ in range(iterations):
+        gradient, bend = energy_gradient(z, mu, x, W_F, pi_z, pi_x)
+        farthest = np.float32(0)
+        for n in range(z.shape[0]):
+            step = STRIDE / (curvature + bend[n])
+            for j in range(z.shape[1]):
+                move = step * gradient[n, j]
+                z[n, j] -= move
+                farthest = max(farthest, abs(move))
+        if farthest < STILL:
+            break
+    return z
+
+
+def iterations_within(budget: float, dt: float) -> int:
+    """Return the inference steps a row, from steps a second and seconds a row. Raises ValueError if below one."""
+    each = check_number("budget", budget, above=0.0) * dt
+    if each < 1.0 - 1e-9:
+        rows = f"{1 / dt:.4g} rows a second"
+        raise ValueError(f"a budget of {budget:g} steps of inference a second is less than one for each of {rows}")
+    return int(each + 1e-9)

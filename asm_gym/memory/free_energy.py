@@ -30,10 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.memory.association import Association
-from asm_gym.memory.inference import Weights
 from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.settling import SettlingWeights
 from asm_gym.memory.temporal import TemporalNetwork
+from asm_gym.memory.traces import Weights
 from asm_gym.scaling import FARTHEST, StreamScaler
 
 Floats = NDArray[np.float64]

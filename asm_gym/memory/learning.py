@@ -1,15 +1,21 @@
-"""Learning rules: each synapse changes by what its own two ends do, with a step size of its own.
+"""Learning rules, and the passes over episodes by which a temporal network learns.
 
     ΔW ∝ ⟨post preᵀ⟩ over a batch,     step: rate · m / √s       m, s: running mean and mean square of ΔW (Adam)
 
-The step size of a synapse uses that synapse's own history only, so it is local too.
+The step size of a synapse uses that synapse's own history only, so it is local too. Episodes are passed over in many
+parallel streams. After a random cue, and with a probability that rises during learning, a stream runs on alone for a
+row: the action is the memory's own and its state follows from its own prediction. Without this a memory learns to
+predict one row, and is lost a few rows after the senses are gone.
 
-Source: Kingma and Ba 2015 (ICLR) for the step size.
+Sources: Kingma and Ba 2015 (ICLR) for the step size; Tang et al. 2023 (NeurIPS) for offline recall; Bengio et al. 2015
+(NeurIPS) for learning from own predictions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +25,10 @@ from asm_gym.memory.energy import Array, kernel
 
 Tick = Callable[[], None]
 """Reports progress."""
+
+LONGEST_CUE = 30  # a stream reads fewer rows than this before it may run on alone
+UPDATES, RECALL_UPDATES = 10_000, 50_000  # largest number of batches without and with running on alone
+REFERENCE_WIDTH = 256  # hidden units up to which ``learning_rate`` is used as it is; it is scaled down beyond
 
 
 class Trajectory(NamedTuple):
@@ -100,7 +110,15 @@ def power_iteration(W: Array, v: Array) -> tuple[float, Array]:
     return norm, v / (norm + np.float32(1e-12))
 
 
-class Learner:
+class Moment(NamedTuple):
+    """One row of B streams."""
+
+    senses: Array  # (B, S)
+    commands: Array  # (B, A + 1)
+    begins: NDArray[np.bool_]  # (B, 1) whether an episode begins
+
+
+class Learner(ABC):
     """A temporal network that learns: its weights, their running moments, and the norm that inference needs.
 
     Args:
@@ -111,7 +129,10 @@ class Learner:
 
     Attributes:
         norm: ‖W_F‖², spectral.
+        early: 1 if running alone is drawn for the row to come, 0 if for the row itself.
     """
+
+    early: int
 
     def __init__(self, weights: Any, names: Collection[str], schedule: Schedule, rng: np.random.Generator) -> None:
         self.weights, self.schedule = weights, schedule
@@ -126,3 +147,115 @@ class Learner:
             synapse.learn(getattr(change, name), rate)
         # W_F moves little in a step, so one iteration keeps the norm up to date.
         self.norm, self._direction = power_iteration(self.weights.W_F, self._direction)
+
+    @abstractmethod
+    def at_rest(self, size: int) -> Array:
+        """Return the state (B, Z) before an episode."""
+
+    @abstractmethod
+    def practise(
+        self, state: Array, now: Moment, own: NDArray[np.bool_], alone: NDArray[np.bool_], rate: float
+    ) -> tuple[Array, float]:
+        """Learn from one row; return the next state (B, Z) and the energy summed over the batch.
+
+        Args:
+            state: (B, Z).
+            now: the row.
+            own: (B, 1) streams that take their own action.
+            alone: (B, 1) streams whose next state follows from what was predicted.
+            rate: of the synapses.
+        """
+
+
+def one_after_another(trajectories: Sequence[Trajectory], size: int, rng: np.random.Generator) -> Iterator[Moment]:
+    """Yield rows of ``size`` endless streams of episodes, each begun at a random row.
+
+    Streams at different phases keep one phase of all skills from displacing what was learned of the others.
+    """
+    senses, commands = (np.concatenate([t[k] for t in trajectories]) for k in range(2))
+    length = np.array([len(t.senses) for t in trajectories])
+    start = np.cumsum(length) - length
+    order = shuffled(len(trajectories), 1, rng)
+    episode = np.array([next(order)[0] for _ in range(size)])
+    step = rng.integers(length[episode])
+    while True:
+        row = start[episode] + step
+        yield Moment(senses[row], commands[row], (step == 0)[:, None])
+        step = step + 1
+        for n in np.flatnonzero(step == length[episode]):
+            episode[n], step[n] = next(order)[0], 0
+
+
+class Practice:
+    """Streams that a learner follows.
+
+    Args:
+        learner: changes its synapses.
+        size: B.
+        rng: draws cues and which streams run on alone.
+
+    Attributes:
+        state: (B, Z) what is carried from row to row.
+        cue: (B, 1) rows that must be read first.
+    """
+
+    def __init__(self, learner: Learner, size: int, rng: np.random.Generator) -> None:
+        self.learner, self.rng = learner, rng
+        self.state = learner.at_rest(size)
+        self.cue = np.full((size, 1), LONGEST_CUE)
+        self._steps = np.zeros((size, 1), np.intp)  # rows since the episode began, or since the stream began
+        self._alone = np.zeros((size, 1), np.bool_)
+
+    def run(self, moments: Iterable[Moment], rate: float, free: float) -> float:
+        """Learn from the moments; return the sum of all energies.
+
+        Args:
+            free: probability of running on alone in a row after the cue.
+        """
+        total, early = 0.0, self.learner.early
+        for now in moments:
+            state = np.where(now.begins, np.float32(0), self.state)
+            self._steps = np.where(now.begins, 0, self._steps) + 1
+            self.cue = np.where(now.begins, self.rng.integers(1, LONGEST_CUE, self.cue.shape), self.cue)
+            before = self._alone & ~now.begins
+            self._alone = (self._steps + early > self.cue) & (self.rng.random(self.cue.shape) < free)
+            own = before if early else self._alone
+            self.state, energy = self.learner.practise(state, now, own, self._alone, rate)
+            total += energy
+        return total
+
+
+def practise(
+    learner: Learner,
+    hidden: int,
+    trajectories: Sequence[Trajectory],
+    schedule: Schedule,
+    rng: np.random.Generator,
+    tick: Tick,
+) -> NDArray[np.float64]:
+    """Pass over the episodes with a decaying rate, more and more alone; return the mean energy of each pass.
+
+    Args:
+        learner: changes its synapses.
+        hidden: H, its hidden units.
+        tick: called after each pass.
+    """
+    streams = Practice(learner, schedule.batch_size, rng)
+    epochs, widest = passes(trajectories, schedule), schedule.learning_rate * min(1.0, REFERENCE_WIDTH / hidden)
+    moments = one_after_another(trajectories, schedule.batch_size, rng)
+    steps = -(-sum(len(t.senses) for t in trajectories) // schedule.batch_size)
+    curve = np.zeros(epochs)
+    for epoch in range(epochs):
+        progress = epoch / epochs
+        free = schedule.free_running_probability * min(1.0, 2 * progress)
+        energy = streams.run(islice(moments, steps), cosine_decay(widest, progress), free)
+        curve[epoch] = energy / (steps * schedule.batch_size)
+        tick()
+    return curve
+
+
+def passes(trajectories: Sequence[Trajectory], schedule: Schedule) -> int:
+    """Return the number of passes over all episodes: ``epochs``, fewer with very many episodes."""
+    updates = sum(len(t.senses) for t in trajectories) / schedule.batch_size
+    most = RECALL_UPDATES if schedule.free_running_probability > 0 else UPDATES
+    return max(1, min(schedule.epochs, round(most / updates)))

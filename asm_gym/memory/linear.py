@@ -4,10 +4,9 @@
     Δ̂_g = m_g + D_g (a_t - m),     D_g = -P_gg⁻¹ P_g·      0 from g itself
 
 One inverse serves every group: D_g is the ridge regression of group g on everything else. λ is chosen for each sense by
-its error on held-out rows; D is then computed from all rows. ``learn_by_delta`` approaches D by local steps.
+its error on held-out rows; D is then computed from all rows.
 
-Sources: Besag 1975 and Lauritzen 1996 for conditionals of a Gaussian; Hoerl and Kennard 1970 for ridge regression;
-Widrow and Hoff 1960 for the delta rule.
+Sources: Besag 1975 and Lauritzen 1996 for conditionals of a Gaussian; Hoerl and Kennard 1970 for ridge regression.
 """
 
 from __future__ import annotations
@@ -18,28 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm, dsyrk
 
-from asm_gym.memory.energy import Array, outward
-from asm_gym.memory.learning import Synapse, coincidence, cosine_decay, shuffled
+from asm_gym.memory.energy import Array
 
 Floats = NDArray[np.float64]
 
-PENALTIES = 10.0 ** np.arange(-8, 3)
-"""λ, in units of the variance of a standardised input."""
-
-EXACT = 1e-8
-"""Mean squared errors below this are equally good."""
-
-MOST_INPUTS = 8192
-"""C of these takes 0.5 GiB, and its eigenvectors minutes."""
-
-FEW_PENALTY = 1e-4
-"""λ where rows are too few to choose it."""
-
-DELTA_RATE, DELTA_BATCH, DELTA_PASSES = 3e-3, 256, 200
-"""Of the delta rule: step size, rows of a batch, passes over all rows."""
-
-HELD_OUT = 5
-"""The last one in so many rows is held out."""
+PENALTIES = 10.0 ** np.arange(-8, 3)  # λ, in units of the variance of a standardised input
+EXACT = 1e-8  # mean squared errors below this are equally good
+MOST_INPUTS = 8192  # C of these takes 0.5 GiB, and its eigenvectors minutes
+FEW_PENALTY = 1e-4  # λ where rows are too few to choose it
+HELD_OUT = 5  # the last one in so many rows is held out
 
 
 class Moments(NamedTuple):
@@ -124,19 +110,3 @@ def learn_from_past(a: Array, changes: slice) -> NDArray[np.float32]:
 def held_out(a: Array) -> Array:
     """Return the last fifth of the rows; all of fewer than five."""
     return a[len(a) - len(a) // HELD_OUT :] if len(a) >= HELD_OUT else a
-
-
-def learn_by_delta(a: Array, changes: slice, exists: Array, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return D (X, I) learned by the delta rule from rows (N, I) in random order.
-
-    Args:
-        changes: columns of the changes among the inputs.
-        exists: (X, I) 1 where there is a synapse.
-    """
-    D = np.zeros(exists.shape, np.float32)
-    synapse, updates = Synapse(D), DELTA_PASSES * len(a) // DELTA_BATCH
-    for n, rows in zip(range(updates), shuffled(len(a), DELTA_BATCH, rng), strict=False):
-        seen = a[rows]
-        error = np.ascontiguousarray(seen[:, changes]) - outward(seen, D)
-        synapse.learn(coincidence(error, seen) * exists, cosine_decay(DELTA_RATE, n / updates))
-    return D

@@ -1,27 +1,33 @@
 """The temporal predictive coding network of the papers: its state is carried on, and is inferred on every row.
 
     μ_t = W_H f(z_{t-1}) + W_U [a_t, 1]                              state expected for the commanded action
-    F = ½ Π_z ‖z - μ_t‖² + ½ Π_x ‖x_t - W_F f(z) - b_F‖²             z_t is where inference from μ_t ends
-    x̂_t = W_F f(μ_t) + b_F                                           senses expected before they are read
     h_t = W_H f(z_{t-1}) + W_U [0, 1],   â_t = W_A f(h_t)            action that belongs to the state
+    F = ½ Π_z ‖z - μ_t‖² + ½ Π_x ‖x_t - W_F f(z) - b_F‖² + ½ ‖a_t - â_t‖²      z_t is where inference from μ_t ends
+    ΔW_H ∝ (Π_z ε_z + ε_h) f(z_{t-1})ᵀ    ΔW_U ∝ Π_z ε_z [a_t, 1]ᵀ + ε_h [0, 1]ᵀ    ε_h = f'(h_t) ⊙ W_Aᵀ ε_a
+    ΔW_F ∝ Π_x ε_x f(z_t)ᵀ    ΔW_A ∝ ε_a f(h_t)ᵀ
 
-The past is in z alone, so each row must be inferred before the next is expected. With few inference steps the state
-lags behind the senses.
+Each change is -∂F/∂W at the inferred state. The past is in z alone, and an error teaches one step back and no further.
+W_H begins near the identity: a unit then keeps its own state, and with it what is long past. A stream that runs on
+alone hands on μ_t in place of z_t, and takes its own action.
 
 Sources: Millidge et al. 2024 (PLOS Comput Biol) and Tang et al. 2023 (NeurIPS); Mahajan et al. 2025 (Neural
-Computation 38(1)) for the motor prediction.
+Computation 38(1)) for the motor prediction; Le et al. 2015 (arXiv 1504.00941) for beginning at the identity.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, activate, outward
-from asm_gym.memory.inference import infer
-from asm_gym.memory.temporal import Step, TemporalNetwork
+from asm_gym.memory.energy import Array, activate, infer, outward
+from asm_gym.memory.learning import Learner, Moment, Schedule, Tick, Trajectory, coincidence, practise
+from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, unassociated
+
+LEAST, FAINT = 0.9, 0.1
+"""Smallest initial weight of a unit on its own last state (the largest is 1), and the gain from all other units."""
 
 
 class SettlingWeights(NamedTuple):
@@ -92,3 +98,108 @@ class SettlingNetwork(TemporalNetwork):
         w = self.weights
         carried = outward(activate(z), w.W_H)
         return carried + outward(u, w.W_U), outward(activate(carried + w.W_U[:, -1]), w.W_A)
+
+
+def initial_settling_weights(
+    hidden: int, sensory: int, motor: int, rng: np.random.Generator, least: float = LEAST
+) -> SettlingWeights:
+    """Return random weights of about unit gain, with W_H near the identity, and no biases.
+
+    Args:
+        hidden, sensory, motor: H, S, A.
+        rng: draws them.
+        least: smallest weight of a unit on its own last state.
+    """
+    weights = {n: np.zeros(shape, np.float32) for n, shape in settling_shapes(hidden, sensory, motor).items()}
+    for name in ("W_H", "W_U", "W_F", "W_A"):
+        W = weights[name]
+        W[:] = rng.standard_normal(W.shape) / np.sqrt(W.shape[1])
+    weights["W_H"][:] = FAINT * weights["W_H"] + np.diag(np.linspace(least, 1.0, hidden, dtype=np.float32))
+    return SettlingWeights(**weights)
+
+
+def settling_change(
+    before: Array, u: Array, h: Array, errors: tuple[Array, Array, Array], z: Array, W_A: Array
+) -> SettlingWeights:
+    """Return the change of each array: local products, averaged over the batch.
+
+    Args:
+        before, z: (B, H) the state carried so far, and the inferred one.
+        u: (B, A + 1) the action that μ used, and a constant 1.
+        h: (B, H) the state that the motor prediction used.
+        errors: Π_z ε_z (B, H), Π_x ε_x (B, S) at ``z``, and ε_a (B, A).
+        W_A: (A, H), by whose transpose ε_a comes back to h.
+    """
+    state, senses, action = errors
+    f = activate(h)
+    motor = (np.float32(1) - f * f) * (action @ W_A)  # (B, H) ε_h
+    W_U = coincidence(state, u)
+    W_U[:, -1] += motor.mean(axis=0)
+    return SettlingWeights(
+        W_H=coincidence(state + motor, activate(before)),
+        W_U=W_U,
+        W_F=coincidence(senses, activate(z)),
+        b_F=senses.mean(axis=0),
+        W_A=coincidence(action, f),
+    )
+
+
+class SettlingLearner(Learner):
+    """The settling network as it learns."""
+
+    weights: SettlingWeights
+    early = 1
+
+    def __init__(self, weights: SettlingWeights, schedule: Schedule, rng: np.random.Generator) -> None:
+        super().__init__(weights, SettlingWeights._fields, schedule, rng)
+
+    def at_rest(self, size: int) -> Array:
+        return np.zeros((size, len(self.weights.W_H)), np.float32)
+
+    def practise(
+        self, state: Array, now: Moment, own: NDArray[np.bool_], alone: NDArray[np.bool_], rate: float
+    ) -> tuple[Array, float]:
+        w, taken = self.weights, now.commands
+        if own.any():
+            action = outward(activate(outward(activate(state), w.W_H) + w.W_U[:, -1]), w.W_A)
+            taken = np.hstack([np.where(own, action, taken[:, :-1]), taken[:, -1:]])
+        mu, z, energy = self.step(state, now.commands, now.senses, rate, taken)
+        return np.where(alone, mu, z), energy
+
+    def step(
+        self, before: Array, u: Array, x: Array, rate: float, taken: Array | None = None
+    ) -> tuple[Array, Array, float]:
+        """Learn from one row; return μ_t and z_t (B, H), and F summed over the batch.
+
+        Args:
+            before: (B, H) z_{t-1}.
+            u: (B, A + 1) the action as commanded, and a constant 1.
+            x: (B, S) what is sensed.
+            rate: of the synapses.
+            taken: (B, A + 1) the action that μ uses; ``u`` where None.
+        """
+        w, how = self.weights, self.schedule
+        pi_z, pi_x = np.float32(how.prior_precision), np.float32(how.sensory_precision)
+        taken = u if taken is None else taken
+        carried = outward(activate(before), w.W_H)
+        mu, h = carried + outward(taken, w.W_U), carried + w.W_U[:, -1]
+        left, curvature = x - w.b_F, np.float32(pi_z + pi_x * self.norm)
+        z = infer(mu, left, w.W_F, pi_z, np.full_like(x, pi_x), curvature, how.iterations)
+        state, senses = z - mu, left - outward(activate(z), w.W_F)
+        action = np.ascontiguousarray(u[:, :-1]) - outward(activate(h), w.W_A)
+        energy = 0.5 * float(pi_z * np.sum(state**2) + pi_x * np.sum(senses**2) + np.sum(action**2))
+        self.learn(settling_change(before, taken, h, (pi_z * state, pi_x * senses, action), z, w.W_A), rate)
+        return mu, z, energy
+
+
+def learn_settling(
+    trajectories: Sequence[Trajectory], hidden: int, schedule: Schedule, rng: np.random.Generator, tick: Tick
+) -> Trained:
+    """Learn the synapses through time; see ``temporal.Learn``."""
+    sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
+    # A network that runs on alone must keep its state; one that reads hundreds of rows would drift if it kept all.
+    least = 1.0 if schedule.free_running_probability > 0 else LEAST
+    weights = initial_settling_weights(hidden, sensory, commands - 1, rng, least)
+    energy = practise(SettlingLearner(weights, schedule, rng), hidden, trajectories, schedule, rng, tick)
+    how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision
+    return Trained(SettlingNetwork(weights, unassociated(), *how), energy)

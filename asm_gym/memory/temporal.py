@@ -1,7 +1,7 @@
-"""What every temporal network does, by traces (``network``) or by a state that settles (``settling``).
+"""What every temporal network does, by ``traces`` or by a state that settles (``settling``).
 
 time          c_{t-1} → μ_t → z_t → c_t    c: traces, or z itself
-association   a_t → Δ̂_t, σ_t               beside it, the same for both
+association   a_t → Δ̂_t, σ_t               beside it, the same for both; they share rows and no state
 """
 
 from __future__ import annotations
@@ -121,8 +121,7 @@ class Trained(NamedTuple):
 
 
 Learn = Callable[[Sequence[Trajectory], int, Schedule, np.random.Generator, Tick], Trained]
-"""Learns the synapses through time from trajectories, H hidden units, a schedule, a generator and a callback that is
-called after each epoch. The network has no association yet."""
+"""Learns the synapses through time, of H hidden units; ticks after each epoch. The network has no association yet."""
 
 
 def unassociated() -> Association:

@@ -1,28 +1,33 @@
-"""Traces: the past of senses and actions over many time scales.
+"""The temporal network by traces: the past is carried as traces of what was sensed and done.
 
-    c^k_t = λ_k c^k_{t-1} + g_k r_t          r_t = [x_t, a_t, 1], standardised;  c_0 = 0
+    c^k_t = λ_k c^k_{t-1} + g_k r_t                  r_t = [x_t, a_t, 1], standardised;  c_0 = 0
+    μ_t = W_C c_{t-1}                                expected state; z_t is inferred from it (``energy``)
+    [x̂_t, â_t] = W_F f(z_t) + W_D [c_{t-1}, a_t, 1]  prediction from a state; â has no synapse from the action itself
+    ΔW_C ∝ Π_z ε_z c_{t-1}ᵀ    ΔW_F ∝ Π_x ε_x f(z_t)ᵀ    ΔW_D ∝ Π_x ε_x [c_{t-1}, a_t, 1]ᵀ
+    ε_z = z_t - μ_t    ε_x = [x_t, a_t] - [x̂_t, â_t]
 
-λ runs from 0, the row itself, to 0.995, which halves in 140 rows. A trace has no learned weight, so no error needs to
-travel back through time. g gives all traces the same mean square.
+λ runs from 0, the row itself, to 0.995, which halves in 140 rows; g gives all traces the same mean square. A trace has
+no learned weight, so no error travels back through time. For Π_z large against Π_x, ε_z is the error that
+backpropagation would send to the state (Whittington and Bogacz 2017).
 
-Sources: de Vries and Principe 1992 (Neural Networks 5(4)) for leaky integrators as a memory; Shankar and Howard 2012
-(Neural Computation 24(1)) for a spectrum of them as a timeline of the past.
+Sources: de Vries and Principe 1992 (Neural Networks 5(4)) and Shankar and Howard 2012 (Neural Computation 24(1)) for
+the traces; Millidge et al. 2024 (PLOS Comput Biol) for inference and learning.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, kernel
+from asm_gym.memory.energy import Array, Scalar, activate, infer, kernel, outward
+from asm_gym.memory.learning import Learner, Moment, Schedule, Tick, Trajectory, coincidence, practise
+from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, unassociated
 
-DECAYS = np.array([0.0, 0.5, 0.75, 0.875, 0.9375, 0.97, 0.985, 0.995], np.float32)
-"""λ (K,)."""
-
-FAINTEST = 1e-3
-"""Smallest root mean square of a trace that is scaled."""
+DECAYS = np.array([0.0, 0.5, 0.75, 0.875, 0.9375, 0.97, 0.985, 0.995], np.float32)  # λ (K,)
+FAINTEST = 1e-3  # smallest root mean square of a trace that is scaled
 
 
 @kernel
@@ -55,3 +60,237 @@ def fit_gains(episodes: Sequence[Array]) -> NDArray[np.float32]:
     count = width * sum(len(episode) for episode in episodes)
     gains: NDArray[np.float32] = (plain / np.maximum(np.sqrt(squares / count), FAINTEST)).astype(np.float32)
     return gains
+
+
+class Weights(NamedTuple):
+    """The synapses of H hidden units, S senses, A motor and I = K (S + A + 1) traces; all float32."""
+
+    W_C: Array  # (H, I) from the traces to the state
+    W_F: Array  # (S + A, H) from the state to senses and action
+    W_D: Array  # (S + A, I + A + 1) from the traces, the action and a constant 1 to senses and action
+    gains: Array  # (K,) of the traces; not learned
+
+
+def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
+    """Return the shape of each array of ``Weights`` by name."""
+    H, N, traces = hidden, sensory + motor, len(DECAYS) * (sensory + motor + 1)
+    return {"W_C": (H, traces), "W_F": (N, H), "W_D": (N, traces + motor + 1), "gains": (len(DECAYS),)}
+
+
+def direct_synapses(sensory: int, motor: int) -> Array:
+    """Return the mask (S + A, I + A + 1) of W_D: 0 from an action to its own prediction, else 1."""
+    exists = np.ones(weight_shapes(1, sensory, motor)["W_D"], np.float32)
+    exists[sensory:, exists.shape[1] - motor - 1 : -1] = 0.0
+    return exists
+
+
+@kernel
+def expect(c: Array, W_C: Array) -> Array:
+    """Return μ_t (B, H) from the traces ``c`` (B, I)."""
+    return outward(c, W_C)
+
+
+def direct(c: Array, u: Array, W_D: Array) -> Array:
+    """Return the prediction (B, S + A) past the state, from traces ``c`` (B, I) and action and 1 ``u`` (B, A + 1)."""
+    found: Array = outward(np.hstack([c, u]), W_D)
+    return found
+
+
+@kernel
+def sense(z: Array, W_F: Array) -> Array:
+    """Return what the state ``z`` (B, H) adds to it (B, S + A)."""
+    return outward(activate(z), W_F)
+
+
+@kernel
+def carry(
+    c: Array,
+    u: Array,
+    x: Array,
+    seen: Array,
+    W_C: Array,
+    W_F: Array,
+    W_D: Array,
+    gains: Array,
+    pi_z: Scalar,
+    pi_x: Scalar,
+    curvature: Scalar,
+    iterations: int,
+    context: bool,
+) -> tuple[Array, Array]:
+    """Return f(μ_t) (B, H) and c_t (B, I); the state is inferred only where a sense is missing.
+
+    Args:
+        c, u, x, seen: (B, I), (B, A + 1), (B, S), (B, S) as in ``Network.follow``.
+        context: whether f(μ_t) is wanted; if not, and all senses are seen, it is 0.
+    """
+    B, S = x.shape
+    rows = np.hstack((x, u))
+    whole = seen.all()
+    if whole and not context:
+        return np.zeros((B, W_C.shape[0]), c.dtype), advance(c, rows, gains)
+    mu = expect(c, W_C)
+    if not whole:
+        past = outward(np.hstack((c, u)), W_D)  # (B, S + A)
+        left, precision = rows[:, :-1] - past, np.full((B, past.shape[1]), pi_x, c.dtype)
+        precision[:, :S] *= seen
+        found = sense(infer(mu, left, W_F, pi_z, precision, curvature, iterations), W_F)
+        for n in range(B):
+            for i in range(S):
+                if seen[n, i] == 0:
+                    rows[n, i] = past[n, i] + found[n, i]
+    return activate(mu), advance(c, rows, gains)
+
+
+class Network(TemporalNetwork):
+    """The temporal network by traces; arguments as in ``TemporalNetwork``."""
+
+    weights: Weights
+
+    @property
+    def hidden_size(self) -> int:
+        return self.weights.W_C.shape[0]
+
+    @property
+    def motor(self) -> int:
+        return self.weights.W_D.shape[1] - self.weights.W_C.shape[1] - 1
+
+    def at_rest(self, batch: int) -> NDArray[np.float32]:
+        return at_rest(batch, self.weights.W_F.shape[0] + 1)
+
+    def predict(self, c: Array, u: Array) -> Array:
+        found: Array = direct(c, u, self.weights.W_D) + sense(expect(c, self.weights.W_C), self.weights.W_F)
+        return found
+
+    def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
+        w = self.weights
+        mu, past = expect(c, w.W_C), direct(c, u, w.W_D)
+        precision = self.sensory_precision * np.hstack([seen, np.ones_like(u[:, :-1])])
+        left = np.hstack([x, u[:, :-1]]) - past
+        z = infer(mu, left, w.W_F, self.prior_precision, precision, self.curvature, self.iterations)
+        whole = np.where(seen > 0, x, (past + sense(z, w.W_F))[:, : x.shape[1]])
+        return Step(mu, past + sense(mu, w.W_F), z, advance(c, np.hstack([whole, u]), w.gains))
+
+    def carry_on(self, c: Array, u: Array, x: Array, seen: Array) -> tuple[Array, Array]:
+        expected, traces = carry(c, u, x, seen, *self.weights, *self.inference, True)
+        return expected, traces
+
+    def run_on(self, c: Array) -> Step:
+        w = self.weights
+        S, A = w.W_F.shape[0] - self.motor, self.motor
+        mu = expect(c, w.W_C)
+        state = sense(mu, w.W_F)
+        u = np.zeros((len(c), A + 1), np.float32)
+        u[:, -1] = 1.0
+        u[:, :A] = (direct(c, u, w.W_D) + state)[:, S:]  # no synapse leads from an action to itself
+        expected = direct(c, u, w.W_D) + state
+        return Step(mu, expected, mu, advance(c, np.hstack([expected[:, :S], u]), w.gains))
+
+
+class HebbianChange(NamedTuple):
+    """The change of each weight array: local products, averaged over a batch."""
+
+    W_C: Array
+    W_F: Array
+    W_D: Array
+
+
+def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> Weights:
+    """Return random weights of about unit gain into the state and of gain 0.1 out of it, and no direct ones."""
+    weights = {n: np.zeros(shape, np.float32) for n, shape in weight_shapes(hidden, sensory, motor).items()}
+    for name, gain in (("W_C", 1.0), ("W_F", 0.1)):
+        W = weights[name]
+        W[:] = gain * rng.standard_normal(W.shape) / np.sqrt(W.shape[1])
+    weights["gains"][:] = np.float32(1) - DECAYS
+    return Weights(**weights)
+
+
+def hebbian_change(
+    c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: float, exists: Array | None = None
+) -> HebbianChange:
+    """Apply the local learning rules.
+
+    Args:
+        c: (B, I) the traces before.
+        u: (B, A + 1) the action, and a constant 1.
+        mu, z: (B, H) the expected state, and the inferred one.
+        error: (B, S + A) Π_x ε_x at ``z``.
+        pi_z: Π_z.
+        exists: ``direct_synapses`` of W_D, computed where None.
+    """
+    motor = u.shape[1] - 1
+    exists = direct_synapses(error.shape[1] - motor, motor) if exists is None else exists
+    return HebbianChange(
+        W_C=coincidence(np.float32(pi_z) * (z - mu), c),
+        W_F=coincidence(error, activate(z)),
+        W_D=coincidence(error, np.hstack([c, u])) * exists,
+    )
+
+
+class TracesLearner(Learner):
+    """The network by traces as it learns."""
+
+    weights: Weights
+    early = 0
+
+    def __init__(self, weights: Weights, schedule: Schedule, rng: np.random.Generator) -> None:
+        super().__init__(weights, HebbianChange._fields, schedule, rng)
+        motor = weights.W_D.shape[1] - weights.W_C.shape[1] - 1
+        self._direct = direct_synapses(len(weights.W_D) - motor, motor)
+
+    def at_rest(self, size: int) -> Array:
+        return at_rest(size, len(self.weights.W_F) + 1)
+
+    def practise(
+        self, state: Array, now: Moment, own: NDArray[np.bool_], alone: NDArray[np.bool_], rate: float
+    ) -> tuple[Array, float]:
+        taken, S = now.commands, now.senses.shape[1]
+        if own.any():
+            w = self.weights
+            action = (direct(state, taken, w.W_D) + sense(expect(state, w.W_C), w.W_F))[:, S:]
+            taken = np.hstack([np.where(own, action, taken[:, :-1]), taken[:, -1:]])
+        expected, energy = self.step(state, now.commands, now.senses, rate, taken)
+        senses = np.where(alone, expected[:, :S], now.senses)
+        return advance(state, np.hstack([senses, taken]), self.weights.gains), energy
+
+    def step(self, c: Array, u: Array, x: Array, rate: float, taken: Array | None = None) -> tuple[Array, float]:
+        """Learn from one row; return [x̂_t, â_t] (B, S + A) as expected before it, and the energy of the batch.
+
+        Args:
+            c: (B, I) the traces before.
+            u: (B, A + 1) the action as commanded, and a constant 1.
+            x: (B, S) what is sensed.
+            rate: of the synapses.
+            taken: (B, A + 1) the action that the prediction of the senses uses; ``u`` where None.
+        """
+        w, pi_z, pi_x = self.weights, self.schedule.prior_precision, self.schedule.sensory_precision
+        taken = u if taken is None else taken
+        past = direct(c, taken, w.W_D)
+        left = np.hstack([x, u[:, :-1]]) - past  # (B, S + A)
+        precision = np.full_like(left, pi_x)
+        mu = expect(c, w.W_C)
+        z = infer(mu, left, w.W_F, pi_z, precision, pi_z + pi_x * self.norm, self.schedule.iterations)
+        error = np.float32(pi_x) * (left - sense(z, w.W_F))
+        change = hebbian_change(c, taken, mu, z, error, pi_z, self._direct)
+        energy = 0.5 * (pi_z * float(np.sum((z - mu) ** 2)) + float(np.sum(error**2)) / pi_x)
+        expected = past + sense(mu, w.W_F)
+        self.learn(change, rate)
+        return expected, energy
+
+
+def learn_traces(
+    trajectories: Sequence[Trajectory],
+    hidden: int,
+    schedule: Schedule,
+    rng: np.random.Generator,
+    tick: Tick,
+    gain: float = 1.0,
+) -> Trained:
+    """Learn the synapses through time; see ``temporal.Learn``. ``gain`` scales the initial weights onto the state."""
+    sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
+    weights = initial_weights(hidden, sensory, commands - 1, rng)
+    weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in trajectories])
+    weights.W_C[:] *= np.float32(gain)
+    energy = practise(TracesLearner(weights, schedule, rng), hidden, trajectories, schedule, rng, tick)
+    how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision
+    return Trained(Network(weights, unassociated(), *how), energy)

@@ -16,7 +16,7 @@ from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.adaptation import followed, specialise
 from asm_gym.memory.association import Association, association_shapes, existing
-from asm_gym.memory.association_learning import FEEDBACK, LEARNED
+from asm_gym.memory.association_learning import LEARNED
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
 from asm_gym.memory.free_energy import FreeEnergy
@@ -95,7 +95,7 @@ class MemoryModel(StreamModel):
         # Nothing came before the first ``lag`` rows, so that no change in them is known.
         trajectories = [Trajectory(r.senses[::lag], r.commands[::lag], r.inputs[lag:]) for r in readings]
         layout = senses.groups, senses.changes, self.hidden_size, self._units_each(senses)
-        how = FEEDBACK[self.feedback](), self.dynamics
+        how = self.feedback, self.dynamics
         trained = train(trajectories, *layout, self.schedule, rng, progress, *how)
         learned = {**senses.arrays, "energy": trained.energy}
         network, completion = trained.network, Completion.fit(senses, streams)

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from asm_gym.episode import Episode
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule, Trajectory
-from asm_gym.memory.network_learning import learn_traces
 from asm_gym.memory.recall import Recalled, follow, run_on, to_rows
 from asm_gym.memory.temporal import TemporalNetwork
+from asm_gym.memory.traces import learn_traces
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import recurrent
 

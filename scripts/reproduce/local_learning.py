@@ -27,12 +27,22 @@ from torch import Tensor
 
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
-from asm_gym.memory.energy import STEEPEST
-from asm_gym.memory.inference import STRIDE, Weights, direct, direct_synapses, expect, infer, sense
-from asm_gym.memory.learning import Schedule, Trajectory, cosine_decay
-from asm_gym.memory.network_learning import TracesLearner, hebbian_change, initial_weights
-from asm_gym.memory.practice import Practice, one_after_another
-from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
+from asm_gym.memory.energy import STEEPEST, STRIDE, infer
+from asm_gym.memory.learning import Practice, Schedule, Trajectory, cosine_decay, one_after_another
+from asm_gym.memory.traces import (
+    DECAYS,
+    TracesLearner,
+    Weights,
+    advance,
+    at_rest,
+    direct,
+    direct_synapses,
+    expect,
+    fit_gains,
+    hebbian_change,
+    initial_weights,
+    sense,
+)
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit

@@ -25,7 +25,7 @@ import numpy as np
 from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import DYNAMICS
-from asm_gym.memory.inference import iterations_within
+from asm_gym.memory.energy import iterations_within
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import ExpressionMemory, Rows
