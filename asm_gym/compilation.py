@@ -1,7 +1,7 @@
-"""Compiled functions, cached on disk for the whole folder they belong to.
+"""Compile functions, cached on disk for the whole folder they belong to.
 
-The cache lies beside the code, or else in the user's cache, or else, where neither can be written to (an install of
-another user, no HOME), in a folder of this user's under the temporary one. ``NUMBA_CACHE_DIR`` names another.
+The cache lies beside the code, else in the user's cache, else in a folder of this user's under the temporary one.
+``NUMBA_CACHE_DIR`` names another.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), nogil: bool = False) -> F:
-    """Compiles ``function``, once a machine.
+    """Compile ``function``, once a machine.
 
     Args:
-        fastmath: lets loops use vector registers; inputs must then be finite. The order of sums is then the compiler's,
-            so what is called is compiled into its caller: of two copies that differ in it, the linker takes the first.
-        calls: folders of the package, beside its own, that hold functions which it calls; ``"."`` for the package's.
-        nogil: other threads run Python meanwhile; worth it for what takes long.
+        function: to be compiled.
+        fastmath: let loops use vector registers; inputs must then be finite. Callees are compiled into their callers,
+            as the linker would take one of two copies that differ in the order of sums.
+        calls: other folders of the package that hold functions which it calls; ``"."`` for the package's own.
+        nogil: let other threads run Python meanwhile.
     """
     how: dict[str, Any] = {"nogil": nogil, "fastmath": fastmath, "forceinline": fastmath, "error_model": "numpy"}
     try:
@@ -47,7 +48,7 @@ def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), n
 
 
 def _index_of(load: Callable[[], dict[Any, str]]) -> dict[Any, str]:
-    """What is kept; nothing where that speaks of types that are gone, which fails before numba compares stamps."""
+    """Load the index; empty where it names types that are gone, which fails before numba compares stamps."""
     try:
         return load()
     except (AttributeError, ImportError):
@@ -55,7 +56,7 @@ def _index_of(load: Callable[[], dict[Any, str]]) -> dict[Any, str]:
 
 
 def must_compile(function: Any) -> bool:
-    """Whether the next call of a compiled function will take seconds, as far as can be told."""
+    """Return whether the next call of a compiled function will take seconds, as far as is known."""
     cache = _cache_of(function)
     if cache is None or function.signatures:
         return False
@@ -64,17 +65,14 @@ def must_compile(function: Any) -> bool:
 
 
 def kept_in(function: Any) -> Path | None:
-    """The folder that holds the compiled code of a function; None where nothing keeps it."""
+    """Return the folder that holds the compiled code of a function; None where nothing keeps it."""
     cache = _cache_of(function)
     return None if cache is None else Path(cache._cache_path)
 
 
 @lru_cache
 def private_folder() -> Path | None:
-    """A folder for compiled code that only this user can write to; None where there is none.
-
-    Compiled code is run as it is found: a folder of that name that another user may have filled is not used.
-    """
+    """Return a folder for compiled code that only this user can write to, as the code is run; None without one."""
     user = os.getuid() if hasattr(os, "getuid") else 0
     path = Path(tempfile.gettempdir()) / f"asm-gym-{user}"
     try:
@@ -88,7 +86,7 @@ def private_folder() -> Path | None:
 
 @contextmanager
 def _cached_in(folder: Path | None) -> Iterator[bool]:
-    """While the block runs numba caches what it decorates there; whether there is such a folder."""
+    """Let numba cache in a folder what the block decorates; yield whether there is one."""
     config: Any = numba.config
     before = config.CACHE_DIR
     config.CACHE_DIR = before if folder is None else str(folder)
@@ -99,22 +97,18 @@ def _cached_in(folder: Path | None) -> Iterator[bool]:
 
 
 def _cache_of(dispatcher: Any) -> Any:
-    """numba's own index of a function's compiled code; None with a numba that keeps it elsewhere, or compiles none."""
+    """Return numba's index of a function's compiled code; None where numba keeps none or elsewhere."""
     return getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
 
 
 @lru_cache
 def _digest(folder: Path) -> str:
-    """Of every source file in a folder, and of what its code is compiled by and linked to."""
-    digest = hashlib.sha256(f"{numba.__version__} {_installed('mujoco')}".encode())
+    """Return the digest of every source file in a folder, and of what compiles and links its code."""
+    try:
+        mujoco = version("mujoco")
+    except PackageNotFoundError:  # in a light install
+        mujoco = "none"
+    digest = hashlib.sha256(f"{numba.__version__} {mujoco}".encode())
     for path in sorted(folder.glob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
-
-
-def _installed(package: str) -> str:
-    """The version of a package, which a light install may be without."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "none"

@@ -19,11 +19,7 @@ from asm_gym.validation import as_float32, typed
 KIND = "episode"
 
 ARRAYS = {"stream": "f", "actions": "f", "observations": "fiub", "rewards": "f", "faults": "b", "contact_force": "f"}
-"""What a file holds, and the kinds of numbers that each may have."""
-
-
-def _empty() -> NDArray[np.float32]:
-    return np.zeros((0, 0), np.float32)
+"""Arrays of a file, and the kinds of numbers that each may have."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +29,10 @@ class EpisodeLabel:
     Args:
         task: a task's name.
         role: ``"fit"``, ``"calibration"``, ``"nominal"``, ``"faulty"`` or ``"harmless"``.
-        kind: of the fault or the harmless variation; empty for the others.
-        severity: of the fault; empty for the others.
+        kind, severity: of the fault or harmless variation; empty without one.
         seed: of the environment and of the policy. Episodes that share it are twins.
         onset: the first step with the fault or variation; None without one.
-        affected_channels: in which the fault shows first. Measured while recording, so two labels that differ in
-            nothing else are equal.
+        affected_channels: in which the fault shows first; measured while recording, and not compared.
     """
 
     task: str
@@ -51,7 +45,7 @@ class EpisodeLabel:
 
     @property
     def path(self) -> Path:
-        """The episode's file in a run's folder."""
+        """File of the episode in a run's folder."""
         parts = [part for part in (self.kind, self.severity) if part]
         return Path("episodes") / self.task / self.role / "-".join([*parts, f"{self.seed}.npz"])
 
@@ -61,17 +55,16 @@ class Episode:
     """One episode of T control steps.
 
     Args:
-        stream: (T, D) float32, the sensorimotor stream; row t was sensed after action t. (k T, D) where the stream runs
-            k times faster than control.
+        stream: (T, D) float32; row t was sensed after action t. (k T, D) at k times the control rate.
         spec: names the D numbers.
         success: the task was solved at some step.
-        seed: what ``reset`` was given.
+        seed: of ``reset``.
         actions: (T, A) float32, as the policy commanded them.
         observations: (T + 1, O) float32, the first one from ``reset``.
         rewards: (T,) float32.
-        faults: (T,) bool, a fault was active in that row of the stream (the ground truth).
+        faults: (T,) bool, a fault was active in that row of the stream.
         contact_force: (T,) float32, between the robot and everything else [N].
-        label: the task and role that it was recorded for; None where they are unknown.
+        label: task and role that it was recorded for; None where unknown.
         info: anything else; JSON-serialisable.
 
     Example:
@@ -87,8 +80,8 @@ class Episode:
     spec: StreamSpec
     success: bool = False
     seed: int | None = None
-    actions: NDArray[np.float32] = field(default_factory=_empty)
-    observations: NDArray[np.float32] = field(default_factory=_empty)
+    actions: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    observations: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     rewards: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     faults: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
     contact_force: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
@@ -104,7 +97,7 @@ class Episode:
         return len(self.stream)
 
     def __repr__(self) -> str:
-        """Length, source and end in a line."""
+        """Return length, source and outcome in a line."""
         seconds, seed = len(self) * self.spec.dt, "" if self.seed is None else f", seed {self.seed}"
         faults = f", {int(self.faults.sum())} rows with a fault" if self.faults.any() else ""
         ended = "success" if self.success else "no success"
@@ -121,7 +114,7 @@ class Episode:
     @classmethod
     @typed
     def from_stream(cls, x: NDArray[np.floating[Any]], spec: StreamSpec, **fields: Any) -> Episode:
-        """Make an episode from a stream ``x`` (T, D) that was recorded elsewhere, such as on a real robot."""
+        """Make an episode from a recorded stream ``x`` (T, D)."""
         return cls(np.ascontiguousarray(as_float32(x, "a stream")), spec, **fields)
 
     @classmethod
@@ -139,16 +132,16 @@ class Episode:
 
         Args:
             frame: a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
-            channels: the columns to read, as patterns such as ``joint*``; or patterns by channel; or the spec of a
-                memory that is to read them. By default all columns of numbers.
+            channels: the columns to read, as patterns such as ``joint*``; or patterns by channel; or a spec. By
+                default all columns of numbers.
             rate: rows a second [Hz]; by default that of its clock.
-            action: patterns of the columns that were commanded and not sensed.
-            labels: patterns of the columns that say what is wrong, beside those that are called so.
+            action: patterns of the commanded columns.
+            labels: patterns of further columns that label faults.
             fields: other arguments of ``Episode``.
 
         Raises:
-            ValueError: columns are missing, doubled, of several lengths or no numbers; the rate is unknown, or another
-                one than the spec's; time runs backwards.
+            ValueError: columns are missing, doubled, of several lengths or no numbers; the rate is unknown or differs
+                from the spec's; time runs backwards.
         """
         found = read_recorded(frame, channels, rate, action, labels)
         return cls(found.stream, found.spec, **{"faults": found.faults} | fields)
@@ -193,15 +186,15 @@ def save_episode(path: str | Path, episode: Episode) -> Path:
 
 @typed
 def load_episode(path: str | Path) -> Episode:
-    """Return what ``save_episode`` wrote.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or something else.
-    """
+    """Read what ``save_episode`` wrote. Raises FileNotFoundError, or ValueError where the file is damaged."""
     regular_file(path)
     try:
-        kept = _fields(Path(path))
+        saved = read_checkpoint(Path(path), KIND)
+        header, label = saved.header, saved.header["label"]
+        if label is not None:
+            label = EpisodeLabel(**{**label, "affected_channels": frozenset(label["affected_channels"])})
+        kept: dict[str, Any] = {**saved.arrays, "label": label, "spec": StreamSpec.from_json(header["spec"])}
+        kept |= {name: header[name] for name in ("success", "seed", "info")}
         for name, kinds in ARRAYS.items():
             if name in kept and kept[name].dtype.kind not in kinds:
                 raise ValueError(f"{name} cannot be of {kept[name].dtype}")
@@ -212,17 +205,6 @@ def load_episode(path: str | Path) -> Episode:
         raise
     except (*DAMAGE, TypeError) as error:
         raise ValueError(f"{path} is damaged or no episode that can be read: {error}") from error
-
-
-def _fields(path: Path) -> dict[str, Any]:
-    """The arguments of ``Episode`` in a file."""
-    saved = read_checkpoint(path, KIND)
-    header = saved.header
-    label = header["label"]
-    if label is not None:
-        label = EpisodeLabel(**{**label, "affected_channels": frozenset(label["affected_channels"])})
-    about = {name: header[name] for name in ("success", "seed", "info")}
-    return {**saved.arrays, **about, "label": label, "spec": StreamSpec.from_json(header["spec"])}
 
 
 def spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:

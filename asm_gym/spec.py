@@ -1,7 +1,6 @@
-"""The sensorimotor stream: what the robot senses, and what it was told to do, one row per control step.
+"""The sensorimotor stream, one row per control step: ``x_t = [sensed_t, commanded_t]``.
 
-A row is ``x_t = [sensed_t, commanded_t]``: the sensors as read after the control step, and the action that was
-commanded during it (the efference copy). A :class:`StreamSpec` names every number in the row.
+The sensors are read after the control step in which the action was commanded (the efference copy).
 """
 
 from __future__ import annotations
@@ -29,15 +28,14 @@ class Channel:
 
     Args:
         name: for example ``joint_position``.
-        size: how many numbers it has.
+        size: number of its numbers.
         unit: SI unit, ``"1"`` where there is none.
         noise: standard deviation of the sensor noise [unit].
-        group: what the channel can be selected by, for example ``joint`` or ``wrench``. The group ``action`` is the
-            efference copy: it is given to the memory, not predicted from the senses.
+        group: for example ``joint`` or ``wrench``. The group ``action`` is the efference copy: it is given to the
+            memory, not predicted from the senses.
         elements: a name for each number; ``0, 1, …`` where empty.
-        resolution: the step between two readings that the sensor tells apart [unit]; 0 where it is not known, or where
-            the numbers are computed from several sensors.
-        stops: (least, most) of each number, where a joint comes to its stops [unit]; empty where nobody knows.
+        resolution: smallest difference of two readings [unit]; 0 where unknown or computed from several sensors.
+        stops: (least, most) of each joint [unit]; empty where unknown.
 
     Example:
         >>> from asm_gym import Channel
@@ -74,27 +72,25 @@ class Channel:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A name for every number, such as ``joint_position[3]``; the bare name where there is one number."""
+        """Name of each number, such as ``joint_position[3]``; the bare name where there is one number."""
         if self.size == 1 and not self.elements:
             return (self.name,)
         return tuple(f"{self.name}[{e}]" for e in (self.elements or range(self.size)))
 
 
 def _is_pair(stops: Any) -> bool:
-    """Whether these are the least and the most of a number; a joint may have no stop to one side."""
     numbers = isinstance(stops, tuple) and len(stops) == 2 and all(isinstance(x, Real) for x in stops)
     return numbers and bool(stops[0] < stops[1])
 
 
 @dataclass(frozen=True)
 class StreamSpec:
-    """The layout of a stream row, and the rate it comes at.
+    """The layout of a stream row, and the rate of rows.
 
     Args:
-        channels: in the order they stand in a row.
+        channels: in their order in a row.
         dt: control period [s].
-        source: what made the stream, for example ``Panda``. A name for people: two specs with the same channels and
-            rate are compatible whatever their source.
+        source: name of the robot, for example ``Panda``; not compared between specs.
 
     Example:
         >>> from asm_gym import Channel, StreamSpec
@@ -118,7 +114,7 @@ class StreamSpec:
         check_number("dt", self.dt, above=0.0)
 
     def __repr__(self) -> str:
-        """Its channels with how many numbers each has, and their units."""
+        """Return source, rate, and size and unit of each channel."""
         channels = ", ".join(f"{c.name} ({c.size}) [{c.unit}]" for c in self.channels)
         return f"<StreamSpec of {self.source or 'a stream'} at {1 / self.dt:g} Hz: {channels}>"
 
@@ -139,7 +135,7 @@ class StreamSpec:
 
     @cached_property
     def slices(self) -> dict[str, slice]:
-        """Where each channel stands in a row."""
+        """Columns of each channel in a row."""
         ends = np.cumsum([c.size for c in self.channels])
         return {c.name: slice(int(e) - c.size, int(e)) for c, e in zip(self.channels, ends, strict=True)}
 
@@ -150,7 +146,7 @@ class StreamSpec:
 
     @cached_property
     def resolution(self) -> NDArray[np.float64]:
-        """(D,) the step between two readings that a sensor tells apart [unit of each channel]; 0 where unknown."""
+        """(D,) smallest difference of two readings [unit of each channel]; 0 where unknown."""
         return np.concatenate([np.full(c.size, c.resolution) for c in self.channels])
 
     @cached_property
@@ -170,7 +166,7 @@ class StreamSpec:
         )
 
     def check_row(self, stream: NDArray[np.floating[Any]]) -> None:
-        """Raises ValueError unless the last axis of ``stream`` is D long."""
+        """Raise ValueError unless the last axis of ``stream`` is D long."""
         if stream.ndim < 1 or stream.shape[-1] != self.size:
             raise ValueError(
                 f"a stream of this spec has {self.size} numbers a step ({', '.join(c.name for c in self.channels)}), "
@@ -178,16 +174,13 @@ class StreamSpec:
             )
 
     def difference(self, other: StreamSpec) -> list[str]:
-        """What keeps a memory of this spec from reading streams of ``other``, a line each; empty where nothing does."""
+        """Return what keeps a memory of this spec from reading streams of ``other``, a line each."""
         mine, theirs = ({c.name: c for c in s.channels} for s in (self, other))
         lines = [f"{n}: missing" for n in mine if n not in theirs] + [f"{n}: new" for n in theirs if n not in mine]
-        for name in mine:
-            if name in theirs and mine[name].size != theirs[name].size:
-                lines.append(f"{name}: size {mine[name].size} against {theirs[name].size}")
-            elif name in theirs and mine[name].unit != theirs[name].unit:
-                lines.append(f"{name}: unit {mine[name].unit} against {theirs[name].unit}")
-            elif name in theirs and mine[name].group != theirs[name].group:
-                lines.append(f"{name}: group {mine[name].group} against {theirs[name].group}")
+        for name in (n for n in mine if n in theirs):
+            a, b = mine[name], theirs[name]
+            pairs = ("size", a.size, b.size), ("unit", a.unit, b.unit), ("group", a.group, b.group)
+            lines += [f"{name}: {what} {x} against {y}" for what, x, y in pairs if x != y][:1]
         if not lines and list(mine) != list(theirs):
             lines.append(f"order: {', '.join(mine)} against {', '.join(theirs)}")
         if abs(self.dt - other.dt) > 1e-9:
@@ -195,7 +188,7 @@ class StreamSpec:
         return lines
 
     def require(self, other: StreamSpec, whose: str) -> None:
-        """Raises ValueError naming the channels that differ, unless ``other`` can be read with this spec."""
+        """Raise ValueError naming the channels that differ, unless ``other`` can be read with this spec."""
         lines = self.difference(other)
         if lines:
             raise ValueError(f"{whose} does not fit this stream:\n  " + "\n  ".join(lines))
@@ -206,7 +199,7 @@ class StreamSpec:
     @classmethod
     @typed
     def from_json(cls, text: str) -> StreamSpec:
-        """What ``to_json`` wrote. Raises ValueError where it is something else."""
+        """Read what ``to_json`` wrote. Raises ValueError where it is something else."""
         try:
             raw = json.loads(text)
             channels = tuple(
@@ -220,10 +213,9 @@ class StreamSpec:
     @classmethod
     @typed
     def from_spaces(cls, observation: spaces.Space[Any], action: spaces.Space[Any], dt: float = 1.0) -> StreamSpec:
-        """The spec of an environment that has no stream of its own: its observation, then the action.
+        """Return the spec of an environment that has no stream of its own: its observation, then the action.
 
-        A dict observation has a channel for each key, ``outer.inner`` where one lies in the other. What is discrete is
-        a 0 or 1 for each of its values.
+        A dict observation has a channel for each key, ``outer.inner`` where nested; discrete values are one-hot.
 
         Raises:
             TypeError: either space cannot be read as a row of numbers.
@@ -231,11 +223,12 @@ class StreamSpec:
         for name, space in (("observation", observation), ("action", action)):
             if not space.is_np_flattenable:
                 raise TypeError(f"the {name} space must be numbers to be read as a stream, got {space}")
-        return cls((*_channels("observation", observation), _motor(action)), dt, "spaces")
+        motor = Channel("action", spaces.flatdim(action), group=MOTOR)
+        return cls((*_channels("observation", observation), motor), dt, "spaces")
 
 
 def _channels(name: str, space: spaces.Space[Any]) -> list[Channel]:
-    """A channel for each key of a dict, in the order in which Gymnasium flattens it; one of anything else."""
+    """Return a channel for each key of a dict, in Gymnasium's order of flattening; one of anything else."""
     if not isinstance(space, spaces.Dict):
         size = spaces.flatdim(space)
         return [Channel(name, size)] if size else []
@@ -243,17 +236,13 @@ def _channels(name: str, space: spaces.Space[Any]) -> list[Channel]:
     return [channel for key, part in space.items() for channel in _channels(f"{prefix}{key}", part)]
 
 
-def _motor(space: spaces.Space[Any]) -> Channel:
-    return Channel("action", spaces.flatdim(space), group=MOTOR)
-
-
 def flat(space: spaces.Space[Any], value: Any) -> NDArray[Any]:
-    """(n,) an observation or action as ``StreamSpec.from_spaces`` lays it out."""
+    """Return an observation or action (n,) as ``StreamSpec.from_spaces`` lays it out."""
     return np.ravel(value) if isinstance(space, spaces.Box) else np.asarray(spaces.flatten(space, value))
 
 
 def flat_rows(space: spaces.Space[Any], values: Any, rows: int) -> NDArray[np.float32]:
-    """(rows, n) of so many observations or actions, which dicts hold by key."""
+    """Return (rows, n) of so many observations or actions, which dicts hold by key."""
     if isinstance(space, spaces.Dict):
         return np.hstack([flat_rows(part, values[key], rows) for key, part in space.items()])
     if isinstance(space, spaces.Box):
@@ -262,7 +251,7 @@ def flat_rows(space: spaces.Space[Any], values: Any, rows: int) -> NDArray[np.fl
 
 
 def control_period(env: gym.Env[Any, Any]) -> float:
-    """Of any environment [s]; 1 where it does not say."""
+    """Return the control period of any environment [s]; 1 where it has none."""
     dt = getattr(env.unwrapped, "dt", None)
     if isinstance(dt, int | float) and dt > 0:
         return float(dt)

@@ -20,13 +20,13 @@ ROBOTS = ("Panda", "Sawyer", "UR5e", "Kinova3", "IIWA", "Jaco")
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """What is special about one task.
+    """One task.
 
     Args:
         name: robosuite's name; the Gymnasium id is ``asm_gym/<name>-v0``.
         horizon: control steps before an episode is truncated, at the default 20 Hz.
-        success: what ``info["success"]`` means.
-        arms: how many robots it takes.
+        success: meaning of ``info["success"]``.
+        arms: number of robots.
         draws_shapes: robosuite draws the shapes of its objects when it loads the model; see ``asm_gym.envs.shapes``.
     """
 
@@ -53,51 +53,32 @@ TASKS = {
         TaskSpec("Wipe", 400, "every marker on the table is wiped off"),
         TaskSpec("ToolHang", 700, "the frame stands in its base and the tool hangs on it"),
         TaskSpec("NutAssembly", 700, "both nuts are around their pegs, and the hand has let go of them"),
-        TaskSpec("NutAssemblySingle", 350, _ON_PEG),
-        TaskSpec("NutAssemblySquare", 350, _ON_PEG),
-        TaskSpec("NutAssemblyRound", 350, _ON_PEG),
+        *(TaskSpec(f"NutAssembly{kind}", 350, _ON_PEG) for kind in ("Single", "Square", "Round")),
         TaskSpec("PickPlace", 1000, "all four objects are in their bins, and the hand has left them"),
-        TaskSpec("PickPlaceSingle", 300, _IN_BIN),
-        TaskSpec("PickPlaceCan", 300, _IN_BIN),
-        TaskSpec("PickPlaceMilk", 300, _IN_BIN),
-        TaskSpec("PickPlaceBread", 300, _IN_BIN),
-        TaskSpec("PickPlaceCereal", 300, _IN_BIN),
-        TaskSpec("TwoArmLift", 200, "the pot is more than 10 cm above the table", arms=2),
-        TaskSpec("TwoArmPegInHole", 300, "the peg is in the hole and aligned with it", arms=2, draws_shapes=True),
-        TaskSpec(
-            "TwoArmHandover",
-            400,
-            "the second arm alone holds the hammer by its handle, off the table",
-            arms=2,
-            draws_shapes=True,
-        ),
-        TaskSpec(
-            "TwoArmTransport",
-            700,
-            "the payload is in the target bin and the trash in the trash bin",
-            arms=2,
-            draws_shapes=True,
-        ),
+        *(TaskSpec(f"PickPlace{kind}", 300, _IN_BIN) for kind in ("Single", "Can", "Milk", "Bread", "Cereal")),
+        TaskSpec("TwoArmLift", 200, "the pot is more than 10 cm above the table", 2),
+        TaskSpec("TwoArmPegInHole", 300, "the peg is in the hole and aligned with it", 2, True),
+        TaskSpec("TwoArmHandover", 400, "the second arm alone holds the hammer by its handle, off the table", 2, True),
+        TaskSpec("TwoArmTransport", 700, "the payload is in the target bin and the trash in the trash bin", 2, True),
     )
 }
 """Every task by its name."""
 
-
 OWN: Registry[EnvSpec] = Registry("task", "asm_gym.tasks:OWN")
-"""What ``register_task`` added, by name."""
+"""Tasks of ``register_task``, by name."""
 
 
 def register_task(
     name: str, make: Callable[..., gym.Env[Any, Any]] | type[Any] | str, horizon: int, **arguments: Any
 ) -> None:
-    """Makes an environment of one's own known as a task, here and in worker processes.
+    """Register a user's environment as a task, here and in worker processes.
 
     Args:
         name: the Gymnasium id is ``asm_gym/<name>-v0``.
-        make: a class of environments with Box spaces or a function that makes one; or ``module:name`` of it. A class of
-            robosuite's environments will do as it is: its sensors become channels of the stream, by their names.
+        make: a class of environments with Box spaces, a function that makes one, or ``module:name`` of either. The
+            sensors of a class of robosuite's environments become channels of the stream.
         horizon: control steps before an episode is truncated.
-        arguments: that it is made with: ``robots="Panda"``, ``controller_configs=…``.
+        arguments: of the environment: ``robots="Panda"``, ``controller_configs=…``.
 
     Raises:
         ValueError: the name is taken.
@@ -121,22 +102,18 @@ def register_task(
 
 
 def task(name: str) -> TaskSpec:
-    """The row of ``name``, which may also be written as a Gymnasium id.
-
-    Raises:
-        ValueError: there is no such task; the message lists those that exist.
-    """
+    """Return the row of a name or Gymnasium id. Raises ValueError, listing the tasks, where there is none."""
     short = check_text("task", name).removeprefix("asm_gym/").removesuffix("-v0")
     check_choice("task", short, (*TASKS, *OWN))
     return TASKS[short]
 
 
 def env_id(name: str) -> str:
-    """The Gymnasium id of a task, or of any other environment that goes by its id.
+    """Return the Gymnasium id of a task, or of any other environment that goes by its id.
 
     Raises:
         ValueError: neither is known; the message lists the tasks.
-        ImportError: the module of ``module:id`` is not installed; the message says what brings it.
+        ImportError: the module of ``module:id`` is not installed; the message names the package.
     """
     if name in OWN:
         gym.registry[OWN[name].id] = OWN[name]  # which a worker has not done yet
@@ -149,7 +126,7 @@ def env_id(name: str) -> str:
 
 
 def env_spec(name: str) -> EnvSpec:
-    """Of a Gymnasium id, ``module:id`` included."""
+    """Return Gymnasium's entry of an id, ``module:id`` included."""
     module, colon, identifier = name.rpartition(":")
     if colon:
         with needed_for(name):
@@ -158,5 +135,5 @@ def env_spec(name: str) -> EnvSpec:
 
 
 def is_task(name: str) -> bool:
-    """Whether it is one of robosuite's, and no other environment."""
+    """Return whether it is one of robosuite's."""
     return name.removeprefix("asm_gym/").removesuffix("-v0") in TASKS

@@ -1,4 +1,4 @@
-"""Refusing at the edge what will not do, in one line that names the argument and what it was.
+"""Check arguments at the public boundary: refuse them in one line that names the argument and what it was.
 
 Numbers within bounds (NaN and booleans are none), names that exist, and arguments of the types that a function is
 annotated with:
@@ -8,8 +8,8 @@ annotated with:
 
     load_monitor(3)                    ArgumentTypeError: path must be str | Path, got 3
 
-``typed`` looks at what can be told cheaply: classes, methods of protocols, unions of them, items of sequences. Numbers
-are not looked at: the checks know their bounds. Nor are names that a module imports for type checkers only.
+``typed`` checks classes, methods of protocols, unions of them and items of sequences. It leaves numbers to
+``check_number``, and skips names that a module imports for type checkers only.
 """
 
 from __future__ import annotations
@@ -21,7 +21,19 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cache, wraps
 from numbers import Integral, Real
 from types import SimpleNamespace, UnionType
-from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints, overload
+from typing import (
+    Any,
+    Literal,
+    ParamSpec,
+    TypedDict,
+    TypeVar,
+    Union,
+    Unpack,
+    get_args,
+    get_origin,
+    get_type_hints,
+    overload,
+)
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,88 +41,60 @@ from numpy.typing import ArrayLike, NDArray
 P = ParamSpec("P")
 R = TypeVar("R")
 
-SHOWN = 80
-"""How many characters of a refused value a message shows."""
+SHOWN = 80  # characters of a refused value that a message shows
+
+
+class Bounds(TypedDict, total=False):
+    """Limits of a number: ``low`` and ``high`` are allowed, ``above`` and ``below`` are not."""
+
+    low: float | None
+    high: float | None
+    above: float | None
+    below: float | None
 
 
 @overload
 def check_number(
-    name: str,
-    value: object,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    above: float | None = None,
-    below: float | None = None,
-    whole: Literal[True],
-    infinite: bool = False,
+    name: str, value: object, *, whole: Literal[True], infinite: bool = False, **bounds: Unpack[Bounds]
 ) -> int: ...
 
 
 @overload
 def check_number(
-    name: str,
-    value: object,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    above: float | None = None,
-    below: float | None = None,
-    whole: Literal[False] = False,
-    infinite: bool = False,
+    name: str, value: object, *, whole: Literal[False] = False, infinite: bool = False, **bounds: Unpack[Bounds]
 ) -> float: ...
 
 
 def check_number(
-    name: str,
-    value: object,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    above: float | None = None,
-    below: float | None = None,
-    whole: bool = False,
-    infinite: bool = False,
+    name: str, value: object, *, whole: bool = False, infinite: bool = False, **bounds: Unpack[Bounds]
 ) -> float:
-    """``value`` as a Python number, once it is one and within its bounds.
+    """Return ``value`` as a Python number.
 
     Args:
-        name: the argument's, for the message.
-        low, high: the least and the greatest that will do.
-        above, below: what it must stay strictly between.
-        whole: only integers will do, and an int comes back.
-        infinite: infinity will do, where the bounds allow it.
+        name: of the argument, for the message.
+        value: to be checked.
+        whole: require an integer.
+        infinite: allow infinity, where the bounds do.
+        bounds: limits.
 
     Raises:
-        ValueError: naming the argument, what it must be, and what it was.
+        ValueError: it is no number, out of bounds, or not finite.
     """
-    wanted = _described("whole number" if whole else "number", low, high, above, below)
+    wanted = _described("whole number" if whole else "number", **bounds)
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral if whole else Real):
         raise ValueError(f"{name} must be a {wanted}, got {short_repr(value)}")
     number: float = int(value) if isinstance(value, Integral) else float(value)
     # NaN alone differs from itself.
-    if number != number or not _within(number, low, high, above, below):
+    if number != number or not _within(number, **bounds):
         raise ValueError(f"{name} must be a {wanted}, got {short_repr(value)}")
     if not infinite and abs(number) > np.finfo(np.float64).max:
         raise ValueError(f"{name} must be finite, got {short_repr(value)}")
     return number
 
 
-def check_numbers(
-    name: str,
-    values: ArrayLike,
-    *shape: int,
-    low: float | None = None,
-    high: float | None = None,
-    above: float | None = None,
-    below: float | None = None,
-) -> NDArray[np.float64]:
-    """``values`` as a float64 array of this shape, once all of them are finite and within their bounds.
-
-    Raises:
-        ValueError: naming the argument, what it must be, and what it was.
-    """
-    wanted = f"{_described('finite numbers', low, high, above, below)} in the shape {shape}"
+def check_numbers(name: str, values: ArrayLike, *shape: int, **bounds: Unpack[Bounds]) -> NDArray[np.float64]:
+    """Return ``values`` as float64. Raises ValueError unless they are finite, within bounds and of this shape."""
+    wanted = f"{_described('finite numbers', **bounds)} in the shape {shape}"
     try:
         given: NDArray[Any] = np.asarray(values)
     except ValueError:  # rows of several lengths
@@ -118,28 +102,28 @@ def check_numbers(
     if given.dtype.kind not in "iuf" or given.shape != shape:
         raise ValueError(f"{name} must be {wanted}, got {short_repr(values)}")
     array = given.astype(np.float64)
-    bad = [v for v in array.ravel().tolist() if not math.isfinite(v) or not _within(v, low, high, above, below)]
+    bad = [v for v in array.ravel().tolist() if not math.isfinite(v) or not _within(v, **bounds)]
     if bad:
         raise ValueError(f"{name} must be {wanted}, got {short_repr(bad[0])} among them")
     return array
 
 
 def check_text(name: str, value: object) -> str:
-    """``value``, once it is a string that is not empty. Raises ValueError."""
+    """Return ``value``. Raises ValueError unless it is a string that is not empty."""
     if not isinstance(value, str) or not value:
         raise ValueError(f"{name} must be a name, got {short_repr(value)}")
     return value
 
 
 def check_flag(name: str, value: object) -> bool:
-    """``value``, once it is True or False. Raises ValueError."""
+    """Return ``value``. Raises ValueError unless it is True or False."""
     if not isinstance(value, (bool, np.bool_)):
         raise ValueError(f"{name} must be True or False, got {short_repr(value)}")
     return bool(value)
 
 
 def check_choice(what: str, got: Any, known: Iterable[Any]) -> None:
-    """Raises ValueError unless ``got`` is one of ``known``, naming them all and the nearest."""
+    """Raise ValueError unless ``got`` is one of ``known``, naming them all and the nearest."""
     names = list(known)
     try:
         if got in names:
@@ -152,10 +136,10 @@ def check_choice(what: str, got: Any, known: Iterable[Any]) -> None:
 
 
 def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
-    """``values`` as a stream and an action hold them: what is too large for that is infinite, and nothing is said.
+    """Return ``values`` as float32; those that are too large become infinite.
 
     Raises:
-        ValueError: naming the argument and what it was, where that is no array of numbers.
+        ValueError: they are no array of numbers.
     """
     if type(values) is np.ndarray and values.dtype == np.float32:
         return values
@@ -172,7 +156,7 @@ def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
 
 
 def short_repr(value: object) -> str:
-    """``value`` as a message shows it: in full where it is short."""
+    """Return ``value`` as a message shows it: in full where it is short."""
     try:
         text = repr(value.item() if isinstance(value, np.generic) else value)
     except ValueError:  # more digits than Python converts
@@ -181,11 +165,11 @@ def short_repr(value: object) -> str:
 
 
 class ArgumentTypeError(TypeError, ValueError):
-    """An argument of another type than annotated: no value of it would do."""
+    """An argument is of another type than annotated: no value of it would do."""
 
 
 def typed(call: Callable[P, R]) -> Callable[P, R]:
-    """``call``, which raises an ``ArgumentTypeError`` that names argument and value before it begins."""
+    """Return ``call``, which first raises an ``ArgumentTypeError`` for an argument of another type than annotated."""
     signature = inspect.signature(call)
 
     @wraps(call)
@@ -193,9 +177,8 @@ def typed(call: Callable[P, R]) -> Callable[P, R]:
         kinds = _kinds(call)
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if name in kinds and not _fits(value, kinds[name]):
-                raise ArgumentTypeError(
-                    f"{name} must be {signature.parameters[name].annotation}, got {short_repr(value)}"
-                )
+                annotation = signature.parameters[name].annotation
+                raise ArgumentTypeError(f"{name} must be {annotation}, got {short_repr(value)}")
         return call(*args, **kwargs)
 
     return checked
@@ -203,15 +186,15 @@ def typed(call: Callable[P, R]) -> Callable[P, R]:
 
 @cache
 def _kinds(call: Callable[..., Any]) -> dict[str, Any]:
-    """What each parameter takes, where that is known at run time."""
+    """Return the annotated type of each parameter, where it is known at run time."""
     many = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
-    there: dict[str, Any] = getattr(inspect.unwrap(call), "__globals__", {})
+    namespace: dict[str, Any] = getattr(inspect.unwrap(call), "__globals__", {})
     found: dict[str, Any] = {}
     for name, parameter in inspect.signature(call).parameters.items():
         if parameter.kind in many or parameter.annotation is inspect.Parameter.empty:
             continue
         try:
-            found |= get_type_hints(SimpleNamespace(__annotations__={name: parameter.annotation}), there)
+            found |= get_type_hints(SimpleNamespace(__annotations__={name: parameter.annotation}), namespace)
         except NameError:  # imported for type checkers only
             continue
     return found
@@ -234,7 +217,7 @@ def _fits(value: Any, kind: Any) -> bool:
 
 @cache
 def _methods(protocol: type) -> list[str]:
-    """Its public ones; properties are not asked for, since asking runs them."""
+    """Return the public methods; properties are not asked for, since asking runs them."""
     bases = [base for base in protocol.__mro__ if getattr(base, "_is_protocol", False)]
     return [name for base in bases for name, m in vars(base).items() if inspect.isfunction(m) and name[0] != "_"]
 
@@ -247,7 +230,8 @@ def _is_sequence(value: Any) -> bool:
     return not isinstance(value, (str, bytes, dict, set))
 
 
-def _within(number: float, low: float | None, high: float | None, above: float | None, below: float | None) -> bool:
+def _within(number: float, **bounds: Unpack[Bounds]) -> bool:
+    low, high, above, below = (bounds.get(name) for name in ("low", "high", "above", "below"))
     return (
         (low is None or number >= low)
         and (high is None or number <= high)
@@ -256,8 +240,9 @@ def _within(number: float, low: float | None, high: float | None, above: float |
     )
 
 
-def _described(what: str, low: float | None, high: float | None, above: float | None, below: float | None) -> str:
-    """For example ``whole number of at least 1``, or ``number in (0, 1]``."""
+def _described(what: str, **bounds: Unpack[Bounds]) -> str:
+    """Return for example ``whole number of at least 1``, or ``number in (0, 1]``."""
+    low, high, above, below = (bounds.get(name) for name in ("low", "high", "above", "below"))
     least, greatest = low if above is None else above, high if below is None else below
     if least is not None and greatest is not None:
         brackets = ("[" if above is None else "(", "]" if below is None else ")")

@@ -14,13 +14,13 @@ from tests.wheel import ROOT
 INFER = """
 import numpy as np
 from asm_gym.compilation import must_compile
-from asm_gym.memory import energy, inference
+from asm_gym.memory import energy
 
 rng = np.random.default_rng(0)
 mu, x, W = (rng.standard_normal(shape).astype(np.float32) for shape in ((64, 256), (64, 107), (107, 256)))
 precision = np.ones_like(x)
-print(must_compile(inference.infer), end=" ")
-z = inference.infer(np.tanh(mu), x, 0.04 * W, 30.0, precision, 60.0, 20)
+print(must_compile(energy.infer), end=" ")
+z = energy.infer(np.tanh(mu), x, 0.04 * W, 30.0, precision, 60.0, 20)
 bend = energy.energy_gradient(z, np.tanh(mu), x, 0.04 * W, 30.0, precision)
 print(z.tobytes().hex()[:100_000], *(part.tobytes().hex()[:100_000] for part in bend))
 """

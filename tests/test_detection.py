@@ -15,24 +15,16 @@ from asm_gym.detection import (
     AdaptiveThreshold,
     Blocks,
     Detector,
-    Evidence,
     ModelOutput,
     Promise,
-    accumulated,
     alarms_in,
-    bounded,
     conformal_episodes,
     conformal_threshold,
     hourly_promise,
     hourly_threshold,
-    no_evidence,
-    pool,
-    strength,
-    whitening,
-    worst_case,
 )
-from asm_gym.detection.evidence import CONTEXT_GAIN
-from asm_gym.detection.habituation import STEPS_PER_NUMBER, USUAL, Habituation, habituate, usual_levels
+from asm_gym.detection.detector import STEPS_PER_NUMBER, USUAL, habituate, usual_levels
+from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, Evidence, accumulated, no_evidence, pool, strength
 from asm_gym.detection.hourly import MINUTE
 from asm_gym.detection.repetition import (
     MOST_BEYOND,
@@ -45,7 +37,8 @@ from asm_gym.detection.repetition import (
     repeated,
     unrepeated,
 )
-from asm_gym.detection.tails import TAIL_INDEX
+from asm_gym.detection.tails import TAIL_INDEX, worst_case
+from asm_gym.detection.whitening import bounded, whitening
 from asm_gym.monitors import NeuralASM
 from tests.streams import frozen, sine_episodes, sine_spec
 
@@ -58,7 +51,7 @@ def accumulate(evidence, whitened, context, gains):
 
 def usual(found, context):
     """log ŝ (N,) in contexts (N, C), the oracle of the compiled step."""
-    return np.clip(context @ found.weights[:-1] + found.weights[-1], *found.span)
+    return np.clip(context @ found[0][:-1] + found[0][-1], *found[1])
 
 
 def correlated(seed: int, n: int = 4000, size: int = 5) -> np.ndarray:
@@ -118,9 +111,11 @@ def test_the_evidence_of_a_whole_episode_is_that_of_its_rows(steps):
 
 
 def test_pooling_is_the_norm_and_its_parts_add_up():
-    pooled, parts = pool(np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0]]), power=2)
-    np.testing.assert_allclose(pooled, [5.0, 0.0], atol=1e-300)
-    np.testing.assert_allclose(parts, [[5 * 9 / 25, 5 * 16 / 25, 0.0], [0.0, 0.0, 0.0]], atol=1e-300)
+    ratios = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0]])
+    pooled, parts = pool(ratios)
+    np.testing.assert_allclose(pooled, np.linalg.norm(ratios, POWER, axis=1), atol=1e-300)
+    np.testing.assert_allclose(parts.sum(axis=1), pooled, atol=1e-300)
+    np.testing.assert_allclose(parts[0, 0] / parts[0, 1], 0.75**POWER)
     huge, parts = pool(np.array([[1e200, 1e-200]]))
     assert huge[0] == pytest.approx(1e200)
     assert parts.sum() == pytest.approx(1e200)
@@ -178,7 +173,7 @@ def test_the_compiled_step_is_the_same_equations_put_together():
     rng = np.random.default_rng(2)
     detector = Detector.fit(runs(rng, 8), runs(rng, 8), [0.8, 0.2], 5.0, 1e-3, rng)
     gains, evidence, plain = detector.gains, detector.start(2), no_evidence(2, 2, 3, 2)
-    habituation = Habituation(detector.context_quantile, detector.context_range)
+    habituation = (detector.context_quantile, detector.context_range)
     for _ in range(30):
         errors, context = 4.0 * rng.normal(size=(2, 3)), rng.random((2, 2))
         evidence, value, parts = detector.step(evidence, errors, context)

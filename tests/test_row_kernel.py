@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, pool, strength
+from asm_gym.detection.evidence import CONTEXT_GAIN, TINY, Evidence, pool, strength
 from asm_gym.detection.evidence_detection import EvidenceState
 from asm_gym.detection.repetition import Repetition, evidence_steps, improbability
 from asm_gym.detection.whitening import bounded
@@ -63,7 +63,7 @@ def observed_by(asm, state, rows):
     attribution, stuck = np.zeros(rows.shape), np.zeros(rows.shape)
     attribution[:, senses], stuck[:, senses] = parts, improbability(repetition, counted[2])
     total = attribution.sum(axis=1, keepdims=True)
-    pooled = pool(np.hstack([total, stuck]), POWER)[1]
+    pooled = pool(np.hstack([total, stuck]))[1]
     attribution = attribution * (pooled[:, :1] / np.maximum(total, TINY)) + pooled[:, 1:]
     finite = np.isfinite(rows)
     broken = ~finite.all(axis=1)

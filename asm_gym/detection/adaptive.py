@@ -3,12 +3,8 @@
     log q_{k+1} = log q_k + η (err_k - α)        err_k = 1 if episode k had a false alarm, else 0
     threshold   min(q_k, c)                      what exceeds c is an alarm, and never counts as a false one
 
-α is the promised rate, and η the step of one false alarm. q stays only where one episode in 1/α has a false alarm. In
-any K episodes that count, at most
-
-    α K + log(c/q_1)/η + 1
-
-have an alarm, as q rises no further than c. Confirmed alarms do not move q, so that it learns drift and not faults.
+α is the promised rate. In any K episodes that count, at most α K + log(c/q_1)/η + 1 have an alarm. Confirmed alarms do
+not move q, so that it learns drift and not faults.
 
 Sources: Angelopoulos et al. 2023 (NeurIPS, arXiv 2307.16895), its P control, on log q as surprise spans decades; Gibbs
 and Candès 2021 (NeurIPS, arXiv 2106.00170), which moves the level instead of the threshold.

@@ -36,7 +36,7 @@ class Nominal(NamedTuple):
 class Detection(Protocol):
     """Turns a model's errors into surprise, attributed to the numbers of the stream.
 
-    Arguments of ``__init__`` beside the stream's spec are hyperparameters, kept as attributes of the same names.
+    Arguments of ``__init__`` beside the spec are hyperparameters, kept as attributes of the same names.
 
     Attributes:
         name: in ``make_monitor`` and in checkpoints.
@@ -51,26 +51,20 @@ class Detection(Protocol):
     @property
     def reach(self) -> float:
         """Largest surprise by errors in a context of 0; a threshold above it would hardly ever alarm."""
-        ...
 
     def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
         """Learn which errors are usual."""
-        ...
 
     def restore(self, learned: Arrays) -> Self:
         """Take over what another has learned."""
-        ...
 
     def start(self, batch: int, errors: int) -> State:
         """Return the state before the first row of ``batch`` streams: arrays with a first axis B, or tuples of them."""
-        ...
 
     def attribute_step(
         self, state: State, output: ModelOutput, rows: NDArray[np.float64], place: Place
     ) -> tuple[State, NDArray[np.float64]]:
         """Return the new state, and each number's share (B, D), perhaps not finite, of the surprise at rows (B, D)."""
-        ...
 
     def reset(self, state: State) -> State:
         """Return the state without accumulated evidence."""
-        ...

@@ -19,11 +19,8 @@ from asm_gym.validation import check_number, short_repr
 EPISODE, HOUR = "episode", "hour"
 """Units of a rate of false alarms."""
 
-LEAST_RATE = 1e-15
-"""Rates are not taken to be smaller, as the inverse of the smallest floats is infinite."""
-
-CONFIDENCE = 0.95
-"""Share of calibrations in which ``Promise.at_most`` holds."""
+LEAST_RATE = 1e-15  # rates are not taken to be smaller, as the inverse of the smallest floats is infinite
+CONFIDENCE = 0.95  # share of calibrations in which ``Promise.at_most`` holds
 
 
 def conformal_episodes(rate: float) -> int:
@@ -42,7 +39,7 @@ def conformal_threshold(maxima: Array, rate: float) -> float:
         rate: P(any alarm in a nominal episode).
 
     Raises:
-        ValueError: maxima are no numbers, or too few for this rate.
+        ValueError: no numbers, or too few for this rate.
     """
     try:
         found = np.asarray(maxima)

@@ -1,7 +1,15 @@
 """The detector: from a model's errors to one number that a threshold can be set on.
 
-ε_t/σ_t → whitened, bounded → evidence → ratios → pooled s_t      see ``whitening``, ``evidence``, ``tails``
-value      s_t / ŝ(c_t)                                           ŝ: usual in such a context, see ``habituation``
+    ε_t/σ_t → whitened, bounded → evidence → ratios → pooled s_t      see ``whitening``, ``evidence``, ``tails``
+    value      s_t / ŝ(c_t)
+    log ŝ_t = min(max(w c_t + b, l), h)          Δw ∝ (τ - [log s_t < w c_t + b]) c_tᵀ
+
+Habituation: ŝ is the surprise below which a share τ of nominal rows in such a context stays, as a hand that meets an
+object is often wrong about when. Its rule is local, and is the gradient of the quantile loss. l and h are the limits of
+nominal episodes, so that a fault cannot excuse itself by changing the context.
+
+Sources: Yu and Dayan 2005 (Neuron 46(4)) for surprise relative to expected uncertainty; Koenker and Bassett 1978 for
+the quantile loss; Romano et al. 2019 (NeurIPS) for quantiles of a context under a conformal threshold.
 """
 
 from __future__ import annotations
@@ -17,25 +25,23 @@ from numpy.typing import NDArray
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Array, ModelOutput
 from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, accumulated, no_evidence, pool, strength
-from asm_gym.detection.habituation import STEPS_PER_NUMBER, usual_levels
 from asm_gym.detection.tails import TAIL_INDEX, worst_case
 from asm_gym.detection.whitening import bounded, whitening
+from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 
 GAINS = (0.8, 0.2, 0.05)
 BOUND = 100.0
-
-UNBOUNDED_LOG = np.array([-700.0, 700.0])
-"""A range of logarithms that bounds nothing."""
-
-MOST_ROWS = 60_000
-"""Largest number of rows, evenly spaced, that teach what is usual in a context."""
-
-FAINTEST = 1e-9
-"""Smallest s whose logarithm is taken."""
-
+UNBOUNDED_LOG = np.array([-700.0, 700.0])  # a range of logarithms that bounds nothing
+FAINTEST = 1e-9  # smallest s whose logarithm is taken
 LEAST = math.log(TINY)
-NEGLIGIBLE = -50.0
-"""Logarithm of a share that vanishes beside 1 in double precision."""
+NEGLIGIBLE = -50.0  # logarithm of a share that vanishes beside 1 in double precision
+
+USUAL = 0.95  # τ
+MOST_ROWS = 60_000  # largest number of rows, evenly spaced, that teach what is usual in a context
+UPDATES, PASSES, FEWEST = 1000, 12, 40  # largest number of batches and of passes, and smallest number of batches
+BATCH, RATE = 512, 1e-2
+STEPS_PER_NUMBER = 8  # with fewer nominal rows for each number of a context, nothing is learned
+EXTREME = 0.005  # share of nominal rows below l, and above h
 
 
 @compiled
@@ -57,8 +63,7 @@ def _step(
 
     Args:
         vector, running, steps: fields of ``Evidence``.
-        errors: (B, X) normalised.
-        context: (B, C).
+        errors, context: (B, X) normalised, and (B, C).
         whitening, ceiling, tail, context_quantile, context_range, gains, bound: fields of ``Detector``.
     """
     B, X = errors.shape
@@ -136,8 +141,7 @@ class Detector:
             contexts.append(np.hstack([r.contexts, running])[::stride].astype(np.float32))
             ratios = ((strengths / ceiling) ** tail).reshape(len(running), -1)
             levels.append(np.log(np.maximum(pool(ratios)[0], FAINTEST))[::stride])
-        usual = usual_levels(contexts, levels, rng)
-        return cls(matrix, ceiling, tail, usual.weights, usual.span, a, bound)
+        return cls(matrix, ceiling, tail, *usual_levels(contexts, levels, rng), a, bound)
 
     @property
     def reach(self) -> float:
@@ -168,13 +172,7 @@ class Detector:
     def step(
         self, evidence: Evidence, errors: Array, context: Array
     ) -> tuple[Evidence, NDArray[np.float64], NDArray[np.float64]]:
-        """Return the new evidence, the value (B,), and each error's share of it (B, X).
-
-        Args:
-            evidence: before the row.
-            errors: (B, X) normalised.
-            context: (B, C).
-        """
+        """Return the new evidence, the value (B,), and each error's share of it (B, X); ``context`` is (B, C)."""
         learned = self.whitening, self.ceiling, self.tail, self.context_quantile, self.context_range
         row = np.asarray(errors, np.float64), np.asarray(context, np.float64)
         new, value, shares = _step(*evidence, *row, *learned, self.gains, self.bound)
@@ -186,3 +184,28 @@ class Detector:
         vectors, running = accumulated(whitened, np.asarray(run.contexts, np.float64), self.gains)
         whole = Evidence(vectors, running, np.arange(1, len(vectors) + 1))
         return strength(whole, self.gains), whole.context
+
+
+def usual_levels(
+    contexts: Sequence[Array], levels: Sequence[Array], rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return w and b (C + 1,), and l and h (2,), from contexts (T, C) and log s (T,) of nominal episodes."""
+    context, level = np.concatenate(contexts), np.concatenate(levels)
+    w, _ = np.split(habituate(context, level, rng), [-1])
+    drive = context @ w
+    low, high = np.quantile(drive, (EXTREME, 1.0 - EXTREME))
+    b = np.quantile(level - np.clip(drive, low, high), USUAL)
+    return np.append(w, b).astype(np.float64), np.array([low + b, high + b])
+
+
+def habituate(context: Array, level: Array, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Return w, then b (C + 1,), from contexts (N, C) and log s (N,) of nominal rows."""
+    w, b = np.zeros(context.shape[1], np.float32), np.array([np.quantile(level, USUAL)], np.float32)
+    weights, bias = Synapse(w), Synapse(b)
+    updates = max(FEWEST, min(UPDATES, PASSES * len(level) // BATCH))
+    for n, rows in zip(range(updates), shuffled(len(level), BATCH, rng), strict=False):
+        c, rate = context[rows], cosine_decay(RATE, n / updates)
+        pull = (USUAL - (level[rows] < c @ w + b)).astype(np.float32)
+        weights.learn(pull @ c / np.float32(len(rows)), rate)
+        bias.learn(pull.mean(keepdims=True), rate)
+    return np.concatenate([w, b])

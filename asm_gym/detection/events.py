@@ -5,13 +5,9 @@
     s'       s / 10 at a knock or a stop, s / 3 where a finger has just slid by 1 cm/s, else s
     after    k rows after a knock or a stop  s / (10 (1 - a)^{2k}), while that is less than s
 
-A hand that strikes a table surprises, and so does a joint that reaches its stop or a finger that slips: none is a fault
-of the body, and most alarms of healthy robots are such events. What exceeds the threshold in spite of the excuse is a
-fault; what exceeds it without the excuse only is counted as the event. A missing number excuses nothing, and neither
-does one that jumps to a stop, as those of swapped joints do: a joint approaches within 5 rad/s in the row before.
-
-Evidence outlives its cause: the slowest fades by (1 - a)² a row, a being the least of the usual gains. The excuse fades
-as slowly, or what is left of a knock after its second would be a fault.
+What exceeds the threshold in spite of the excuse is a fault; what exceeds it without the excuse only is counted as the
+event. A missing number excuses nothing, and neither does one that jumps to a stop, as those of swapped joints do. The
+excuse fades as slowly as the slowest evidence, (1 - a)² a row, a being the least of the usual gains.
 """
 
 from __future__ import annotations
@@ -31,22 +27,13 @@ NO_EVENT, KNOCK, STOP, FAULT = "", "knock", "stop", "fault"
 EVENTS = NO_EVENT, KNOCK, STOP, FAULT
 """Kinds of rows; the last is the worst."""
 
-KNOCKING = 50.0
-"""Force at the wrist, on an axis [N]."""
-KNOCKED_S = 1.0
-"""Duration of the excuse of a knock [s]."""
-NEAR_STOP, PAST_STOP = 0.03, 0.1
-"""A joint is at its stop from so far before it to so far past it [rad]. In 4,199 episodes healthy arms went 0.04 rad
-past theirs at most."""
-FASTEST = 5.0
-"""Largest joint speed [rad/s]: a joint that was farther from its stop in the row before is not at it now."""
-EXCUSED, SLIPPED = 10.0, 3.0
-"""Divisors of surprise at a knock or a stop, and where fingers slide."""
-FADE = (1.0 - min(GAINS)) ** 2
-FADING = math.ceil(-math.log(EXCUSED) / math.log(FADE))
-"""Share of the slowest evidence left after a row; rows in which it, and the excuse, falls to a tenth."""
-MOVING, MOVED_S = 0.01, 0.1
-"""Speed of a sliding finger [m/s], and duration of its excuse [s]. Turning fingers never rest and do not count."""
+KNOCKING, KNOCKED_S = 50.0, 1.0  # force at the wrist, on an axis [N], and duration of its excuse [s]
+NEAR_STOP, PAST_STOP = 0.03, 0.1  # a joint is at its stop from so far before it to so far past it [rad]
+FASTEST = 5.0  # largest joint speed [rad/s]: a joint farther from its stop in the row before is not at it now
+EXCUSED, SLIPPED = 10.0, 3.0  # divisors of surprise at a knock or a stop, and where fingers slide
+FADE = (1.0 - min(GAINS)) ** 2  # share of the slowest evidence left after a row
+FADING = math.ceil(-math.log(EXCUSED) / math.log(FADE))  # rows in which it, and the excuse, falls to a tenth
+MOVING, MOVED_S = 0.01, 0.1  # speed of a sliding finger [m/s], and duration of its excuse [s]
 
 
 class Excused(NamedTuple):
@@ -73,11 +60,6 @@ class Excuses:
         self._rows = np.array([*(max(1, round(seconds / spec.dt)) for seconds in (KNOCKED_S, MOVED_S)), FADING])
 
     @property
-    def joints(self) -> int:
-        """Number of joints with stops."""
-        return len(self._joints)
-
-    @property
     def arrays(self) -> tuple[list[NDArray[Any]], NDArray[np.float64]]:
         """Columns of wrists, joints and fingers and the rows of their excuses; (J, 2) the stops."""
         return [self._wrist, self._joints, self._fingers, self._rows], self._ends
@@ -85,7 +67,7 @@ class Excuses:
     def start(self, batch: int) -> NDArray[np.int64]:
         """Return the state (B, 3 + J): rows that the excuses of a knock, a stop and a finger still last, 0; and
         whether each joint may be at its stop in the next row, 1."""
-        left = np.ones((batch, 3 + self.joints), np.int64)
+        left = np.ones((batch, 3 + len(self._joints)), np.int64)
         left[:, :3] = 0
         return left
 

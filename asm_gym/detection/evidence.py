@@ -20,12 +20,8 @@ from numpy.typing import NDArray
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Array
 
-POWER = 8
-"""p."""
-
-CONTEXT_GAIN = 0.2
-"""Weight of the newest row in the running mean of the context."""
-
+POWER = 8  # p
+CONTEXT_GAIN = 0.2  # weight of the newest row in the running mean of the context
 TINY = float(np.finfo(np.float64).tiny)
 
 
@@ -44,13 +40,7 @@ def no_evidence(batch: int, gains: int, size: int, context: int = 0) -> Evidence
 
 @compiled
 def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return w_t (T, G, X) of a whole episode, and the running mean of its contexts (T, C).
-
-    Args:
-        whitened: (T, X) ẽ_t.
-        contexts: (T, C).
-        gains: (G,) a.
-    """
+    """Return w_t (T, G, X) of whitened errors ẽ_t (T, X), and the running mean of the contexts (T, C)."""
     T, X = whitened.shape
     vectors, running = np.zeros((T, len(gains), X)), np.zeros(contexts.shape)
     for t in range(T):
@@ -71,10 +61,10 @@ def strength(evidence: Evidence, gains: Array) -> NDArray[np.float64]:
     return squared
 
 
-def pool(ratios: Array, power: float = POWER) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def pool(ratios: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return (Σ_i r_i^p)^(1/p) (B,), and each ratio's part of it (B, X), which add up to it; r >= 0."""
     greatest = np.maximum(ratios.max(axis=1, keepdims=True), TINY)
-    powers = (ratios / greatest) ** power
+    powers = (ratios / greatest) ** POWER
     total = powers.sum(axis=1, keepdims=True)
-    pooled = greatest * total ** (1.0 / power)
+    pooled = greatest * total ** (1.0 / POWER)
     return pooled[:, 0], pooled * (powers / np.maximum(total, TINY))

@@ -24,12 +24,8 @@ from asm_gym.detection.base import Array
 from asm_gym.detection.conformal import HOUR, Promise, surely_below
 from asm_gym.validation import check_number, short_repr
 
-MINUTE = 60.0
-"""Longest block, and time below the threshold before another alarm counts [s]."""
-
-LEAST_PER_HOUR, MOST_PER_HOUR = 1e-6, 1e6
-"""Limits of a rate."""
-
+MINUTE = 60.0  # longest block, and time below the threshold before another alarm counts [s]
+LEAST_PER_HOUR, MOST_PER_HOUR = 1e-6, 1e6  # limits of a rate
 ROUNDING = 1e-9
 
 

@@ -5,14 +5,11 @@
           and at most n_0 + 24, so that a sense that works again is believed within about ten rows
     r_t = exp(ξ_0 (n_t - n_0)) where n_t > 0, else 0                 pooled with the ratios of ``tails``
 
-A prediction of changes cannot tell a stuck sense from one at rest. But noise moves a working sense between its
-readings, and p, counted in nominal episodes, tells how seldom it stays. n_t is the evidence for "it repeats itself with
-probability ρ" against "with p" (CUSUM). A sense that often repeats itself, because it is coarse or slower than the
-stream, counts for little; none counts for more than it reached in nominal episodes. If no channel declares its noise,
-the senses that never repeated themselves are watched.
-
-A sense is not watched here if its noise is too small to change its reading at rest (σ < δ/2, see ``readings``), or if
-it kept repeating itself in nominal episodes.
+n_t is the evidence for "it repeats itself with probability ρ" against "with p" (CUSUM). A sense that often repeats
+itself, because it is coarse or slower than the stream, counts for little; none counts for more than it reached in
+nominal episodes. A sense is not watched if its noise is too small to change its reading at rest (σ < δ/2, see
+``readings``), or if it kept repeating itself in nominal episodes. If no channel declares its noise, the senses that
+never repeated themselves are watched.
 
 Source: Page 1954 (Biometrika 41, 100-115).
 """
@@ -29,26 +26,13 @@ from asm_gym.compilation import compiled
 from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.readings import noise_of, resolution
 
-STUCK = 0.9
-"""ρ; below 1, as a loose cable lets a reading through now and then."""
-
-REPETITION_OFFSET = 12.0
-"""n_0: one in 160,000, which among a hundred senses happens once in some thousand rows."""
-
-UNMOVED = 0.5
-"""Noise below this many steps of the resolution leaves a reading where it is."""
-
-RESTS = 0.5
-"""A sense that repeats itself this often after a repetition is at rest now and then."""
-
-RESTLESS = 5.0
-"""A repetition is assumed no rarer than one in this many times the number of nominal episodes."""
-
-MOST_READ = 20_000
-"""Largest number of rows from which noise and resolution are estimated."""
-
-MOST_BEYOND = 24.0
-"""Largest n - n_0."""
+STUCK = 0.9  # ρ; below 1, as a loose cable lets a reading through now and then
+REPETITION_OFFSET = 12.0  # n_0: one in 160,000, which among a hundred senses happens once in some thousand rows
+MOST_BEYOND = 24.0  # largest n - n_0
+UNMOVED = 0.5  # noise below this many steps of the resolution leaves a reading where it is
+RESTS = 0.5  # a sense that repeats itself this often after a repetition is at rest now and then
+RESTLESS = 5.0  # a repetition is assumed no rarer than one in this many times the number of nominal episodes
+MOST_READ = 20_000  # largest number of rows from which noise and resolution are estimated
 
 
 class Repetition(NamedTuple):
@@ -67,11 +51,8 @@ def unrepeated(batch: int, size: int) -> Repetition:
 
 def stands_still(streams: Sequence[NDArray[np.floating[Any]]]) -> NDArray[np.bool_]:
     """Return the senses (X,) that repeat themselves at rest, judged by nominal episodes (T, X)."""
-    enough: list[NDArray[np.floating[Any]]] = []
-    for stream in streams:
-        enough.append(stream)
-        if sum(map(len, enough)) >= MOST_READ:
-            break
+    read = np.cumsum([len(stream) for stream in streams])
+    enough = streams[: int(np.searchsorted(read, MOST_READ)) + 1]
     X = streams[0].shape[1]
     found = np.zeros(X, np.bool_)
     for i in range(X):
@@ -129,9 +110,8 @@ def evidence_steps(surprise: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def improbability(repetition: Repetition, offset: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return r (B, X), with n_0 ``offset`` (X,)."""
-    unlikely = repetition.unlikely
-    ratio: NDArray[np.float64] = np.where(unlikely > 0, np.exp(TAIL_INDEX * (unlikely - offset)), 0.0)
-    return ratio
+    n = repetition.unlikely
+    return np.where(n > 0, np.exp(TAIL_INDEX * (n - offset)), 0.0)
 
 
 @compiled
@@ -140,9 +120,7 @@ def repeated(row: Any, again: Any, unlikely: Any, rows: Any, steps: Any, most: A
 
     Args:
         row, again, unlikely: the fields before.
-        rows: (B, X).
-        steps: (2, 2, X) of ``evidence_steps``.
-        most: (X,) upper bound of n.
+        rows, steps, most: (B, X); (2, 2, X) of ``evidence_steps``; (X,) upper bound of n.
     """
     B, X = rows.shape
     now, evidence = np.zeros((B, X), np.bool_), np.zeros((B, X))

@@ -23,11 +23,8 @@ from asm_gym.detection.whitening import whitening
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number
 
-WINDOW = 5
-"""Rows of the moving mean."""
-
-SELDOM, TINY = 1e-3, 1e-6
-"""Share of nominal rows above q_i, and the least q_i."""
+WINDOW = 5  # rows of the moving mean
+SELDOM, TINY = 1e-3, 1e-6  # share of nominal rows above q_i, and the least q_i
 
 
 class Squares:
@@ -65,12 +62,7 @@ class Squares:
 
 
 class Mahalanobis(Squares):
-    """The Mahalanobis distance of errors, squared.
-
-    Args:
-        spec: the stream.
-        shrinkage: λ in [0, 1], towards no correlation between errors.
-    """
+    """The Mahalanobis distance of errors, squared; ``shrinkage`` is that of ``whitening``."""
 
     name = "mahalanobis"
     arrays = ("mahalanobis",)
@@ -89,10 +81,7 @@ class Mahalanobis(Squares):
 
 
 class MovingMean(Squares):
-    """Squared errors, averaged over the last few rows.
-
-    The state is (B, WINDOW, X), the newest first; NaN before the first row.
-    """
+    """Squared errors, averaged over the last few rows: the state (B, WINDOW, X), NaN before the first row."""
 
     name = "moving_mean"
 

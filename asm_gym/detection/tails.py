@@ -3,11 +3,8 @@
     r_i = (v_i/q_i)^κ_i        q_i: v_i stays below it in 90 % of episodes
                                κ_i = min(1, ξ_0/ξ_i),  ξ_i: the index of the tail beyond q_i
 
-Relative to its own worst, a wrist that contact often surprises does not drown an encoder that is never surprised.
-Beyond q the maxima of episodes fall off as v^(-1/ξ). κ makes equal ratios equally rare for all numbers.
-
-Hours of healthy operation tell q better than the learned episodes (``ceilings``): q is then a quantile of 98 %, and κ
-goes by a smaller ξ_0. ξ_i stays what was learned, as few hours show no tail beyond 98 %.
+Beyond q the maxima of episodes fall off as v^(-1/ξ), and κ makes equal ratios equally rare for all numbers. Where hours
+of healthy operation set q (``ceilings``), it is a quantile of 98 % and κ goes by a smaller ξ_0; ξ_i stays as learned.
 
 Source: Hill 1975 for the index of a tail.
 """
@@ -19,26 +16,13 @@ from numpy.typing import NDArray
 
 from asm_gym.detection.base import Array
 
-TAIL_INDEX = 0.3
-"""ξ_0: a ratio falls off as probability to this power."""
-
-HOURS_TAIL_INDEX, HOURS_QUANTILE = 0.2, 0.98
-"""ξ_0, and the share of episodes below q, where hours of healthy operation set q."""
-
-FEWEST_EPISODES = 100
-"""Number of episodes that such a quantile needs."""
-
-NOMINAL_QUANTILE = 0.9
-"""Share of nominal episodes whose maximum of v stays below q."""
-
-TAIL_PRIOR_COUNT = 10
-"""Maxima beyond q after which a number's own tail counts as much as the tail common to all."""
-
-SMALLEST = 1e-9
-"""Lower bound of q."""
-
-LEAST_SHARE = 1e-3
-"""Lower bound of q as a share of the median q, for numbers that never erred in a few episodes."""
+TAIL_INDEX = 0.3  # ξ_0: a ratio falls off as probability to this power
+NOMINAL_QUANTILE = 0.9  # share of nominal episodes whose maximum of v stays below q
+HOURS_TAIL_INDEX, HOURS_QUANTILE = 0.2, 0.98  # the same two where hours of healthy operation set q
+FEWEST_EPISODES = 100  # that such a quantile needs
+TAIL_PRIOR_COUNT = 10  # maxima beyond q after which a number's own tail counts as much as the tail common to all
+SMALLEST = 1e-9  # lower bound of q
+LEAST_SHARE = 1e-3  # the same as a share of the median q, for numbers that never erred in a few episodes
 
 
 def worst_case(maxima: Array, tail_index: float = TAIL_INDEX) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from asm_gym.detection.base import Array
 from asm_gym.memory.linear import gram
 
-MOST_ERRORS = 8192
-"""Their covariance takes 0.5 GiB, and its eigenvectors minutes."""
+MOST_ERRORS = 8192  # their covariance takes 0.5 GiB, and its eigenvectors minutes
 
 
 def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
@@ -23,8 +22,7 @@ def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
 
     Args:
         errors: normalised errors of nominal rows, of mean 0.
-        shrinkage: λ in [0, 1], towards equal variance and no correlation. Above 0 constant channels and copies of
-            channels are no trouble.
+        shrinkage: λ in [0, 1]. Above 0 constant channels and copies of channels are no trouble.
 
     Raises:
         ValueError: too many errors, or shrinkage out of range.
