@@ -19,12 +19,10 @@ from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 Floats = NDArray[np.float64]
 
-JOINTS = 7
-SUBSTEPS, DT = 10, 0.01
+JOINTS, SUBSTEPS, DT = 7, 10, 0.01
 MASS = np.array([2.5, 2.5, 1.5, 1.5, 0.5, 0.5, 0.2])  # [kg m²]
 GRAVITY = np.array([0.0, 30.0, 10.0, 12.0, 2.0, 1.5, 0.0])  # [N m]
-COUPLING = 0.15
-"""Between neighbouring joints, as a share of the geometric mean of their masses."""
+COUPLING = 0.15  # between neighbouring joints, as a share of the geometric mean of their masses
 
 
 @compiled
@@ -50,11 +48,7 @@ def _advance(
 
 
 class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """Observe noisy positions [rad], velocities [rad/s] and torques [N m] of the joints; actions are velocities.
-
-    Args:
-        horizon: control steps of an episode.
-    """
+    """Observe noisy positions [rad], velocities [rad/s] and torques [N m] of the joints; actions are velocities."""
 
     metadata = {"render_modes": []}  # noqa: RUF012 (as Gymnasium has it)
     stream_spec = StreamSpec(

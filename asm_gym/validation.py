@@ -17,23 +17,12 @@ from __future__ import annotations
 import difflib
 import inspect
 import math
+import typing
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, wraps
 from numbers import Integral, Real
 from types import SimpleNamespace, UnionType
-from typing import (
-    Any,
-    Literal,
-    ParamSpec,
-    TypedDict,
-    TypeVar,
-    Union,
-    Unpack,
-    get_args,
-    get_origin,
-    get_type_hints,
-    overload,
-)
+from typing import Any, Literal, ParamSpec, TypedDict, TypeVar, Unpack, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,13 +42,13 @@ class Bounds(TypedDict, total=False):
     below: float | None
 
 
-@overload
+@typing.overload
 def check_number(
     name: str, value: object, *, whole: Literal[True], infinite: bool = False, **bounds: Unpack[Bounds]
 ) -> int: ...
 
 
-@overload
+@typing.overload
 def check_number(
     name: str, value: object, *, whole: Literal[False] = False, infinite: bool = False, **bounds: Unpack[Bounds]
 ) -> float: ...
@@ -202,7 +191,7 @@ def _kinds(call: Callable[..., Any]) -> dict[str, Any]:
 
 def _fits(value: Any, kind: Any) -> bool:
     origin = get_origin(kind) or kind
-    if origin in (Union, UnionType):
+    if origin in (typing.Union, UnionType):
         return any(_fits(value, each) for each in get_args(kind))
     if origin in (int, float, bool, np.ndarray):
         return True

@@ -33,9 +33,7 @@ from asm_gym.detection.repetition import (
     Repetition,
     count_repetitions,
     evidence_steps,
-    improbability,
     repeated,
-    unrepeated,
 )
 from asm_gym.detection.tails import TAIL_INDEX, worst_case
 from asm_gym.detection.whitening import bounded, whitening
@@ -404,7 +402,7 @@ def test_adaptive_settings_that_mean_nothing_are_refused_by_name(wrong):
 
 
 def repetitions(rows: np.ndarray, counted: np.ndarray, most: float = np.inf) -> list[Repetition]:
-    state, states = unrepeated(1, rows.shape[1]), []
+    state, states = Repetition.start(1, rows.shape[1]), []
     for row in rows:
         state = Repetition(*repeated(*state, row[None], evidence_steps(counted[:2]), np.full(rows.shape[1], most)))
         states.append(state)
@@ -437,9 +435,9 @@ def test_evidence_for_a_stuck_sense_is_that_of_pages_test():
     change = np.log((1 - STUCK) / (1 - p[:, 0]))
     rest = np.cumsum([one + two, change[1], change[0], change[0]])
     np.testing.assert_allclose([s.unlikely[0, 0] for s in states], [0.0, one, *rest])
-    ratio = improbability(states[2], np.array([REPETITION_OFFSET]))
+    ratio = states[2].ratios(np.array([REPETITION_OFFSET]))
     np.testing.assert_allclose(ratio, np.exp(TAIL_INDEX * (one + two - REPETITION_OFFSET)))
-    assert improbability(states[0], np.array([REPETITION_OFFSET])) == 0.0
+    assert states[0].ratios(np.array([REPETITION_OFFSET])) == 0.0
 
 
 def quantised(steps: int, seed: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_info
 
 from asm_gym.detection.evidence import CONTEXT_GAIN, TINY, Evidence, pool, strength
 from asm_gym.detection.evidence_detection import EvidenceState
-from asm_gym.detection.repetition import Repetition, evidence_steps, improbability
+from asm_gym.detection.repetition import Repetition, evidence_steps
 from asm_gym.detection.whitening import bounded
 from asm_gym.memory.readout import KEPT, SMALLEST, certainty
 from asm_gym.memory.state import UNSURE, MemoryState
@@ -61,7 +61,7 @@ def observed_by(asm, state, rows):
     unlikely = np.clip(before.unlikely + added, 0.0, counted[2] + 24.0)
     repetition = Repetition(now, again, unlikely)
     attribution, stuck = np.zeros(rows.shape), np.zeros(rows.shape)
-    attribution[:, senses], stuck[:, senses] = parts, improbability(repetition, counted[2])
+    attribution[:, senses], stuck[:, senses] = parts, repetition.ratios(counted[2])
     total = attribution.sum(axis=1, keepdims=True)
     pooled = pool(np.hstack([total, stuck]))[1]
     attribution = attribution * (pooled[:, :1] / np.maximum(total, TINY)) + pooled[:, 1:]

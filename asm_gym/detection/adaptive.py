@@ -25,7 +25,7 @@ class AdaptiveThreshold:
     Args:
         rate: α in (0, 1), share of nominal episodes that may raise an alarm.
         step: η > 0; a false alarm raises the threshold by a factor of about exp(η).
-        ceiling: > 1, largest multiple of the calibrated threshold; anything above is an alarm.
+        ceiling: > 1, largest multiple of the calibrated threshold.
     """
 
     rate: float = 0.01
@@ -43,15 +43,7 @@ class AdaptiveThreshold:
 
 
 class RunningThreshold:
-    """A threshold that moves at the end of every episode.
-
-    Args:
-        how: it follows.
-        threshold: q_1, the calibrated one.
-
-    Attributes:
-        ceiling: c.
-    """
+    """A threshold that begins at ``threshold``, q_1, and moves at the end of every episode; ``ceiling`` is c."""
 
     def __init__(self, how: AdaptiveThreshold, threshold: float) -> None:
         self._how, self.ceiling = how, how.ceiling * threshold
@@ -73,7 +65,7 @@ class RunningThreshold:
 
         Args:
             largest: its greatest surprise.
-            judged_by: the threshold that it began with; the present one by default.
+            judged_by: its own threshold; the present one by default.
             confirmed: whether an alarm in it was true.
         """
         alarm = not largest <= (self.value if judged_by is None else judged_by)

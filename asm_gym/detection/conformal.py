@@ -58,10 +58,10 @@ def conformal_threshold(maxima: Array, rate: float) -> float:
 
 
 class Promise(NamedTuple):
-    """What a threshold set on nominal episodes promises.
+    """The promise of a threshold set on nominal episodes.
 
-    By the episode: if k of n maxima exceed the threshold, the share of fresh episodes that alarm is
-    Beta(k + 1, n - k)-distributed (Vovk 2012, continuous maxima). By the hour the same holds of n blocks.
+    If k of n maxima exceed the threshold, the share of fresh episodes (or blocks, by the hour) that alarm is
+    Beta(k + 1, n - k)-distributed (Vovk 2012, continuous maxima).
     """
 
     episodes: int  # that it was set on

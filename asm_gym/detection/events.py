@@ -44,11 +44,7 @@ class Excused(NamedTuple):
 
 
 class Excuses:
-    """Detects events by the names of a stream's channels.
-
-    Args:
-        spec: of the stream; knocks need forces at a wrist, stops need ``Channel.stops``.
-    """
+    """Detects events by the names of a stream's channels; stops need ``Channel.stops``."""
 
     def __init__(self, spec: StreamSpec) -> None:
         peaks = _columns(spec, lambda c: c.name.endswith("wrist_force_peak"))
@@ -61,12 +57,12 @@ class Excuses:
 
     @property
     def arrays(self) -> tuple[list[NDArray[Any]], NDArray[np.float64]]:
-        """Columns of wrists, joints and fingers and the rows of their excuses; (J, 2) the stops."""
+        """Columns of wrists, joints and fingers, rows of their excuses, and the stops (J, 2)."""
         return [self._wrist, self._joints, self._fingers, self._rows], self._ends
 
     def start(self, batch: int) -> NDArray[np.int64]:
-        """Return the state (B, 3 + J): rows that the excuses of a knock, a stop and a finger still last, 0; and
-        whether each joint may be at its stop in the next row, 1."""
+        """Return the state (B, 3 + J): rows left of the excuses of a knock, a stop and a finger; whether each joint may
+        be at its stop in the next row."""
         left = np.ones((batch, 3 + len(self._joints)), np.int64)
         left[:, :3] = 0
         return left

@@ -16,23 +16,14 @@ from numpy.typing import NDArray
 from asm_gym.detection.base import Array, Arrays, ModelOutput, Nominal, Place
 from asm_gym.detection.detector import BOUND, GAINS, Detector
 from asm_gym.detection.evidence import TINY, Evidence, pool
-from asm_gym.detection.repetition import (
-    MOST_BEYOND,
-    REPETITION_OFFSET,
-    Repetition,
-    count_repetitions,
-    evidence_steps,
-    improbability,
-    repeated,
-    unrepeated,
-)
+from asm_gym.detection.repetition import MOST_BEYOND, Repetition, count_repetitions, evidence_steps, repeated
 from asm_gym.detection.tails import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, ceilings
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, check_number, short_repr, typed
 
 
 class EvidenceState(NamedTuple):
-    """State of B streams; a value, never changed in place."""
+    """State of B streams; never changed in place."""
 
     evidence: Evidence
     repetition: Repetition
@@ -43,8 +34,7 @@ class EvidenceDetection:
 
     Args:
         spec: the stream.
-        gains: a in (0, 1], weights of the newest row in the accumulated evidence; several, for sudden faults and slow
-            ones.
+        gains: a in (0, 1], weights of the newest row in the accumulated evidence, for sudden and slow faults.
         bound: ν > 0, standard deviations to which an error is bounded, so that a short knock counts less than a
             lasting error.
         shrinkage: λ in [0, 1] of the whitening, towards no correlation between errors.
@@ -54,6 +44,7 @@ class EvidenceDetection:
 
     Attributes:
         detector_: turns errors into surprise; None before ``fit``.
+        repeating: evidence steps (2, 2, X) of repetitions, their upper bound (X,) and offset (X,), after ``fit``.
     """
 
     name = "evidence"
@@ -99,12 +90,9 @@ class EvidenceDetection:
             anew: whether κ does not go by the smaller ξ_0 yet.
         """
         tail = np.minimum(self.learned_["tail"] * (HOURS_TAIL_INDEX / self.tail_index if anew else 1.0), 1.0)
-        return self._like(self.spec).restore(
-            {**self.learned_, "ceiling": ceilings(maxima, HOURS_QUANTILE), "tail": tail}
-        )
-
-    def _like(self, spec: StreamSpec) -> EvidenceDetection:
-        return EvidenceDetection(spec, self.gains, self.bound, self.shrinkage, self.habituates, self.tail_index)
+        how = self.gains, self.bound, self.shrinkage, self.habituates, self.tail_index
+        learned = {**self.learned_, "ceiling": ceilings(maxima, HOURS_QUANTILE), "tail": tail}
+        return EvidenceDetection(self.spec, *how).restore(learned)
 
     def restore(self, learned: Arrays) -> Self:
         """Take over what another has learned. Raises ValueError where it does not fit."""
@@ -119,15 +107,12 @@ class EvidenceDetection:
         detector = Detector(**found, gains=np.array(self.gains), bound=self.bound)
         if not detector.reach > 1.0:  # what is seldom exceeded in nominal episodes
             raise ValueError(f"no error can add up to evidence: at most {detector.reach:g} of what is usual")
-        counted, senses = learned["repetition"], len(self.spec.sensory)
-        if counted.shape == (2, senses):  # of an older memory
-            counted = np.concatenate([counted, np.full((1, senses), REPETITION_OFFSET)])
-        if counted.shape != (3, senses) or not ((counted >= 0.0) & np.isfinite(counted)).all():
+        counted, shape = learned["repetition"], (3, len(self.spec.sensory))
+        if counted.shape != shape or not ((counted >= 0.0) & np.isfinite(counted)).all():
             raise ValueError(
-                f"the repetition of evidence should be (3, {senses}) numbers of at least 0, found {short_repr(counted)}"
+                f"the repetition of evidence should be {shape} numbers of at least 0, found {short_repr(counted)}"
             )
-        offset = counted[2]
-        self._steps, self._offset, self._most = evidence_steps(counted[:2]), offset, offset + MOST_BEYOND
+        self.repeating = evidence_steps(counted[:2]), counted[2] + MOST_BEYOND, counted[2]
         self.learned_, self.detector_ = learned, detector
         return self
 
@@ -136,11 +121,6 @@ class EvidenceDetection:
         """The detector, after ``fit``."""
         assert self.detector_ is not None
         return self.detector_
-
-    @property
-    def repeating(self) -> tuple[NDArray[np.float64], ...]:
-        """Evidence steps (2, 2, X) of repetitions, its upper bound (X,) and its offset (X,); see ``repetition``."""
-        return self._steps, self._most, self._offset
 
     @property
     def reach(self) -> float:
@@ -153,19 +133,19 @@ class EvidenceDetection:
 
     def start(self, batch: int, errors: int) -> EvidenceState:
         """Return the state before the first row."""
-        return EvidenceState(self.fitted_detector.start(batch), unrepeated(batch, len(self.spec.sensory)))
+        return EvidenceState(self.fitted_detector.start(batch), Repetition.start(batch, len(self.spec.sensory)))
 
     def attribute_step(
         self, state: EvidenceState, output: ModelOutput, rows: NDArray[np.float64], place: Place
     ) -> tuple[EvidenceState, NDArray[np.float64]]:
         """Return the new state, and each number's share (B, D) of the surprise at the next rows (B, D)."""
         evidence, _, parts = self.fitted_detector.step(state.evidence, *output)
-        senses = self.spec.sensory
-        repetition = Repetition(*repeated(*state.repetition, rows[:, senses], self._steps, self._most))
+        senses, (steps, most, offset) = self.spec.sensory, self.repeating
+        repetition = Repetition(*repeated(*state.repetition, rows[:, senses], steps, most))
         found = place(parts)
         if repetition.unlikely.any():
             ratios = np.zeros_like(found)
-            ratios[:, senses] = improbability(repetition, self._offset)
+            ratios[:, senses] = repetition.ratios(offset)
             found = _joined(found, ratios)
         return EvidenceState(evidence, repetition), found
 

@@ -48,7 +48,7 @@ class Blocks(NamedTuple):
 
     @classmethod
     def restored(cls, kept: NDArray[np.float64]) -> Blocks:
-        """Return what ``array`` was made of. Raises ValueError where that is no maxima and hours."""
+        """Read an ``array``. Raises ValueError where that is no maxima and hours."""
         if kept.ndim != 2 or len(kept) not in (2, 3) or not kept.size or not (kept[1] > 0).all():
             raise ValueError(
                 f"blocks should be maxima and hours in the shape (2, n) or (3, n), found {short_repr(kept)}"
@@ -85,7 +85,7 @@ def check_per_hour(rate: float) -> float:
 
 
 def check_hours(rate: float, hours: float) -> None:
-    """Raise ValueError, with the hours that are missing, where so many nominal hours are too few for this rate."""
+    """Raise ValueError, naming the missing hours, where ``hours`` are too few for this rate."""
     if math.floor(rate * hours + ROUNDING) < 1:
         raise ValueError(
             f"{rate:g} false alarms an hour need at least {1.0 / rate:.4g} hours of nominal episodes, got {hours:.3g}: "
@@ -97,10 +97,7 @@ def check_hours(rate: float, hours: float) -> None:
 def hourly_threshold(blocks: Blocks, rate: float) -> float:
     """Return the q that healthy operation exceeds in at most ``rate`` blocks an hour, on average over calibrations.
 
-    With several groups it is the greatest that a group needs, so that the rate holds in each.
-
-    Raises:
-        ValueError: there are too few hours for this rate.
+    The rate holds in each group. Raises ValueError where there are too few hours for it.
     """
     check_per_hour(rate)
     if len(groups := blocks.groups) > 1:

@@ -17,7 +17,7 @@ Source: Page 1954 (Biometrika 41, 100-115).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,17 +36,21 @@ MOST_READ = 20_000  # largest number of rows from which noise and resolution are
 
 
 class Repetition(NamedTuple):
-    """State of B streams; a value, never changed in place."""
+    """State of B streams; never changed in place."""
 
     row: NDArray[np.float64]  # (B, X) the last readings; NaN before the first
     again: NDArray[np.bool_]  # (B, X) whether they were repetitions
     unlikely: NDArray[np.float64]  # (B, X) n
 
+    @classmethod
+    def start(cls, batch: int, size: int) -> Self:
+        """Return the state before the first row of ``size`` senses."""
+        shape = batch, size
+        return cls(np.full(shape, np.nan), np.zeros(shape, np.bool_), np.zeros(shape))
 
-def unrepeated(batch: int, size: int) -> Repetition:
-    """Return the state before the first row of ``size`` senses."""
-    shape = batch, size
-    return Repetition(np.full(shape, np.nan), np.zeros(shape, np.bool_), np.zeros(shape))
+    def ratios(self, offset: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return r (B, X), with n_0 ``offset`` (X,)."""
+        return np.where(self.unlikely > 0, np.exp(TAIL_INDEX * (self.unlikely - offset)), 0.0)
 
 
 def stands_still(streams: Sequence[NDArray[np.floating[Any]]]) -> NDArray[np.bool_]:
@@ -86,7 +90,7 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
     counted = np.where(watched, -np.log(p), 0.0)
     offset, steps = np.full(len(noisy), REPETITION_OFFSET), evidence_steps(counted)
     ordered = sorted(streams, key=len, reverse=True)
-    state, unbounded = unrepeated(len(ordered), len(noisy)), np.full(len(noisy), np.inf)
+    state, unbounded = Repetition.start(len(ordered), len(noisy)), np.full(len(noisy), np.inf)
     for t in range(len(ordered[0])):
         rows = np.array([stream[t] for stream in ordered if t < len(stream)], np.float64)
         row, again, unlikely = (part[: len(rows)] for part in state)
@@ -106,12 +110,6 @@ def evidence_steps(surprise: NDArray[np.float64]) -> NDArray[np.float64]:
         steps = np.log([(1.0 - STUCK) / (1.0 - p), STUCK / p])  # (now, before, X)
     found: NDArray[np.float64] = np.where(p < STUCK, steps, 0.0).swapaxes(0, 1)
     return np.ascontiguousarray(found)
-
-
-def improbability(repetition: Repetition, offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return r (B, X), with n_0 ``offset`` (X,)."""
-    n = repetition.unlikely
-    return np.where(n > 0, np.exp(TAIL_INDEX * (n - offset)), 0.0)
 
 
 @compiled

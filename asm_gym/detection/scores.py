@@ -13,15 +13,17 @@ Munn et al. 2026 (arXiv 2602.01515) for the calibration of each dimension.
 from __future__ import annotations
 
 import math
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.base import Arrays, ModelOutput, Nominal, Place, State
+from asm_gym.detection.base import Array, Arrays, ModelOutput, Nominal, Place, State
 from asm_gym.detection.whitening import whitening
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number
+
+Floats = NDArray[np.float64]
 
 WINDOW = 5  # rows of the moving mean
 SELDOM, TINY = 1e-3, 1e-6  # share of nominal rows above q_i, and the least q_i
@@ -47,17 +49,15 @@ class Squares:
     def start(self, batch: int, errors: int) -> State:
         return ()
 
-    def attribute_step(
-        self, state: State, output: ModelOutput, rows: NDArray[np.float64], place: Place
-    ) -> tuple[State, NDArray[np.float64]]:
+    def attribute_step(self, state: State, output: ModelOutput, rows: Array, place: Place) -> tuple[State, Floats]:
         return state, place(self.parts(output))
 
     def reset(self, state: State) -> State:
         return state
 
-    def parts(self, output: ModelOutput) -> NDArray[np.float64]:
+    def parts(self, output: ModelOutput) -> Floats:
         """Return each error's share of the score (B, X), >= 0."""
-        squared: NDArray[np.float64] = np.asarray(output.errors, np.float64) ** 2
+        squared: Floats = np.asarray(output.errors, np.float64) ** 2
         return squared
 
 
@@ -75,8 +75,8 @@ class Mahalanobis(Squares):
         errors = np.concatenate([r.errors for r in nominal.outputs(nominal.episodes)])
         return self.restore({"mahalanobis": whitening(errors, self.shrinkage)})
 
-    def parts(self, output: ModelOutput) -> NDArray[np.float64]:
-        white: NDArray[np.float64] = np.asarray(output.errors, np.float64) @ self.learned_["mahalanobis"]
+    def parts(self, output: ModelOutput) -> Floats:
+        white: Floats = np.asarray(output.errors, np.float64) @ self.learned_["mahalanobis"]
         return white**2
 
 
@@ -88,9 +88,7 @@ class MovingMean(Squares):
     def start(self, batch: int, errors: int) -> NDArray[np.float64]:
         return np.full((batch, WINDOW, errors), np.nan)
 
-    def attribute_step(
-        self, state: NDArray[Any], output: ModelOutput, rows: NDArray[np.float64], place: Place
-    ) -> tuple[State, NDArray[np.float64]]:
+    def attribute_step(self, state: State, output: ModelOutput, rows: Array, place: Place) -> tuple[State, Floats]:
         state = np.concatenate([self.parts(output)[:, None], state[:, :-1]], axis=1)
         return state, place(np.nanmean(state, axis=1))
 
@@ -100,7 +98,7 @@ class Largest(Squares):
 
     name = "largest"
 
-    def parts(self, output: ModelOutput) -> NDArray[np.float64]:
+    def parts(self, output: ModelOutput) -> Floats:
         sizes = np.abs(np.asarray(output.errors, np.float64))
         return np.where(np.arange(sizes.shape[1]) == sizes.argmax(axis=1)[:, None], sizes, 0.0)
 
@@ -115,5 +113,5 @@ class PerDimension(Largest):
         errors = np.abs(np.concatenate([r.errors for r in nominal.outputs(nominal.held_out)]))
         return self.restore({"seldom": np.maximum(np.quantile(errors, 1.0 - SELDOM, axis=0), TINY).astype(np.float64)})
 
-    def parts(self, output: ModelOutput) -> NDArray[np.float64]:
+    def parts(self, output: ModelOutput) -> Floats:
         return super().parts(output._replace(errors=np.asarray(output.errors) / self.learned_["seldom"]))

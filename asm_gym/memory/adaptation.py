@@ -4,9 +4,8 @@
                   ΔU = η ε_t f(h_t)ᵀ / n_t    ΔD = η ε_t a_tᵀ / n_t
     specialised   ΔD, ΔU = argmin Σ (r_t - ΔD a_t - ΔU f(h_t))² + λ (‖ΔD‖² + ‖ΔU‖²),   r_t = (Δ_t - Δ̂_t)/s
 
-Symbols as in ``association``. n_t makes η the share of an error that one step removes, so that no row can make learning
-diverge. The hidden units stay as they are. λ is chosen for each sense on rows that were not learned; without a
-better choice (λ = ∞) the memory stays as it is.
+Symbols as in ``association``. η is the share of an error that one step removes, so that learning cannot diverge. The
+hidden units stay. λ is chosen for each sense on rows that were not learned; λ = ∞ leaves the memory as it is.
 
 Sources: Nagumo and Noda 1967 (IEEE Trans. Automatic Control 12(3)) for the normalised delta rule; Hoerl and Kennard
 1970 for ridge regression, here towards what is known instead of towards 0.

@@ -1,4 +1,4 @@
-"""Completion: what a sense should say, from all other senses, the command and the row before.
+"""Completion: predict a sense from all other senses, the command and the row before.
 
     y_t = [v_t, v_{t-1}, u_t, p_t]      values now and before, the command, products of two slow values
     C   = ⟨y_t y_tᵀ⟩                    learned by coincidence alone (Hebb)
@@ -28,17 +28,10 @@ from asm_gym.spec import StreamSpec
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-PAIRED = 18
-"""Number of the slowest senses that go into products: an arm's joints and its hand."""
-
-PENALTY = 1e-4
-"""λ, in units of the variance of a standardised number."""
-
-MOST_ENTRIES = 2048
-"""Largest length of y; wider streams are not completed, as C would outgrow the rest of the memory."""
-
-FARTHEST = 30.0
-"""Standardised numbers are clipped to this, so that one broken sense does not spoil all completions."""
+PAIRED = 18  # the slowest senses go into products: an arm's joints and its hand
+PENALTY = 1e-4  # λ, in units of the variance of a standardised number
+MOST_ENTRIES = 2048  # largest length of y; wider streams are not completed, as C would outgrow the memory
+FARTHEST = 30.0  # standardised numbers are clipped to this, so that one broken sense does not spoil all completions
 
 ARRAYS = ("completion_products", "completion_covariance", "completion_centre", "completion_error")
 

@@ -1,14 +1,12 @@
 """The two temporal networks by name, and the training of a whole memory.
 
-    traces      traces of senses and actions are carried on, and the state follows from them     ``traces``
-    settling    the state is carried on by learned synapses, and is inferred on every row        ``settling``
+    traces      traces of senses and actions are carried on, and the state follows from them
+    settling    the state is carried on by learned synapses, and is inferred on every row
 
 Every synapse descends its own term of
 
     F = ½ Π_z ‖z - μ‖² + ½ Π_x ‖[x, a] - [x̂, â](z)‖² + Σ_i σ_i ρ(e_i/σ_i),     e = Δ - D a - U f(V a)
     ρ(r) = ½ r² for |r| ≤ 1, |r| - ½ beyond;     D in closed form, for ρ(r) = ½ r²
-
-The last sum is that of association. It shares rows and no state with the first two.
 """
 
 from __future__ import annotations
@@ -40,10 +38,8 @@ class Dynamics(NamedTuple):
 
 
 DYNAMICS = {
-    TRACES: Dynamics(weight_shapes, Weights, Network, learn_traces, iterations=5, prior_precision=30.0),
-    SETTLING: Dynamics(
-        settling_shapes, SettlingWeights, SettlingNetwork, learn_settling, iterations=20, prior_precision=1.0
-    ),
+    TRACES: Dynamics(weight_shapes, Weights, Network, learn_traces, 5, 30.0),
+    SETTLING: Dynamics(settling_shapes, SettlingWeights, SettlingNetwork, learn_settling, 20, 1.0),
 }
 
 
@@ -68,10 +64,8 @@ def train(
 
     Args:
         trajectories: the episodes.
-        groups: (X,) group number of each change.
-        changes: columns of the changes among the inputs of association.
+        groups, changes, units: as in ``association.synapses``.
         hidden: H.
-        units: hidden units of association for each group.
         schedule: of the temporal network.
         rng: draws everything random.
         progress: called with steps done and their total.

@@ -10,10 +10,8 @@
     reaction      (x, u) ← argmin F over the command and the row that it will lead to
     learning      ΔW ∝ -∂F/∂W of every synapse, in its own term
 
-ε and μ are those of ``inference`` or ``settling``, e and σ of ``association``, û of ``motor``. The free parameters are
-τ, one for the temporal network, and τ_j, one for each command: the spreads left in healthy rows. With them the sums
-have one unit, nats. Learning of association bounds e/σ, the slope of Huber's ρ in place of ½r²; within the bound they
-agree.
+ε and μ are those of ``traces`` or ``settling``, e and σ of ``association``, û of ``motor``. τ and τ_j are the spreads
+left in healthy rows, so that all sums are in nats. Learning of association bounds e/σ; within the bound they agree.
 
 Sources: Friston 2005 (Phil. Trans. R. Soc. B) for the sum and its precisions; Millidge et al. 2024 for the part through
 time; Adams, Shipp and Friston 2013 (Brain Struct. Funct.) for actions that descend the energy of their outcome.
@@ -38,11 +36,8 @@ from asm_gym.scaling import FARTHEST, StreamScaler
 
 Floats = NDArray[np.float64]
 
-STEPS = 200
-"""Largest number of L-BFGS steps for a row."""
-
-SMALLEST_SPREAD = 1e-3
-"""Of τ."""
+STEPS = 200  # largest number of L-BFGS steps for a row
+SMALLEST_SPREAD = 1e-3  # of τ
 
 
 class Terms(NamedTuple):
@@ -66,7 +61,7 @@ class Slope(NamedTuple):
 
 
 class Before(NamedTuple):
-    """What is known before a row."""
+    """State and rows before a row."""
 
     c: NDArray[np.float32]  # (1, I) the carried state of the temporal network
     before: Floats  # (1, D) the row l rows before
@@ -75,20 +70,11 @@ class Before(NamedTuple):
 
 
 class _Given(NamedTuple):
-    """What follows from ``Before``, whatever the row is."""
+    """Consequences of ``Before``, whatever the row is."""
 
     moment: Before
     carried: tuple[Floats, ...]  # by traces μ and W_D's part of c; by settling W_H f(c)
     command: Floats  # (A,) û, in spreads of the stream
-
-
-class _Read(NamedTuple):
-    """A row as the memory reads it, in double precision."""
-
-    x: Floats  # (S,)
-    u: Floats  # (A + 1,)
-    inputs: Floats  # (I,) of association
-    changes: Floats  # (X,)
 
 
 Through = tuple[float, Floats, Floats, Floats]
@@ -115,11 +101,7 @@ class FreeEnergy:
 
     @classmethod
     def of(
-        cls,
-        network: TemporalNetwork,
-        senses: StreamScaler,
-        motor: Motor | None,
-        streams: Sequence[NDArray[np.floating[Any]]],
+        cls, network: TemporalNetwork, senses: StreamScaler, motor: Motor | None, streams: Sequence[NDArray[Any]]
     ) -> Self:
         """Return F with τ and τ_j from healthy ``streams`` (T, D). Raises ValueError where they are too short."""
         raw = cls(network, senses, motor, 1.0, np.ones(len(senses.spec.motor)))
@@ -127,7 +109,7 @@ class FreeEnergy:
         for stream in streams:
             for moment, row in raw.moments(stream):
                 time += raw.terms(moment, row, raw.inferred(moment, row)).time
-                commands += raw._unexpected(raw._given(moment), raw._read(moment, row).u[:-1]) ** 2
+                commands += raw._unexpected(raw._given(moment), raw._read(moment, row)[1][:-1]) ** 2
                 rows += 1
         if not rows:
             raise ValueError("no healthy row is long enough to learn the spreads of")
@@ -135,7 +117,7 @@ class FreeEnergy:
         return replace(raw, tau=tau, tau_motor=np.maximum(np.sqrt(commands / rows), SMALLEST_SPREAD))
 
     def moments(self, stream: NDArray[np.floating[Any]]) -> list[tuple[Before, Floats]]:
-        """Return each row (D,) of an episode (T, D) from the ``2 lag``-th on, with what is known before it."""
+        """Return each row (D,) of an episode (T, D) from the ``2 lag``-th on, with its ``Before``."""
         rows, lag = np.asarray(stream, np.float64), self.senses.lag
         c, found = self.network.at_rest(1), []
         for t in range(len(rows)):
@@ -156,7 +138,8 @@ class FreeEnergy:
         if not turn:
             return moment.c
         read = self.senses.read(row[None], moment.before, moment.earlier)
-        return self.network.carry_on(moment.c, read.commands, read.senses, read.seen)[1]
+        traces: NDArray[np.float32] = self.network.follow(moment.c, read.commands, read.senses, read.seen).traces
+        return traces
 
     def terms(self, moment: Before, row: Floats, z: Floats) -> Terms:
         """Return the parts of F for a row (D,) and a state (H,)."""
@@ -169,7 +152,7 @@ class FreeEnergy:
     def settled(self, moment: Before, row: Floats, free: NDArray[np.bool_]) -> tuple[Floats, Terms]:
         """Return the row (D,) of lowest F over its ``free`` (D,) numbers and the state, and F there.
 
-        F has several valleys: ``free`` numbers should begin near likely values, such as those of ``expected``.
+        F has several valleys: ``free`` numbers should begin near likely values.
         """
         from scipy.optimize import minimize  # takes a third of a second to import
 
@@ -214,15 +197,18 @@ class FreeEnergy:
         """N, the numbers that the temporal network predicts."""
         return self.senses.size + len(self.senses.spec.motor)
 
-    def _read(self, moment: Before, row: Floats) -> _Read:
-        """Read a row as ``StreamScaler.read`` does, unrounded: L-BFGS takes rounding for valleys."""
+    def _read(self, moment: Before, row: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return senses (S,), command (A + 1,), inputs (I,) and changes (X,) of a row.
+
+        Not rounded as those of ``StreamScaler.read`` are: L-BFGS takes rounding for valleys.
+        """
         senses, spec, before = self.senses, self.senses.spec, moment.before[0]
         value, moved = (row - senses.mean) / senses.spread, (row - before) / senses.change
         x = np.concatenate([value[spec.sensory], moved[senses.slow]])
         u, changes = np.append(value[spec.motor], 1.0), moved[spec.sensory]
         past = (before - moment.earlier[0])[senses.slow] / senses.change[senses.slow]
         inputs = np.concatenate([(before - senses.mean) / senses.spread, changes, past, u])
-        return _Read(x, u, np.where(np.abs(inputs) < FARTHEST, inputs, 0.0), changes)
+        return x, u, np.where(np.abs(inputs) < FARTHEST, inputs, 0.0), changes
 
     def _given(self, moment: Before) -> _Given:
         senses, motor, (w, _) = self.senses, self.senses.spec.motor, self._weights

@@ -6,9 +6,9 @@
     W ← (1 - ηλ) W                                 weight decay
 
 The rules are those of association with three differences. Errors are not bounded: bounded errors find the median, and
-where a gripper closes, most rows around it say open. Rates and the last command are not inputs: they predict the next
-command best, and a policy that copies them never moves again once it stands still. Weights decay, because objects stay
-in place during an episode, and episodes would otherwise be told apart by them and learned by heart.
+where a gripper closes, most rows around it say open. Rates and the last command are not inputs: a policy that copies
+them never moves again once it stands still. Weights decay, or each episode would be learned by heart from the places of
+its objects.
 
 Sources: as ``association``; de Haan et al. 2019 (NeurIPS) for copied commands; Krogh and Hertz 1991 (NeurIPS) for
 weight decay.
@@ -31,22 +31,11 @@ from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, StreamSpec
 
-UPDATES, PASSES = 12_000, 100
-"""Largest number of batches, and of passes over the rows."""
-
-BATCH = 256
-RATE = 3e-3
-FORGETTING = 0.3
-"""λ."""
-
-FINE = 8.0
-"""κ of relative positions of objects, where a centimetre decides."""
-
-PLACED = 4.0
-"""κ of the position of the hand: objects are put down at places that nothing else marks."""
-
-FARTHEST = 100.0
-"""Inputs are clipped to this."""
+UPDATES, PASSES, BATCH = 12_000, 100, 256  # largest number of batches, and of passes over the rows; rows of a batch
+RATE, FORGETTING = 3e-3, 0.3  # step size, and λ
+FINE = 8.0  # κ of relative positions of objects, where a centimetre decides
+PLACED = 4.0  # κ of the position of the hand: objects are put down at places that nothing else marks
+FARTHEST = 100.0  # inputs are clipped to this
 
 
 @lru_cache(maxsize=8)
@@ -88,8 +77,7 @@ class Motor(NamedTuple):
 
     def named(self, senses: StreamScaler) -> dict[str, NDArray[Any]]:
         """Return the arrays of a checkpoint, with κ."""
-        arrays = {**self._asdict(), "kappa": fineness(senses.spec)}
-        return {f"motor_{name}": array for name, array in arrays.items()}
+        return {f"motor_{n}": a for n, a in {**self._asdict(), "kappa": fineness(senses.spec)}.items()}
 
     @classmethod
     def found(cls, learned: Mapping[str, NDArray[Any]], senses: StreamScaler) -> Self | None:
@@ -116,8 +104,8 @@ class Motor(NamedTuple):
 def lessons(senses: StreamScaler, episodes: Sequence[Episode]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return situations (N, I), and the next command in each (N, A).
 
-    The command is that of ``episode.actions``, which is the intended one where noise was added to what was executed
-    (DART: Laskey et al. 2017, CoRL); without actions, that of the stream.
+    The command is that of ``episode.actions``, the intended one where noise was added to the executed one (DART: Laskey
+    et al. 2017, CoRL); without actions, that of the stream.
 
     Raises:
         ValueError: the streams have no commands.
@@ -133,14 +121,7 @@ def lessons(senses: StreamScaler, episodes: Sequence[Episode]) -> tuple[NDArray[
     return np.concatenate(m), np.concatenate(commands)
 
 
-def learn_motor(
-    m: Array,
-    commands: Array,
-    units: int,
-    rng: np.random.Generator,
-    updates: int = UPDATES,
-    forgetting: float = FORGETTING,
-) -> Motor:
+def learn_motor(m: Array, commands: Array, units: int, rng: np.random.Generator) -> Motor:
     """Learn the synapses from N rows in random order.
 
     Args:
@@ -148,8 +129,6 @@ def learn_motor(
         commands: (N, A) the next command in each.
         units: M.
         rng: draws initial weights and the order of rows.
-        updates: largest number of batches.
-        forgetting: λ, in units of the learning rate.
 
     Raises:
         ValueError: fewer than one unit.
@@ -163,11 +142,11 @@ def learn_motor(
     V = (rng.standard_normal((units, inputs)) / np.sqrt(inputs)).astype(np.float32)
     weights = V, np.zeros((A, units), np.float32), np.zeros((A, inputs), np.float32)
     synapses, plain = [Synapse(W) for W in weights], np.ones(A, np.float32)
-    updates = max(1, min(updates, PASSES * len(m) // BATCH))
+    updates = max(1, min(UPDATES, PASSES * len(m) // BATCH))
     for n, rows in zip(range(updates), shuffled(len(m), BATCH, rng), strict=False):
         change, _ = association_change(m[rows], wanted[rows], plain, *weights, bound=np.inf)
         rate = cosine_decay(RATE, n / updates)
         for synapse, product in zip(synapses, change, strict=True):
-            synapse.W *= np.float32(1.0 - forgetting * rate)
+            synapse.W *= np.float32(1.0 - FORGETTING * rate)
             synapse.learn(product, rate)
     return Motor(*weights, mean, spread)

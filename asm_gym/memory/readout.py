@@ -21,15 +21,9 @@ from numpy.typing import NDArray
 from asm_gym.memory.energy import Array, kernel, outward
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 
-UPDATES = 6000
-BATCH = 512
-RATE = 1e-2
-
-KEPT = np.float32(0.9)
-"""1 - λ."""
-
-SMALLEST = np.float32(1e-6)
-"""Smallest p whose logarithm is taken."""
+UPDATES, BATCH, RATE = 6000, 512, 1e-2
+KEPT = np.float32(0.9)  # 1 - λ
+SMALLEST = np.float32(1e-6)  # smallest p whose logarithm is taken
 
 
 def certainty(units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
@@ -61,29 +55,27 @@ def add_up(L: Array, units: Array, state: Array, W_K: Array, b_K: Array) -> Arra
 
 
 def learn_readout(
-    look: Callable[[NDArray[np.intp]], Array],
+    rates: Callable[[NDArray[np.intp]], Array],
     skill: NDArray[np.intp],
     count: int,
     rng: np.random.Generator,
-    updates: int = UPDATES,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return W_K (K, M) and b_K (K,) learned from N rows whose skill is known.
 
     Args:
-        look: returns the firing rates (B, M) of the rows of B indices, as all of them at once might not fit.
+        rates: returns the firing rates (B, M) of the rows of B indices, as all of them at once might not fit.
         skill: (N,) each below ``count``.
         count: K.
         rng: draws the order of rows.
-        updates: number of batches.
     """
-    W_K, b_K = np.zeros((count, look(np.arange(1)).shape[1]), np.float32), np.zeros(count, np.float32)
+    W_K, b_K = np.zeros((count, rates(np.arange(1)).shape[1]), np.float32), np.zeros(count, np.float32)
     weights, bias = Synapse(W_K), Synapse(b_K)
     rarity = (len(skill) / (count * np.bincount(skill, minlength=count))).astype(np.float32)  # (K,) n
-    for n, rows in zip(range(updates), shuffled(len(skill), BATCH, rng), strict=False):
-        f = np.ascontiguousarray(look(rows), np.float32)
+    for n, rows in zip(range(UPDATES), shuffled(len(skill), BATCH, rng), strict=False):
+        f = np.ascontiguousarray(rates(rows), np.float32)
         error = np.eye(count, dtype=np.float32)[skill[rows]] - certainty(f, W_K, b_K)
         error *= rarity[skill[rows], None]
-        rate = cosine_decay(RATE, n / updates)
+        rate = cosine_decay(RATE, n / UPDATES)
         weights.learn(error.T @ f / np.float32(len(rows)), rate)
         bias.learn(error.mean(axis=0), rate)
     return W_K, b_K

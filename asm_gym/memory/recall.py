@@ -22,8 +22,7 @@ from asm_gym.memory.temporal import Step, TemporalNetwork
 from asm_gym.scaling import StreamScaler
 from asm_gym.validation import check_number
 
-MOST_STEPS = 1_000_000
-"""Largest number of rows recalled at once."""
+MOST_STEPS = 1_000_000  # largest number of rows recalled at once
 
 
 class Recalled(NamedTuple):

@@ -67,13 +67,10 @@ class SettlingNetwork(TemporalNetwork):
         return np.hstack([self._sense(mu), action])
 
     def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
+        w, precision = self.weights, self.sensory_precision * seen
         mu, action = self._expected(c, u)
-        z = self._infer(mu, x, seen)
+        z = infer(mu, x - w.b_F, w.W_F, self.prior_precision, precision, self.curvature, self.iterations)
         return Step(mu, np.hstack([self._sense(mu), action]), z, z)
-
-    def carry_on(self, c: Array, u: Array, x: Array, seen: Array) -> tuple[Array, Array]:
-        mu = outward(activate(c), self.weights.W_H) + outward(u, self.weights.W_U)
-        return activate(mu), self._infer(mu, x, seen)
 
     def run_on(self, c: Array) -> Step:
         u = np.zeros((len(c), self.motor + 1), np.float32)
@@ -86,12 +83,6 @@ class SettlingNetwork(TemporalNetwork):
         """Return x̂ (B, S)."""
         found: Array = outward(activate(z), self.weights.W_F) + self.weights.b_F
         return found
-
-    def _infer(self, mu: Array, x: Array, seen: Array) -> Array:
-        """Return z_t (B, H)."""
-        w, precision = self.weights, self.sensory_precision * seen
-        z: Array = infer(mu, x - w.b_F, w.W_F, self.prior_precision, precision, self.curvature, self.iterations)
-        return z
 
     def _expected(self, z: Array, u: Array) -> tuple[Array, Array]:
         """Return μ_t (B, H), and â_t (B, A), which does not depend on the action."""

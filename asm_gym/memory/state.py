@@ -15,12 +15,11 @@ from asm_gym.memory.temporal import TemporalNetwork
 
 Rows = NDArray[np.float64]
 
-UNSURE = np.float32(0.1)
-"""Weight of an error while only one earlier row is known: who begins in mid-motion does not know the speed."""
+UNSURE = np.float32(0.1)  # weight of an error while only one earlier row is known, and with it no speed
 
 
 class RowHistory(NamedTuple):
-    """The rows that the next ones are compared with, one entry a stream; a value, never changed in place."""
+    """The rows that the next ones are compared with, one entry a stream; never changed in place."""
 
     before: Rows  # (B, l, D) the rows seen last, the oldest first
     earlier: Rows  # (B, l, D) those before
@@ -53,7 +52,7 @@ class RowHistory(NamedTuple):
 
 
 class MemoryState(NamedTuple):
-    """Where the memory is, one entry a stream; a value, never changed in place."""
+    """State of the memory, one entry a stream; never changed in place."""
 
     traces: NDArray[np.float32]  # (B, I) c, of what was sensed and done; or the state z that settled on it
     expected: NDArray[np.float32]  # (B, H) f(μ), of the state that was expected then

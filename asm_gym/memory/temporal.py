@@ -105,10 +105,6 @@ class TemporalNetwork(ABC):
         """
 
     @abstractmethod
-    def carry_on(self, c: Array, u: Array, x: Array, seen: Array) -> tuple[Array, Array]:
-        """Return f(μ_t) (B, H) and c_t (B, I), the part of ``follow`` that a monitor needs."""
-
-    @abstractmethod
     def run_on(self, c: Array) -> Step:
         """Predict a row without reading it: both the action and the senses are the network's own."""
 

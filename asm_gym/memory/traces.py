@@ -171,10 +171,6 @@ class Network(TemporalNetwork):
         whole = np.where(seen > 0, x, (past + sense(z, w.W_F))[:, : x.shape[1]])
         return Step(mu, past + sense(mu, w.W_F), z, advance(c, np.hstack([whole, u]), w.gains))
 
-    def carry_on(self, c: Array, u: Array, x: Array, seen: Array) -> tuple[Array, Array]:
-        expected, traces = carry(c, u, x, seen, *self.weights, *self.inference, True)
-        return expected, traces
-
     def run_on(self, c: Array) -> Step:
         w = self.weights
         S, A = w.W_F.shape[0] - self.motor, self.motor
